@@ -1,0 +1,67 @@
+"""Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or written."""
+
+from jaxba.damping import (
+    POLICIES,
+    Ceres,
+    Classic,
+    DampingPolicy,
+    Geometric,
+    ProblemInfo,
+    Safeguard,
+    Schedule,
+    make_policy,
+)
+from jaxba.io import read_bal, read_bundler, read_problem, write_bal, write_ply, write_problem
+from jaxba.layout import Layout, build_layout
+from jaxba.lm import LMState, StepInfo, initial_state, lm_step
+from jaxba.losses import Loss
+from jaxba.options import StepOptions
+from jaxba.problem import BundleProblem, ProblemError
+from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
+from jaxba.solve import History, IterationRecord, Solution, Termination, Tolerances, solve, solve_loop
+from jaxba.transform import drop_invalid, normalize, perturb, poba_start
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "POLICIES",
+    "BundleProblem",
+    "Ceres",
+    "Classic",
+    "DampingPolicy",
+    "Geometric",
+    "History",
+    "IterationRecord",
+    "LMState",
+    "Layout",
+    "Loss",
+    "ProblemError",
+    "ProblemInfo",
+    "Safeguard",
+    "SceneConfig",
+    "Schedule",
+    "Solution",
+    "StepInfo",
+    "StepOptions",
+    "Termination",
+    "Tolerances",
+    "build_layout",
+    "drop_invalid",
+    "initial_state",
+    "like",
+    "lm_step",
+    "make_policy",
+    "normalize",
+    "perturb",
+    "poba_start",
+    "random_scene",
+    "random_scene_with_truth",
+    "read_bal",
+    "read_bundler",
+    "read_problem",
+    "solve",
+    "solve_loop",
+    "write_bal",
+    "write_ply",
+    "write_problem",
+]

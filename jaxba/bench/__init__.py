@@ -1,0 +1,1 @@
+"""The benchmark: runner, records, performance profiles, tables, figures and the report."""

@@ -1,0 +1,209 @@
+"""Runs solvers on problems, one record a run, and keeps what is done."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import jaxba
+from jaxba.bench.records import Record, TracePoint, append_record, read_records
+from jaxba.bench.sources import Source
+from jaxba.bench.summary import write_text
+from jaxba.naming import SolverName, parse_solver
+from jaxba.options import StepOptions
+from jaxba.problem import BundleProblem, ProblemError
+from jaxba.solve import MAX_ITERATIONS, IterationRecord, Solution, Tolerances, solve
+
+RESULTS = "results.jsonl"
+"""One line a run."""
+
+SETTINGS = "settings.json"
+"""What the runs of a folder have in common; a run with other settings may not continue there."""
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """What every run of a benchmark shares."""
+
+    max_iterations: int = MAX_ITERATIONS
+    """Linear solves after which a solver has failed."""
+
+    ftol: float = Tolerances().ftol
+    """Relative decrease of an accepted step that ends a solve."""
+
+    linear_solver: str = "auto"
+    """`auto`, `explicit` or `implicit`."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run to do."""
+
+    source: Source
+    solver: SolverName
+    repeat: int
+
+
+def run_solver(
+    problem: BundleProblem,
+    source: Source,
+    solver: SolverName,
+    repeat: int,
+    settings: RunSettings,
+    on_iteration: Callable[[IterationRecord], Any] | None = None,
+) -> Record:
+    """Solves one problem once, step by step, with real time stamps."""
+    steps: list[IterationRecord] = []
+
+    def watch(step: IterationRecord) -> None:
+        steps.append(step)
+        if on_iteration:
+            on_iteration(step)
+
+    solution = solve(
+        problem,
+        solver.policy,
+        StepOptions(refine_points=solver.refine_points),
+        linear_solver=settings.linear_solver,
+        max_iterations=settings.max_iterations,
+        tolerances=Tolerances(ftol=settings.ftol),
+        dtype=solver.dtype,
+        callback=watch,
+    )
+    return record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
+
+
+def record_of(
+    solution: Solution, steps: Sequence[IterationRecord], *, name: str, family: str, solver: SolverName, repeat: int = 0
+) -> Record:
+    """A solution as a line of `results.jsonl`."""
+    trace = [TracePoint(0, 0.0, solution.initial_cost, float("nan"), True, 0, float("nan"))]
+    for item in steps:
+        step = item.step
+        trace.append(
+            TracePoint(
+                iteration=item.iteration,
+                time_s=item.time_s,
+                cost=float(step.cost),
+                damping=float(step.damping),
+                accepted=bool(step.accepted),
+                cg_iterations=int(step.cg_iterations),
+                gain_ratio=float(step.gain_ratio),
+            )
+        )
+    device = jax.devices()[0]
+    return Record(
+        problem=name,
+        family=family,
+        cameras=solution.problem.num_cameras,
+        points=solution.problem.num_points,
+        observations=solution.problem.num_observations,
+        solver=str(solver),
+        backend=f"jaxba {jaxba.__version__} ({solution.linear_solver})",
+        device=f"{device.platform}: {device.device_kind}",
+        dtype=solver.dtype,
+        threads=threads(),
+        repeat=repeat,
+        setup_s=solution.setup_s,
+        compile_s=solution.compile_s,
+        total_s=solution.total_s,
+        initial_cost=solution.initial_cost,
+        final_cost=solution.final_cost,
+        iterations=solution.iterations,
+        accepted=solution.accepted,
+        cg_iterations=int(solution.history.cg_iterations.sum()),
+        termination=solution.termination.name.lower(),
+        trace=tuple(trace),
+    )
+
+
+def threads() -> int:
+    """Processor cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
+def machine() -> dict[str, str]:
+    """The machine in words, for a report."""
+    device = jax.devices()[0]
+    return {
+        "device": f"{device.platform}: {device.device_kind}",
+        "processor": f"{platform.machine()}, {threads()} threads",
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "jaxba": jaxba.__version__,
+    }
+
+
+def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> list[Job]:
+    """All runs, problem by problem.
+
+    Raises:
+        SolverNameError, UnknownPolicyError: a name that is no solver.
+    """
+    names = list(dict.fromkeys(str(parse_solver(name)) for name in solvers))
+    parsed = [parse_solver(name) for name in names]
+    return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
+
+
+def open_folder(folder: Path, settings: RunSettings, sources: Sequence[Source]) -> list[Record]:
+    """Makes the folder, or finds what an earlier run left there.
+
+    Raises:
+        ProblemError: the folder holds runs with other settings, or of other problems under the same names.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / SETTINGS
+    mine: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}}
+    if path.exists():
+        try:
+            before = json.loads(path.read_text())
+            known = dict(before.pop("problems"))
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
+        other = [key for key, value in asdict(settings).items() if before.get(key) != value]
+        other += [name for name, place in mine["problems"].items() if known.get(name, place) != place]
+        if other:
+            raise ProblemError(f"{folder} holds a run with another {other[0]}; give another --out, or remove it")
+        mine["problems"] = {**known, **mine["problems"]}
+    write_text(path, json.dumps(mine, indent=1) + "\n")
+    results = folder / RESULTS
+    return read_records(results) if results.exists() else []
+
+
+def execute(
+    jobs: Sequence[Job],
+    done: Sequence[Record],
+    folder: Path,
+    settings: RunSettings,
+    on_start: Callable[[Job], Any],
+    on_iteration: Callable[[IterationRecord], Any],
+    on_error: Callable[[Job, ProblemError], Any],
+) -> Iterator[Record]:
+    """Does the jobs that have no record yet, appending each result as soon as it is there.
+
+    A problem that cannot be read is reported once and skipped.
+    """
+    finished = {(r.problem, r.solver, r.repeat) for r in done}
+    problem, loaded, broken = None, None, set()
+    for job in jobs:
+        if (job.source.name, str(job.solver), job.repeat) in finished or job.source in broken:
+            continue
+        on_start(job)
+        if loaded != job.source:
+            try:
+                problem, loaded = job.source.read(), job.source
+            except ProblemError as error:
+                broken.add(job.source)
+                on_error(job, error)
+                continue
+        assert problem is not None
+        record = run_solver(problem, job.source, job.solver, job.repeat, settings, on_iteration)
+        append_record(folder / RESULTS, record)
+        yield record

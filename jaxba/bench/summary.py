@@ -1,0 +1,487 @@
+"""Tables from records: one row per solver, one per problem and solver, as data, JSON, Markdown and terminal text.
+
+How unreached targets enter the means: every mean over reached problems stands beside "reached k of n", n being
+all problems of the benchmark, run or not. Iterations also have a capped mean over all n, in which an unreached
+target counts as `ITERATION_LIMIT`; there a solver cannot look good by failing on the hard problems.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import statistics
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxba.bench import profile
+from jaxba.bench.profile import NEVER, Reach, Target
+from jaxba.bench.records import Record
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+YARDSTICKS = ("classic", "ceres")
+"""Solvers that every other one is compared with: the paper's yardstick and what people use. Source: design."""
+
+SHORTEST_TIME = 1e-6
+"""Seconds; a shorter time (0 where the start already satisfies a target) enters geometric means as this."""
+
+FORMAT = 1
+"""Version of `summary.json`; it changes when a key changes its meaning."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One solver on one problem; numbers are medians over repeats."""
+
+    problem: str
+    solver: str
+    repeats: int
+    converged: bool
+    """In more than half of the repeats, each within `ITERATION_LIMIT` iterations."""
+    termination: str
+    """Reasons of the repeats, each once, joined by a slash."""
+    final_cost: float
+    """Pixels squared; infinite if not finite."""
+    final_ratio: float
+    """(final + floor) / (f* + floor), floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best."""
+    iterations: float
+    rejected: float
+    seconds: float
+    """Solve time without compilation."""
+    seconds_per_iteration: float
+    """Median over the iterations of all repeats; NaN without iterations."""
+    setup_s: float
+    compile_s: float
+    reach: dict[str, Reach]
+    """By `Target.key`."""
+
+
+@dataclass(frozen=True)
+class TargetSummary:
+    """How a solver does on one target over all problems."""
+
+    reached: int
+    total: int
+    """All problems, also those that the solver was not run on."""
+    iterations: float
+    """Geometric mean over the reached problems; a count of 0 enters as 1. NaN if none."""
+    iterations_capped: float
+    """Geometric mean over all problems with counts capped at `ITERATION_LIMIT`, unreached ones included."""
+    seconds: float
+    """Geometric mean over the reached problems. NaN if none."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A solver against a yardstick on one target; ratios are solver / yardstick, so below 1 is better."""
+
+    both: int
+    """Problems that both reached; the ratios are geometric means over these only."""
+    only_solver: int
+    only_yardstick: int
+    iterations: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class SolverSummary:
+    """One solver over all problems."""
+
+    solver: str
+    run: int
+    """Problems that it was run on."""
+    total: int
+    """Problems of the benchmark."""
+    targets: dict[str, TargetSummary]
+    """By `Target.key`."""
+    against: dict[str, dict[str, Comparison]]
+    """By yardstick, then by `Target.key`; without the solver itself."""
+    final_ratio_worst: float
+    final_ratio_mean: float
+    """Geometric mean; both over the problems it was run on."""
+    rejected_share: float
+    """Rejected iterations / iterations, over all runs."""
+    linear_failure_share: float
+    """Rejected iterations without a finite gain ratio (failed factorisation, non-finite cost) / iterations;
+    NaN where the trace has no gain ratios at all."""
+    seconds_per_iteration: float
+    """Median over problems."""
+    setup_s: float
+    compile_s: float
+    """Medians over problems."""
+
+
+@dataclass(frozen=True)
+class ProblemSummary:
+    """Size and costs of one problem."""
+
+    problem: str
+    family: str
+    cameras: int
+    points: int
+    observations: int
+    initial_cost: float
+    """f0, pixels squared."""
+    best_cost: float
+    """f*, pixels squared."""
+    best_solver: str
+    """Who reached f*; "known" if it was given."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Everything that tables show."""
+
+    targets: tuple[Target, ...]
+    problems: list[ProblemSummary]
+    solvers: list[SolverSummary]
+    cells: list[Cell]
+    warnings: list[str]
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def cell(self, problem: str, solver: str) -> Cell | None:
+        """The cell of a pair, None if it was not run."""
+        return next((c for c in self.cells if c.problem == problem and c.solver == solver), None)
+
+
+def summarize(
+    records: Sequence[Record],
+    tolerance: float = 1e-3,
+    known_best: Mapping[str, float] | None = None,
+    facts: Mapping[str, Any] | None = None,
+) -> Summary:
+    """Condenses records into tables.
+
+    Args:
+        records: any number, also none.
+        tolerance: tau of the tolerance target.
+        known_best: costs (pixels squared) of some problems known from elsewhere, see `profile.best_cost`.
+        facts: what to say about the run (device, threads, versions); copied into the result.
+    """
+    targets = profile.standard_targets(tolerance)
+    starts, bests = profile.initial_costs(records), profile.best_cost(records, known_best)
+    tables = {target.key: profile.reach_table(records, target, known_best) for target in targets}
+    names, solvers = profile.problem_names(records), profile.solver_names(records)
+    cells = []
+    for name in names:
+        for solver in solvers:
+            runs = [r for r in records if r.problem == name and r.solver == solver]
+            if runs:
+                reaches = {key: table[solver][name] for key, table in tables.items()}
+                cells.append(_cell(runs, reaches, starts[name], bests[name]))
+    return Summary(
+        targets=targets,
+        problems=[_problem([r for r in records if r.problem == name], starts[name], bests[name]) for name in names],
+        solvers=[_solver(solver, records, cells, targets, names) for solver in solvers],
+        cells=cells,
+        warnings=profile.cost_warnings(records) + _coverage_warnings(cells, solvers, names),
+        facts=dict(facts or {}),
+    )
+
+
+def geometric_mean(values: Iterable[float], floor: float = 0.0) -> float:
+    """exp(mean(log)); values below `floor` count as `floor`, a zero makes it 0, infinity infinite, none NaN."""
+    raised = [max(value, floor) for value in values]
+    if not raised:
+        return math.nan
+    return 0.0 if 0.0 in raised else math.exp(math.fsum(math.log(value) for value in raised) / len(raised))
+
+
+def _median(values: Iterable[float]) -> float:
+    known = [value for value in values if not math.isnan(value)]
+    return statistics.median(known) if known else math.nan
+
+
+def _cell(runs: Sequence[Record], reaches: dict[str, Reach], f0: float, f_star: float) -> Cell:
+    final = statistics.median(r.final_cost if math.isfinite(r.final_cost) else math.inf for r in runs)
+    steps = [b.time_s - a.time_s for r in runs for a, b in zip(r.trace, r.trace[1:], strict=False)]
+    floor = profile.ZERO_RESIDUAL_FLOOR * f0
+    return Cell(
+        problem=runs[0].problem,
+        solver=runs[0].solver,
+        repeats=len(runs),
+        converged=math.isfinite(reaches["converged"].iterations),
+        termination="/".join(dict.fromkeys(r.termination for r in runs)),
+        final_cost=final,
+        final_ratio=(final + floor) / (f_star + floor) if f_star + floor > 0 else 1.0 if final <= 0 else math.inf,
+        iterations=_median(float(r.iterations) for r in runs),
+        rejected=_median(float(r.iterations - r.accepted) for r in runs),
+        seconds=_median(r.trace[-1].time_s if r.trace else r.total_s for r in runs),
+        seconds_per_iteration=_median(steps),
+        setup_s=_median(r.setup_s for r in runs),
+        compile_s=_median(r.compile_s for r in runs),
+        reach=reaches,
+    )
+
+
+def _problem(runs: Sequence[Record], f0: float, f_star: float) -> ProblemSummary:
+    first = runs[0]
+    holder = [r.solver for r in runs if r.final_cost <= f_star or any(p.cost <= f_star for p in r.trace)]
+    sizes = (first.cameras, first.points, first.observations)
+    return ProblemSummary(first.problem, first.family, *sizes, f0, f_star, holder[0] if holder else "known")
+
+
+def _solver(
+    solver: str, records: Sequence[Record], cells: Sequence[Cell], targets: Sequence[Target], names: Sequence[str]
+) -> SolverSummary:
+    own = [cell for cell in cells if cell.solver == solver]
+    runs = [r for r in records if r.solver == solver]
+    yardsticks = [y for y in YARDSTICKS if y != solver and any(cell.solver == y for cell in cells)]
+    iterations = sum(r.iterations for r in runs)
+    points = [point for r in runs for point in r.trace[1:]]
+    failures = sum(not p.accepted and not math.isfinite(p.gain_ratio) for p in points)
+    knows_gain = any(math.isfinite(p.gain_ratio) for p in points)
+    return SolverSummary(
+        solver=solver,
+        run=len(own),
+        total=len(names),
+        targets={t.key: _target(own, t.key, len(names)) for t in targets},
+        against={y: {t.key: _compare(cells, solver, y, t.key, names) for t in targets} for y in yardsticks},
+        final_ratio_worst=max(cell.final_ratio for cell in own),
+        final_ratio_mean=geometric_mean(cell.final_ratio for cell in own),
+        rejected_share=(iterations - sum(r.accepted for r in runs)) / iterations if iterations else math.nan,
+        linear_failure_share=failures / len(points) if knows_gain else math.nan,
+        seconds_per_iteration=_median(cell.seconds_per_iteration for cell in own),
+        setup_s=_median(cell.setup_s for cell in own),
+        compile_s=_median(cell.compile_s for cell in own),
+    )
+
+
+def _target(own: Sequence[Cell], key: str, total: int) -> TargetSummary:
+    reaches = [cell.reach[key] for cell in own] + [NEVER] * (total - len(own))
+    reached = [item for item in reaches if math.isfinite(item.iterations)]
+    return TargetSummary(
+        reached=len(reached),
+        total=total,
+        iterations=geometric_mean((item.iterations for item in reached), floor=1.0),
+        iterations_capped=geometric_mean(
+            (min(item.iterations, float(profile.ITERATION_LIMIT)) for item in reaches), 1.0
+        ),
+        seconds=geometric_mean((item.seconds for item in reached), SHORTEST_TIME),
+    )
+
+
+def _compare(cells: Sequence[Cell], solver: str, yardstick: str, key: str, names: Sequence[str]) -> Comparison:
+    reaches = {(cell.problem, cell.solver): cell.reach[key] for cell in cells}
+    pairs = [(reaches.get((name, solver), NEVER), reaches.get((name, yardstick), NEVER)) for name in names]
+    both = [(a, b) for a, b in pairs if math.isfinite(a.iterations) and math.isfinite(b.iterations)]
+    ours, theirs = (sum(math.isfinite(pair[side].iterations) for pair in pairs) - len(both) for side in (0, 1))
+    iterations = geometric_mean(max(a.iterations, 1.0) / max(b.iterations, 1.0) for a, b in both)
+    seconds = geometric_mean(max(a.seconds, SHORTEST_TIME) / max(b.seconds, SHORTEST_TIME) for a, b in both)
+    return Comparison(len(both), ours, theirs, iterations, seconds)
+
+
+def _coverage_warnings(cells: Sequence[Cell], solvers: Sequence[str], names: Sequence[str]) -> list[str]:
+    counts = {solver: sum(cell.solver == solver for cell in cells) for solver in solvers}
+    return [
+        f"{solver} was run on {count} of {len(names)} problems; the others count as not reached"
+        for solver, count in counts.items()
+        if count < len(names)
+    ]
+
+
+def to_json(summary: Summary) -> dict[str, Any]:
+    """The object written to `summary.json`; non-finite numbers (never reached, unknown) become None."""
+    body = asdict(summary)
+    body["targets"] = [{"key": t.key, "label": t.label, "kind": t.kind, "value": t.value} for t in summary.targets]
+    rules = {
+        "iteration_limit": profile.ITERATION_LIMIT,
+        "zero_residual_floor": profile.ZERO_RESIDUAL_FLOOR,
+        "means": "geometric, over reached problems; iterations_capped over all problems; ratios solver / yardstick",
+    }
+    return _clean({"format": FORMAT, "rules": rules, **body})
+
+
+def _clean(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _clean(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_clean(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
+
+
+def write_summary(path: str | os.PathLike[str], summary: Summary) -> None:
+    """Writes `summary.json` atomically: readers see the old file or the whole new one. Raises OSError."""
+    write_text(path, json.dumps(to_json(summary), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Writes a UTF-8 text through a temporary file in the same folder and `os.replace`. Raises OSError."""
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table ready to be drawn: plain text, first column(s) left, numbers right."""
+
+    title: str
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    note: str
+    """What the numbers mean, one or two sentences."""
+    text_columns: int = 1
+    """Columns from the left that hold names."""
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number for people: `digits` significant ones, an infinity as its sign, NaN as a dash."""
+    if math.isnan(value):
+        return "-"
+    if math.isinf(value):
+        return "∞"
+    return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{100 * share:.0f} %"
+
+
+def tables(summary: Summary, details: bool = True) -> list[Table]:
+    """The tables of every rendering.
+
+    Args:
+        summary: from `summarize`.
+        details: also the table of every problem and solver.
+    """
+    found = [_overview(summary), *_reach_tables(summary)]
+    found += [
+        _against(summary, yardstick) for yardstick in YARDSTICKS if any(yardstick in s.against for s in summary.solvers)
+    ]
+    return [*found, _details(summary)] if details else found
+
+
+def _overview(summary: Summary) -> Table:
+    header = ("solver", "converged", "iterations", "capped", "time s", "s / iteration", "final / best worst", "mean")
+    rows = []
+    for s in summary.solvers:
+        end = s.targets["converged"]
+        means = (end.iterations, end.iterations_capped, end.seconds, s.seconds_per_iteration)
+        shares = (_percent(s.rejected_share), _percent(s.linear_failure_share))
+        ratios = (number(s.final_ratio_worst, 6), number(s.final_ratio_mean, 6))
+        rows.append(
+            (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *shares, number(s.compile_s))
+        )
+    note = (
+        f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
+        "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
+        f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): shares of all iterations. "
+        "Seconds per iteration and compilation: medians over problems."
+    )
+    return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
+
+
+def _reach_tables(summary: Summary) -> list[Table]:
+    targets = [target for target in summary.targets if target.kind != "converged"]
+    header = ("solver", *(target.label for target in targets))
+    iterations, seconds = [], []
+    for s in summary.solvers:
+        cells = [s.targets[target.key] for target in targets]
+        reached = [f"{cell.reached}/{cell.total}" for cell in cells]
+        capped = [
+            f"{number(c.iterations)} [{number(c.iterations_capped)}] {k}" for c, k in zip(cells, reached, strict=True)
+        ]
+        iterations.append((s.solver, *capped))
+        seconds.append((s.solver, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
+    note = (
+        "Geometric mean over the k of n problems reached (k/n). f*: lowest accepted cost of any solver; "
+        "τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged."
+    )
+    capped_note = f" In brackets: over all n, unreached ones counting as {profile.ITERATION_LIMIT}."
+    return [
+        Table("Iterations to tolerance", header, iterations, note + capped_note),
+        Table("Time to tolerance (s, without compilation)", header, seconds, note),
+    ]
+
+
+def _against(summary: Summary, yardstick: str) -> Table:
+    rows = []
+    for s in summary.solvers:
+        if yardstick in s.against:
+            rows.append((s.solver, *(_ratio_text(s.against[yardstick][target.key]) for target in summary.targets)))
+    note = (
+        f"Iterations / time as a share of {yardstick}'s (below 1 is better), geometric means over the problems that "
+        "both reached; their number in brackets, then + those that only this solver and - those that only "
+        f"{yardstick} reached."
+    )
+    return Table(f"Against {yardstick}", ("solver", *(target.label for target in summary.targets)), rows, note)
+
+
+def _ratio_text(item: Comparison) -> str:
+    ours = f" +{item.only_solver}" if item.only_solver else ""
+    theirs = f" -{item.only_yardstick}" if item.only_yardstick else ""
+    return f"{number(item.iterations)} / {number(item.seconds)} ({item.both}{ours}{theirs})"
+
+
+def _details(summary: Summary) -> Table:
+    keys = (f"relative_{1e-3:g}", f"own_end_{profile.OWN_END_TOLERANCE:g}", "converged")
+    header = (
+        "problem",
+        "solver",
+        "its to f*(1+0.001)",
+        "own end",
+        "converged",
+        "rejected",
+        "final cost",
+        "final / best",
+    )
+    rows = []
+    for c in summary.cells:
+        reaches = [c.reach[key] for key in keys]
+        counts = [number(item.iterations) for item in reaches] + [number(c.rejected)]
+        ends = [number(c.final_cost, 7), number(c.final_ratio, 6)]
+        times = [number(reaches[0].seconds), number(c.seconds)]
+        rows.append((c.problem, c.solver, *counts, *ends, *times, c.termination))
+    note = "Medians over repeats; ∞: never. Times in seconds, without compilation; time s is that of the whole solve."
+    return Table("Problems", (*header, "s to f*(1+0.001)", "time s", "termination"), rows, note, text_columns=2)
+
+
+def to_markdown(summary: Summary, details: bool = True) -> str:
+    """All tables as GitHub Markdown, warnings first."""
+
+    def plain(text: str) -> str:
+        return re.sub(r"([\\`*|<>\[\]$])", r"\\\1", " ".join(text.split()))
+
+    def line(cells: Iterable[str]) -> str:
+        return f"| {' | '.join(cells)} |"
+
+    parts = [f"> **Warning:** {plain(warning)}" for warning in summary.warnings]
+    for table in tables(summary, details):
+        marks = [":--" if i < table.text_columns else "--:" for i in range(len(table.header))]
+        rows = [line(map(plain, table.header)), line(marks), *(line(map(plain, row)) for row in table.rows)]
+        parts.append("\n".join([f"### {plain(table.title)}", "", *rows, "", plain(table.note)]))
+    return "\n\n".join(parts) + "\n"
+
+
+def print_summary(summary: Summary, console: Console, details: bool = True) -> None:
+    """Prints all tables to a rich console, warnings first."""
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    for warning in summary.warnings:
+        console.print(Text(f"warning: {warning}", style="yellow"))
+    for table in tables(summary, details):
+        drawn = RichTable(
+            title=Text(table.title), caption=Text(table.note), title_justify="left", caption_justify="left"
+        )
+        for i, name in enumerate(table.header):
+            drawn.add_column(Text(name), justify="left" if i < table.text_columns else "right", overflow="fold")
+        for row in table.rows:
+            drawn.add_row(*(Text(cell) for cell in row))
+        console.print(drawn)

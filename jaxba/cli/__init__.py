@@ -1,0 +1,1 @@
+"""Command-line programs. Each module imports what it needs when it runs, so that errors come fast."""

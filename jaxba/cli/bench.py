@@ -1,0 +1,194 @@
+"""`jaxba-bench`: solvers side by side on many problems."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from jaxba.cli import common
+
+DEFAULT_SOLVERS = "classic,ceres,gauss-newton,schedule,ceres+refine3"
+"""Both yardsticks, the extremes, and the best hand-written rule."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of `jaxba-bench`."""
+
+    problems: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Files, or random scenes such as scene:ladybug-49 or scene:tiny:7. Without them (and without a suite) an
+    embedded suite of four random scenes runs."""
+
+    suite: str | None = None
+    """YAML file with any of: problems (globs and $VARIABLES allowed), solvers, tolerance, repeats,
+    max_iterations."""
+
+    solvers: str | None = None
+    """Comma-separated names, [method+]policy[+refineK][@dtype]. Default:
+    classic,ceres,gauss-newton,schedule,ceres+refine3."""
+
+    tolerance: float | None = None
+    """tau of the performance profile: cost <= f* + tau (f0 - f*). Default 1e-3."""
+
+    repeats: int | None = None
+    """Runs of each solver on each problem; times are medians. Default 3."""
+
+    max_iterations: int | None = None
+    """Linear solves after which a solver has failed. Default 100."""
+
+    linear_solver: Literal["auto", "explicit", "implicit"] = "auto"
+    """For all solvers."""
+
+    out: str = "runs/bench"
+    """Folder of the results. A second run into the same folder does only what is missing."""
+
+
+def main() -> None:
+    """Entry point of `jaxba-bench`."""
+    common.exit_with(run())
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; status 0 when all is done, 2 for bad input, 130 after Ctrl-C (results are kept)."""
+    return common.run_command(Arguments, _bench, "Solvers side by side: table, profiles, plots.", argv)
+
+
+def _bench(args: Arguments) -> int:
+    args = _with_suite(args)
+    solvers = [name for name in (args.solvers or DEFAULT_SOLVERS).split(",") if name.strip()]
+    tolerance = 1e-3 if args.tolerance is None else args.tolerance
+    repeats = 3 if args.repeats is None else args.repeats
+    if not 0 < tolerance < 1:
+        raise common.UsageError(f"--tolerance must lie between 0 and 1, is {tolerance:g}")
+    max_iterations = 100 if args.max_iterations is None else args.max_iterations
+    common.check_positive(repeats=repeats, max_iterations=max_iterations)
+    if not solvers:
+        raise common.UsageError("--solvers names no solver")
+    from rich.console import Console
+
+    from jaxba.bench import report, run
+    from jaxba.bench.records import Record
+    from jaxba.bench.sources import embedded_sources, sources
+    from jaxba.bench.summary import print_summary, summarize
+
+    places = sources(list(args.problems)) if args.problems else embedded_sources()
+    jobs = run.plan(places, solvers, repeats)
+    settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
+    folder = Path(args.out)
+    try:
+        done = run.open_folder(folder, settings, places)
+    except OSError as error:
+        raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
+    common.use_compilation_cache()
+    console = Console()
+    wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
+    records: list[Record] = [r for r in done if (r.problem, r.solver, r.repeat) in wanted]
+    if records:
+        console.print(f"{len(records)} of {len(jobs)} runs are already in {folder}", highlight=False)
+    status = 0
+    try:
+        status = _execute(jobs, done, folder, settings, console, records)
+    except KeyboardInterrupt:
+        console.print("interrupted; what is done is kept, run the same command again to continue", highlight=False)
+        status = common.INTERRUPTED
+    if records:
+        console.print("drawing", highlight=False)
+        files = report.write_all(records, folder, tolerance, facts={**report.run_facts(records), **run.machine()})
+        print_summary(summarize(records, tolerance), console)
+        console.print(f"wrote {len(files)} files; see {folder / 'report.html'}", highlight=False)
+    return status
+
+
+def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, records: list) -> int:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from jaxba.bench import run
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[now]}"),
+    )
+    failures = []
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("runs", total=len(jobs), completed=len(records), now="")
+
+        def start(job: Any) -> None:
+            progress.update(task, now=f"{job.source.name} {job.solver} #{job.repeat + 1}: compiling")
+
+        def iterate(step: Any) -> None:
+            now = progress.tasks[0].fields["now"].rpartition(":")[0]
+            progress.update(task, now=f"{now}: iteration {step.iteration}, cost {step.step.cost:.6g}")
+
+        def fail(job: Any, error: Exception) -> None:
+            failures.append(job)
+            common.complain(str(error))
+
+        for record in run.execute(jobs, done, folder, settings, start, iterate, fail):
+            records.append(record)
+            progress.advance(task)
+            if not console.is_terminal:
+                console.print(
+                    f"{record.problem} {record.solver} #{record.repeat + 1}: {record.iterations} iterations, "
+                    f"cost {record.final_cost:.8g}, {record.total_s:.2f} s, {record.termination}",
+                    highlight=False,
+                    soft_wrap=True,
+                )
+    return common.BAD_INPUT if failures else 0
+
+
+def _with_suite(args: Arguments) -> Arguments:
+    """Fills what the command line leaves open from the suite file."""
+    if args.suite is None:
+        return args
+    import yaml
+
+    try:
+        text = Path(args.suite).read_text(encoding="utf-8")
+        suite = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise common.UsageError(f"--suite {args.suite}: {getattr(error, 'strerror', None) or 'not text'}") from None
+    except yaml.YAMLError as error:
+        place = getattr(error, "problem_mark", None)
+        where = f" line {place.line + 1}" if place else ""
+        raise common.UsageError(f"--suite {args.suite}{where}: not YAML") from None
+    kinds: dict[str, tuple[type, ...]] = {
+        "problems": (list,),
+        "solvers": (list,),
+        "tolerance": (float, int),
+        "repeats": (int,),
+        "max_iterations": (int,),
+    }
+    if not isinstance(suite, dict):
+        raise common.UsageError(f"--suite {args.suite}: must be a mapping with keys {', '.join(kinds)}")
+    for key, value in suite.items():
+        if key not in kinds:
+            raise common.UsageError(f"--suite {args.suite}: unknown key {key!r}; known: {', '.join(kinds)}")
+        if not isinstance(value, kinds[key]) or isinstance(value, bool):
+            raise common.UsageError(f"--suite {args.suite}: {key} is {value!r}, not a {kinds[key][0].__name__}")
+    problems = args.problems or tuple(
+        place for entry in suite.get("problems", ()) for place in _expand(args, str(entry))
+    )
+    solvers = args.solvers or (",".join(map(str, suite["solvers"])) if "solvers" in suite else None)
+    rest = {k: suite.get(k) for k in ("tolerance", "repeats", "max_iterations") if getattr(args, k) is None}
+    return replace(args, problems=problems, solvers=solvers, **rest)
+
+
+def _expand(args: Arguments, entry: str) -> list[str]:
+    expanded = os.path.expandvars(entry)
+    if "$" in expanded:
+        raise common.UsageError(f"--suite {args.suite}: {entry}: the environment variable is not set")
+    if not glob.has_magic(expanded):
+        return [expanded]
+    found = sorted(glob.glob(expanded))
+    if not found:
+        raise common.UsageError(f"--suite {args.suite}: {entry}: no such file")
+    return found

@@ -1,0 +1,105 @@
+"""What the commands share: arguments, errors in one line, the compilation cache."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+Arguments = TypeVar("Arguments")
+
+BAD_INPUT = 2
+"""Exit status for input that cannot be used."""
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells define it."""
+
+CACHE_VARIABLE = "JAXBA_CACHE"
+"""Environment variable: folder of compiled programs; `off` switches the cache off."""
+
+
+class UsageError(ValueError):
+    """Arguments that make no sense. The message is one line for a person."""
+
+
+def run_command(
+    arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
+) -> int:
+    """Parses the command line and runs `main`; every expected error becomes one line on stderr and status 2."""
+    import tyro
+
+    parsed = tyro.cli(arguments, args=argv, description=description)
+    from jaxba.damping.registry import UnknownPolicyError
+    from jaxba.naming import SolverNameError
+    from jaxba.problem import ProblemError
+
+    try:
+        return main(parsed)
+    except (ProblemError, UsageError, UnknownPolicyError, SolverNameError) as error:
+        return complain(str(error))
+
+
+def complain(message: str) -> int:
+    """Prints an error line and returns the exit status for bad input."""
+    print(f"error: {message}", file=sys.stderr)
+    return BAD_INPUT
+
+
+def exit_with(status: int) -> NoReturn:
+    """Ends the process after flushing; a closed pipe on stdout is no error."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(status)
+
+
+def use_compilation_cache() -> None:
+    """Keeps compiled programs in the user's cache folder, so that the next run starts at once."""
+    import jax
+
+    choice = os.environ.get(CACHE_VARIABLE, "")
+    if choice.lower() == "off" or jax.config.jax_compilation_cache_dir:
+        return
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(choice) if choice else Path(base) / "jaxba" / "xla"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return  # a home that cannot be written costs time, nothing else
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def check_writable(option: str, path: str | None) -> None:
+    """Refuses an output file that could not be written later, before any work is done.
+
+    Raises:
+        UsageError: the folder is missing or not writable, or the path is a folder.
+    """
+    if path is None:
+        return
+    target = Path(path)
+    if target.is_dir():
+        raise UsageError(f"{option} {path}: is a directory")
+    if not target.absolute().parent.is_dir():
+        raise UsageError(f"{option} {path}: folder {target.parent} does not exist")
+    if not os.access(target.absolute().parent, os.W_OK):
+        raise UsageError(f"{option} {path}: folder {target.parent} cannot be written")
+
+
+def check_positive(**values: Any) -> None:
+    """Refuses numbers that are not positive (or, for tolerances, negative).
+
+    Raises:
+        UsageError: naming the option.
+    """
+    for name, value in values.items():
+        option = "--" + name.replace("_", "-")
+        if name.endswith("tol"):
+            if not value >= 0:
+                raise UsageError(f"{option} must not be negative, is {value:g}")
+        elif not value > 0:
+            raise UsageError(f"{option} must be positive, is {value:g}")

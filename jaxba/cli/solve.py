@@ -1,0 +1,167 @@
+"""`jaxba-solve`: one problem in, an optimised one out."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jaxba.cli import common
+
+DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
+"""What is solved where no problem is named."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of `jaxba-solve`."""
+
+    problem: Annotated[str | None, tyro.conf.Positional] = None
+    """BAL file or Bundler .out file, plain or .bz2, .gz, .xz. Without it a built-in random scene is solved."""
+
+    damping: str = "ceres"
+    """Who chooses lambda: ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4;
+    most take a first lambda, as in classic:0.03."""
+
+    refine_points: int = 0
+    """Embedded point iterations after each camera step; 3 is a good number."""
+
+    linear_solver: Literal["auto", "explicit", "implicit"] = "auto"
+    """Form and factor the reduced camera system, or solve it by conjugate gradients without forming it."""
+
+    dtype: Literal["float64", "float32"] = "float64"
+    """Type of all arithmetic."""
+
+    max_iterations: int = 100
+    """Linear solves before giving up."""
+
+    ftol: float = 1e-6
+    """Converged when an accepted step lowers the cost by less than this share."""
+
+    xtol: float = 1e-8
+    """Converged when an accepted step is shorter than this share of the parameters."""
+
+    gtol: float = 1e-10
+    """Converged when no gradient entry is larger."""
+
+    scaling: Literal["diagonal", "identity"] = "diagonal"
+    """What lambda multiplies: the Hessian's diagonal, or the unit matrix (the paper's equation)."""
+
+    rotation: Literal["angle-axis", "manifold"] = "angle-axis"
+    """Coordinates of rotation steps: those of the file, as Ceres, or multiplication by exp(step)."""
+
+    loss: Literal["squared", "huber", "soft_l1", "cauchy", "tukey"] = "squared"
+    """Robust loss of the squared residual."""
+
+    loss_scale: float = 1.0
+    """Residual in pixels where the loss bends."""
+
+    output: str | None = None
+    """Write the solution here: BAL format, compressed by its ending, or .ply for a viewer."""
+
+    log: str | None = None
+    """Write a JSON record of the solve here."""
+
+
+def main() -> None:
+    """Entry point of `jaxba-solve`."""
+    common.exit_with(run())
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Runs the command and returns its exit status: 0 when a solution was found and written, 2 for bad input."""
+    return common.run_command(Arguments, _solve, "Bundle adjustment of one problem.", argv)
+
+
+def _solve(args: Arguments) -> int:
+    common.check_positive(
+        max_iterations=args.max_iterations, ftol=args.ftol, xtol=args.xtol, gtol=args.gtol, loss_scale=args.loss_scale
+    )
+    if args.refine_points < 0:
+        raise common.UsageError(f"--refine-points must not be negative, is {args.refine_points}")
+    common.check_writable("--output", args.output)
+    common.check_writable("--log", args.log)
+    from jaxba.bench.records import record_to_json
+    from jaxba.bench.run import record_of
+    from jaxba.bench.sources import embedded_sources
+    from jaxba.bench.summary import write_text
+    from jaxba.cli import table
+    from jaxba.damping import make_policy
+    from jaxba.io import read_problem, write_problem
+    from jaxba.losses import Loss
+    from jaxba.naming import SolverName
+    from jaxba.options import StepOptions
+    from jaxba.solve import IterationRecord, Tolerances, solve
+
+    policy = make_policy(args.damping)
+    problem = read_problem(args.problem) if args.problem else embedded_sources()[0].read()
+    common.use_compilation_cache()
+    options = StepOptions(
+        scaling=args.scaling,
+        rotation=args.rotation,
+        refine_points=args.refine_points,
+        loss=Loss(args.loss, args.loss_scale),
+    )
+    print(table.heading(args.problem or DEFAULT_SCENE, problem, args))
+    steps: list[IterationRecord] = []
+    with _Interrupt() as interrupt:
+
+        def show(record: IterationRecord) -> bool:
+            if not steps:
+                print(table.header(record.step.previous_cost))
+            print(table.row(record, steps[-1].time_s if steps else 0.0), flush=True)
+            steps.append(record)
+            return interrupt.asked
+
+        solution = solve(
+            problem,
+            policy,
+            options,
+            linear_solver=args.linear_solver,
+            max_iterations=args.max_iterations,
+            tolerances=Tolerances(args.ftol, args.xtol, args.gtol),
+            dtype=args.dtype,
+            callback=show,
+        )
+    print(table.summary(problem, solution))
+    if args.output:
+        try:
+            write_problem(solution.problem, args.output)
+        except OSError as error:
+            raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
+        print(f"wrote {args.output}")
+    if args.log:
+        name = SolverName(args.damping, args.refine_points, args.dtype)
+        record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
+        try:
+            write_text(Path(args.log), json.dumps(record_to_json(record), allow_nan=False) + "\n")
+        except OSError as error:
+            raise common.UsageError(f"--log {args.log}: {error.strerror or error}") from None
+        print(f"wrote {args.log}")
+    return 0
+
+
+class _Interrupt:
+    """Turns the first Ctrl-C into a request to stop after the current iteration; the second one is real."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __enter__(self) -> _Interrupt:
+        self._before = signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _handle(self, *_: object) -> None:
+        if self.asked:
+            raise KeyboardInterrupt
+        self.asked = True
+        print("stopping after this iteration", file=sys.stderr)

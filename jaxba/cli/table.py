@@ -1,0 +1,67 @@
+"""Text of a solve: a table in the manner of Ceres, and a summary."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from jaxba import geometry
+from jaxba.problem import BundleProblem
+from jaxba.solve import IterationRecord, Solution
+
+_COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
+
+
+def heading(name: str, problem: BundleProblem, args: Any) -> str:
+    """What is about to be solved, and how."""
+    refine = f" + {args.refine_points} point iterations" if args.refine_points else ""
+    sizes = f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations"
+    return f"{name}: {sizes}\ndamping {args.damping}{refine}, {args.dtype}, linear solver {args.linear_solver}"
+
+
+def header(initial_cost: float) -> str:
+    """Column names and the row of the start."""
+    return f"{_COLUMNS}\n{0:4d}  {initial_cost:.6e}"
+
+
+def row(record: IterationRecord, time_before: float) -> str:
+    """One iteration; the cost is the accepted one, the change that of the proposed step."""
+    step = record.step
+    cells = (
+        f"{record.iteration:4d}  {step.cost:.6e}  {step.previous_cost - step.candidate_cost: .2e}   "
+        f"{step.gradient_max:.2e}   {step.step_norm:.2e}  {step.gain_ratio: .2e}  {step.damping:.2e}  "
+        f"{step.cg_iterations:7d}   {record.time_s - time_before:.2e}   {record.time_s:.2e}"
+    )
+    return cells if step.accepted else f"{cells}  rejected"
+
+
+def summary(problem: BundleProblem, solution: Solution) -> str:
+    """How it ended, in lines for a person."""
+    state = "converged" if solution.converged else "not converged"
+    count = solution.problem.num_observations
+    rms = [np.sqrt(2 * cost / count) for cost in (solution.initial_cost, solution.final_cost)]
+    lines = [
+        f"{state}: {solution.termination.reason}",
+        f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e} (rms {rms[0]:.4g} -> {rms[1]:.4g} px)",
+        f"{solution.iterations} iterations, {solution.accepted} accepted; linear solver {solution.linear_solver}",
+        f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
+        f"iterations {solution.total_s:.2f} s",
+    ]
+    return "\n".join([*lines, *remarks(problem, solution)])
+
+
+def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
+    """What a user should know about the data: unobserved, seen once, behind a camera."""
+    cameras = np.bincount(np.asarray(problem.camera_index), minlength=problem.num_cameras)
+    points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
+    before, after = (int(np.sum(geometry.depths(p) <= 0)) for p in (problem, solution.problem))
+    found = [
+        (int(np.sum(cameras == 0)), "cameras without observations, kept as they are"),
+        (int(np.sum(points == 0)), "points without observations, kept as they are"),
+        (int(np.sum(points == 1)), "points seen once; damping alone fixes their depth"),
+    ]
+    lines = [f"note: {count} {text}" for count, text in found if count]
+    if before or after:
+        lines.append(f"note: observations behind their camera: {before} at the start, {after} at the end")
+    return lines

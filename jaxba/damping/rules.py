@@ -1,0 +1,195 @@
+"""Hand-written damping rules. All lambdas multiply what `StepOptions.scaling` says.
+
+Formulas and sources: the docstring of each class; collected in docs/definitions.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.damping.policy import ProblemInfo
+from jaxba.lm import StepInfo
+
+LARGEST = 1e32
+"""Upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32."""
+
+
+def _scalar(value: Any, info: ProblemInfo) -> Array:
+    return jnp.asarray(value, info.cost.dtype)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Classic:
+    """The paper's baseline: halve after a good step, double otherwise.
+
+    Source: Belder et al. 2023, implementation details (first lambda 1/4); directions and the gain threshold
+    0.4 as in the authors' released code, since the printed text swaps them. A step that lowers the cost is
+    always accepted.
+    """
+
+    initial: float = 0.25
+    """First lambda. Source: the paper."""
+
+    good_gain: float = 0.4
+    """Gain ratio above which lambda is halved. Source: released code."""
+
+    min_gain: float = 0.0
+    """Any decrease is accepted."""
+
+    def init(self, info: ProblemInfo) -> tuple[Array, Array]:
+        """See `DampingPolicy`."""
+        damping = _scalar(self.initial, info)
+        return damping, damping
+
+    def propose(self, state: Float[Array, ""], step: StepInfo) -> tuple[Array, Array]:
+        """See `DampingPolicy`."""
+        good = step.accepted & (step.gain_ratio > self.good_gain)
+        damping = jnp.minimum(state * jnp.where(good, 0.5, 2.0), LARGEST).astype(state.dtype)
+        return damping, damping
+
+
+class _Growing(NamedTuple):
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]  # factor after the next rejection
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Ceres:
+    """Ceres' trust-region rule with radius 1 / lambda.
+
+    Accepted with gain `rho`: lambda times `clip(1 - (2 rho - 1)^3, 1/3, upper)`; rejected: times 2, 4, 8 ...
+    Source: Ceres levenberg_marquardt_strategy.cc (after Madsen, Nielsen, Tingleff 2004, section 3.2).
+    """
+
+    initial: float = 1e-4
+    """First lambda. Source: Ceres initial_trust_region_radius 1e4."""
+
+    shrink_floor: float = 1 / 3
+    """Smallest factor after an accepted step."""
+
+    shrink_ceiling: float = 2.0
+    """Largest factor after an accepted step; the formula's own supremum for positive gains."""
+
+    reject_growth: float = 2.0
+    """First factor after a rejection; doubles with each further one."""
+
+    minimum: float = 1e-16
+    """Smallest lambda. Source: Ceres max_trust_region_radius 1e16."""
+
+    min_gain: float = 1e-3
+    """Source: Ceres min_relative_decrease."""
+
+    relative: float = 0.0
+    """1 where `initial` counts in units of the largest Hessian entry under identity scaling (g2o)."""
+
+    def init(self, info: ProblemInfo) -> tuple[_Growing, Array]:
+        """See `DampingPolicy`."""
+        damping = _scalar(self.initial * (1 + self.relative * (info.unit - 1)), info)
+        return _Growing(damping, _scalar(self.reject_growth, info)), damping
+
+    def propose(self, state: _Growing, step: StepInfo) -> tuple[_Growing, Array]:
+        """See `DampingPolicy`."""
+        shrink = jnp.clip(1 - (2 * step.gain_ratio - 1) ** 3, self.shrink_floor, self.shrink_ceiling)
+        factor = jnp.where(step.accepted, shrink, state.growth)
+        growth = jnp.where(step.accepted, self.reject_growth, 2 * state.growth).astype(state.growth.dtype)
+        damping = jnp.clip(state.damping * factor, self.minimum, LARGEST).astype(state.damping.dtype)
+        return _Growing(damping, growth), damping
+
+
+def nielsen() -> Ceres:
+    """g2o's rule: as Ceres', but an accepted step always shrinks lambda (factor in [1/3, 2/3]).
+
+    Source: g2o optimization_algorithm_levenberg.cpp: first lambda 1e-5 times the largest Hessian diagonal, which
+    under diagonal scaling is 1e-5 itself; any decrease is accepted.
+    """
+    return Ceres(initial=1e-5, shrink_ceiling=2 / 3, min_gain=0.0, minimum=0.0, relative=1.0)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Geometric:
+    """Multiply by a constant after success, by another after a rejection."""
+
+    initial: float
+    """First lambda."""
+
+    success: float
+    """Factor after an accepted step."""
+
+    failure: float
+    """Factor after a rejected step."""
+
+    minimum: float
+    """Smallest lambda."""
+
+    maximum: float
+    """Largest lambda."""
+
+    min_gain: float = 0.0
+    """A step with a smaller gain ratio is rejected."""
+
+    def init(self, info: ProblemInfo) -> tuple[Array, Array]:
+        """See `DampingPolicy`."""
+        damping = _scalar(self.initial, info)
+        return damping, damping
+
+    def propose(self, state: Float[Array, ""], step: StepInfo) -> tuple[Array, Array]:
+        """See `DampingPolicy`."""
+        factor = jnp.where(step.accepted, self.success, self.failure)
+        damping = jnp.clip(state * factor, self.minimum, self.maximum).astype(state.dtype)
+        return damping, damping
+
+
+def gtsam() -> Geometric:
+    """GTSAM's legacy rule: divide by 10, multiply by 10, lambda in [0, 1e5]. Source: LevenbergMarquardtParams."""
+    return Geometric(initial=1e-5, success=0.1, failure=10.0, minimum=0.0, maximum=1e5)
+
+
+def stba() -> Geometric:
+    """STBA's rule: divide by 3, multiply by 3. Source: Zhou et al. 2020, authors' main branch (radius 1e4)."""
+    return Geometric(initial=1e-4, success=1 / 3, failure=3.0, minimum=0.0, maximum=LARGEST)
+
+
+def theseus() -> Geometric:
+    """Theseus' adaptive rule: divide by 9, multiply by 11, lambda in [1e-7, 1e7]; accepts gains above 0.1."""
+    return Geometric(initial=1e-3, success=1 / 9, failure=11.0, minimum=1e-7, maximum=1e7, min_gain=0.1)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Schedule:
+    """Repeats a list of lambdas whatever happens; a list of one is a constant.
+
+    Source of the default: Belder et al. 2023, constant scheduler, the average of the authors' agent.
+    """
+
+    values: tuple[float, ...] = (1e-15, 1e-15, 0.194, 0.551)
+    """Lambdas, in order."""
+
+    min_gain: float = 0.0
+    """Any decrease is accepted."""
+
+    def init(self, info: ProblemInfo) -> tuple[Int[Array, ""], Array]:
+        """See `DampingPolicy`."""
+        return jnp.zeros((), jnp.int32), _scalar(self.values[0], info)
+
+    def propose(self, state: Int[Array, ""], step: StepInfo) -> tuple[Array, Array]:
+        """See `DampingPolicy`."""
+        after = (state + 1) % len(self.values)
+        return after, jnp.asarray(self.values, step.damping.dtype)[after]
+
+
+def gauss_newton() -> Schedule:
+    """Next to no damping. The seven gauge freedoms make the undamped system singular, so lambda is 1e-10.
+
+    Under diagonal scaling this changes no direction that the observations determine by more than 1e-10.
+    """
+    return Schedule(values=(1e-10,))

@@ -1,0 +1,35 @@
+"""Problems to and from files: BAL text, Bundler models, PLY point clouds."""
+
+from __future__ import annotations
+
+from pathlib import PurePath
+
+from jaxba.io.bal import read_bal, write_bal
+from jaxba.io.bundler import read_bundler
+from jaxba.io.files import StrPath, strip_compression
+from jaxba.io.ply import write_ply
+from jaxba.problem import BundleProblem
+
+__all__ = ["read_bal", "read_bundler", "read_problem", "write_bal", "write_ply", "write_problem"]
+
+
+def read_problem(path: StrPath) -> BundleProblem:
+    """Reads a problem: `.out` is a Bundler model, every other name a BAL file; each also compressed.
+
+    Raises:
+        ProblemError: as `read_bundler` and `read_bal` do.
+    """
+    return (read_bundler if _kind(path) == ".out" else read_bal)(path)
+
+
+def write_problem(problem: BundleProblem, path: StrPath) -> None:
+    """Writes a problem: `.ply` is a point cloud for viewers, every other name a BAL file; each also compressed.
+
+    Raises:
+        ProblemError: as `write_ply` and `write_bal` do.
+    """
+    (write_ply if _kind(path) == ".ply" else write_bal)(problem, path)
+
+
+def _kind(path: StrPath) -> str:
+    return PurePath(strip_compression(path)).suffix.lower()

@@ -1,0 +1,106 @@
+"""BAL files, the text format of "Bundle Adjustment in the Large".
+
+The numbers, whatever whitespace separates them, are: cameras, points, observations (counts); for each observation its
+camera, its point, and its x and y in pixels; for each camera 9 numbers; for each point 3. There is no place for
+covariances. Source: Agarwal et al. 2010, https://grail.cs.washington.edu/projects/bal/
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from jaxba.io.files import StrPath, display_name, open_input, open_output
+from jaxba.io.text import NumberReader
+from jaxba.problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
+
+MAX_COUNT = 2**31 - 1
+"""Largest count in a header: indices are int32."""
+
+_WRITE_ROWS = 1 << 15  # lines formatted at once
+_COUNTS = ("cameras", "points", "observations")
+_OBSERVATION = ("camera index", "point index", "x", "y")
+_CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z", "f", "k1", "k2")
+
+
+def read_bal(path: StrPath) -> BundleProblem:
+    """Reads a BAL file, plain or compressed by bzip2, gzip or xz (told by its first bytes).
+
+    Numbers are decimal and correctly rounded, so `write_bal` and `read_bal` together change no bit. Counts in the
+    header allocate nothing: memory follows what the file really holds.
+
+    Args:
+        path: the file; may be a pipe.
+
+    Raises:
+        ProblemError: the file cannot be read or is no valid problem; one line that names the file and, where there is
+            one, the line and the field.
+    """
+    with open_input(path) as blocks:
+        return _read(NumberReader(blocks, display_name(path), partial(_field, ())))
+
+
+def write_bal(problem: BundleProblem, path: StrPath) -> None:
+    """Writes a BAL file that reads back bit by bit; compressed if the name ends in `.bz2`, `.gz` or `.xz`.
+
+    The file appears whole or not at all. BAL has no place for covariances or weights: `problem.whitening` is **not**
+    written, and the problem reads back with the identity.
+
+    Args:
+        problem: of NumPy or JAX arrays; float32 is written as the float64 of the same value.
+        path: the file, replaced if it exists.
+
+    Raises:
+        ProblemError: the problem is not valid, for example not finite, or the file cannot be written.
+    """
+    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
+    valid = BundleProblem.create(*arrays)
+    observations, camera_index, point_index = valid.observations, valid.camera_index, valid.point_index
+    with open_output(path) as file:
+        file.write(f"{valid.num_cameras} {valid.num_points} {valid.num_observations}\n".encode())
+        for start in range(0, valid.num_observations, _WRITE_ROWS):
+            rows = slice(start, start + _WRITE_ROWS)
+            x, y = observations[rows].T.tolist()
+            index = zip(camera_index[rows].tolist(), point_index[rows].tolist(), x, y, strict=True)
+            file.write("".join([f"{c} {p} {x} {y}\n" for c, p, x, y in index]).encode())
+        for numbers in (valid.cameras.ravel(), valid.points.ravel()):
+            for start in range(0, numbers.size, _WRITE_ROWS):
+                file.write("".join([f"{v}\n" for v in numbers[start : start + _WRITE_ROWS].tolist()]).encode())
+
+
+def _read(reader: NumberReader) -> BundleProblem:
+    (ordinal, header), *_ = reader.rows(1, 3)
+    counts = reader.integers(range(ordinal, 3), header[0], 1, MAX_COUNT).tolist()
+    num_cameras, num_points, num_observations = counts
+    reader.field = partial(_field, counts)
+    camera_index, point_index, observations = [], [], []
+    for first, rows in reader.rows(num_observations, 4):
+        end = first + rows.size
+        camera_index.append(reader.integers(range(first, end, 4), rows[:, 0], 0, num_cameras - 1))
+        point_index.append(reader.integers(range(first + 1, end, 4), rows[:, 1], 0, num_points - 1))
+        observations.append(rows[:, 2:].copy())  # a view would keep the whole block
+    cameras = [rows for _, rows in reader.rows(num_cameras, CAMERA_SIZE)]
+    points = [rows for _, rows in reader.rows(num_points, POINT_SIZE)]
+    reader.finish()
+    parts = (cameras, points, observations, camera_index, point_index)
+    try:
+        return BundleProblem.create(*(np.concatenate(part) for part in parts))
+    except ProblemError as error:
+        raise ProblemError(f"{reader.name}: {error}") from error
+
+
+def _field(counts: Sequence[int], ordinal: int) -> str:
+    """What the number of an ordinal is, by the counts of the header (no counts while it is being read)."""
+    if ordinal < 3:
+        return f"number of {_COUNTS[ordinal]}"
+    cameras, _, observations = counts
+    at = ordinal - 3
+    if at < 4 * observations:
+        return f"{_OBSERVATION[at % 4]} of observation {at // 4}"
+    at -= 4 * observations
+    if at < CAMERA_SIZE * cameras:
+        return f"{_CAMERA[at % CAMERA_SIZE]} of camera {at // CAMERA_SIZE}"
+    at -= CAMERA_SIZE * cameras
+    return f"{'xyz'[at % POINT_SIZE]} of point {at // POINT_SIZE}"

@@ -1,0 +1,152 @@
+"""Bytes in and out: compression, whole-or-nothing output, and errors a person can read."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import os
+import secrets
+import stat
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from io import BufferedReader
+from typing import IO, Any, BinaryIO, TypeAlias
+
+from jaxba.problem import ProblemError
+
+StrPath: TypeAlias = str | os.PathLike[str]
+
+BLOCK_BYTES = 1 << 22
+"""Text handed to a parser at once, in bytes. 4 MiB keeps its arrays near the cache; memory then follows the result."""
+
+READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError)
+"""What reading and decompressing a file raises when the file, not this program, is at fault."""
+
+_STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")  # links to files where a shell redirects them
+_MAGIC = {".bz2": b"BZh", ".gz": b"\x1f\x8b", ".xz": b"\xfd7zXZ\0"}
+
+
+def strip_compression(path: StrPath) -> str:
+    """The path without `.bz2`, `.gz` or `.xz` at its end."""
+    root, suffix = os.path.splitext(os.fspath(path))
+    return root if suffix.lower() in _MAGIC else os.fspath(path)
+
+
+def display_name(path: StrPath) -> str:
+    """The path as it may stand in a message of one line: control characters and stray bytes are escaped."""
+    return _one_line(os.fspath(path))
+
+
+def reason(error: BaseException) -> str:
+    """One line on why reading or writing failed."""
+    if isinstance(error, MemoryError):
+        return "not enough memory"
+    if isinstance(error, OSError) and error.strerror:
+        return _one_line(error.strerror)
+    return _one_line(str(error)) or type(error).__name__
+
+
+@contextmanager
+def open_input(path: StrPath) -> Iterator[Iterator[bytes]]:
+    """Blocks of a file's bytes, decompressed where its first bytes say bzip2, gzip or xz, whatever its name.
+
+    The iterator raises one of `READ_ERRORS` at damaged, cut-short or trailing compressed data.
+
+    Raises:
+        ProblemError: the file cannot be opened or read, or its name promises a compression that it does not have.
+    """
+    name = display_name(path)
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(open(path, "rb"))
+            blocks = _blocks(file, os.path.splitext(path)[1].lower(), name)
+        except ProblemError:
+            raise
+        except (*READ_ERRORS, ValueError) as error:  # ValueError: a name with NUL or a lone surrogate
+            raise ProblemError(f"cannot read {name}: {reason(error)}") from error
+        try:
+            yield blocks
+        except READ_ERRORS as error:
+            raise ProblemError(f"cannot read {name}: {reason(error)}") from error
+
+
+@contextmanager
+def open_output(path: StrPath) -> Iterator[BinaryIO]:
+    """A stream whose bytes become the file at the end of the block, or not at all; compressed as the name says.
+
+    They go to a temporary file in the same folder, which then replaces the target (of a symbolic link, what it points
+    to) and is removed if anything fails. A device or pipe, such as standard output, is written straight away.
+
+    Raises:
+        ProblemError: the file cannot be written.
+    """
+    name = display_name(path)
+    try:
+        target = os.path.realpath(path)
+        special = os.path.exists(target) and not stat.S_ISREG(os.stat(target).st_mode)
+        if special or os.fspath(path).startswith(_STREAMS):
+            with open(path, "wb") as file, _compressor(file, path) as stream:
+                yield stream
+            return
+        temporary = os.path.join(os.path.dirname(target), f".jaxba-{secrets.token_hex(8)}.tmp")
+        try:
+            with open(temporary, "xb") as file, _compressor(file, path) as stream:
+                yield stream
+            os.replace(temporary, target)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(temporary)
+            raise
+    except ProblemError:
+        raise
+    except (OSError, ValueError) as error:
+        raise ProblemError(f"cannot write {name}: {reason(error)}") from error
+
+
+def _blocks(file: BufferedReader, suffix: str, name: str) -> Iterator[bytes]:
+    head = file.peek(8)
+    kind = next((kind for kind, magic in _MAGIC.items() if head.startswith(magic)), None)
+    if head and suffix in _MAGIC and kind is None:
+        raise ProblemError(f"{name}: the file is no {suffix[1:]} file, as its name says")
+    if kind == ".bz2":
+        return _decompressed(file, bz2.BZ2Decompressor)
+    if kind == ".xz":
+        return _decompressed(file, lzma.LZMADecompressor)
+    stream = gzip.GzipFile(fileobj=file, mode="rb") if kind == ".gz" else file
+    return iter(lambda: stream.read(BLOCK_BYTES), b"")
+
+
+def _decompressed(file: IO[bytes], new_decoder: Callable[[], Any]) -> Iterator[bytes]:
+    """Blocks of all streams of a file. BZ2File and LZMAFile would keep silent about garbage after the first one."""
+    rest = file.read(BLOCK_BYTES)
+    while rest:
+        decoder = new_decoder()
+        while not decoder.eof:
+            if decoder.needs_input and not rest:
+                rest = file.read(BLOCK_BYTES)
+                if not rest:
+                    raise EOFError("the compressed data is cut short")
+            yield decoder.decompress(rest, BLOCK_BYTES)
+            rest = b""
+        rest = decoder.unused_data.lstrip(b"\0")  # xz allows zeros between streams
+        while not rest and (block := file.read(BLOCK_BYTES)):
+            rest = block.lstrip(b"\0")
+
+
+def _compressor(file: IO[bytes], path: StrPath) -> Any:
+    suffix = os.path.splitext(os.fspath(path))[1].lower()
+    if suffix == ".bz2":
+        return bz2.BZ2File(file, "wb")
+    if suffix == ".xz":
+        # The default preset, 6, takes 8 times as long on digits to save 7 % more.
+        return lzma.LZMAFile(file, "wb", preset=1)
+    if suffix == ".gz":
+        # No name and no time inside: the same problem gives the same bytes.
+        return gzip.GzipFile(filename="", fileobj=file, mode="wb", compresslevel=6, mtime=0)
+    return file
+
+
+def _one_line(text: str) -> str:
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

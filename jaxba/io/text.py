@@ -1,0 +1,199 @@
+"""Whitespace-separated numbers of a text: read a block at a time, and every complaint names its line."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+
+from jaxba.io.files import READ_ERRORS, reason
+from jaxba.problem import ProblemError
+
+MAX_WORD_BYTES = 1 << 16
+"""A longer run of bytes without whitespace at the end of a block ends the reading. No number needs more than about
+1100 characters; without the bound a large file without whitespace would be gathered in memory as one word."""
+
+_WORD = re.compile(rb"[^ \t\n\r\v\f]+")
+_NUMBER = re.compile(rb"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf|infinity)", re.IGNORECASE)
+
+
+class _Piece(NamedTuple):
+    text: bytes
+    ordinal: int  # position in the file of its first number, from 0
+    line: int  # line on which it starts, from 1
+
+
+class NumberReader:
+    """The numbers of a text in their order, as float64, correctly rounded.
+
+    A number's *ordinal* is its position in the file, from 0. Only the text of numbers that were not taken yet (and of
+    the last block) is kept, so memory follows the result and not the file.
+    """
+
+    def __init__(self, blocks: Iterable[bytes], name: str, field: Callable[[int], str], *, line: int = 1):
+        """Reads `blocks` of the file called `name`.
+
+        Args:
+            blocks: the bytes, cut anywhere.
+            name: file name for messages.
+            field: what the number of an ordinal is, such as "number of cameras"; may be exchanged while reading.
+            line: number of the line on which `blocks` start.
+        """
+        self.name = name
+        self.field = field
+        self._blocks = iter(blocks)
+        self._line = line
+        self._last_line = line
+        self._pieces: list[_Piece] = []  # the text of the numbers in self._parts, and a little more
+        self._parts: list[np.ndarray] = []  # numbers read and not yet taken
+        self._size = 0  # how many these are
+        self._taken = 0
+        self._carry = b""
+        self._complaint: str | None = None  # about the word after the last number read
+        self._ended = False
+
+    def rows(self, count: int, width: int) -> Iterator[tuple[int, np.ndarray]]:
+        """The next `count * width` numbers in blocks of shape (rows, width), each with its first number's ordinal.
+
+        Raises:
+            ProblemError: the file ends early, a word is no finite number, or the data cannot be decompressed.
+        """
+        while count:
+            while self._size < width:
+                if self._ended or self._complaint is not None:
+                    self.missing()
+                self._read()
+            ordinal, size = self._taken, min(count, self._size // width) * width
+            block = self._joined()[:size].reshape(-1, width)
+            self.skip(size)
+            count -= len(block)
+            yield ordinal, block
+
+    def peek_all(self) -> np.ndarray:
+        """All remaining numbers up to the end of the file or to the first bad word; none of them is taken."""
+        while not self._ended and self._complaint is None:
+            self._read()
+        return self._joined()
+
+    def skip(self, count: int) -> None:
+        """Takes `count` of the numbers that were read already."""
+        self._parts = [self._joined()[count:]]
+        self._size -= count
+        self._taken += count
+
+    def finish(self) -> None:
+        """Checks that nothing but whitespace follows.
+
+        Raises:
+            ProblemError: a word is left over, or the rest cannot be decompressed.
+        """
+        while not self._ended and not self._size and self._complaint is None:
+            self._read()
+        if self._size or self._complaint is not None:
+            self.fail(self._taken, "is left over after the last number", field="")
+
+    def integers(self, ordinals: Sequence[int] | np.ndarray, values: np.ndarray, low: int, high: int) -> np.ndarray:
+        """`values` as int32, shape (n,), after a check that they are integers in `[low, high]`.
+
+        Args:
+            ordinals: shape (n,), where the numbers stand in the file.
+            values: shape (n,), float64.
+            low: smallest allowed value.
+            high: largest allowed value, at most 2**31 - 1.
+
+        Raises:
+            ProblemError: one of them is not.
+        """
+        whole = values == np.floor(values)
+        bad = np.flatnonzero(~(whole & (values >= low) & (values <= high)))
+        if bad.size:
+            complaint = f"is outside {low}..{high}" if whole[bad[0]] else "is not an integer"
+            self.fail(int(ordinals[bad[0]]), complaint)
+        return values.astype(np.int32)
+
+    def missing(self) -> NoReturn:
+        """Says why there are no more numbers than those that were read."""
+        ordinal = self._taken + self._size
+        if self._complaint is not None:
+            self.fail(ordinal, self._complaint)
+        raise ProblemError(f"{self.name} line {self._last_line}: the file ends before the {self.field(ordinal)}")
+
+    def fail(self, ordinal: int, complaint: str, *, field: str | None = None) -> NoReturn:
+        """Raises a `ProblemError` about the number (or bad word) of an ordinal that is still kept."""
+        piece = next(piece for piece in reversed(self._pieces) if piece.ordinal <= ordinal)
+        offset = int(np.flatnonzero(_word_starts(_spaces(piece.text)))[ordinal - piece.ordinal])
+        line = piece.line + piece.text.count(b"\n", 0, offset)
+        word = piece.text[offset : offset + 41].split(None, 1)[0].decode("latin-1")
+        shown = ascii(word if len(word) <= 40 else word[:37] + "...")
+        field = self.field(ordinal) if field is None else field
+        raise ProblemError(f"{self.name} line {line}: {shown} {complaint}" + (f" ({field})" if field else ""))
+
+    def _joined(self) -> np.ndarray:
+        if len(self._parts) != 1:
+            self._parts = [np.concatenate(self._parts) if self._parts else np.empty(0)]
+        return self._parts[0]
+
+    def _read(self) -> None:
+        """Parses one more block and appends its numbers to `self._parts`."""
+        try:
+            block = next(self._blocks, None)
+        except READ_ERRORS as error:
+            raise ProblemError(f"{self.name} line {self._line}: cannot read on: {reason(error)}") from error
+        data = self._carry if block is None else self._carry + block
+        self._ended = block is None
+        spaces = _spaces(data)
+        cut = len(data)
+        if not self._ended:  # the last word may go on in the next block
+            cut -= int(spaces[::-1].argmax()) if spaces.any() else cut
+        text, self._carry = data[:cut], data[cut:]
+        values, complaint = _parse(text, int(np.count_nonzero(_word_starts(spaces[:cut]))))
+        if complaint is None and len(self._carry) > MAX_WORD_BYTES:
+            complaint, text, self._carry = f"is longer than {MAX_WORD_BYTES} characters", data, b""
+        self._complaint = complaint
+        ends = [piece.ordinal for piece in self._pieces[1:]] + [self._taken + self._size]
+        self._pieces = [piece for piece, end in zip(self._pieces, ends, strict=False) if end > self._taken]
+        if text.strip():
+            self._pieces.append(_Piece(text, self._taken + self._size, self._line))
+            self._last_line = self._line + text.rstrip().count(b"\n")
+        self._line += text.count(b"\n")
+        if values.size:
+            self._parts.append(values)
+            self._size += values.size
+
+
+def _spaces(text: bytes) -> np.ndarray:
+    """Which bytes are whitespace as C's isspace() has it, shape (bytes,)."""
+    codes = np.frombuffer(text, np.uint8)
+    return (codes == 32) | (codes - np.uint8(9) < 5)
+
+
+def _word_starts(spaces: np.ndarray) -> np.ndarray:
+    starts = ~spaces
+    starts[1:] &= spaces[:-1]
+    return starts
+
+
+def _parse(text: bytes, count: int) -> tuple[np.ndarray, str | None]:
+    """The numbers of `text`, which has `count` words, up to a bad one, and what is wrong with that one."""
+    if count == 0:
+        return np.empty(0), None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # what NumPy before 2.3 says instead of the ValueError
+            values = np.fromstring(text, dtype=np.float64, sep=" ")
+    except (ValueError, DeprecationWarning):
+        values = np.empty(0)
+    if values.size != count:  # one of the words is no number: look for it, word by word
+        good = []
+        for word in _WORD.findall(text):
+            if not _NUMBER.fullmatch(word):
+                break
+            good.append(float(word))
+        values = np.array(good, dtype=np.float64)
+    finite = np.isfinite(values)
+    if not finite.all():
+        return values[: finite.argmin()], "is not a finite number"
+    return values, None if values.size == count else "is not a number"

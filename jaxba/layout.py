@@ -1,0 +1,281 @@
+"""Static index arrays that turn a problem's sparse sums into dense ones.
+
+A *slot* holds one observation. Points are put in buckets by track length and a bucket of `n` points with
+up to `t` observations owns `t x n` slots, so the sum over a point's observations is a dense sum over
+`t`. Sums over a camera, or over a block of the reduced camera system, are trees: rows are gathered in
+chunks of fixed width that belong to one target, summed densely, and the partial sums again, until one row
+a target is left. Nothing is ever scattered. Padding points at a slot without observation, whose values are
+exactly zero.
+
+Everything is made once per problem on the host with vectorised NumPy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxba.problem import BundleProblem
+
+MAX_PADDING = 0.10
+"""Largest share of slots that may be empty because track lengths share a bucket (design, section 3)."""
+
+CAMERA_CHUNK = 64
+"""Observations summed at once for a camera; 64 rows of 20 float64 values fill a third of a 32 KiB cache."""
+
+TREE_WIDTH = 8
+"""Partial sums added at once on the higher levels of a tree."""
+
+PAIR_CHUNKS = (4, 8, 16, 32)
+"""Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
+
+PAIR_BATCH = 1024
+"""Most chunks multiplied at once: bounds the gathered operands to a few MiB, which stay in cache."""
+
+PAIR_ITEM_COST = 1.5
+"""Cost of one partial 9 x 9 block, in pairs; decides between few long and many short chunks."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PairLayout:
+    """Which slots multiply into which block of the reduced camera system (lower triangle)."""
+
+    left: Int[np.ndarray, "batches chunks width"]
+    """Slot of the block row's camera."""
+
+    right: Int[np.ndarray, "batches chunks width"]
+    """Slot of the block column's camera, seen by the same point."""
+
+    levels: tuple[Int[np.ndarray, "targets width"], ...]
+    """Tree from chunks to blocks; the last block is always zero."""
+
+    block_camera: Int[np.ndarray, " blocks"]
+    """Camera of a block on the diagonal; the number of cameras for the others."""
+
+    table: Int[np.ndarray, "cameras cameras"]
+    """Block number of (row, column) in the lower triangle; the zero block elsewhere."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Layout:
+    """A problem's observations in slot order, and how to sum them."""
+
+    slot_camera: Int[np.ndarray, " slots"]
+    slot_point: Int[np.ndarray, " slots"]
+    """Column of the point in layout order."""
+
+    slot_mask: Bool[np.ndarray, " slots"]
+    """Whether the slot holds an observation."""
+
+    pixels: Float[np.ndarray, "2 slots"]
+    """Measured pixels; zero in empty slots."""
+
+    whitening: Float[np.ndarray, "2 2 slots"] | None
+    """`Sigma^(-1/2)` of each observation."""
+
+    bucket_points: tuple[Int[np.ndarray, " bucket"], ...]
+    """Problem index of the points of each bucket; padding repeats an index out of range."""
+
+    camera_levels: tuple[Int[np.ndarray, "targets width"], ...]
+    """Tree from slots to cameras."""
+
+    camera_seen: Bool[np.ndarray, " cameras"]
+    """Cameras with at least one observation; the others never move."""
+
+    pairs: PairLayout | None
+    """None where the reduced camera system is never formed."""
+
+    buckets: tuple[tuple[int, int], ...] = field(metadata={"static": True})
+    """(slots per point, points) of each bucket."""
+
+    @property
+    def num_slots(self) -> int:
+        """Slots, empty ones included."""
+        return self.slot_camera.shape[-1]
+
+    @property
+    def num_points(self) -> int:
+        """Points in layout order, padding included."""
+        return sum(points for _, points in self.buckets)
+
+    @property
+    def num_cameras(self) -> int:
+        """Cameras, observed or not."""
+        return self.camera_seen.shape[-1]
+
+
+def build_layout(problem: BundleProblem, *, pairs: bool = True) -> Layout:
+    """Sorts a problem's observations into slots.
+
+    Args:
+        problem: a checked problem; host arrays.
+        pairs: whether to list the pairs that form the explicit reduced camera system. Their number is
+            the sum of t (t + 1) / 2 over track lengths t.
+
+    Returns:
+        A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths.
+    """
+    camera = np.asarray(problem.camera_index)
+    point = np.asarray(problem.point_index)
+    tracks = np.bincount(point, minlength=problem.num_points)
+    # by point, then by camera: pairs of a track then come with sorted cameras
+    order = np.argsort(point.astype(np.int64) * problem.num_cameras + camera, kind="stable")
+    camera, point = camera[order], point[order]
+    start = np.concatenate([[0], np.cumsum(tracks)])
+
+    lengths = _bucket_lengths(tracks)
+    which = np.searchsorted(lengths, tracks)
+    column = np.zeros(problem.num_points, np.int64)  # column of a point in its bucket
+    bucket_points, offsets, columns_before = [], [], []
+    slots = columns = 0
+    for number, length in enumerate(lengths):
+        members = np.flatnonzero((which == number) & (tracks > 0))
+        column[members] = np.arange(len(members))
+        if number == 0:  # one empty point, so that there always is an empty slot
+            members = np.append(members, problem.num_points)
+        bucket_points.append(members.astype(np.int32))
+        offsets.append(slots)
+        columns_before.append(columns)
+        slots += length * len(members)
+        columns += len(members)
+    size = np.array([len(members) for members in bucket_points])
+    step = np.arange(len(point)) - start[point]
+    slot = np.array(offsets)[which[point]] + step * size[which[point]] + column[point]
+
+    slot_point = np.concatenate(
+        [
+            np.tile(np.arange(len(members), dtype=np.int32) + before, length)
+            for members, length, before in zip(bucket_points, lengths, columns_before, strict=True)
+        ]
+    )
+    mask = np.zeros(slots, bool)
+    mask[slot] = True
+    slot_camera = np.zeros(slots, np.int32)
+    slot_camera[slot] = camera
+    pixels = np.zeros((2, slots))
+    pixels[:, slot] = np.asarray(problem.observations)[order].T
+    whitening = None
+    if problem.whitening is not None:
+        whitening = np.zeros((2, 2, slots))
+        whitening[:, :, slot] = np.moveaxis(np.asarray(problem.whitening)[order], 0, -1)
+    empty = int(len(bucket_points[0]) - 1)  # the first bucket's empty point
+    by_camera = np.argsort(camera, kind="stable")
+    seen = np.bincount(camera, minlength=problem.num_cameras)
+    return Layout(
+        slot_camera=slot_camera,
+        slot_point=slot_point,
+        slot_mask=mask,
+        pixels=pixels,
+        whitening=whitening,
+        bucket_points=tuple(bucket_points),
+        camera_levels=sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK),
+        camera_seen=seen > 0,
+        pairs=_pair_layout(camera, slot, tracks, start, problem.num_cameras, empty) if pairs else None,
+        buckets=tuple((int(length), len(members)) for length, members in zip(lengths, bucket_points, strict=True)),
+    )
+
+
+def sum_tree(items: np.ndarray, counts: np.ndarray, empty: int, width: int) -> tuple[np.ndarray, ...]:
+    """Index arrays that sum `items` into targets, `width` at a time, then `TREE_WIDTH` at a time.
+
+    Args:
+        items: row numbers, those of target 0 first, then those of target 1, ...
+        counts: number of items of each target; zero is allowed.
+        empty: a row that is known to be zero, for padding.
+        width: items summed at once on the first level.
+
+    Returns:
+        Arrays [targets, width]; level l + 1 indexes the sums of level l. Every level but the last ends with
+        an all-padding row; the last has exactly one row a target, in order.
+    """
+    levels = []
+    while True:
+        width = max(1, min(width, int(counts.max(initial=1))))
+        chunks = -(-counts // width)
+        last = bool((chunks <= 1).all())
+        rows = np.arange(len(counts)) if last else np.cumsum(chunks) - chunks
+        total = len(counts) if last else int(chunks.sum()) + 1
+        target = np.repeat(np.arange(len(counts)), counts)
+        rank = np.arange(len(items)) - np.repeat(np.cumsum(counts) - counts, counts)
+        level = np.full((total, width), empty, np.int32)
+        level[rows[target] + rank // width, rank % width] = items
+        levels.append(level)
+        if last:
+            return tuple(levels)
+        items, counts, empty, width = np.arange(total - 1), chunks, total - 1, TREE_WIDTH
+
+
+def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
+    """Largest track length of each bucket: few buckets with little padding.
+
+    Dynamic programme over the distinct lengths; a bucket costs as many slots as `MAX_PADDING / 10` of
+    all observations, halved until padding stays below `MAX_PADDING`.
+    """
+    values, counts = np.unique(tracks[tracks > 0], return_counts=True)
+    total = int(values @ counts)
+    before = np.concatenate([[0], np.cumsum(counts)])
+    price = total * MAX_PADDING / 10
+    while True:
+        best = np.zeros(len(values) + 1)
+        cut = np.zeros(len(values) + 1, int)
+        for end in range(1, len(values) + 1):
+            cost = best[:end] + values[end - 1] * (before[end] - before[:end]) + price
+            cut[end] = np.argmin(cost)
+            best[end] = cost[cut[end]]
+        ends, end = [], len(values)
+        while end:
+            ends.append(end - 1)
+            end = cut[end]
+        if best[-1] - price * len(ends) <= (1 + MAX_PADDING) * total:
+            return values[ends[::-1]]
+        price /= 2
+
+
+def _pair_layout(
+    camera: np.ndarray, slot: np.ndarray, tracks: np.ndarray, start: np.ndarray, cameras: int, empty: int
+) -> PairLayout:
+    """Lists all pairs of observations of one point, sorted by the block they add to."""
+    lefts, rights = [], []
+    for length in np.unique(tracks[tracks > 0]):
+        first = start[np.flatnonzero(tracks == length)]
+        a, b = np.tril_indices(length)
+        lefts.append((first[:, None] + a).ravel())
+        rights.append((first[:, None] + b).ravel())
+    left, right = np.concatenate(lefts), np.concatenate(rights)
+    # a camera that sees a point twice: both orders add to the same diagonal block
+    twice = (camera[left] == camera[right]) & (left != right)
+    left, right = np.concatenate([left, right[twice]]), np.concatenate([right, left[twice]])
+    diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
+    block = camera[left].astype(np.int64) * cameras + camera[right]
+    order = np.argsort(block, kind="stable")
+    names = np.union1d(block, diagonal)
+    counts = np.bincount(np.searchsorted(names, block), minlength=len(names))
+    width = min(PAIR_CHUNKS, key=lambda w: int((-(-counts // w)).sum()) * (w + PAIR_ITEM_COST))
+    width = max(1, min(width, int(counts.max())))
+    chunks = -(-counts // width)
+    row = np.repeat(np.cumsum(chunks) - chunks, counts)
+    rank = np.arange(len(left)) - np.repeat(np.cumsum(counts) - counts, counts)
+    total = int(chunks.sum()) + 1  # at least one chunk is all padding
+    batches = -(-total // PAIR_BATCH)
+    batch = -(-total // batches)
+    padded = []
+    for side in (left, right):
+        array = np.full((batches * batch, width), empty, np.int32)
+        array[row + rank // width, rank % width] = slot[side[order]]
+        padded.append(array.reshape(batches, batch, width))
+    table = np.full(cameras * cameras, len(names), np.int32)
+    table[names] = np.arange(len(names))
+    block_camera = np.full(len(names) + 1, cameras, np.int32)
+    block_camera[np.searchsorted(names, diagonal)] = np.arange(cameras)
+    return PairLayout(
+        left=padded[0],
+        right=padded[1],
+        levels=sum_tree(np.arange(total - 1), np.append(chunks, 0), total - 1, TREE_WIDTH),
+        block_camera=block_camera,
+        table=table.reshape(cameras, cameras),
+    )

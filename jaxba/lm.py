@@ -1,0 +1,123 @@
+"""The Levenberg-Marquardt step: the one piece that solver, game and benchmark share.
+
+`lm_step` is pure. It compiles once per problem shape and `StepOptions`, runs under `vmap`, and never
+branches in Python on a value: a failed factorisation or an overflow is a candidate with a non-finite cost,
+and that is a rejected step.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxba import camera
+from jaxba.layout import Layout
+from jaxba.linearize import cost, linearize, residuals, slot_costs, slot_frames
+from jaxba.options import StepOptions
+from jaxba.problem import BundleProblem
+from jaxba.refine import refine_points
+from jaxba.schur import solve_step
+
+
+class LMState(NamedTuple):
+    """Parameters in layout order and their cost."""
+
+    cameras: Float[Array, "9 cameras"]
+    points: Float[Array, "3 points"]
+    cost: Float[Array, ""]
+
+
+class StepInfo(NamedTuple):
+    """What one iteration did. Everything a damping policy may look at is here or follows from it."""
+
+    cost: Float[Array, ""]  # accepted cost after the iteration, pixels^2
+    previous_cost: Float[Array, ""]  # accepted cost before it
+    candidate_cost: Float[Array, ""]  # cost at the proposed parameters, perhaps not finite
+    predicted: Float[Array, ""]  # decrease promised by the linear model
+    gain_ratio: Float[Array, ""]  # actual over predicted decrease
+    accepted: Bool[Array, ""]
+    damping: Float[Array, ""]  # lambda that was used
+    gradient_max: Float[Array, ""]  # largest gradient entry before the step
+    step_norm: Float[Array, ""]  # of the proposed step, refined points included
+    parameter_norm: Float[Array, ""]  # before the step
+    cg_iterations: Int[Array, ""]
+
+
+def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
+    """The problem's parameters in layout order.
+
+    Args:
+        layout: made from the same problem.
+        problem: start of the optimisation.
+        options: only the loss matters, for the cost.
+        dtype: floating point type of the solve; the problem's own when None.
+    """
+    cameras = jnp.asarray(problem.cameras, dtype).T
+    order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
+    # padding points name an index out of range; they rest at the origin
+    points = jnp.asarray(problem.points, dtype).at[order].get(mode="fill", fill_value=0).T
+    return LMState(cameras, points, cost(layout, cameras, points, options.loss))
+
+
+def lm_step(
+    layout: Layout,
+    state: LMState,
+    damping: Float[Array, ""],
+    options: StepOptions,
+    min_gain: float | Float[Array, ""] = 0.0,
+) -> tuple[LMState, StepInfo]:
+    """One iteration: one linear solve with one lambda, accepted or rejected (design, section 2).
+
+    Args:
+        layout: the problem's observations.
+        state: current parameters.
+        damping: lambda; see `StepOptions.scaling`.
+        options: static.
+        min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
+
+    Returns:
+        The next state (the same one after a rejection) and a record of what happened.
+    """
+    damping = jnp.asarray(damping, state.cost.dtype)
+    linear = linearize(layout, state.cameras, state.points, options.loss)
+    step = solve_step(layout, linear, state.cameras, damping, options)
+    cameras = move_cameras(state.cameras, step.cameras, options)
+    points = state.points + step.points
+    frames = slot_frames(layout, cameras)
+    if options.refine_points:
+        points, costs = refine_points(layout, frames, points, options.loss, options.refine_points)
+        candidate = jnp.sum(costs)
+    else:
+        candidate = jnp.sum(slot_costs(options.loss, residuals(layout, frames, points)[1]))
+    decrease = state.cost - candidate
+    gain = decrease / step.predicted
+    accepted = (decrease > 0) & (step.predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
+    choose = lambda new, old: jnp.where(accepted, new, old)
+    moved = points - state.points
+    after = LMState(choose(cameras, state.cameras), choose(points, state.points), choose(candidate, state.cost))
+    return after, StepInfo(
+        cost=after.cost,
+        previous_cost=state.cost,
+        candidate_cost=candidate,
+        predicted=step.predicted,
+        gain_ratio=gain,
+        accepted=accepted,
+        damping=damping,
+        gradient_max=step.gradient_max,
+        step_norm=jnp.sqrt(jnp.sum(step.cameras**2) + jnp.sum(moved**2)),
+        parameter_norm=jnp.sqrt(jnp.sum(state.cameras**2) + jnp.sum(state.points**2)),
+        cg_iterations=step.cg_iterations,
+    )
+
+
+def move_cameras(
+    cameras: Float[Array, "9 cameras"], step: Float[Array, "9 cameras"], options: StepOptions
+) -> Float[Array, "9 cameras"]:
+    """Adds a step; on the manifold the rotation becomes `exp(step) R`."""
+    moved = cameras + step
+    if options.rotation == "angle-axis":
+        return moved
+    return moved.at[:3].set(camera.compose_left(step[:3], cameras[:3]))

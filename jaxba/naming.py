@@ -1,0 +1,72 @@
+"""Solver names, the same in every command, table and file: `[method+]policy[+refineK][@dtype]`."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from jaxba.damping import make_policy
+
+METHODS = ("lm",)
+"""Known methods; `lm` is understood where none is named."""
+
+DTYPES = ("float64", "float32")
+"""Known floating point types; the first is understood where none is named."""
+
+
+class SolverNameError(ValueError):
+    """A name that is no solver. The message is one line for a person."""
+
+
+@dataclass(frozen=True)
+class SolverName:
+    """A parsed name; `str` gives it back in its shortest form."""
+
+    policy: str
+    """Damping policy, see `jaxba.damping.make_policy`."""
+
+    refine_points: int = 0
+    """Embedded point iterations."""
+
+    dtype: str = DTYPES[0]
+    """Floating point type."""
+
+    method: str = METHODS[0]
+    """How a step is computed."""
+
+    def __str__(self) -> str:
+        method = "" if self.method == METHODS[0] else f"{self.method}+"
+        refine = f"+refine{self.refine_points}" if self.refine_points else ""
+        dtype = "" if self.dtype == DTYPES[0] else f"@{self.dtype}"
+        return f"{method}{self.policy}{refine}{dtype}"
+
+
+def parse_solver(name: str) -> SolverName:
+    """Reads a solver's name.
+
+    Raises:
+        SolverNameError: an unknown method or type, or a malformed name.
+        UnknownPolicyError: an unknown policy.
+    """
+    rest, _, dtype = name.strip().partition("@")
+    parts = rest.split("+")
+    # the plus sign of an exponent belongs to its number: constant:1e+2
+    merged: list[str] = []
+    for part in parts:
+        if merged and re.search(r":\d*\.?\d*[eE]$", merged[-1]):
+            merged[-1] += "+" + part
+        else:
+            merged.append(part)
+    refine = 0
+    if len(merged) > 1 and (match := re.fullmatch(r"refine(\d+)", merged[-1])):
+        refine = int(match[1])
+        merged.pop()
+    method = merged.pop(0) if len(merged) > 1 else METHODS[0]
+    if len(merged) != 1 or not merged[0]:
+        raise SolverNameError(f"{name!r} is no solver; the form is [method+]policy[+refineK][@dtype]")
+    if method not in METHODS:
+        raise SolverNameError(f"unknown method {method!r} in {name!r}; known: {', '.join(METHODS)}")
+    if dtype and dtype not in DTYPES:
+        raise SolverNameError(f"unknown type {dtype!r} in {name!r}; known: {', '.join(DTYPES)}")
+    make_policy(merged[0])
+    return SolverName(merged[0], refine, dtype or DTYPES[0], method)

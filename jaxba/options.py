@@ -1,0 +1,63 @@
+"""What a step may be asked to do differently; hashable, so that it selects a compiled program."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from jaxba.losses import Loss
+
+LinearSolver = Literal["explicit", "implicit"]
+Scaling = Literal["diagonal", "identity"]
+Rotation = Literal["angle-axis", "manifold"]
+
+DIAGONAL_MINIMUM = 1e-6
+"""Smallest diagonal entry that damping multiplies. Source: Ceres min_lm_diagonal."""
+
+DIAGONAL_MAXIMUM = 1e32
+"""Largest diagonal entry that damping multiplies. Source: Ceres max_lm_diagonal."""
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Static options of `lm_step`. Each distinct value is compiled once."""
+
+    linear_solver: LinearSolver = "explicit"
+    """`explicit`: form the reduced camera system and factor it. `implicit`: conjugate gradients without
+    forming it, preconditioned by its block diagonal (Schur-Jacobi)."""
+
+    scaling: Scaling = "diagonal"
+    """What lambda multiplies: `diagonal` the clamped diagonal of the Hessian (Ceres), `identity` the unit
+    matrix (the paper's equation)."""
+
+    rotation: Rotation = "angle-axis"
+    """Coordinates of a rotation step: `angle-axis` adds to the three numbers of the file, as Ceres does with
+    BAL cameras; `manifold` multiplies by exp(step). They differ in what diagonal damping damps."""
+
+    refine_points: int = 0
+    """Embedded point iterations after each camera step."""
+
+    loss: Loss = field(default_factory=Loss)
+    """Robust loss of the squared whitened residual."""
+
+    cg_forcing: float = 0.1
+    """Conjugate gradients stop when i (Q_i - Q_(i-1)) / Q_i falls below this. Source: Ceres eta."""
+
+    cg_tolerance: float = 0.0
+    """... or when the residual is below this share of the right-hand side; 0 switches it off."""
+
+    cg_max_iterations: int = 500
+    """... or after this many iterations. Source: Ceres max_linear_solver_iterations."""
+
+    def __post_init__(self) -> None:
+        for name, known in (
+            ("linear_solver", ("explicit", "implicit")),
+            ("scaling", ("diagonal", "identity")),
+            ("rotation", ("angle-axis", "manifold")),
+        ):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
+        if self.refine_points < 0:
+            raise ValueError(f"refine_points must not be negative, is {self.refine_points}")
+        if self.cg_max_iterations < 1:
+            raise ValueError(f"cg_max_iterations must be at least 1, is {self.cg_max_iterations}")

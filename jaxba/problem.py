@@ -1,0 +1,158 @@
+"""The bundle adjustment problem: what is optimised, and the checks that it makes sense.
+
+Everything to the right of this module (layout, step, solver, game, benchmark) may assume that a
+`BundleProblem` made by `BundleProblem.create` is finite, non-empty and has indices in range.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+CAMERA_SIZE = 9
+"""Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""
+
+POINT_SIZE = 3
+"""Parameters of a point: x, y, z in scene units."""
+
+
+class ProblemError(ValueError):
+    """Input that is no valid bundle adjustment problem. The message is one line for a person."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class BundleProblem:
+    """Cameras, points and the pixels at which they were seen (BAL convention).
+
+    A camera `[w, t, f, k1, k2]` maps a point `X` to `P = R(w) X + t`, `p = -P.xy / P.z`,
+    `z = f (1 + k1 |p|^2 + k2 |p|^4) p`. Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
+    """
+
+    cameras: Float[np.ndarray | jax.Array, "cameras 9"]
+    """Angle-axis (radians), translation (scene units), focal length (pixels), k1, k2."""
+
+    points: Float[np.ndarray | jax.Array, "points 3"]
+    """Positions in scene units."""
+
+    observations: Float[np.ndarray | jax.Array, "observations 2"]
+    """Measured pixels, origin at the image centre, x to the right, y upwards."""
+
+    camera_index: Int[np.ndarray | jax.Array, " observations"]
+    """Camera of each observation, int32."""
+
+    point_index: Int[np.ndarray | jax.Array, " observations"]
+    """Point of each observation, int32."""
+
+    whitening: Float[np.ndarray | jax.Array, "observations 2 2"] | None = None
+    """`Sigma^(-1/2)` of each observation; None stands for the identity (pixels)."""
+
+    @classmethod
+    def create(
+        cls,
+        cameras: Any,
+        points: Any,
+        observations: Any,
+        camera_index: Any,
+        point_index: Any,
+        *,
+        covariance: Any = None,
+        weight: Any = None,
+    ) -> BundleProblem:
+        """Checks the arrays and makes a problem of float64 / int32 NumPy arrays.
+
+        Args:
+            cameras: shape (cameras, 9).
+            points: shape (points, 3).
+            observations: shape (observations, 2), pixels.
+            camera_index: shape (observations,), integers in [0, cameras).
+            point_index: shape (observations,), integers in [0, points).
+            covariance: optional, shape (observations, 2, 2), pixels squared; symmetric and
+                positive definite. The cost then uses `|Sigma^(-1/2) r|^2`.
+            weight: optional, shape (observations,), non-negative; multiplies the squared
+                residual, so it stands for the covariance `I / weight`. Excludes `covariance`.
+
+        Raises:
+            ProblemError: shapes differ, an index is out of range, a number is not finite, there
+                are no observations, or a covariance is not positive definite.
+        """
+        if covariance is not None and weight is not None:
+            raise ProblemError("give a covariance or a weight per observation, not both")
+        problem = cls(
+            cameras=_floats("cameras", cameras, CAMERA_SIZE),
+            points=_floats("points", points, POINT_SIZE),
+            observations=_floats("observations", observations, 2),
+            camera_index=_indices("camera_index", camera_index, len(cameras)),
+            point_index=_indices("point_index", point_index, len(points)),
+        )
+        count = problem.num_observations
+        if count == 0:
+            raise ProblemError("the problem has no observations")
+        for name in ("camera_index", "point_index"):
+            if len(getattr(problem, name)) != count:
+                raise ProblemError(f"{name} has {len(getattr(problem, name))} entries for {count} observations")
+        whitening = _whitening(covariance, weight, count)
+        return problem if whitening is None else replace(problem, whitening=whitening)
+
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras, observed or not."""
+        return self.cameras.shape[0]
+
+    @property
+    def num_points(self) -> int:
+        """Number of points, observed or not."""
+        return self.points.shape[0]
+
+    @property
+    def num_observations(self) -> int:
+        """Number of observations; the cost has twice as many residuals."""
+        return self.observations.shape[0]
+
+    def replace(self, **changes: Any) -> BundleProblem:
+        """The same problem with some fields exchanged; nothing is checked again."""
+        return replace(self, **changes)
+
+
+def _floats(name: str, values: Any, width: int) -> np.ndarray:
+    array = np.ascontiguousarray(np.asarray(values, dtype=np.float64))
+    if array.ndim != 2 or array.shape[1] != width:
+        raise ProblemError(f"{name} must have shape (n, {width}), not {array.shape}")
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
+    if bad.size:
+        raise ProblemError(f"{name}[{bad[0]}] is not finite: {array[bad[0]].tolist()}")
+    return array
+
+
+def _indices(name: str, values: Any, bound: int) -> np.ndarray:
+    array = np.asarray(values)
+    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
+        raise ProblemError(f"{name} must be a vector of integers, not {array.dtype} of shape {array.shape}")
+    bad = np.flatnonzero((array < 0) | (array >= bound))
+    if bad.size:
+        raise ProblemError(f"{name}[{bad[0]}] is {array[bad[0]]}, outside 0..{bound - 1}")
+    return np.ascontiguousarray(array, dtype=np.int32)
+
+
+def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:
+    if weight is not None:
+        weight = np.asarray(weight, dtype=np.float64)
+        if weight.shape != (count,) or not np.isfinite(weight).all() or (weight < 0).any():
+            raise ProblemError(f"weight must be {count} finite numbers that are not negative")
+        return np.sqrt(weight)[:, None, None] * np.eye(2)
+    if covariance is None:
+        return None
+    covariance = np.asarray(covariance, dtype=np.float64)
+    if covariance.shape != (count, 2, 2) or not np.isfinite(covariance).all():
+        raise ProblemError(f"covariance must be finite, of shape ({count}, 2, 2), not {covariance.shape}")
+    values, vectors = np.linalg.eigh(covariance)
+    bad = np.flatnonzero(
+        (values[:, 0] <= 0) | (np.abs(covariance[:, 0, 1] - covariance[:, 1, 0]) > 1e-9 * values[:, 1])
+    )
+    if bad.size:
+        raise ProblemError(f"covariance[{bad[0]}] is not symmetric positive definite")
+    return (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)

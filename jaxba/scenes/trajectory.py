@@ -1,0 +1,143 @@
+"""Where the cameras of a random scene stand and what they look at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba.geometry import angle_axis, rotation_matrices, translations
+from jaxba.problem import CAMERA_SIZE
+from jaxba.scenes.config import SceneConfig
+
+CORNER_SHARE = 0.4
+"""Part of a street that bends. With 400 cameras a round the view turns by 2.25 degrees a camera there."""
+
+FIRST_CORNER = 0.3
+"""The path starts this part of a side along, so that short paths bend too."""
+
+ORBIT_WAVE = 0.2
+"""Height of an orbit's rise and fall relative to its radius, so that the centres are in no plane."""
+
+PHOTO_SPREAD = 0.4
+"""Sigma of the logarithm of a photographer's distance: most stand within a factor of 2."""
+
+PHOTO_ANGLE = np.deg2rad(50)
+"""Photographers stand up to this far to either side of the facade's normal."""
+
+RELIEF = 1.5
+"""Points of photos are within this factor of the photographer's distance to the facade."""
+
+
+Depth = float | np.ndarray
+"""Scene units: one for all cameras, or one for each."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """Cameras in the order of the path, and the depths at which each one finds its points."""
+
+    rotations: Float[np.ndarray, "cameras 3 3"]
+    """World to camera; a camera looks down its -z, x to the right, y up."""
+
+    centers: Float[np.ndarray, "cameras 3"]
+    """Scene units."""
+
+    near: Float[np.ndarray, " cameras"]
+    """Nearest new points, in scene units."""
+
+    far: Float[np.ndarray, " cameras"]
+    """Farthest new points, in scene units."""
+
+    focus: Float[np.ndarray, " cameras"]
+    """Depth of the points that most other cameras see too, in scene units."""
+
+    lap: int
+    """The path is at the same place again after this many cameras; 0 where it never is."""
+
+    labels: Int[np.ndarray, " cameras"]
+    """Number in the problem of the camera at each place of the path."""
+
+
+def make_path(config: SceneConfig, rng: np.random.Generator) -> Path:
+    """The cameras of a scene, jitter included."""
+    make = {"forward": _streets, "lateral": _streets, "orbit": _orbit, "photos": _photos}[config.trajectory]
+    path = make(config, rng)
+    jitter = config.rotation_jitter * rng.standard_normal((config.cameras, 3))
+    return replace(path, rotations=rotation_matrices(jitter) @ path.rotations)
+
+
+def true_cameras(config: SceneConfig, path: Path, rng: np.random.Generator) -> Float[np.ndarray, "cameras 9"]:
+    """BAL parameters of the path's cameras, in the order of the path."""
+    cameras = np.empty((config.cameras, CAMERA_SIZE))
+    cameras[:, :3] = angle_axis(path.rotations)
+    cameras[:, 3:6] = translations(path.rotations, path.centers)
+    shortest, longest = config.focal
+    cameras[:, 6] = shortest * (longest / shortest) ** rng.random(config.cameras)
+    cameras[:, 7] = rng.uniform(*config.k1, config.cameras)
+    cameras[:, 8] = rng.uniform(*config.k2, config.cameras)
+    return cameras
+
+
+def _streets(config: SceneConfig, rng: np.random.Generator) -> Path:
+    """Round after round of a square with rounded corners; lateral looks to the outside of it."""
+    side = max(round(config.lap / 4), 1)
+    place = np.arange(config.cameras) / side + FIRST_CORNER
+    block, within = np.divmod(place, 1.0)
+    heading = np.pi / 2 * (block + np.clip((within - 1 + CORNER_SHARE) / CORNER_SHARE, 0, 1))
+    ahead = _directions(heading)
+    centers = config.step * (np.cumsum(ahead, axis=0) - ahead)
+    centers += config.step * config.position_jitter * rng.standard_normal(centers.shape)
+    view = ahead if config.trajectory == "forward" else _directions(heading - np.pi / 2)
+    far = config.step * config.max_depth
+    return _path(view, centers, config.step * config.min_depth, far, far, 4 * side)
+
+
+def _orbit(config: SceneConfig, rng: np.random.Generator) -> Path:
+    """Round after round about the origin, which every camera looks at."""
+    radius = np.sqrt(config.min_depth * config.max_depth)
+    lap = max(round(2 * np.pi * radius), 1)
+    angle = 2 * np.pi * np.arange(config.cameras) / lap
+    centers = -_directions(angle)
+    centers[:, 1] = ORBIT_WAVE * np.sin(2 * angle)
+    centers = config.step * (radius * centers + config.position_jitter * rng.standard_normal(centers.shape))
+    focus = np.linalg.norm(centers, axis=1)
+    near = np.maximum(config.step * config.min_depth, focus / 2)
+    far = np.minimum(config.step * config.max_depth, focus * 2)
+    return _path(-centers, centers, near, far, focus, lap)
+
+
+def _photos(config: SceneConfig, rng: np.random.Generator) -> Path:
+    """Photographs of places along a facade (the plane z = 0), from many sides and distances, shuffled."""
+    count = config.cameras
+    places = np.zeros((count, 3))
+    places[:, 0] = np.cumsum(rng.exponential(config.step, count))
+    low, high = np.log(config.min_depth), np.log(config.max_depth)
+    distance = np.clip((low + high) / 2 + PHOTO_SPREAD * rng.standard_normal(count), low, high)
+    focus = config.step * np.exp(distance)
+    side = -_directions(rng.uniform(-PHOTO_ANGLE, PHOTO_ANGLE, count))
+    centers = places + focus[:, None] * side
+    centers[:, 1] += config.step * rng.standard_normal(count)
+    path = _path(places - centers, centers, focus / RELIEF, focus * RELIEF, focus, 0)
+    return replace(path, labels=rng.permutation(count).astype(np.int32))
+
+
+def _path(view: np.ndarray, centers: np.ndarray, near: Depth, far: Depth, focus: Depth, lap: int) -> Path:
+    """Cameras that look along `view` from `centers` (both (n, 3)); a depth may be one number for all."""
+    count = len(centers)
+    near, far, focus = (np.broadcast_to(np.asarray(depth, dtype=np.float64), (count,)) for depth in (near, far, focus))
+    return Path(_look(view), centers, np.minimum(near, far), far, focus, lap, np.arange(count, dtype=np.int32))
+
+
+def _directions(heading: np.ndarray) -> np.ndarray:
+    """Horizontal unit vectors (n, 3): heading 0 is -z and a quarter turn is x, seen from above to the right."""
+    return np.stack([np.sin(heading), np.zeros_like(heading), -np.cos(heading)], axis=1)
+
+
+def _look(view: np.ndarray) -> np.ndarray:
+    """World-to-camera rotations (n, 3, 3) that look along `view` (n, 3), with the world's y upwards."""
+    back = -view / np.linalg.norm(view, axis=1, keepdims=True)
+    right = np.cross([0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return np.stack([right, np.cross(back, right), back], axis=1)

@@ -1,0 +1,225 @@
+"""Places points where cameras see them and chooses the cameras of every track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxba.geometry import rotation_matrices
+from jaxba.problem import ProblemError
+from jaxba.scenes.config import VIEW_MARGIN, SceneConfig
+from jaxba.scenes.tracks import MIN_LENGTH
+from jaxba.scenes.trajectory import Path
+
+BUDGET = 1 << 20
+"""Candidate views handled at once: some 100 MB of temporaries."""
+
+ATTEMPTS = 24
+"""Tries to place a point where enough cameras see it; each looks nearer to the focus of the view than the last."""
+
+WINDOW = 2.5
+"""Candidate cameras per view wanted. Two sides of the path would be 2 at its ends; the rest is for missed views."""
+
+NEAREST = 0.5
+"""A view nearer than this part of min_depth does not count."""
+
+FARTHEST = 2.0
+"""A view farther than this many times max_depth does not count."""
+
+MIN_VIEWS = 4
+"""Every camera should see so many points: 8 residuals for its 6 degrees of freedom and focal length."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Where points are and who sees them."""
+
+    points: Float[np.ndarray, "points 3"]
+    """Scene units."""
+
+    camera_index: Int[np.ndarray, " observations"]
+    """Place on the path of each observation's camera."""
+
+    point_index: Int[np.ndarray, " observations"]
+    """Point of each observation."""
+
+
+class Rig:
+    """The true cameras, stored for fast tests of visibility."""
+
+    def __init__(self, config: SceneConfig, path: Path, cameras: Float[np.ndarray, "cameras 9"]):
+        self.config, self.path, self.count = config, path, len(cameras)
+        self.rotations = rotation_matrices(cameras[:, :3])
+        self.translations = cameras[:, 3:6]
+        self.rows = np.ascontiguousarray(np.concatenate([self.rotations, self.translations[:, :, None]], axis=2).T)
+        self.focal, self.k1, self.k2 = np.ascontiguousarray(cameras[:, 6:].T)
+        self.half = np.array([config.image_width, config.image_height]) / 2
+
+    def sample(self, reference: np.ndarray, effort: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+        """Points that the reference cameras (n,) see; an effort near 1 goes to the middle of their view."""
+        near, far, focus = (np.log(depth[reference]) for depth in (self.path.near, self.path.far, self.path.focus))
+        depth = np.exp((1 - effort) * rng.uniform(near, far) + effort * focus)
+        local = np.empty((len(reference), 3))
+        plane = rng.uniform(-1, 1, (len(reference), 2)) * self.half / self.focal[reference, None]
+        local[:, :2] = (1 - effort) * depth[:, None] * plane
+        local[:, 2] = -depth
+        return np.einsum("nji,nj->ni", self.rotations[reference], local - self.translations[reference])
+
+    def sees(self, points: Float[np.ndarray, "n 3"], cameras: Int[np.ndarray, "n k"]) -> Bool[np.ndarray, "n k"]:
+        """Whether each candidate camera has the row's point in front of it and in its image."""
+        x, y, z = (points[:, axis, None] for axis in range(3))
+        across, upwards, behind = (
+            a[cameras] * x + b[cameras] * y + c[cameras] * z + d[cameras] for a, b, c, d in self.rows.transpose(1, 0, 2)
+        )
+        depth = -behind
+        unit = self.config.step * np.array([NEAREST * self.config.min_depth, FARTHEST * self.config.max_depth])
+        good = (depth >= unit[0]) & (depth <= unit[1])
+        inverse = 1 / np.where(good, depth, 1.0)
+        px, py = across * inverse, upwards * inverse
+        square = px * px + py * py
+        focal = self.focal[cameras]
+        scale = focal * (1 + square * (self.k1[cameras] + square * self.k2[cameras]))
+        for p, half in ((px, self.half[0]), (py, self.half[1])):
+            good &= (np.abs(p) * focal <= VIEW_MARGIN * half) & (np.abs(p) * scale <= half)
+        return good
+
+
+def place_points(rig: Rig, lengths: Int[np.ndarray, " points"], rng: np.random.Generator) -> Views:
+    """Points with the wanted numbers of views, which add up exactly.
+
+    Args:
+        rig: the cameras.
+        lengths: wanted views, longest first. Where the cameras cannot see a point that often, it gets
+            as many views as there are, and others, that could have more, get the rest.
+        rng: source of the randomness.
+
+    Raises:
+        ProblemError: the cameras overlap too little for so many views.
+    """
+    count = len(lengths)
+    reference = rng.permutation(np.arange(count, dtype=np.int32) % rig.count)
+    points = np.empty((count, 3))
+    cameras, owners = [], []
+    missing, start = 0, 0
+    while start < count:
+        part = _next_part(lengths, start, _width(rig, int(lengths[start])))
+        points[part], candidates, visible = _place(rig, lengths[part], reference[part], rng)
+        taken, missing = _balance(lengths[part], visible.sum(axis=1), missing, rng)
+        chosen = _choose(visible, taken, rig.config.gap_share, rng)
+        cameras.append(candidates[chosen])
+        owners.append(np.repeat(np.arange(part.start, part.stop, dtype=np.int32), taken))
+        start = part.stop
+    if missing:
+        raise ProblemError(
+            f"{missing} of {lengths.sum()} observations found no place: the cameras overlap too little "
+            "(ask for fewer observations, deepen max_depth or shorten focal)"
+        )
+    views = Views(points, np.concatenate(cameras), np.concatenate(owners))
+    return _feed(rig, views, rng)
+
+
+def _width(rig: Rig, longest: int) -> int:
+    """Candidate cameras for tracks of up to `longest` views; an odd number."""
+    wanted = WINDOW * longest / max(1 - rig.config.gap_share, 1 / WINDOW) + 4
+    return int(min(2 * (wanted // 2) + 1, 2 * rig.count - 1))
+
+
+def _next_part(lengths: np.ndarray, start: int, width: int) -> slice:
+    """Points from `start` on that share a window: within the memory budget and of similar length."""
+    stop = min(start + max(BUDGET // width, 1), len(lengths))
+    similar = np.searchsorted(-lengths[start:stop], -(lengths[start] // 2), side="right")
+    return slice(start, start + int(similar))
+
+
+def _place(rig: Rig, lengths: np.ndarray, reference: np.ndarray, rng: np.random.Generator) -> tuple:
+    """Points (n, 3), candidate cameras (n, k) and which of them see the point (n, k).
+
+    The best try of each point is kept. In the second half of the tries other reference cameras are
+    taken, since one in a bend of the path may never share a point with enough others.
+    """
+    count, width = len(lengths), _width(rig, int(lengths[0]))
+    points, seen = np.empty((count, 3)), np.zeros(count, dtype=int)
+    candidates, visible = np.zeros((count, width), dtype=np.int32), np.zeros((count, width), dtype=bool)
+    todo = np.arange(count)
+    for attempt in range(ATTEMPTS):
+        first = reference[todo] if attempt < ATTEMPTS // 2 else rng.integers(rig.count, size=todo.size)
+        trial = rig.sample(first, attempt / ATTEMPTS, rng)
+        cameras, inside = _window(rig, first, width, rng)
+        views = rig.sees(trial, cameras) & inside
+        number = views.sum(axis=1)
+        better = np.flatnonzero(number > seen[todo])
+        rows = todo[better]
+        points[rows], candidates[rows], visible[rows] = trial[better], cameras[better], views[better]
+        seen[rows] = number[better]
+        todo = todo[seen[todo] < lengths[todo]]
+        if not todo.size:
+            break
+    if seen.min() < MIN_LENGTH:
+        raise ProblemError("a camera shares no point with any other: deepen max_depth or shorten focal")
+    return points, candidates, visible
+
+
+def _window(rig: Rig, reference: np.ndarray, width: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Cameras around the reference, nearest first (n, width), and which of them exist.
+
+    For a share of the rows every other column is around the same place on another round of the path.
+    """
+    column = np.arange(width)
+    offset = (column + 1) // 2 * np.where(column % 2, 1, -1)
+    cameras = reference[:, None] + offset.astype(np.int32)
+    lap, share = rig.path.lap, rig.config.revisit_share
+    if share > 0 and width < lap < rig.count:
+        rows = np.flatnonzero(rng.random(len(reference)) < share)
+        here = reference[rows]
+        there = np.where(here + lap < rig.count, here + lap, here - lap)
+        there = np.where(there < 0, here, there)
+        pair = np.where(column % 2, there[:, None], here[:, None]) + offset[column // 2]
+        cameras[rows] = np.where((there != here)[:, None], pair, cameras[rows])
+    inside = (cameras >= 0) & (cameras < rig.count)
+    return np.where(inside, cameras, 0).astype(np.int32), inside
+
+
+def _balance(wanted: np.ndarray, possible: np.ndarray, missing: int, rng: np.random.Generator) -> tuple:
+    """Views of each point, at most the possible ones, and how many are still missing from the sum."""
+    taken = np.minimum(wanted, possible)
+    missing += int(wanted.sum() - taken.sum())
+    while missing:
+        open_rows = np.flatnonzero(possible > taken)
+        if not open_rows.size:
+            break
+        taken[rng.permutation(open_rows)[:missing]] += 1
+        missing -= min(missing, open_rows.size)
+    return taken, missing
+
+
+def _choose(visible: np.ndarray, taken: np.ndarray, gap_share: float, rng: np.random.Generator) -> np.ndarray:
+    """Picks `taken` of the visible candidates of each row (n, k), nearest first, leaving gaps where it can."""
+    skipped = rng.random(visible.shape, dtype=np.float32) < gap_share
+    skipped[:, 0] = False  # the reference camera
+    first = visible & ~skipped
+    first &= np.cumsum(first, axis=1, dtype=np.int32) <= taken[:, None]
+    rest = visible & skipped
+    rest &= np.cumsum(rest, axis=1, dtype=np.int32) <= (taken - first.sum(axis=1))[:, None]
+    return first | rest
+
+
+def _feed(rig: Rig, views: Views, rng: np.random.Generator) -> Views:
+    """Gives cameras that see fewer than four points views from the cameras that see most, where they can see them."""
+    owner, points = views.camera_index, views.points
+    load = np.bincount(owner, minlength=rig.count)
+    for poor in np.flatnonzero(load < MIN_VIEWS):
+        known = views.point_index[owner == poor]
+        could = rig.sees(points, np.full((len(points), 1), poor))[:, 0]
+        could[known] = False
+        for point in rng.permutation(np.flatnonzero(could)):
+            if load[poor] >= MIN_VIEWS:
+                break
+            track = np.flatnonzero(views.point_index == point)
+            richest = track[np.argmax(load[owner[track]])]
+            if load[owner[richest]] > MIN_VIEWS:
+                load[owner[richest]] -= 1
+                load[poor] += 1
+                owner[richest] = poor
+    return views

@@ -1,0 +1,371 @@
+"""The whole solve: iterate the step under a damping policy until it converges.
+
+Without a callback the loop is one compiled program. With one, the same iteration runs step by step
+from Python and every record carries the wall-clock time at which it was finished.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Bool, Float, Int
+
+from jaxba.damping import DampingPolicy, ProblemInfo, make_policy
+from jaxba.layout import Layout, build_layout
+from jaxba.linearize import linearize
+from jaxba.lm import LMState, StepInfo, initial_state, lm_step
+from jaxba.options import StepOptions
+from jaxba.problem import BundleProblem
+from jaxba.schur import largest_diagonal
+
+MAX_ITERATIONS = 100
+"""Iterations after which a solve has failed. Source: the paper."""
+
+EXPLICIT_MAX_CAMERAS = 400
+"""Up to this many cameras `auto` forms and factors the reduced camera system: 3,600 unknowns, 104 MB."""
+
+
+class Termination(enum.IntEnum):
+    """Why a solve ended."""
+
+    RUNNING = 0
+    COST = 1
+    STEP = 2
+    GRADIENT = 3
+    MAX_ITERATIONS = 4
+    STALLED = 5
+    DAMPING_LIMIT = 6
+    STOPPED = 7
+
+    @property
+    def converged(self) -> bool:
+        """Whether one of the three convergence tests ended the solve."""
+        return self in (Termination.COST, Termination.STEP, Termination.GRADIENT)
+
+    @property
+    def reason(self) -> str:
+        """One phrase for a person."""
+        return _REASONS[self]
+
+
+_REASONS = {
+    Termination.RUNNING: "still running",
+    Termination.COST: "relative decrease of an accepted step within ftol",
+    Termination.STEP: "accepted step within xtol",
+    Termination.GRADIENT: "gradient within gtol",
+    Termination.MAX_ITERATIONS: "iteration limit",
+    Termination.STALLED: "a rejected step would be repeated unchanged",
+    Termination.STOPPED: "stopped by the caller",
+    Termination.DAMPING_LIMIT: "lambda at its upper limit, or not a number, and still rejected",
+}
+
+DAMPING_LIMIT = 1e32
+"""A step rejected with this lambda ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
+
+
+class Tolerances(NamedTuple):
+    """Convergence tests, on accepted steps only (design, section 2)."""
+
+    ftol: float = 1e-6
+    """`|f - f'| <= ftol f`."""
+
+    xtol: float = 1e-8
+    """`|step| <= xtol (|x| + xtol)`."""
+
+    gtol: float = 1e-10
+    """Largest gradient entry."""
+
+
+class History(NamedTuple):
+    """One entry an iteration; NumPy arrays of equal length in a `Solution`."""
+
+    cost: np.ndarray  # accepted cost after the iteration, pixels^2
+    candidate_cost: np.ndarray  # cost of the proposed step
+    damping: np.ndarray  # lambda that was used
+    gain_ratio: np.ndarray
+    accepted: np.ndarray
+    cg_iterations: np.ndarray
+    gradient_max: np.ndarray  # largest gradient entry before the step
+    step_norm: np.ndarray
+
+
+class IterationRecord(NamedTuple):
+    """What a callback sees."""
+
+    iteration: int  # from 1
+    time_s: float  # seconds since the first iteration started, compilation excluded
+    step: StepInfo  # Python and NumPy scalars
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Result of `solve`."""
+
+    problem: BundleProblem
+    """The input with optimised cameras and points; what nobody observes is unchanged."""
+
+    initial_cost: float
+    """Pixels squared."""
+
+    final_cost: float
+    """Pixels squared; never above the initial cost."""
+
+    iterations: int
+    """Linear solves, accepted or not."""
+
+    accepted: int
+    """Accepted iterations."""
+
+    termination: Termination
+    """Why it ended; `termination.converged` says whether that is a success."""
+
+    history: History
+    """Fixed-length records cut to `iterations`."""
+
+    linear_solver: str
+    """`explicit` or `implicit`."""
+
+    setup_s: float
+    """Seconds for the layout and the transfer to the device."""
+
+    compile_s: float
+    """Seconds for compilation; nearly zero when an executable was at hand."""
+
+    total_s: float
+    """Seconds for the iterations."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether a convergence test ended the solve."""
+        return self.termination.converged
+
+
+class _Carry(NamedTuple):
+    state: LMState
+    policy: Any
+    damping: Float[Array, ""]
+    iteration: Int[Array, ""]
+    termination: Int[Array, ""]
+
+
+def solve(
+    problem: BundleProblem,
+    damping: str | DampingPolicy = "ceres",
+    options: StepOptions | None = None,
+    *,
+    linear_solver: str | None = None,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerances: Tolerances | None = None,
+    dtype: str = "float64",
+    callback: Callable[[IterationRecord], bool | None] | None = None,
+) -> Solution:
+    """Minimises the reprojection cost over cameras and points.
+
+    Args:
+        problem: start of the optimisation.
+        damping: a policy, or the name of one (`jaxba.make_policy`).
+        options: how a step is made.
+        linear_solver: overrides that of the options; `auto` chooses by the number of cameras.
+        max_iterations: limit of linear solves.
+        tolerances: convergence tests.
+        dtype: `float64` or `float32`, the type of all arithmetic.
+        callback: called after every iteration, which then run one by one; a true return value stops the
+            solve.
+
+    Returns:
+        Parameters as NumPy float64 arrays, histories and timings.
+
+    Raises:
+        ValueError: unknown names, or limits that make no sense.
+    """
+    if dtype not in ("float64", "float32"):
+        raise ValueError(f"dtype must be float64 or float32, not {dtype!r}")
+    if max_iterations < 1:
+        raise ValueError(f"max_iterations must be at least 1, is {max_iterations}")
+    policy = make_policy(damping) if isinstance(damping, str) else damping
+    options = choose_linear_solver(problem, options or StepOptions(), linear_solver)
+    tolerances = tolerances or Tolerances()
+    with jax.enable_x64(dtype == "float64"):
+        started = time.perf_counter()
+        layout = jax.device_put(build_layout(problem, pairs=options.linear_solver == "explicit"))
+        state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
+        setup_s = time.perf_counter() - started
+        run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)
+        final, history, compile_s, total_s = run(layout, state, policy, tolerances, options, max_iterations)
+        count = int(final.iteration)
+        return Solution(
+            problem=_write_back(problem, layout, final.state),
+            initial_cost=float(state.cost),
+            final_cost=float(final.state.cost),
+            iterations=count,
+            accepted=int(np.sum(history.accepted[:count])),
+            termination=Termination(int(final.termination)),
+            history=History(*(np.asarray(field)[:count] for field in history)),
+            linear_solver=options.linear_solver,
+            setup_s=setup_s,
+            compile_s=compile_s,
+            total_s=total_s,
+        )
+
+
+def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_solver: str | None) -> StepOptions:
+    """Resolves `auto`; None keeps what the options say."""
+    if linear_solver == "auto":
+        linear_solver = "explicit" if problem.num_cameras <= EXPLICIT_MAX_CAMERAS else "implicit"
+    return options if linear_solver is None else replace(options, linear_solver=linear_solver)  # type: ignore[arg-type]
+
+
+@functools.partial(jax.jit, static_argnames=("options", "dtype"))
+def _initial(layout: Layout, problem: BundleProblem, options: StepOptions, dtype: Any) -> LMState:
+    return initial_state(layout, problem, options, dtype)
+
+
+@functools.partial(jax.jit, static_argnames=("options", "max_iterations"))
+def _start(layout: Layout, state: LMState, policy: DampingPolicy, options: StepOptions, max_iterations: int) -> _Carry:
+    """Carry before the first iteration."""
+    unit = jnp.ones_like(state.cost)
+    if options.scaling == "identity":
+        unit = largest_diagonal(layout, linearize(layout, state.cameras, state.points, options.loss))
+    count = lambda n: jnp.asarray(n, jnp.int32)
+    info = ProblemInfo(
+        cost=state.cost,
+        observations=count(jnp.sum(layout.slot_mask)),
+        cameras=count(layout.num_cameras),
+        points=count(layout.num_points),
+        unit=unit,
+        max_iterations=count(max_iterations),
+    )
+    policy_state, damping = policy.init(info)
+    return _Carry(state, policy_state, damping, count(0), count(Termination.RUNNING))
+
+
+_step = jax.jit(lm_step, static_argnames=("options",))
+
+
+def _advance(
+    carry: _Carry, state: LMState, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
+) -> _Carry:
+    """Everything of an iteration that follows the step: the policy's answer and the stop rules."""
+    policy_state, damping = policy.propose(carry.policy, step)
+    iteration = carry.iteration + 1
+    return _Carry(
+        state, policy_state, damping, iteration, _termination(step, damping, iteration, tolerances, max_iterations)
+    )
+
+
+_advance_jit = jax.jit(_advance)
+
+
+def _termination(
+    step: StepInfo, damping: Float[Array, ""], iteration: Int[Array, ""], tolerances: Tolerances, max_iterations: Any
+) -> Int[Array, ""]:
+    """First stop rule that applies. Only an accepted step, or a zero gradient, ends a solve as converged."""
+    by_cost = step.accepted & (step.previous_cost - step.cost <= tolerances.ftol * step.previous_cost)
+    by_step = step.accepted & (step.step_norm <= tolerances.xtol * (step.parameter_norm + tolerances.xtol))
+    by_gradient = step.gradient_max <= tolerances.gtol
+    limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
+    stalled = ~step.accepted & (damping == step.damping)
+    rules: list[tuple[Bool[Array, ""], Termination]] = [
+        (by_cost, Termination.COST),
+        (by_step, Termination.STEP),
+        (by_gradient, Termination.GRADIENT),
+        (limit, Termination.DAMPING_LIMIT),
+        (stalled, Termination.STALLED),
+        (iteration >= max_iterations, Termination.MAX_ITERATIONS),
+    ]
+    return jnp.select(
+        [rule for rule, _ in rules], [jnp.asarray(int(code), jnp.int32) for _, code in rules], jnp.zeros((), jnp.int32)
+    )
+
+
+def _history(step: StepInfo) -> History:
+    return History(
+        cost=step.cost,
+        candidate_cost=step.candidate_cost,
+        damping=step.damping,
+        gain_ratio=step.gain_ratio,
+        accepted=step.accepted,
+        cg_iterations=step.cg_iterations,
+        gradient_max=step.gradient_max,
+        step_norm=step.step_norm,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("options", "max_iterations"))
+def solve_loop(
+    layout: Layout,
+    state: LMState,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    options: StepOptions,
+    max_iterations: int,
+) -> tuple[_Carry, History]:
+    """The loop as one program; vmappable over layouts and states of equal shape.
+
+    Returns:
+        Final carry, and histories of length `max_iterations`, zero past the last iteration.
+    """
+    carry = _start(layout, state, policy, options, max_iterations)
+    step_of = lambda c: lm_step(layout, c.state, c.damping, options, policy.min_gain)
+    shapes = jax.eval_shape(lambda c: _history(step_of(c)[1]), carry)
+    empty = jax.tree.map(lambda s: jnp.zeros((max_iterations, *s.shape), s.dtype), shapes)
+
+    def body(loop: tuple[_Carry, History]) -> tuple[_Carry, History]:
+        carry, history = loop
+        state, step = step_of(carry)
+        history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, _history(step))
+        return _advance(carry, state, step, policy, tolerances, max_iterations), history
+
+    return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))
+
+
+def _run_compiled(layout, state, policy, tolerances, options, max_iterations):
+    started = time.perf_counter()
+    compiled = solve_loop.lower(layout, state, policy, tolerances, options, max_iterations).compile()
+    compile_s = time.perf_counter() - started
+    started = time.perf_counter()
+    carry, history = jax.block_until_ready(compiled(layout, state, policy, tolerances))
+    return carry, history, compile_s, time.perf_counter() - started
+
+
+def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *, callback):
+    started = time.perf_counter()
+    carry = _start(layout, state, policy, options, max_iterations)
+    min_gain = jnp.asarray(policy.min_gain, state.cost.dtype)
+    limit = jnp.asarray(max_iterations, jnp.int32)
+    warm = _step(layout, state, carry.damping, options, min_gain)  # compiles; the result is thrown away
+    jax.block_until_ready(_advance_jit(carry, *warm, policy, tolerances, limit))
+    compile_s = time.perf_counter() - started
+    records = []
+    started = time.perf_counter()
+    while int(carry.termination) == Termination.RUNNING:
+        state, step = _step(layout, carry.state, carry.damping, options, min_gain)
+        carry = _advance_jit(carry, state, step, policy, tolerances, limit)
+        step = jax.tree.map(lambda x: x.item(), jax.device_get(step))
+        records.append(step)
+        wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started, step))
+        if wants_stop and int(carry.termination) == Termination.RUNNING:
+            carry = carry._replace(termination=jnp.asarray(int(Termination.STOPPED), jnp.int32))
+    total_s = time.perf_counter() - started
+    history = jax.tree.map(lambda *values: np.array(values), *map(_history, records))
+    return carry, history, compile_s, total_s
+
+
+def _write_back(problem: BundleProblem, layout: Layout, state: LMState) -> BundleProblem:
+    """Optimised parameters in the problem's own order; what was not optimised is copied bit by bit."""
+    cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
+    seen = np.asarray(layout.camera_seen)
+    cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
+    order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    real = order < problem.num_points
+    points[order[real]] = np.asarray(state.points, np.float64).T[real]
+    return problem.replace(cameras=cameras, points=points)

@@ -1,0 +1,36 @@
+"""The two dense sums that a `Layout` makes possible: over a point's slots and over a camera's."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.layout import Layout
+
+
+def take(values: Array, index: Int[Array, "..."]) -> Array:
+    """Columns (last axis) of `values` at `index`, which is known to be in range."""
+    return values.at[..., index].get(mode="promise_in_bounds")
+
+
+def take_rows(values: Array, index: Int[Array, "..."]) -> Array:
+    """Rows (first axis) of `values` at `index`, which is known to be in range."""
+    return values.at[index].get(mode="promise_in_bounds")
+
+
+def tree_sum(rows: Array, levels: tuple[Int[Array, "targets width"], ...]) -> Array:
+    """Sums rows into targets along a tree made by `layout.sum_tree`."""
+    for level in levels:
+        rows = jnp.sum(take_rows(rows, level), axis=1)
+    return rows
+
+
+def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "k points"]:
+    """Sums each point's slots; every bucket is a dense sum."""
+    parts, start = [], 0
+    for length, points in layout.buckets:
+        block = values[:, start : start + length * points]
+        parts.append(jnp.sum(block.reshape(-1, length, points), axis=1))
+        start += length * points
+    return jnp.concatenate(parts, axis=1)

@@ -1,0 +1,136 @@
+"""Changes of a problem before it is solved: normalise, perturb, drop what no camera can see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxba.geometry import camera_centers, depths, rotation_matrices, translations
+from jaxba.problem import BundleProblem, ProblemError
+
+POBA_SIZE = 100.0
+"""Size of a normalised scene. Source: Ceres `BALProblem::Normalize`, kept by rootba and PoBA."""
+
+POBA_NOISE = 0.01
+"""Sigma of the translation and of the point noise in PoBA's experiments, in units of a scene of size 100."""
+
+POBA_MIN_DEPTH = 0.1
+"""PoBA drops observations nearer than this, in units of a scene of size 100."""
+
+POBA_SEED = 38401
+"""Default seed of rootba and PoBA. Their generator is C++'s, so equal seeds give other numbers here."""
+
+MIN_TRACK = 2
+"""A point needs two views to have a position. Source: rootba drops points with fewer."""
+
+
+def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
+    """The same problem in coordinates where the points are centred and have a given spread.
+
+    A similarity moves the marginal median of the points to the origin and scales their median L1
+    distance from it to `size` (scene units). Every residual, and so the cost, stays as it was.
+
+    Raises:
+        ProblemError: `size` is not positive, or half of the points coincide.
+
+    Source: Ceres `BALProblem::Normalize` (its median is the upper one of an even count).
+    """
+    if not (np.isfinite(size) and size > 0):
+        raise ProblemError(f"the size of a normalised scene must be positive, not {size}")
+    points = np.asarray(problem.points, dtype=np.float64)
+    middle = _upper_median(points)
+    spread = float(_upper_median(np.abs(points - middle).sum(axis=1)))
+    if spread == 0:
+        raise ProblemError("the scene has no extent: half of its points are at one place")
+    scale = size / spread
+    cameras = np.array(problem.cameras, dtype=np.float64)
+    # c' = s (c - m) with t = -R c gives t' = s (t + R m).
+    cameras[:, 3:6] = scale * (cameras[:, 3:6] + rotation_matrices(cameras[:, :3]) @ middle)
+    return problem.replace(cameras=cameras, points=scale * (points - middle))
+
+
+def perturb(
+    problem: BundleProblem,
+    seed: int | np.random.Generator,
+    rotation_sigma: float = 0.0,
+    translation_sigma: float = 0.0,
+    point_sigma: float = 0.0,
+) -> BundleProblem:
+    """Adds Gaussian noise to the start of a problem; the observations stay.
+
+    Read as Ceres does it: rotation noise is added to the angle-axis vector while the camera *centre*
+    stays, and translation noise is then added to the translation `t = -R c`. rootba and PoBA add theirs
+    to the centre instead, which is the same in distribution, since the noise is isotropic.
+
+    Args:
+        problem: the problem to start further away.
+        seed: a seed or a generator; the same seed gives the same numbers.
+        rotation_sigma: radians, on each component of the angle-axis vector.
+        translation_sigma: scene units, on each component.
+        point_sigma: scene units, on each coordinate.
+
+    Raises:
+        ProblemError: a sigma is negative or not finite.
+
+    Source: Ceres `BALProblem::Perturb`; PoBA's values are in `poba_start`.
+    """
+    for name, sigma in (("rotation", rotation_sigma), ("translation", translation_sigma), ("point", point_sigma)):
+        if not (np.isfinite(sigma) and sigma >= 0):
+            raise ProblemError(f"{name}_sigma must not be negative, got {sigma}")
+    rng = np.random.default_rng(seed)
+    points = np.asarray(problem.points, dtype=np.float64)
+    points = points + point_sigma * rng.standard_normal(points.shape)
+    cameras = np.array(problem.cameras, dtype=np.float64)
+    centers = camera_centers(cameras)
+    turn = rng.standard_normal((problem.num_cameras, 3))
+    shift = translation_sigma * rng.standard_normal((problem.num_cameras, 3))
+    if rotation_sigma > 0:
+        cameras[:, :3] += rotation_sigma * turn
+        cameras[:, 3:6] = translations(rotation_matrices(cameras[:, :3]), centers)
+    cameras[:, 3:6] += shift
+    return problem.replace(cameras=cameras, points=points)
+
+
+def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> BundleProblem:
+    """Removes observations of points nearer than `min_depth` (scene units) in front of their camera or behind it.
+
+    Points that keep fewer than two observations go too, and the others are numbered anew in their old
+    order; cameras keep their numbers, even one that sees nothing any more.
+
+    Raises:
+        ProblemError: nothing would be left.
+
+    Source: rootba `BalProblem::filter_obs`, which PoBA uses.
+    """
+    keep = depths(problem) >= min_depth
+    point_index = np.asarray(problem.point_index)
+    tracks = np.bincount(point_index[keep], minlength=problem.num_points)
+    keep &= tracks[point_index] >= MIN_TRACK
+    if not keep.any():
+        raise ProblemError(f"no point is seen by two cameras from at least {min_depth} away: nothing would be left")
+    used = tracks >= MIN_TRACK
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    return problem.replace(
+        points=np.asarray(problem.points)[used],
+        observations=np.asarray(problem.observations)[keep],
+        camera_index=np.asarray(problem.camera_index)[keep],
+        point_index=number[point_index[keep]],
+        whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
+    )
+
+
+def poba_start(problem: BundleProblem, seed: int | np.random.Generator = POBA_SEED) -> BundleProblem:
+    """The start of PoBA's experiments: normalised to 100, translations and points moved by 0.01, depth >= 0.1.
+
+    Raises:
+        ProblemError: as `normalize` and `drop_invalid`.
+
+    Source: Weber et al. 2023, "Power Bundle Adjustment for Large-Scale 3D Reconstruction", and its code.
+    """
+    moved = perturb(normalize(problem), seed, translation_sigma=POBA_NOISE, point_sigma=POBA_NOISE)
+    return drop_invalid(moved, POBA_MIN_DEPTH)
+
+
+def _upper_median(values: np.ndarray) -> np.ndarray:
+    """The element of rank n // 2 along the first axis, as C++'s nth_element gives it."""
+    middle = len(values) // 2
+    return np.asarray(np.partition(values, middle, axis=0)[middle])

@@ -1,0 +1,177 @@
+"""Figures and the report: files, names, consistency of styles, odd inputs. Warnings are errors."""
+
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from jaxba.bench import plots
+from jaxba.bench.profile import Target
+from jaxba.bench.records import Record, TracePoint
+from jaxba.bench.report import file_names, run_facts, write_all
+from jaxba.problem import ProblemError
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+def make_record(problem, solver, iterations, *, rate=0.3, floor=100.0, damping=0.25, termination="ftol"):
+    """A run that approaches `floor` geometrically; every fourth iteration is rejected."""
+    cost, points = 1000.0, [TracePoint(0, 0.0, 1000.0, math.nan, True, 0, math.nan)]
+    for i in range(1, iterations + 1):
+        ok = i % 4 != 0
+        cost = floor + (cost - floor) * rate if ok else cost
+        points.append(TracePoint(i, 0.1 * i, cost, damping / i, ok, 0, 0.9 if ok else -0.1))
+    counts = (iterations, sum(p.accepted for p in points[1:]), 0, termination)
+    start = (problem, "f", 2, 3, 4, solver, "jax", "cpu", "float64", 2, 0, 0.1, 1.0, 0.1 * iterations)
+    return Record(*start, 1000.0, cost, *counts, tuple(points))
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+class Tags(HTMLParser):
+    """Collects sources of loaded content and checks that tags close."""
+
+    def __init__(self):
+        super().__init__()
+        self.stack, self.sources = [], []
+
+    def handle_starttag(self, tag, attrs):
+        self.sources += [value for key, value in attrs if key in ("src", "href")]
+        if tag not in ("meta", "img"):
+            self.stack.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.stack.pop() == tag
+
+
+def test_write_all_leaves_the_files_of_the_contract(tmp_path):
+    records = [make_record("a", "classic", 30), make_record("a", "ceres", 14), make_record("dir/b c", "classic", 12)]
+    files = write_all(records, tmp_path / "out", 1e-3, facts={"device": "<cpu>", "threads": 2})
+    stems = (
+        "profile_tau_0.001",
+        "profile_relative",
+        "convergence_a",
+        "convergence_dir_b_c",
+        "lambda_a",
+        "lambda_dir_b_c",
+    )
+    expected = {f"{stem}.{kind}" for stem in stems for kind in ("png", "svg")} | {"summary.json", "report.html"}
+    assert names(tmp_path / "out") == expected == {path.name for path in files}
+    for path in files:
+        if path.suffix == ".png":
+            assert path.read_bytes().startswith(b"\x89PNG")
+        elif path.suffix == ".svg":
+            ElementTree.parse(path)
+
+
+def test_report_is_self_contained_well_formed_and_escaped(tmp_path):
+    hostile = "<script>alert(1)</script>&\"'"
+    write_all([make_record(hostile, hostile, 3)], tmp_path, facts={hostile: hostile})
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "<script" not in text
+    parser = Tags()
+    parser.feed(text)
+    assert parser.stack == []
+    assert len(parser.sources) == 4
+    assert all(s.startswith("data:image/svg+xml;base64,") for s in parser.sources)
+    assert not re.search(r"url\(|@import|https?://", text)
+
+
+@pytest.mark.parametrize(
+    "records",
+    [
+        [make_record("a", "x", 1)],
+        [make_record("a", "x", 0)],
+        [make_record("a", s, 100, rate=0.9999, termination="max_iterations") for s in ("classic", "x")],
+        [make_record("z", "x", 12, rate=1e-3, floor=0.0), make_record("z", "y", 30, rate=0.1, floor=0.0)],
+        [make_record("z", "gauss-newton", 15, damping=0.0), make_record("z", "y", 15)],
+        [make_record("a", "slow", 100), replace(make_record("a", "fast", 2), trace=make_record("a", "f", 1).trace)],
+    ],
+    ids=["one record", "no iteration", "all failed", "zero residual", "zero damping", "log time"],
+)
+def test_unusual_results_still_make_a_report(tmp_path, records):
+    write_all(records, tmp_path)
+    assert "report.html" in names(tmp_path)
+
+
+def test_run_that_produced_no_numbers_still_makes_a_report(tmp_path):
+    nothing = {"initial_cost": math.nan, "final_cost": math.nan, "iterations": 0, "accepted": 0, "trace": ()}
+    crashed = replace(make_record("$x_1$ \u6f22", "_$policy$", 1, termination="error"), **nothing)
+    write_all([crashed], tmp_path / "alone")
+    write_all([crashed, make_record(crashed.problem, "x", 12)], tmp_path / "beside")
+    text = (tmp_path / "alone" / "report.html").read_text(encoding="utf-8")
+    assert "no solver has a finite initial cost" in text
+
+
+def test_many_solvers_keep_different_styles_and_the_yardsticks_theirs():
+    solvers = [f"s{i}" for i in range(20)] + ["ceres", "classic"]
+    styles = plots.solver_styles(solvers)
+    assert len({(s.color, str(s.linestyle)) for s in styles.values()}) == len(solvers)
+    assert styles["classic"] == plots.solver_styles(["x", "classic"])["classic"]
+    assert list(styles) == solvers
+
+
+def test_profile_curves_lie_at_the_shares_computed_by_hand():
+    # x needs 3 accepted steps to 1e-2 f* (900 * 0.1**3 < 1), y 9 iterations with two rejections (900 * 0.37**7 < 1).
+    records = [make_record("a", "x", 12, rate=0.1), make_record("a", "y", 12, rate=0.37)]
+    figure = plots.plot_profiles(records, [Target("relative", 1e-2)], known_best={"a": 100.0})
+    by_iterations = figure.axes[1]
+    curves = {line.get_color(): np.asarray(line.get_xydata()) for line in by_iterations.get_lines()}
+    styles = plots.solver_styles(["x", "y"])
+    assert curves[styles["x"].color][0].tolist() == [1.0, 100.0]
+    assert [3.0, 100.0] in curves[styles["y"].color].tolist()
+
+
+def test_damping_chart_marks_rejections_hollow_and_zooms_into_the_end_of_classic():
+    records = [make_record("a", "classic", 30), make_record("a", "x", 60)]
+    main, zoom = plots.plot_lambda(records, "a").axes
+    assert zoom.get_xlim() == (20.5, 30.5)
+    hollow = [line for line in main.get_lines() if line.get_markerfacecolor() == "white"]
+    assert sorted(np.size(line.get_xdata()) for line in hollow) == [7, 15]
+    assert len(plots.plot_lambda([make_record("a", "x", 10)], "a").axes) == 1
+
+
+def dashed_levels(axes):
+    heights = [np.unique(np.asarray(line.get_ydata())) for line in axes.get_lines()]
+    return sorted(height[0] for height in heights if len(height) == 1)
+
+
+def test_convergence_plot_has_dashed_lines_at_the_tolerances():
+    figure = plots.plot_convergence([make_record("a", "x", 30)], "a", 1e-2, known_best={"a": 100.0})
+    top, bottom = figure.axes[0], figure.axes[2]
+    assert dashed_levels(top) == pytest.approx([100.9, 109.0, 190.0])
+    assert dashed_levels(bottom) == pytest.approx([1e-4, 1e-3, 1e-2])
+
+
+def test_same_figure_is_written_with_the_same_bytes(tmp_path):
+    for name in ("one", "two"):
+        plots.save_figure(plots.plot_lambda([make_record("a", "x", 12)], "a"), tmp_path / name)
+    for kind in ("png", "svg"):
+        assert (tmp_path / f"one.{kind}").read_bytes() == (tmp_path / f"two.{kind}").read_bytes()
+
+
+def test_file_names_are_safe_and_different():
+    found = file_names(["a/b", "a b", "A_b", "../..", "", "x" * 300, "ok-1.2"])
+    assert list(found.values())[:5] == ["a_b", "a_b-2", "A_b-3", "problem", "problem-2"]
+    assert len(found["x" * 300]) == 100
+    assert found["ok-1.2"] == "ok-1.2"
+
+
+def test_facts_come_from_the_records_when_none_are_given():
+    facts = run_facts([make_record("a", "x", 2), replace(make_record("a", "y", 2), device="gpu", repeat=2)])
+    assert facts["device"] == "cpu, gpu"
+    assert facts["repeats"] == "3"
+
+
+def test_nothing_to_report_and_bad_tolerance_are_refused(tmp_path):
+    with pytest.raises(ProblemError, match="no results"):
+        write_all([], tmp_path / "out")
+    with pytest.raises(ProblemError, match="between 0 and 1"):
+        write_all([make_record("a", "x", 2)], tmp_path / "out", 1.5)
+    assert not (tmp_path / "out").exists()

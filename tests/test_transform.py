@@ -1,0 +1,281 @@
+"""Geometry of the BAL camera on the host, and the changes of a problem that are built on it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxba import geometry
+from jaxba.geometry import angle_axis, camera_centers, cost, depths, project, residuals, rotation_matrices
+from jaxba.problem import BundleProblem, ProblemError
+from jaxba.transform import drop_invalid, normalize, perturb, poba_start
+
+DATA = os.environ.get("JAXBA_DATA")
+needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
+
+ANGLES = [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 0.5, 3.0, np.pi - 1e-4, np.pi - 1e-8, np.pi - 1e-12, np.pi]
+
+
+def axes(seed: int, count: int) -> np.ndarray:
+    vectors = np.random.default_rng(seed).standard_normal((count, 3))
+    return np.concatenate([vectors / np.linalg.norm(vectors, axis=1, keepdims=True), np.eye(3), -np.eye(3)])
+
+
+def small_problem(seed: int = 0, **options) -> BundleProblem:
+    """12 points in front of 5 cameras, all visible, with measurements some pixels off."""
+    rng = np.random.default_rng(seed)
+    cameras = np.zeros((5, 9))
+    cameras[:, :3] = 0.2 * rng.standard_normal((5, 3))
+    cameras[:, 3:6] = rng.standard_normal((5, 3)) - [0, 0, 8]
+    cameras[:, 6:] = rng.uniform([500, -0.1, 0.0], [900, 0.0, 0.01], (5, 3))
+    points = rng.uniform([-1.7, -2.2, -1.5], [2.3, 1.8, 2.5], (12, 3))
+    camera_index, point_index = (index.ravel() for index in np.meshgrid(np.arange(5), np.arange(12)))
+    return BundleProblem.create(
+        cameras, points, 30 * rng.standard_normal((60, 2)), camera_index, point_index, **options
+    )
+
+
+# Rotations
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, 4.0, 7.0])
+def test_rotation_matrices_equal_scipy_at_every_angle(angle):
+    vectors = angle * axes(1, 20)
+    np.testing.assert_allclose(rotation_matrices(vectors), Rotation.from_rotvec(vectors).as_matrix(), atol=4e-15)
+
+
+@pytest.mark.parametrize("angle", ANGLES[:-2])
+def test_angle_axis_inverts_rotation_matrices_up_to_pi(angle):
+    vectors = angle * axes(2, 50)
+    np.testing.assert_allclose(angle_axis(rotation_matrices(vectors)), vectors, rtol=0, atol=1e-14 + 1e-9 * angle)
+
+
+def test_tiny_rotations_keep_their_relative_precision():
+    vectors = 1e-10 * axes(3, 20)
+    np.testing.assert_allclose(angle_axis(rotation_matrices(vectors)), vectors, rtol=1e-6, atol=1e-26)
+
+
+@pytest.mark.parametrize("angle", ANGLES[-3:])
+def test_angle_axis_near_half_a_turn_is_the_same_rotation(angle):
+    matrices = Rotation.from_rotvec(angle * axes(4, 50)).as_matrix()
+    vectors = angle_axis(matrices)
+    assert (np.linalg.norm(vectors, axis=1) <= np.pi + 1e-15).all()
+    np.testing.assert_allclose(rotation_matrices(vectors), matrices, atol=1e-14)
+
+
+def test_angle_axis_equals_scipy_on_random_rotations():
+    rotations = Rotation.from_quat(np.random.default_rng(5).standard_normal((1000, 4)))
+    np.testing.assert_allclose(angle_axis(rotations.as_matrix()), rotations.as_rotvec(), atol=1e-13)
+
+
+# Cameras
+
+
+def test_a_camera_maps_its_centre_to_the_origin():
+    cameras = small_problem().cameras
+    centers = camera_centers(cameras)
+    np.testing.assert_allclose(Rotation.from_rotvec(cameras[:, :3]).apply(centers) + cameras[:, 3:6], 0, atol=1e-14)
+
+
+def test_projection_is_the_formula_of_bal():
+    problem = small_problem()
+    for n, predicted in enumerate(project(problem)):
+        camera = problem.cameras[problem.camera_index[n]]
+        local = Rotation.from_rotvec(camera[:3]).apply(problem.points[problem.point_index[n]]) + camera[3:6]
+        plane = -local[:2] / local[2]
+        square = plane @ plane
+        pixels = camera[6] * (1 + camera[7] * square + camera[8] * square**2) * plane
+        np.testing.assert_allclose(predicted, pixels, rtol=1e-12)
+        assert depths(problem)[n] == pytest.approx(-local[2])
+
+
+def test_pieces_do_not_change_the_projection(monkeypatch):
+    problem = small_problem()
+    whole, depth = project(problem), depths(problem)
+    monkeypatch.setattr(geometry, "CHUNK", 7)
+    np.testing.assert_array_equal(project(problem), whole)
+    np.testing.assert_array_equal(depths(problem), depth)
+
+
+def test_a_point_in_the_plane_of_the_camera_gives_no_warning_and_no_number():
+    cameras = [[0.0, 0, 0, 0, 0, -5, 500, 0, 0]]
+    problem = BundleProblem.create(cameras, [[1.0, 0, 5]], [[0.0, 0]], [0], [0])
+    assert depths(problem) == 0
+    assert not np.isfinite(cost(problem))
+
+
+def test_cost_is_half_the_squared_mahalanobis_distance():
+    rng = np.random.default_rng(6)
+    root = rng.standard_normal((60, 2, 2)) + 3 * np.eye(2)
+    covariance = root @ root.transpose(0, 2, 1)
+    plain, weighed = small_problem(), small_problem(covariance=covariance)
+    difference = plain.observations - project(plain)
+    np.testing.assert_allclose(residuals(plain), difference)
+    squares = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(covariance), difference)
+    assert cost(weighed) == pytest.approx(0.5 * squares.sum())
+    assert cost(small_problem(weight=np.full(60, 4.0))) == pytest.approx(4 * cost(plain))
+
+
+# Normalise
+
+
+@pytest.mark.parametrize("size", [100.0, 0.3])
+def test_normalising_leaves_every_residual(size):
+    problem = small_problem()
+    np.testing.assert_allclose(residuals(normalize(problem, size)), residuals(problem), rtol=1e-9)
+
+
+@pytest.mark.parametrize("size", [100.0, 7.0])
+def test_a_normalised_scene_has_median_zero_and_the_asked_size(size):
+    problem = small_problem()
+    points = normalize(problem.replace(points=problem.points[:11]), size).points
+    np.testing.assert_allclose(np.median(points, axis=0), 0, atol=1e-12)
+    assert np.median(np.abs(points).sum(axis=1)) == pytest.approx(size)
+
+
+def test_the_median_of_an_even_number_of_points_is_the_upper_one():
+    points = normalize(small_problem()).points
+    np.testing.assert_allclose(np.sort(points, axis=0)[6], 0, atol=1e-12)
+    assert np.sort(np.abs(points).sum(axis=1))[6] == pytest.approx(100)
+
+
+def test_normalising_twice_is_normalising_once():
+    once = normalize(small_problem())
+    twice = normalize(once)
+    np.testing.assert_allclose(twice.points, once.points, atol=1e-11)
+    np.testing.assert_allclose(twice.cameras, once.cameras, rtol=1e-12)
+
+
+def test_a_scene_without_extent_or_size_is_refused():
+    problem = small_problem()
+    with pytest.raises(ProblemError, match="no extent"):
+        normalize(problem.replace(points=np.ones((12, 3))))
+    for size in (0.0, -1.0, np.nan):
+        with pytest.raises(ProblemError, match="size"):
+            normalize(problem, size)
+
+
+# Perturb
+
+
+def test_the_same_seed_gives_the_same_noise_and_another_seed_another():
+    problem = small_problem()
+    first, again, other = (perturb(problem, seed, 0.01, 0.1, 0.2) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first.cameras, again.cameras)
+    np.testing.assert_array_equal(first.points, again.points)
+    assert (first.points != other.points).all()
+    np.testing.assert_array_equal(first.observations, problem.observations)
+
+
+def test_no_noise_changes_nothing():
+    problem = small_problem()
+    same = perturb(problem, 0)
+    np.testing.assert_array_equal(same.cameras, problem.cameras)
+    np.testing.assert_array_equal(same.points, problem.points)
+
+
+def test_rotation_noise_keeps_the_centres_and_translation_noise_the_rotations():
+    problem = small_problem()
+    turned = perturb(problem, 0, rotation_sigma=0.1)
+    np.testing.assert_allclose(camera_centers(turned.cameras), camera_centers(problem.cameras), atol=1e-13)
+    assert (turned.cameras[:, :3] != problem.cameras[:, :3]).all()
+    moved = perturb(problem, 0, translation_sigma=0.1)
+    np.testing.assert_array_equal(moved.cameras[:, [0, 1, 2, 6, 7, 8]], problem.cameras[:, [0, 1, 2, 6, 7, 8]])
+    assert (moved.cameras[:, 3:6] != problem.cameras[:, 3:6]).all()
+
+
+def test_the_noise_has_the_asked_sigma():
+    rng = np.random.default_rng(7)
+    cameras = np.concatenate([rng.standard_normal((5000, 6)), np.full((5000, 3), 1.0)], axis=1)
+    zeros = np.zeros(5000, dtype=int)
+    problem = BundleProblem.create(cameras, rng.standard_normal((5000, 3)), np.zeros((5000, 2)), zeros, zeros)
+    noisy = perturb(problem, 8, 0.02, 0.3, 0.05)
+    centers = camera_centers(noisy.cameras) - camera_centers(problem.cameras)
+    for noise, sigma in (
+        (noisy.cameras[:, :3] - cameras[:, :3], 0.02),
+        (centers, 0.3),
+        (noisy.points - problem.points, 0.05),
+    ):
+        assert noise.mean() == pytest.approx(0, abs=5 * sigma / np.sqrt(15000))
+        assert noise.std() == pytest.approx(sigma, rel=5 / np.sqrt(30000))
+
+
+@pytest.mark.parametrize("name", ["rotation_sigma", "translation_sigma", "point_sigma"])
+def test_a_negative_sigma_is_refused(name):
+    with pytest.raises(ProblemError, match=name):
+        perturb(small_problem(), 0, **{name: -0.1})
+
+
+# Drop
+
+
+def test_what_stays_is_deep_enough_and_keeps_its_pixels():
+    problem = small_problem(weight=np.arange(1.0, 61.0))
+    limit = float(np.median(depths(problem)))
+    left = drop_invalid(problem, limit)
+    assert 0 < left.num_observations < problem.num_observations
+    assert (depths(left) >= limit).all()
+    assert (np.bincount(left.point_index, minlength=left.num_points) >= 2).all()
+    old_rows = {tuple(pixels): row for row, pixels in enumerate(problem.observations)}
+    rows = [old_rows[tuple(pixels)] for pixels in left.observations]
+    np.testing.assert_allclose(residuals(left), residuals(problem)[rows])
+
+
+def test_a_point_left_with_one_view_goes_and_the_rest_are_renumbered():
+    cameras = np.tile([0.0, 0, 0, 0, 0, -5, 500, 0, 0], (2, 1))
+    cameras[1, 5] = -1.0  # the second camera stands at z = 1, so the point at z = 2 is behind it
+    points = np.array([[0, 0, 2.0], [0.1, 0, 0], [0, 0.1, -1]])
+    problem = BundleProblem.create(cameras, points, np.zeros((6, 2)), [0, 1, 0, 1, 0, 1], [0, 0, 1, 1, 2, 2])
+    left = drop_invalid(problem)
+    np.testing.assert_array_equal(left.points, points[1:])
+    np.testing.assert_array_equal(left.point_index, [0, 0, 1, 1])
+    np.testing.assert_array_equal(left.camera_index, [0, 1, 0, 1])
+    assert left.point_index.dtype == np.int32
+    assert left.num_cameras == 2
+
+
+def test_a_valid_problem_loses_nothing():
+    problem = small_problem()
+    left = drop_invalid(problem)
+    np.testing.assert_array_equal(left.points, problem.points)
+    np.testing.assert_array_equal(left.point_index, problem.point_index)
+
+
+def test_dropping_everything_is_refused():
+    with pytest.raises(ProblemError, match="nothing would be left"):
+        drop_invalid(small_problem(), 1e6)
+
+
+def test_poba_start_is_normalised_moved_by_a_hundredth_and_repeatable():
+    problem = small_problem()
+    start, again = poba_start(problem), poba_start(problem, 38401)
+    np.testing.assert_array_equal(start.points, again.points)
+    noise = start.points - normalize(problem).points
+    assert 0.003 < noise.std() < 0.03
+    assert (start.cameras[:, :3] == problem.cameras[:, :3]).all()
+
+
+# Real problems
+
+
+@needs_data
+def test_the_cost_of_ladybug_is_the_known_one_also_when_normalised():
+    from jaxba.io import read_problem
+
+    problem = read_problem(Path(str(DATA)) / "bal" / "problem-49-7776-pre.txt.bz2")
+    assert cost(problem) == pytest.approx(850912.460681, rel=1e-9)  # reference.json
+    assert cost(normalize(problem)) == pytest.approx(850912.460681, rel=1e-9)
+    assert np.count_nonzero(depths(problem) <= 0) == 31
+
+
+@needs_data
+def test_the_poba_start_of_ladybug_has_nothing_behind_a_camera():
+    from jaxba.io import read_problem
+
+    start = poba_start(read_problem(Path(str(DATA)) / "bal" / "problem-49-7776-pre.txt.bz2"))
+    assert 31 <= 31843 - start.num_observations <= 100
+    assert depths(start).min() >= 0.1
