@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from jaxba.io import files, read_bundler, read_problem
-from jaxba.io.rotations import angle_axis_from_matrix, rotate
 from jaxba.problem import ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")
@@ -129,29 +128,6 @@ def test_damaged_compressed_files_are_refused(tmp_path, suffix):
     for content in (b"", whole[:10], whole[:-1], whole[: len(whole) // 2], whole + b"garbage", b"# Bundle file v0.3\n"):
         path.write_bytes(content)
         message_of(path)
-
-
-def test_angle_axis_turns_vectors_as_its_matrix_does():
-    rng = np.random.default_rng(0)
-    angles = np.array([0, 1e-300, 1e-16, 1e-8, 1e-4, 0.1, 1, 2, 3, np.pi - 1e-4, np.pi - 1e-8, np.pi - 1e-15, np.pi])
-    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(50, 3)), [[1, 1e-9, 0], [1, -1, 0], [0, 1e-5, 1]]])
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    expected = (angles[:, None, None] * axes).reshape(-1, 3)
-    matrices = np.stack([rotate(expected, np.tile(column, (len(expected), 1))) for column in np.eye(3)], axis=-1)
-    found = angle_axis_from_matrix(matrices)
-    # Near a half turn the two directions of the axis stand for nearly the same rotation.
-    flipped = expected * (1 - 2 * np.pi / np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-9))
-    error = np.minimum(np.linalg.norm(found - expected, axis=1), np.linalg.norm(found - flipped, axis=1))
-    assert error.max() < 4e-15
-    assert np.linalg.norm(found, axis=1).max() <= np.pi * (1 + 4e-16)
-
-
-def test_tiny_rotations_keep_their_relative_accuracy():
-    small = np.array([[1e-9, -2e-9, 3e-9], [1e-200, 0, 0], [0, -3e-13, 0]])
-    x, y, z = small.T
-    one, zero = np.ones(3), np.zeros(3)
-    matrices = np.array([[one, -z, y], [z, one, -x], [-y, x, one]]).transpose(2, 0, 1) + zero[:, None, None]
-    np.testing.assert_allclose(angle_axis_from_matrix(matrices), small, rtol=1e-14, atol=0)
 
 
 @needs_data

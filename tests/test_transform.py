@@ -54,6 +54,20 @@ def test_angle_axis_inverts_rotation_matrices_up_to_pi(angle):
     np.testing.assert_allclose(angle_axis(rotation_matrices(vectors)), vectors, rtol=0, atol=1e-14 + 1e-9 * angle)
 
 
+def test_angle_axis_inverts_rotation_matrices_up_to_a_half_turn():
+    rng = np.random.default_rng(0)
+    angles = np.array([0, 1e-300, 1e-16, 1e-8, 1e-4, 0.1, 1, 2, 3, np.pi - 1e-4, np.pi - 1e-8, np.pi - 1e-15, np.pi])
+    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(50, 3)), [[1, 1e-9, 0], [1, -1, 0], [0, 1e-5, 1]]])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    expected = (angles[:, None, None] * axes).reshape(-1, 3)
+    found = angle_axis(rotation_matrices(expected))
+    # Near a half turn the two directions of the axis stand for nearly the same rotation.
+    flipped = expected * (1 - 2 * np.pi / np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-9))
+    error = np.minimum(np.linalg.norm(found - expected, axis=1), np.linalg.norm(found - flipped, axis=1))
+    assert error.max() < 4e-15
+    assert np.linalg.norm(found, axis=1).max() <= np.pi * (1 + 4e-16)
+
+
 def test_tiny_rotations_keep_their_relative_precision():
     vectors = 1e-10 * axes(3, 20)
     np.testing.assert_allclose(angle_axis(rotation_matrices(vectors)), vectors, rtol=1e-6, atol=1e-26)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jax import Array
 from jaxtyping import Float, Int
@@ -21,6 +21,7 @@ class ProblemInfo(NamedTuple):
     max_iterations: Int[Array, ""]
 
 
+@runtime_checkable
 class DampingPolicy(Protocol):
     """Chooses lambda for every iteration.
 

@@ -13,8 +13,8 @@ from itertools import chain
 
 import numpy as np
 
+from jaxba.geometry import angle_axis
 from jaxba.io.files import READ_ERRORS, StrPath, display_name, open_input, reason
-from jaxba.io.rotations import angle_axis_from_matrix
 from jaxba.io.text import NumberReader
 from jaxba.problem import BundleProblem, ProblemError
 
@@ -96,7 +96,7 @@ def _read(reader: NumberReader) -> BundleProblem:
         raise ProblemError(f"{reader.name}: no camera sees a point")
     registered = _check_cameras(reader, cameras, camera_index)
     rotations = cameras[registered, 3:12].reshape(-1, 3, 3)
-    parameters = (angle_axis_from_matrix(rotations), cameras[registered, 12:], cameras[registered, :3])
+    parameters = (angle_axis(rotations), cameras[registered, 12:], cameras[registered, :3])
     points = values[first_view[:, None] - len(_POINT) + np.arange(3)]
     observations = values[at[:, None] + [2, 3]]
     reader.skip(position)

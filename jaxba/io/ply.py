@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxba.geometry import camera_centers
 from jaxba.io.files import StrPath, open_output
-from jaxba.io.rotations import rotate
 from jaxba.problem import BundleProblem, ProblemError
 
 POINT_COLOUR = (192, 192, 192)
@@ -16,12 +16,6 @@ CAMERA_COLOUR = (0, 255, 0)
 
 _VERTEX = np.dtype([("position", "<f8", 3), ("colour", "u1", 3)])
 _WRITE_ROWS = 1 << 15
-
-
-def camera_centres(cameras: np.ndarray) -> np.ndarray:
-    """Where the cameras stand, `-R^T t` in scene units, shape (cameras, 3), of BAL cameras, shape (cameras, 9)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return rotate(-cameras[:, :3], -cameras[:, 3:6])
 
 
 def write_ply(problem: BundleProblem, path: StrPath, *, ascii: bool = False) -> None:
@@ -38,7 +32,8 @@ def write_ply(problem: BundleProblem, path: StrPath, *, ascii: bool = False) -> 
         ProblemError: a point or camera centre is not finite, or the file cannot be written.
     """
     points = np.asarray(problem.points, dtype=np.float64)
-    centres = camera_centres(np.asarray(problem.cameras, dtype=np.float64))
+    with np.errstate(over="ignore", invalid="ignore"):
+        centres = camera_centers(problem.cameras)
     for name, positions in (("point", points), ("centre of camera", centres)):
         bad = np.flatnonzero(~np.isfinite(positions).all(axis=1))
         if bad.size:
