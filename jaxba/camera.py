@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
+from jaxba.problem import AnyArray
+
 SMALL_ANGLE_SQUARED = 1e-6
 """Below this squared angle (radians^2) the series of sin and cos is used; its error is under 1e-20."""
 
@@ -29,7 +31,7 @@ class Frames(NamedTuple):
     k1: Float[Array, " cameras"]
     k2: Float[Array, " cameras"]
 
-    def at(self, index: Array) -> Frames:
+    def at(self, index: AnyArray) -> Frames:
         """The frames of the cameras in `index`, one column an entry."""
         take = lambda x: x.at[..., index].get(mode="promise_in_bounds")
         return Frames(*(take(field) for field in self))
@@ -127,7 +129,7 @@ def frames(cameras: Float[Array, "9 cameras"]) -> Frames:
     return Frames(rotation_matrix(cameras[:3]), cameras[3:6], cameras[6], cameras[7], cameras[8])
 
 
-def project(frame: Frames, points: Float[Array, "3 n"], mask: Bool[Array, " n"] | None = None) -> Projection:
+def project(frame: Frames, points: Float[Array, "3 n"], mask: Bool[AnyArray, " n"] | None = None) -> Projection:
     """Projects one point through one camera per column.
 
     Args:

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.problem import BundleProblem
+from jaxba.problem import AnyArray, BundleProblem
 
 MAX_PADDING = 0.10
 """Largest share of slots that may be empty because track lengths share a bucket (design, section 3)."""
@@ -44,19 +44,19 @@ PAIR_ITEM_COST = 1.5
 class PairLayout:
     """Which slots multiply into which block of the reduced camera system (lower triangle)."""
 
-    left: Int[np.ndarray, "batches chunks width"]
+    left: Int[AnyArray, "batches chunks width"]
     """Slot of the block row's camera."""
 
-    right: Int[np.ndarray, "batches chunks width"]
+    right: Int[AnyArray, "batches chunks width"]
     """Slot of the block column's camera, seen by the same point."""
 
-    levels: tuple[Int[np.ndarray, "targets width"], ...]
+    levels: tuple[Int[AnyArray, "targets width"], ...]
     """Tree from chunks to blocks; the last block is always zero."""
 
-    block_camera: Int[np.ndarray, " blocks"]
+    block_camera: Int[AnyArray, " blocks"]
     """Camera of a block on the diagonal; the number of cameras for the others."""
 
-    table: Int[np.ndarray, "cameras cameras"]
+    table: Int[AnyArray, "cameras cameras"]
     """Block number of (row, column) in the lower triangle; the zero block elsewhere."""
 
 
@@ -65,26 +65,26 @@ class PairLayout:
 class Layout:
     """A problem's observations in slot order, and how to sum them."""
 
-    slot_camera: Int[np.ndarray, " slots"]
-    slot_point: Int[np.ndarray, " slots"]
+    slot_camera: Int[AnyArray, " slots"]
+    slot_point: Int[AnyArray, " slots"]
     """Column of the point in layout order."""
 
-    slot_mask: Bool[np.ndarray, " slots"]
+    slot_mask: Bool[AnyArray, " slots"]
     """Whether the slot holds an observation."""
 
-    pixels: Float[np.ndarray, "2 slots"]
+    pixels: Float[AnyArray, "2 slots"]
     """Measured pixels; zero in empty slots."""
 
-    whitening: Float[np.ndarray, "2 2 slots"] | None
+    whitening: Float[AnyArray, "2 2 slots"] | None
     """`Sigma^(-1/2)` of each observation."""
 
-    bucket_points: tuple[Int[np.ndarray, " bucket"], ...]
+    bucket_points: tuple[Int[AnyArray, " bucket"], ...]
     """Problem index of the points of each bucket; padding repeats an index out of range."""
 
-    camera_levels: tuple[Int[np.ndarray, "targets width"], ...]
+    camera_levels: tuple[Int[AnyArray, "targets width"], ...]
     """Tree from slots to cameras."""
 
-    camera_seen: Bool[np.ndarray, " cameras"]
+    camera_seen: Bool[AnyArray, " cameras"]
     """Cameras with at least one observation; the others never move."""
 
     pairs: PairLayout | None

@@ -13,6 +13,9 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
+AnyArray = np.ndarray | jax.Array
+"""An array on the host or on a device; tracers are of the second kind."""
+
 CAMERA_SIZE = 9
 """Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""
 
@@ -33,22 +36,22 @@ class BundleProblem:
     `z = f (1 + k1 |p|^2 + k2 |p|^4) p`. Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
     """
 
-    cameras: Float[np.ndarray | jax.Array, "cameras 9"]
+    cameras: Float[AnyArray, "cameras 9"]
     """Angle-axis (radians), translation (scene units), focal length (pixels), k1, k2."""
 
-    points: Float[np.ndarray | jax.Array, "points 3"]
+    points: Float[AnyArray, "points 3"]
     """Positions in scene units."""
 
-    observations: Float[np.ndarray | jax.Array, "observations 2"]
+    observations: Float[AnyArray, "observations 2"]
     """Measured pixels, origin at the image centre, x to the right, y upwards."""
 
-    camera_index: Int[np.ndarray | jax.Array, " observations"]
+    camera_index: Int[AnyArray, " observations"]
     """Camera of each observation, int32."""
 
-    point_index: Int[np.ndarray | jax.Array, " observations"]
+    point_index: Int[AnyArray, " observations"]
     """Point of each observation, int32."""
 
-    whitening: Float[np.ndarray | jax.Array, "observations 2 2"] | None = None
+    whitening: Float[AnyArray, "observations 2 2"] | None = None
     """`Sigma^(-1/2)` of each observation; None stands for the identity (pixels)."""
 
     @classmethod

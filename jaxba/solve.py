@@ -24,7 +24,7 @@ from jaxba.layout import Layout, build_layout
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.options import StepOptions
-from jaxba.problem import BundleProblem
+from jaxba.problem import AnyArray, BundleProblem
 from jaxba.schur import largest_diagonal
 
 MAX_ITERATIONS = 100
@@ -88,14 +88,14 @@ class Tolerances(NamedTuple):
 class History(NamedTuple):
     """One entry an iteration; NumPy arrays of equal length in a `Solution`."""
 
-    cost: np.ndarray  # accepted cost after the iteration, pixels^2
-    candidate_cost: np.ndarray  # cost of the proposed step
-    damping: np.ndarray  # lambda that was used
-    gain_ratio: np.ndarray
-    accepted: np.ndarray
-    cg_iterations: np.ndarray
-    gradient_max: np.ndarray  # largest gradient entry before the step
-    step_norm: np.ndarray
+    cost: AnyArray  # accepted cost after the iteration, pixels^2
+    candidate_cost: AnyArray  # cost of the proposed step
+    damping: AnyArray  # lambda that was used
+    gain_ratio: AnyArray
+    accepted: AnyArray
+    cg_iterations: AnyArray
+    gradient_max: AnyArray  # largest gradient entry before the step
+    step_norm: AnyArray
 
 
 class IterationRecord(NamedTuple):
@@ -257,23 +257,25 @@ def _advance(
     """Everything of an iteration that follows the step: the policy's answer and the stop rules."""
     policy_state, damping = policy.propose(carry.policy, step)
     iteration = carry.iteration + 1
-    return _Carry(
-        state, policy_state, damping, iteration, _termination(step, damping, iteration, tolerances, max_iterations)
-    )
+    # the same state and lambda after a rejection: the policy would ask for the same step for ever
+    same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (carry.policy, policy_state)), strict=True)]
+    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping)
+    end = _termination(step, stuck, iteration, tolerances, max_iterations)
+    return _Carry(state, policy_state, damping, iteration, end)
 
 
 _advance_jit = jax.jit(_advance)
 
 
 def _termination(
-    step: StepInfo, damping: Float[Array, ""], iteration: Int[Array, ""], tolerances: Tolerances, max_iterations: Any
+    step: StepInfo, stuck: Bool[Array, ""], iteration: Int[Array, ""], tolerances: Tolerances, max_iterations: Any
 ) -> Int[Array, ""]:
     """First stop rule that applies. Only an accepted step, or a zero gradient, ends a solve as converged."""
     by_cost = step.accepted & (step.previous_cost - step.cost <= tolerances.ftol * step.previous_cost)
     by_step = step.accepted & (step.step_norm <= tolerances.xtol * (step.parameter_norm + tolerances.xtol))
     by_gradient = step.gradient_max <= tolerances.gtol
     limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
-    stalled = ~step.accepted & (damping == step.damping)
+    stalled = ~step.accepted & stuck
     rules: list[tuple[Bool[Array, ""], Termination]] = [
         (by_cost, Termination.COST),
         (by_step, Termination.STEP),

@@ -7,19 +7,20 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.layout import Layout
+from jaxba.problem import AnyArray
 
 
-def take(values: Array, index: Int[Array, "..."]) -> Array:
+def take(values: Array, index: Int[AnyArray, "..."]) -> Array:
     """Columns (last axis) of `values` at `index`, which is known to be in range."""
     return values.at[..., index].get(mode="promise_in_bounds")
 
 
-def take_rows(values: Array, index: Int[Array, "..."]) -> Array:
+def take_rows(values: Array, index: Int[AnyArray, "..."]) -> Array:
     """Rows (first axis) of `values` at `index`, which is known to be in range."""
     return values.at[index].get(mode="promise_in_bounds")
 
 
-def tree_sum(rows: Array, levels: tuple[Int[Array, "targets width"], ...]) -> Array:
+def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "targets width"], ...]) -> Array:
     """Sums rows into targets along a tree made by `layout.sum_tree`."""
     for level in levels:
         rows = jnp.sum(take_rows(rows, level), axis=1)

@@ -1,1 +1,1 @@
-"""The benchmark: runner, records, performance profiles, tables, figures and the report."""
+"""Solvers side by side: records, tolerances, profiles, plots and reports."""

@@ -14,7 +14,8 @@ from typing import Any
 from jaxba.bench import plots, profile
 from jaxba.bench.profile import RELATIVE_TOLERANCES, Target
 from jaxba.bench.records import Record
-from jaxba.bench.summary import Summary, Table, summarize, tables, write_summary, write_text
+from jaxba.bench.summary import Summary, summarize, write_summary, write_text
+from jaxba.bench.tables import Table, tables
 from jaxba.problem import ProblemError
 
 _CSS = """

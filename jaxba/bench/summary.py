@@ -1,4 +1,4 @@
-"""Tables from records: one row per solver, one per problem and solver, as data, JSON, Markdown and terminal text.
+"""Tables from records: one row per solver, one per problem and solver (data and JSON).
 
 How unreached targets enter the means: every mean over reached problems stands beside "reached k of n", n being
 all problems of the benchmark, run or not. Iterations also have a capped mean over all n, in which an unreached
@@ -10,20 +10,16 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import statistics
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jaxba.bench import profile
 from jaxba.bench.profile import NEVER, Reach, Target
 from jaxba.bench.records import Record
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 YARDSTICKS = ("classic", "ceres")
 """Solvers that every other one is compared with: the paper's yardstick and what people use. Source: design."""
@@ -325,163 +321,3 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table ready to be drawn: plain text, first column(s) left, numbers right."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-    note: str
-    """What the numbers mean, one or two sentences."""
-    text_columns: int = 1
-    """Columns from the left that hold names."""
-
-
-def number(value: float, digits: int = 3) -> str:
-    """A number for people: `digits` significant ones, an infinity as its sign, NaN as a dash."""
-    if math.isnan(value):
-        return "-"
-    if math.isinf(value):
-        return "∞"
-    return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
-
-
-def _percent(share: float) -> str:
-    return "-" if math.isnan(share) else f"{100 * share:.0f} %"
-
-
-def tables(summary: Summary, details: bool = True) -> list[Table]:
-    """The tables of every rendering.
-
-    Args:
-        summary: from `summarize`.
-        details: also the table of every problem and solver.
-    """
-    found = [_overview(summary), *_reach_tables(summary)]
-    found += [
-        _against(summary, yardstick) for yardstick in YARDSTICKS if any(yardstick in s.against for s in summary.solvers)
-    ]
-    return [*found, _details(summary)] if details else found
-
-
-def _overview(summary: Summary) -> Table:
-    header = ("solver", "converged", "iterations", "capped", "time s", "s / iteration", "final / best worst", "mean")
-    rows = []
-    for s in summary.solvers:
-        end = s.targets["converged"]
-        means = (end.iterations, end.iterations_capped, end.seconds, s.seconds_per_iteration)
-        shares = (_percent(s.rejected_share), _percent(s.linear_failure_share))
-        ratios = (number(s.final_ratio_worst, 6), number(s.final_ratio_mean, 6))
-        rows.append(
-            (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *shares, number(s.compile_s))
-        )
-    note = (
-        f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
-        "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
-        f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): shares of all iterations. "
-        "Seconds per iteration and compilation: medians over problems."
-    )
-    return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
-
-
-def _reach_tables(summary: Summary) -> list[Table]:
-    targets = [target for target in summary.targets if target.kind != "converged"]
-    header = ("solver", *(target.label for target in targets))
-    iterations, seconds = [], []
-    for s in summary.solvers:
-        cells = [s.targets[target.key] for target in targets]
-        reached = [f"{cell.reached}/{cell.total}" for cell in cells]
-        capped = [
-            f"{number(c.iterations)} [{number(c.iterations_capped)}] {k}" for c, k in zip(cells, reached, strict=True)
-        ]
-        iterations.append((s.solver, *capped))
-        seconds.append((s.solver, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
-    note = (
-        "Geometric mean over the k of n problems reached (k/n). f*: lowest accepted cost of any solver; "
-        "τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged."
-    )
-    capped_note = f" In brackets: over all n, unreached ones counting as {profile.ITERATION_LIMIT}."
-    return [
-        Table("Iterations to tolerance", header, iterations, note + capped_note),
-        Table("Time to tolerance (s, without compilation)", header, seconds, note),
-    ]
-
-
-def _against(summary: Summary, yardstick: str) -> Table:
-    rows = []
-    for s in summary.solvers:
-        if yardstick in s.against:
-            rows.append((s.solver, *(_ratio_text(s.against[yardstick][target.key]) for target in summary.targets)))
-    note = (
-        f"Iterations / time as a share of {yardstick}'s (below 1 is better), geometric means over the problems that "
-        "both reached; their number in brackets, then + those that only this solver and - those that only "
-        f"{yardstick} reached."
-    )
-    return Table(f"Against {yardstick}", ("solver", *(target.label for target in summary.targets)), rows, note)
-
-
-def _ratio_text(item: Comparison) -> str:
-    ours = f" +{item.only_solver}" if item.only_solver else ""
-    theirs = f" -{item.only_yardstick}" if item.only_yardstick else ""
-    return f"{number(item.iterations)} / {number(item.seconds)} ({item.both}{ours}{theirs})"
-
-
-def _details(summary: Summary) -> Table:
-    keys = (f"relative_{1e-3:g}", f"own_end_{profile.OWN_END_TOLERANCE:g}", "converged")
-    header = (
-        "problem",
-        "solver",
-        "its to f*(1+0.001)",
-        "own end",
-        "converged",
-        "rejected",
-        "final cost",
-        "final / best",
-    )
-    rows = []
-    for c in summary.cells:
-        reaches = [c.reach[key] for key in keys]
-        counts = [number(item.iterations) for item in reaches] + [number(c.rejected)]
-        ends = [number(c.final_cost, 7), number(c.final_ratio, 6)]
-        times = [number(reaches[0].seconds), number(c.seconds)]
-        rows.append((c.problem, c.solver, *counts, *ends, *times, c.termination))
-    note = "Medians over repeats; ∞: never. Times in seconds, without compilation; time s is that of the whole solve."
-    return Table("Problems", (*header, "s to f*(1+0.001)", "time s", "termination"), rows, note, text_columns=2)
-
-
-def to_markdown(summary: Summary, details: bool = True) -> str:
-    """All tables as GitHub Markdown, warnings first."""
-
-    def plain(text: str) -> str:
-        return re.sub(r"([\\`*|<>\[\]$])", r"\\\1", " ".join(text.split()))
-
-    def line(cells: Iterable[str]) -> str:
-        return f"| {' | '.join(cells)} |"
-
-    parts = [f"> **Warning:** {plain(warning)}" for warning in summary.warnings]
-    for table in tables(summary, details):
-        marks = [":--" if i < table.text_columns else "--:" for i in range(len(table.header))]
-        rows = [line(map(plain, table.header)), line(marks), *(line(map(plain, row)) for row in table.rows)]
-        parts.append("\n".join([f"### {plain(table.title)}", "", *rows, "", plain(table.note)]))
-    return "\n\n".join(parts) + "\n"
-
-
-def print_summary(summary: Summary, console: Console, details: bool = True) -> None:
-    """Prints all tables to a rich console, warnings first."""
-    from rich.table import Table as RichTable
-    from rich.text import Text
-
-    for warning in summary.warnings:
-        console.print(Text(f"warning: {warning}", style="yellow"))
-    for table in tables(summary, details):
-        drawn = RichTable(
-            title=Text(table.title), caption=Text(table.note), title_justify="left", caption_justify="left"
-        )
-        for i, name in enumerate(table.header):
-            drawn.add_column(Text(name), justify="left" if i < table.text_columns else "right", overflow="fold")
-        for row in table.rows:
-            drawn.add_row(*(Text(cell) for cell in row))
-        console.print(drawn)

@@ -16,6 +16,12 @@ from jaxba.cli import common
 DEFAULT_SOLVERS = "classic,ceres,gauss-newton,schedule,ceres+refine3"
 """Both yardsticks, the extremes, and the best hand-written rule."""
 
+FILE_WIDTH = 180
+"""Columns of the tables where the output is no terminal."""
+
+DETAILS_WIDTH = 120
+"""A narrower terminal gets no table of every problem; the report has it."""
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -75,7 +81,8 @@ def _bench(args: Arguments) -> int:
     from jaxba.bench import report, run
     from jaxba.bench.records import Record
     from jaxba.bench.sources import embedded_sources, sources
-    from jaxba.bench.summary import print_summary, summarize
+    from jaxba.bench.summary import summarize
+    from jaxba.bench.tables import print_summary
 
     places = sources(list(args.problems)) if args.problems else embedded_sources()
     jobs = run.plan(places, solvers, repeats)
@@ -87,6 +94,8 @@ def _bench(args: Arguments) -> int:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     common.use_compilation_cache()
     console = Console()
+    if not console.is_terminal:
+        console = Console(width=FILE_WIDTH)
     wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
     records: list[Record] = [r for r in done if (r.problem, r.solver, r.repeat) in wanted]
     if records:
@@ -100,7 +109,7 @@ def _bench(args: Arguments) -> int:
     if records:
         console.print("drawing", highlight=False)
         files = report.write_all(records, folder, tolerance, facts={**report.run_facts(records), **run.machine()})
-        print_summary(summarize(records, tolerance), console)
+        print_summary(summarize(records, tolerance), console, details=console.width >= DETAILS_WIDTH)
         console.print(f"wrote {len(files)} files; see {folder / 'report.html'}", highlight=False)
     return status
 

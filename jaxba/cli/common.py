@@ -61,7 +61,7 @@ def use_compilation_cache() -> None:
     import jax
 
     choice = os.environ.get(CACHE_VARIABLE, "")
-    if choice.lower() == "off" or jax.config.jax_compilation_cache_dir:
+    if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):
         return
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     folder = Path(choice) if choice else Path(base) / "jaxba" / "xla"

@@ -114,7 +114,7 @@ def _solve(args: Arguments) -> int:
 
         def show(record: IterationRecord) -> bool:
             if not steps:
-                print(table.header(record.step.previous_cost))
+                print(table.header(float(record.step.previous_cost)))
             print(table.row(record, steps[-1].time_s if steps else 0.0), flush=True)
             steps.append(record)
             return interrupt.asked
