@@ -56,6 +56,15 @@ class PairLayout:
     block_camera: Int[AnyArray, " blocks"]
     """Camera of a block on the diagonal; the number of cameras for the others."""
 
+    block_row: Int[AnyArray, " blocks"]
+    """Camera of a block's rows."""
+
+    block_column: Int[AnyArray, " blocks"]
+    """Camera of a block's columns."""
+
+    product_levels: tuple[Int[AnyArray, "targets width"], ...]
+    """Tree to cameras from the products of blocks with their columns, then of mirrored blocks with their rows."""
+
     table: Int[AnyArray, "cameras cameras"]
     """Block number of (row, column) in the lower triangle; the zero block elsewhere."""
 
@@ -272,10 +281,18 @@ def _pair_layout(
     table[names] = np.arange(len(names))
     block_camera = np.full(len(names) + 1, cameras, np.int32)
     block_camera[np.searchsorted(names, diagonal)] = np.arange(cameras)
+    block_row, block_column = (np.append(part, 0).astype(np.int32) for part in np.divmod(names, cameras))
+    mirrored = np.flatnonzero(block_row[:-1] != block_column[:-1])
+    targets = np.concatenate([block_row[:-1], block_column[mirrored]])
+    items = np.concatenate([np.arange(len(names)), len(names) + 1 + mirrored])
+    by_target = np.argsort(targets, kind="stable")
     return PairLayout(
         left=padded[0],
         right=padded[1],
         levels=sum_tree(np.arange(total - 1), np.append(chunks, 0), total - 1, TREE_WIDTH),
         block_camera=block_camera,
+        block_row=block_row,
+        block_column=block_column,
+        product_levels=sum_tree(items[by_target], np.bincount(targets, minlength=cameras), len(names), TREE_WIDTH),
         table=table.reshape(cameras, cameras),
     )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from jaxba.losses import Loss
 
-LinearSolver = Literal["explicit", "implicit"]
+LinearSolver = Literal["explicit", "sparse", "implicit", "power"]
+LinearSolverChoice = Literal["auto", "explicit", "sparse", "implicit", "power"]
+Preconditioner = Literal["schur-jacobi", "jacobi", "power-series"]
 Scaling = Literal["diagonal", "identity"]
 Rotation = Literal["angle-axis", "manifold"]
 
@@ -23,8 +25,18 @@ class StepOptions:
     """Static options of `lm_step`. Each distinct value is compiled once."""
 
     linear_solver: LinearSolver = "explicit"
-    """`explicit`: form the reduced camera system and factor it. `implicit`: conjugate gradients without
-    forming it, preconditioned by its block diagonal (Schur-Jacobi)."""
+    """`explicit`: form the reduced camera system and factor it. `sparse`: form its blocks, conjugate gradients.
+    `implicit`: conjugate gradients without forming it. `power`: a power series, without forming it."""
+
+    preconditioner: Preconditioner = "schur-jacobi"
+    """Of conjugate gradients: the block diagonal of the reduced system, that of the camera blocks, or a short power
+    series."""
+
+    preconditioner_order: int = 5
+    """Terms of a power series as preconditioner. Source: Ceres max_num_spse_iterations."""
+
+    power_order: int = 20
+    """Terms of a power series as solver. Source: Weber et al. 2023, section 5 (order 20)."""
 
     scaling: Scaling = "diagonal"
     """What lambda multiplies: `diagonal` the clamped diagonal of the Hessian (Ceres), `identity` the unit
@@ -51,13 +63,22 @@ class StepOptions:
 
     def __post_init__(self) -> None:
         for name, known in (
-            ("linear_solver", ("explicit", "implicit")),
-            ("scaling", ("diagonal", "identity")),
-            ("rotation", ("angle-axis", "manifold")),
+            ("linear_solver", get_args(LinearSolver)),
+            ("preconditioner", get_args(Preconditioner)),
+            ("scaling", get_args(Scaling)),
+            ("rotation", get_args(Rotation)),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
         if self.refine_points < 0:
             raise ValueError(f"refine_points must not be negative, is {self.refine_points}")
+        for name in ("preconditioner_order", "power_order"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
         if self.cg_max_iterations < 1:
             raise ValueError(f"cg_max_iterations must be at least 1, is {self.cg_max_iterations}")
+
+    @property
+    def forms_reduced_system(self) -> bool:
+        """Whether the layout must list pairs."""
+        return self.linear_solver in ("explicit", "sparse")

@@ -196,7 +196,7 @@ def solve(
     tolerances = tolerances or Tolerances()
     with jax.enable_x64(dtype == "float64"):
         started = time.perf_counter()
-        layout = jax.device_put(build_layout(problem, pairs=options.linear_solver == "explicit"))
+        layout = jax.device_put(build_layout(problem, pairs=options.forms_reduced_system))
         state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
         setup_s = time.perf_counter() - started
         run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)

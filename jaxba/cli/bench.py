@@ -7,11 +7,12 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
 from jaxba.cli import common
+from jaxba.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "classic,ceres,gauss-newton,schedule,ceres+refine3"
 """Both yardsticks, the extremes, and the best hand-written rule."""
@@ -48,7 +49,7 @@ class Arguments:
     max_iterations: int | None = None
     """Linear solves after which a solver has failed. Default 100."""
 
-    linear_solver: Literal["auto", "explicit", "implicit"] = "auto"
+    linear_solver: LinearSolverChoice = "auto"
     """For all solvers."""
 
     out: str = "runs/bench"
@@ -92,7 +93,7 @@ def _bench(args: Arguments) -> int:
         done = run.open_folder(folder, settings, places)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
-    common.use_compilation_cache()
+    common.prepare_process()
     console = Console()
     if not console.is_terminal:
         console = Console(width=FILE_WIDTH)

@@ -56,6 +56,14 @@ def exit_with(status: int) -> NoReturn:
     sys.exit(status)
 
 
+def prepare_process() -> None:
+    """Settings for speed: memory is kept, compiled programs are cached."""
+    from jaxba import host
+
+    host.keep_memory()
+    use_compilation_cache()
+
+
 def use_compilation_cache() -> None:
     """Keeps compiled programs in the user's cache folder, so that the next run starts at once."""
     import jax

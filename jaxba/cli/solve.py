@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxba.cli import common
+from jaxba.options import LinearSolverChoice
 
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
 """What is solved where no problem is named."""
@@ -32,8 +33,9 @@ class Arguments:
     refine_points: int = 0
     """Embedded point iterations after each camera step; 3 is a good number."""
 
-    linear_solver: Literal["auto", "explicit", "implicit"] = "auto"
-    """Form and factor the reduced camera system, or solve it by conjugate gradients without forming it."""
+    linear_solver: LinearSolverChoice = "auto"
+    """explicit: form and factor the reduced camera system. sparse: form it, conjugate gradients. implicit: conjugate
+    gradients without forming it. power: a power series. auto chooses by size."""
 
     dtype: Literal["float64", "float32"] = "float64"
     """Type of all arithmetic."""
@@ -101,7 +103,7 @@ def _solve(args: Arguments) -> int:
 
     policy = make_policy(args.damping)
     problem = read_problem(args.problem) if args.problem else embedded_sources()[0].read()
-    common.use_compilation_cache()
+    common.prepare_process()
     options = StepOptions(
         scaling=args.scaling,
         rotation=args.rotation,

@@ -1,0 +1,152 @@
+"""Points eliminated from the damped normal equations; what is left for the cameras.
+
+With `H = [[B, E], [E^T, C]]` and damping `D`, points are eliminated through `C + D_p = L L^T`: with `Q = J_p L^-T` per
+observation and `Y = J_c^T Q`, the reduced camera system is `S = B + D_c - sum Y Y^T`, its right-hand side
+`-J_c^T (r - Q h)`, `h = L^-1 g_p`. Writing the right-hand side with the projected residual `r - Q h` keeps it free
+of cancellation.
+
+Rotations are perturbed on the manifold here. `Coordinates` says in which coordinates damping is diagonal.
+Source: Triggs et al. 2000, section 6; Agarwal et al. 2010, section 3.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxba import camera
+from jaxba.blocks3 import Cholesky3, cholesky3
+from jaxba.layout import Layout
+from jaxba.linearize import Linearization, normal_entries
+from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
+from jaxba.sums import point_sum, take, take_rows, tree_sum
+
+
+class Coordinates(NamedTuple):
+    """Maps between manifold rotation steps and the coordinates in which damping is diagonal."""
+
+    forward: Float[Array, "cameras 3 3"]  # coordinates -> manifold
+    inverse: Float[Array, "cameras 3 3"]
+
+    @classmethod
+    def of(cls, cameras: Float[Array, "9 cameras"], options: StepOptions) -> Coordinates:
+        """Angle-axis coordinates need the left Jacobian; the manifold's own need nothing."""
+        if options.rotation == "manifold":
+            one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
+            return cls(one, one)
+        to_front = lambda m: jnp.moveaxis(m, -1, 0)
+        return cls(to_front(camera.left_jacobian(cameras[:3])), to_front(camera.left_jacobian_inverse(cameras[:3])))
+
+
+class PointSystem(NamedTuple):
+    """The eliminated points."""
+
+    factor: Cholesky3
+    gradient: list[Array]  # g_p, [3] of (points,)
+    damping: list[Array]  # D_p, [3] of (points,)
+    solved: list[Array]  # h = L^-1 g_p
+    projected: list[list[Array]]  # Q, [2][3] of (slots,)
+
+
+class CameraSystem(NamedTuple):
+    """What is left for the cameras, except the sum of Y Y^T."""
+
+    blocks: Float[Array, "cameras 9 9"]  # B + D_c, manifold coordinates
+    gradient: Float[Array, "cameras 9"]  # g_c, manifold coordinates
+    right: Float[Array, "cameras 9"]  # right-hand side of the reduced system
+    damping: Float[Array, "cameras 9"]  # D_c, diagonal in the options' coordinates
+
+
+def eliminate_points(
+    layout: Layout, linear: Linearization, damping: Float[Array, ""], options: StepOptions
+) -> PointSystem:
+    """Forms, damps and factors the 3 x 3 block of every point."""
+    sums = point_sum(layout, jnp.stack(normal_entries(linear.point_jacobian, linear.residual)))
+    matrix, gradient = [sums[k] for k in range(6)], [sums[k] for k in range(6, 9)]
+    diagonal = [_damping_diagonal(matrix[k], damping, options) for k in (0, 2, 5)]
+    for place, extra in zip((0, 2, 5), diagonal, strict=True):
+        matrix[place] = matrix[place] + extra
+    factor = cholesky3(matrix)
+    solved = factor.forward(gradient)
+    at_slot = Cholesky3(*take(jnp.stack(factor), layout.slot_point))
+    projected = [at_slot.forward(row) for row in linear.point_jacobian]
+    return PointSystem(factor, gradient, diagonal, solved, projected)
+
+
+def camera_system(
+    layout: Layout,
+    linear: Linearization,
+    points: PointSystem,
+    coordinates: Coordinates,
+    damping: Float[Array, ""],
+    options: StepOptions,
+) -> CameraSystem:
+    """Sums `[J_c, r, r - Q h]^T [J_c, r, r - Q h]` per camera: block, gradient and right-hand side at once."""
+    solved = take(jnp.stack(points.solved), layout.slot_point)
+    rows = []
+    for k in range(2):
+        reduced = linear.residual[k] - sum(points.projected[k][i] * solved[i] for i in range(3))
+        rows += [*linear.camera_jacobian[k], linear.residual[k], reduced]
+    level, *levels = layout.camera_levels
+    gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 11)
+    products = tree_sum(jnp.einsum("kla,klb->kab", gathered, gathered), tuple(levels))
+    blocks, gradient, right = products[:, :9, :9], products[:, :9, 9], -products[:, :9, 10]
+    rotation = jnp.einsum("cji,cjk,ckl->cil", coordinates.forward, blocks[:, :3, :3], coordinates.forward)
+    diagonal = jnp.concatenate(
+        [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
+    )
+    extra = _damping_diagonal(diagonal, damping, options)
+    # a camera that nobody uses gets a unit block and so a zero step
+    extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
+    turned = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
+    damped = blocks + extra[:, :, None] * jnp.eye(9, dtype=extra.dtype)
+    damped = damped.at[:, :3, :3].set(blocks[:, :3, :3] + turned)
+    return CameraSystem(damped, gradient, right, extra)
+
+
+def back_substitute(
+    layout: Layout, linear: Linearization, points: PointSystem, step: Float[Array, "cameras 9"]
+) -> list[Array]:
+    """Point steps `-L^-T (h + sum Y^T step)`, three vectors over points."""
+    inner = project_to_points(layout, linear, points, step)
+    return [-x for x in points.factor.backward([h + w for h, w in zip(points.solved, inner, strict=True)])]
+
+
+def apply_reduced(
+    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, x: Float[Array, "cameras 9"]
+) -> Float[Array, "cameras 9"]:
+    """`S x` without forming S: two passes over the observations."""
+    inner = project_to_points(layout, linear, points, x)
+    at_slot = take(jnp.stack(inner), layout.slot_point)
+    lifted = [sum(points.projected[k][i] * at_slot[i] for i in range(3)) for k in range(2)]
+    first, second = linear.camera_jacobian
+    columns = jnp.stack([first[a] * lifted[0] + second[a] * lifted[1] for a in range(9)])
+    return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(columns.T, layout.camera_levels)
+
+
+def coupling_rows(linear: Linearization, points: PointSystem) -> Float[Array, "slots 27"]:
+    """`Y = J_c^T Q` of every slot, the point's index slow and the camera's fast."""
+    first, second = linear.camera_jacobian
+    over, under = points.projected
+    columns = [first[a] * over[i] + second[a] * under[i] for i in range(3) for a in range(9)]
+    return jnp.stack(columns).T
+
+
+def project_to_points(
+    layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras 9"]
+) -> list[Array]:
+    """`sum Y^T x` over each point's slots."""
+    at_slot = take(x.T, layout.slot_camera)
+    moved = [sum(row[a] * at_slot[a] for a in range(9)) for row in linear.camera_jacobian]
+    inner = jnp.stack([points.projected[0][i] * moved[0] + points.projected[1][i] * moved[1] for i in range(3)])
+    return list(point_sum(layout, inner))
+
+
+def _damping_diagonal(diagonal: Array, damping: Float[Array, ""], options: StepOptions) -> Array:
+    if options.scaling == "identity":
+        return jnp.full_like(diagonal, 1) * damping
+    high = min(DIAGONAL_MAXIMUM, float(jnp.finfo(diagonal.dtype).max) / 4)
+    return damping * jnp.clip(diagonal, DIAGONAL_MINIMUM, high)
