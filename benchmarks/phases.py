@@ -2,8 +2,8 @@
 
     python benchmarks/phases.py PROBLEM [--solver explicit|sparse|implicit] [--refine 3] [--repeats 30]
 
-PROBLEM is a file or a random scene (`scene:random-150`). `least` is the time the machine's measured copy bandwidth would
-need for the phase's inputs and outputs, each moved once; `share` is that over the measured time.
+PROBLEM is a file or a random scene (`scene:random-150`). `least` is the time that the measured copy bandwidth needs
+for the phase's inputs and outputs, each moved once; `share` is that over the measured time.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ def main() -> None:
     problem = sources([args.problem])[0].read()
     options = StepOptions(linear_solver=args.solver)
     started = time.perf_counter()
-    host = build_layout(problem, pairs=options.forms_reduced_system)
+    arrays = build_layout(problem, pairs=options.forms_reduced_system)
     print(f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations")
-    print(f"layout on the host {1e3 * (time.perf_counter() - started):.2f} ms; {host.num_slots} slots")
-    layout = jax.device_put(host)
+    print(f"layout on the host {1e3 * (time.perf_counter() - started):.2f} ms; {arrays.num_slots} slots")
+    layout = jax.device_put(arrays)
     rate = bandwidth()
     print(f"copy bandwidth {rate / 1e9:.1f} GB/s, device {jax.devices()[0].device_kind}")
     print(f"{'phase':14s} {'min ms':>8s} {'median':>8s} {'least ms':>9s} {'share':>6s} {'compile s':>9s}")
@@ -74,9 +74,8 @@ def main() -> None:
     def phase(name: str, function: Any, *arguments: Any) -> Any:
         result, least, median, compile_s = timed(function, *arguments, repeats=args.repeats)
         floor = (size(arguments) + size(result)) / rate
-        print(
-            f"{name:14s} {1e3 * least:8.2f} {1e3 * median:8.2f} {1e3 * floor:9.2f} {floor / least:6.0%} {compile_s:9.2f}"
-        )
+        times = f"{1e3 * least:8.2f} {1e3 * median:8.2f} {1e3 * floor:9.2f} {floor / least:6.0%} {compile_s:9.2f}"
+        print(f"{name:14s} {times}")
         return result
 
     state = lm.initial_state(layout, problem, options)
@@ -86,10 +85,10 @@ def main() -> None:
     points = phase("eliminate", lambda li, d: eliminate.eliminate_points(layout, li, d, options), linear, damping)
     turn = eliminate.Coordinates.of(state.cameras, options)
     system = phase(
-        "camera sums", lambda *a: eliminate.camera_system(layout, *a, turn, damping, options), linear, points
+        "camera sums", lambda li, po: eliminate.camera_system(layout, li, po, turn, damping, options), linear, points
     )
     if options.forms_reduced_system:
-        blocks = phase("form", lambda *a: reduced.reduced_blocks(layout, *a), linear, points, system)
+        blocks = phase("form", lambda li, po, sy: reduced.reduced_blocks(layout, li, po, sy), linear, points, system)
         if args.solver == "explicit":
             phase(
                 "factor",
@@ -100,9 +99,20 @@ def main() -> None:
         else:
             phase("one product", lambda b, x: reduced.apply_blocks(layout, b, x), blocks, system.right)
     else:
-        phase("one product", lambda *a: eliminate.apply_reduced(layout, *a), linear, points, system, system.right)
-    phase("reduced solve", lambda *a: reduced.solve_reduced(layout, *a, options), linear, points, system)
-    phase("back-substitute", lambda *a: eliminate.back_substitute(layout, *a), linear, points, system.right)
+        phase(
+            "one product",
+            lambda li, po, sy, x: eliminate.apply_reduced(layout, li, po, sy, x),
+            linear,
+            points,
+            system,
+            system.right,
+        )
+    phase(
+        "reduced solve", lambda li, po, sy: reduced.solve_reduced(layout, li, po, sy, options), linear, points, system
+    )
+    phase(
+        "back-substitute", lambda li, po, x: eliminate.back_substitute(layout, li, po, x), linear, points, system.right
+    )
 
     def cost(state: Any) -> Any:
         frames = slot_frames(layout, state.cameras)
