@@ -18,7 +18,8 @@ from jaxba.losses import Loss
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
-from jaxba.solve import History, IterationRecord, Solution, Termination, Tolerances, solve, solve_loop
+from jaxba.solve import History, IterationRecord, Solution, solve, solve_loop
+from jaxba.termination import Termination, Tolerances
 from jaxba.transform import drop_invalid, normalize, perturb, poba_start
 
 __version__ = "0.1.0"

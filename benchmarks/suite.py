@@ -1,0 +1,223 @@
+"""Speed of jaxba beside its peers, in one run.
+
+    python -m benchmarks.suite [--only iteration,tolerance,scenes,cold] [--repeats 3] [--gate] [--update-baseline]
+
+Real problems come from the folder `JAXBA_DATA`; the C++ Ceres peer from `JAXBA_CERES` (benchmarks/README.md). What is
+missing is left out, and said. Ratios are compared with benchmarks/baseline.json by `--gate`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from benchmarks import peers
+from benchmarks.metrics import Metric, read_baseline, regressions, to_json, to_text, write_baseline
+
+HERE = Path(__file__).parent
+BASELINE = HERE / "baseline.json"
+GATE_TOLERANCE = 0.25
+"""Ratios of short runs on a shared machine vary by some 10%; see benchmarks/README.md."""
+
+ITERATION_PROBLEMS = (
+    "bal/problem-49-7776-pre.txt.bz2",
+    "bal/problem-21-11315-pre.txt.bz2",
+    "scene:random-150",
+    "bal-converted/kitti00vo-250-24288-pre.txt.bz2",
+    "scene:ladybug-1197",
+)
+ITERATIONS = 8
+"""Iterations that are timed; later ones cost the same."""
+
+COLD_PROBLEM = "bal/problem-49-7776-pre.txt.bz2"
+
+
+def locate(name: str) -> str | None:
+    """A source's location, or None where the file is not at hand."""
+    if name.startswith("scene:"):
+        return name
+    folder = os.environ.get("JAXBA_DATA", "")
+    path = Path(folder) / name
+    return str(path) if folder and path.is_file() else None
+
+
+def real_problems() -> list[str]:
+    """Every real problem at hand but the hand-cut miniatures, which end at rounding noise."""
+    folder = Path(os.environ.get("JAXBA_DATA", ""))
+    files = [*folder.glob("bal/problem-*.bz2"), *folder.glob("bal-converted/*.bz2")]
+    return sorted(map(str, files)) if folder.name else []
+
+
+def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
+    """Seconds per LM iteration, jaxba's `auto` against the best of Ceres' modes."""
+    from jaxba.bench.sources import sources
+    from jaxba.io import write_problem
+
+    binary = peers.program()
+    for name in ITERATION_PROBLEMS:
+        location = locate(name)
+        if location is None:
+            print(f"left out: {name} (JAXBA_DATA)", file=sys.stderr)
+            continue
+        source = sources([location])[0]
+        problem = source.read()
+        ours, linear_solver = _our_iteration(problem, repeats)
+        label = f"iteration/{source.name}"
+        yield Metric(f"{label}/jaxba ({linear_solver})", ours, "s", "lower")
+        if binary is None:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "problem.txt"
+            write_problem(problem, file)
+            theirs = {}
+            for mode in peers.MODES:
+                if mode == "DENSE_SCHUR" and problem.num_cameras > 500:
+                    continue  # minutes an iteration
+                count = 1 if problem.num_observations > 200_000 else repeats
+                runs = [peers.run(binary, file, mode, threads, ITERATIONS) for _ in range(count)]
+                theirs[mode] = statistics.median(run.seconds_per_iteration for run in runs)
+                yield Metric(f"{label}/ceres {mode}", theirs[mode], "s", "lower")
+        best = min(theirs.values())
+        yield Metric(f"{label}/jaxba over ceres", ours / best, "ratio", "lower", GATE_TOLERANCE, target=0.5)
+
+
+def _our_iteration(problem, repeats: int) -> tuple[float, str]:
+    import jaxba
+
+    times, solver = [], ""
+    for _ in range(repeats):
+        stamps = [0.0]
+        solution = jaxba.solve(
+            problem,
+            "ceres",
+            linear_solver="auto",
+            max_iterations=ITERATIONS,
+            callback=lambda record, stamps=stamps: stamps.append(record.time_s) and False,
+        )
+        solver = solution.linear_solver
+        times += [after - before for before, after in itertools.pairwise(stamps)]
+    return statistics.median(times), solver
+
+
+def time_to_tolerance(repeats: int, threads: int) -> Iterator[Metric]:
+    """Time to f*(1 + 1e-3) over the real problems: the best hand-written policy against Ceres under its own rule."""
+    from jaxba.bench.profile import first_time
+    from jaxba.bench.run import RunSettings, run_solver
+    from jaxba.bench.sources import sources
+    from jaxba.io import write_problem
+    from jaxba.naming import parse_solver
+
+    binary, places = peers.program(), real_problems()
+    if binary is None or not places:
+        print("left out: time to tolerance (needs JAXBA_CERES and JAXBA_DATA)", file=sys.stderr)
+        return
+    ratios = []
+    for source in sources(places):
+        problem = source.read()
+        solver = parse_solver("ceres+refine3")
+        records = [run_solver(problem, source, solver, k, RunSettings()) for k in range(repeats)]
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "problem.txt"
+            write_problem(problem, file)
+            runs = [[peers.run(binary, file, mode, threads, 100) for _ in range(repeats)] for mode in peers.MODES]
+        best = min([r.final_cost for r in records] + [run.final_cost for mode in runs for run in mode])
+        goal = best * (1 + 1e-3)
+        ours = statistics.median(first_time(record, goal) for record in records)
+        theirs = min(statistics.median(run.seconds_to(goal) for run in mode) for mode in runs)
+        yield Metric(f"tolerance/{source.name}/jaxba ceres+refine3", ours, "s", "lower")
+        yield Metric(f"tolerance/{source.name}/ceres best mode", theirs, "s", "lower")
+        if math.isfinite(ours) and math.isfinite(theirs):
+            ratios.append(ours / max(theirs, 1e-6))
+    mean = math.exp(statistics.fmean(map(math.log, ratios)))
+    yield Metric("tolerance/geometric mean, jaxba over ceres", mean, "ratio", "lower", GATE_TOLERANCE, target=0.25)
+    yield Metric("tolerance/problems that both reached", len(ratios), "count", "higher")
+
+
+def scene_throughput(repeats: int) -> Iterator[Metric]:
+    """LM environment steps a second on 10 x 10 scenes, all in one vmapped program."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxba
+
+    scenes = 256
+    with jax.enable_x64(True):
+        problems = [jaxba.random_scene(jaxba.like("paper"), seed) for seed in range(scenes)]
+        options = jaxba.StepOptions()
+        stack = lambda trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+        layouts = [jaxba.build_layout(problem) for problem in problems]
+        layout = stack(layouts)
+        states = stack([jaxba.initial_state(one, p, options) for one, p in zip(layouts, problems, strict=True)])
+        damping = jnp.full(scenes, 1e-3)
+        step = jax.jit(jax.vmap(lambda la, s, d: jaxba.lm_step(la, s, d, options)))
+        jax.block_until_ready(step(layout, states, damping))
+        times = []
+        for _ in range(10 * repeats):
+            started = time.perf_counter()
+            jax.block_until_ready(step(layout, states, damping))
+            times.append(time.perf_counter() - started)
+    yield Metric("scenes/10 x 10 steps", scenes / statistics.median(times), "1/s", "higher", target=20_000)
+
+
+def cold_start() -> Iterator[Metric]:
+    """Wall time of `jaxba-solve`, import and compilation included, without and with a warm cache."""
+    location = locate(COLD_PROBLEM)
+    if location is None:
+        print("left out: cold start (JAXBA_DATA)", file=sys.stderr)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "JAXBA_CACHE": folder}
+        for name, target in (("cold", 8.0), ("warm", 3.0)):
+            started = time.perf_counter()
+            command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", location]
+            subprocess.run(command, env=environment, check=True, capture_output=True)
+            seconds = time.perf_counter() - started
+            yield Metric(f"start/jaxba-solve on ladybug-49, {name}", seconds, "s", "lower", target=target)
+
+
+def main() -> int:
+    """Runs the parts asked for; status 1 when the gate finds a regression."""
+    parser = argparse.ArgumentParser(description="Speed of jaxba beside its peers.")
+    parser.add_argument("--only", default="iteration,scenes,cold,tolerance", help="comma-separated parts")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--gate", action="store_true", help="fail when a ratio is worse than the baseline")
+    parser.add_argument("--update-baseline", action="store_true")
+    parser.add_argument("--out", default="", help="write the metrics as JSON here")
+    args = parser.parse_args()
+    from jaxba import host
+    from jaxba.bench.run import machine, threads
+
+    host.keep_memory()
+    parts = {
+        "iteration": lambda: iteration_times(args.repeats, threads()),
+        "scenes": lambda: scene_throughput(args.repeats),
+        "cold": cold_start,
+        "tolerance": lambda: time_to_tolerance(args.repeats, threads()),
+    }
+    metrics = []
+    for name in args.only.split(","):
+        for metric in parts[name]():
+            print(to_text([metric]).splitlines()[1], flush=True)
+            metrics.append(metric)
+    print(to_text(metrics))
+    if args.out:
+        Path(args.out).write_text(to_json(metrics, machine()))
+    failures = regressions(metrics, read_baseline(BASELINE)) if args.gate else []
+    for line in failures:
+        print(f"worse than the baseline: {line}")
+    if args.update_baseline:
+        write_baseline(BASELINE, metrics)
+    return 1 if failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

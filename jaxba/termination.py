@@ -1,0 +1,85 @@
+"""When a solve ends, and why."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Int
+
+from jaxba.lm import StepInfo
+
+DAMPING_LIMIT = 1e32
+"""A step rejected with this lambda ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
+
+
+class Termination(enum.IntEnum):
+    """Why a solve ended."""
+
+    RUNNING = 0
+    COST = 1
+    STEP = 2
+    GRADIENT = 3
+    MAX_ITERATIONS = 4
+    STALLED = 5
+    DAMPING_LIMIT = 6
+    STOPPED = 7
+
+    @property
+    def converged(self) -> bool:
+        """Whether one of the three convergence tests ended the solve."""
+        return self in (Termination.COST, Termination.STEP, Termination.GRADIENT)
+
+    @property
+    def reason(self) -> str:
+        """One phrase for a person."""
+        return _REASONS[self]
+
+
+_REASONS = {
+    Termination.RUNNING: "still running",
+    Termination.COST: "relative decrease of an accepted step within ftol",
+    Termination.STEP: "accepted step within xtol",
+    Termination.GRADIENT: "gradient within gtol",
+    Termination.MAX_ITERATIONS: "iteration limit",
+    Termination.STALLED: "a rejected step would be repeated unchanged",
+    Termination.STOPPED: "stopped by the caller",
+    Termination.DAMPING_LIMIT: "lambda at its upper limit, or not a number, and still rejected",
+}
+
+
+class Tolerances(NamedTuple):
+    """Convergence tests, on accepted steps only (design, section 2)."""
+
+    ftol: float = 1e-6
+    """`|f - f'| <= ftol f`."""
+
+    xtol: float = 1e-8
+    """`|step| <= xtol (|x| + xtol)`."""
+
+    gtol: float = 1e-10
+    """Largest gradient entry."""
+
+
+def termination_of(
+    step: StepInfo, stuck: Bool[Array, ""], iteration: Int[Array, ""], tolerances: Tolerances, max_iterations: Any
+) -> Int[Array, ""]:
+    """First stop rule that applies. Only an accepted step, or a zero gradient, ends a solve as converged."""
+    by_cost = step.accepted & (step.previous_cost - step.cost <= tolerances.ftol * step.previous_cost)
+    by_step = step.accepted & (step.step_norm <= tolerances.xtol * (step.parameter_norm + tolerances.xtol))
+    by_gradient = step.gradient_max <= tolerances.gtol
+    limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
+    stalled = ~step.accepted & stuck
+    rules: list[tuple[Bool[Array, ""], Termination]] = [
+        (by_cost, Termination.COST),
+        (by_step, Termination.STEP),
+        (by_gradient, Termination.GRADIENT),
+        (limit, Termination.DAMPING_LIMIT),
+        (stalled, Termination.STALLED),
+        (iteration >= max_iterations, Termination.MAX_ITERATIONS),
+    ]
+    return jnp.select(
+        [rule for rule, _ in rules], [jnp.asarray(int(code), jnp.int32) for _, code in rules], jnp.zeros((), jnp.int32)
+    )
