@@ -220,4 +220,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from jaxba.host import calm_blas
+
+    with calm_blas():
+        sys.exit(main())

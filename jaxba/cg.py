@@ -60,13 +60,15 @@ def conjugate_gradients(
         residual = c.residual - step * image
         model = -jnp.sum(x * (right + residual))
         count = c.count + 1
-        settled = count * (model - c.model) / model < forcing
+        settled = (forcing > 0) & (count * (model - c.model) / model < forcing)
         finished = settled | (jnp.sum(residual * residual) <= enough) | (count >= max_iterations)
         scaled = precondition(residual)
         product = jnp.sum(residual * scaled)
         direction = scaled + product / c.product * c.direction
         done = _Carry(x, residual, direction, product, model, count, valid & ~finished)
-        return _Carry(*(jnp.where(valid, new, old) for new, old in zip(done, c._replace(running=valid), strict=True)))
+        # negative curvature keeps the iterate; a curvature that is no number must not look like a good one
+        rest = c._replace(x=jnp.where(jnp.isfinite(curvature), c.x, jnp.nan), running=valid)
+        return _Carry(*(jnp.where(valid, new, old) for new, old in zip(done, rest, strict=True)))
 
     scaled = precondition(right)
     product = jnp.sum(right * scaled)

@@ -50,7 +50,7 @@ class PairLayout:
     right: Int[AnyArray, "batches chunks width"]
     """Slot of the block column's camera, seen by the same point."""
 
-    levels: tuple[Int[AnyArray, "targets width"], ...]
+    levels: tuple[Int[AnyArray, "_ _"], ...]
     """Tree from chunks to blocks; the last block is always zero."""
 
     block_camera: Int[AnyArray, " blocks"]
@@ -62,7 +62,7 @@ class PairLayout:
     block_column: Int[AnyArray, " blocks"]
     """Camera of a block's columns."""
 
-    product_levels: tuple[Int[AnyArray, "targets width"], ...]
+    product_levels: tuple[Int[AnyArray, "_ _"], ...]
     """Tree to cameras from the products of blocks with their columns, then of mirrored blocks with their rows."""
 
     table: Int[AnyArray, "cameras cameras"]
@@ -87,10 +87,10 @@ class Layout:
     whitening: Float[AnyArray, "2 2 slots"] | None
     """`Sigma^(-1/2)` of each observation."""
 
-    bucket_points: tuple[Int[AnyArray, " bucket"], ...]
+    bucket_points: tuple[Int[AnyArray, "_"], ...]
     """Problem index of the points of each bucket; padding repeats an index out of range."""
 
-    camera_levels: tuple[Int[AnyArray, "targets width"], ...]
+    camera_levels: tuple[Int[AnyArray, "_ _"], ...]
     """Tree from slots to cameras."""
 
     camera_seen: Bool[AnyArray, " cameras"]

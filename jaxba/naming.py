@@ -48,7 +48,7 @@ def parse_solver(name: str) -> SolverName:
         SolverNameError: an unknown method or type, or a malformed name.
         UnknownPolicyError: an unknown policy.
     """
-    rest, _, dtype = name.strip().partition("@")
+    rest, at, dtype = name.strip().partition("@")
     parts = rest.split("+")
     # the plus sign of an exponent belongs to its number: constant:1e+2
     merged: list[str] = []
@@ -66,7 +66,7 @@ def parse_solver(name: str) -> SolverName:
         raise SolverNameError(f"{name!r} is no solver; the form is [method+]policy[+refineK][@dtype]")
     if method not in METHODS:
         raise SolverNameError(f"unknown method {method!r} in {name!r}; known: {', '.join(METHODS)}")
-    if dtype and dtype not in DTYPES:
+    if at and dtype not in DTYPES:
         raise SolverNameError(f"unknown type {dtype!r} in {name!r}; known: {', '.join(DTYPES)}")
     make_policy(merged[0])
     return SolverName(merged[0], refine, dtype or DTYPES[0], method)

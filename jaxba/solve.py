@@ -18,21 +18,20 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
+from jaxba import geometry, host
+from jaxba.choose import choose
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, ProblemInfo, make_policy
 from jaxba.layout import Layout, build_layout
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.options import StepOptions
-from jaxba.problem import AnyArray, BundleProblem
+from jaxba.problem import AnyArray, BundleProblem, ProblemError
 from jaxba.schur import largest_diagonal
 from jaxba.termination import Termination, Tolerances, termination_of
 
 MAX_ITERATIONS = 100
 """Iterations after which a solve has failed. Source: the paper."""
-
-EXPLICIT_MAX_CAMERAS = 400
-"""Up to this many cameras `auto` forms and factors the reduced camera system: 3,600 unknowns, 104 MB."""
 
 
 class History(NamedTuple):
@@ -82,7 +81,7 @@ class Solution:
     """Fixed-length records cut to `iterations`."""
 
     linear_solver: str
-    """`explicit` or `implicit`."""
+    """How the reduced camera system was solved."""
 
     setup_s: float
     """Seconds for the layout and the transfer to the device."""
@@ -124,7 +123,7 @@ def solve(
         problem: start of the optimisation.
         damping: a policy, or the name of one (`jaxba.make_policy`).
         options: how a step is made.
-        linear_solver: overrides that of the options; `auto` chooses by the number of cameras.
+        linear_solver: overrides that of the options; `auto` asks the cost model in choose.py.
         max_iterations: limit of linear solves.
         tolerances: convergence tests.
         dtype: `float64` or `float32`, the type of all arithmetic.
@@ -136,6 +135,7 @@ def solve(
 
     Raises:
         ValueError: unknown names, or limits that make no sense.
+        ProblemError: the cost at the start is not finite.
     """
     if dtype not in ("float64", "float32"):
         raise ValueError(f"dtype must be float64 or float32, not {dtype!r}")
@@ -144,11 +144,13 @@ def solve(
     policy = make_policy(damping) if isinstance(damping, str) else damping
     options = choose_linear_solver(problem, options or StepOptions(), linear_solver)
     tolerances = tolerances or Tolerances()
-    with jax.enable_x64(dtype == "float64"):
+    with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
         layout = jax.device_put(build_layout(problem, pairs=options.forms_reduced_system))
         state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
         setup_s = time.perf_counter() - started
+        if not np.isfinite(float(state.cost)):
+            raise ProblemError(_explain_start(problem))
         run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)
         final, history, compile_s, total_s = run(layout, state, policy, tolerances, options, max_iterations)
         count = int(final.iteration)
@@ -167,10 +169,24 @@ def solve(
         )
 
 
+def _explain_start(problem: BundleProblem) -> str:
+    """Which observation makes the initial cost infinite."""
+    with np.errstate(all="ignore"):
+        bad = np.flatnonzero(~np.isfinite(geometry.residuals(problem)).all(axis=1))
+    if not bad.size:
+        return "the cost at the start overflows"
+    camera, point = (int(index[bad[0]]) for index in (problem.camera_index, problem.point_index))
+    others = f" (and {bad.size - 1} more)" if bad.size > 1 else ""
+    return (
+        f"the cost at the start is not finite: observation {bad[0]}{others}, point {point} lies on the plane of camera "
+        f"{camera} or its projection overflows"
+    )
+
+
 def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_solver: str | None) -> StepOptions:
     """Resolves `auto`; None keeps what the options say."""
     if linear_solver == "auto":
-        linear_solver = "explicit" if problem.num_cameras <= EXPLICIT_MAX_CAMERAS else "implicit"
+        linear_solver = choose(problem)
     return options if linear_solver is None else replace(options, linear_solver=linear_solver)  # type: ignore[arg-type]
 
 

@@ -20,7 +20,7 @@ def take_rows(values: Array, index: Int[AnyArray, "..."]) -> Array:
     return values.at[index].get(mode="promise_in_bounds")
 
 
-def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "targets width"], ...]) -> Array:
+def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     """Sums rows into targets along a tree made by `layout.sum_tree`."""
     for level in levels:
         rows = jnp.sum(take_rows(rows, level), axis=1)

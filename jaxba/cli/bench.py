@@ -69,7 +69,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _bench(args: Arguments) -> int:
     args = _with_suite(args)
     solvers = [name for name in (args.solvers or DEFAULT_SOLVERS).split(",") if name.strip()]
-    tolerance = 1e-3 if args.tolerance is None else args.tolerance
+    tolerance = 1e-3 if args.tolerance is None else float(args.tolerance)
     repeats = 3 if args.repeats is None else args.repeats
     if not 0 < tolerance < 1:
         raise common.UsageError(f"--tolerance must lie between 0 and 1, is {tolerance:g}")
@@ -189,6 +189,8 @@ def _with_suite(args: Arguments) -> Arguments:
     )
     solvers = args.solvers or (",".join(map(str, suite["solvers"])) if "solvers" in suite else None)
     rest = {k: suite.get(k) for k in ("tolerance", "repeats", "max_iterations") if getattr(args, k) is None}
+    if isinstance(rest.get("tolerance"), int):
+        rest["tolerance"] = float(rest["tolerance"])
     return replace(args, problems=problems, solvers=solvers, **rest)
 
 

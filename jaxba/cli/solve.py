@@ -89,6 +89,8 @@ def _solve(args: Arguments) -> int:
         raise common.UsageError(f"--refine-points must not be negative, is {args.refine_points}")
     common.check_writable("--output", args.output)
     common.check_writable("--log", args.log)
+    if args.output and args.log and Path(args.output).resolve() == Path(args.log).resolve():
+        raise common.UsageError(f"--output and --log name the same file, {args.output}")
     from jaxba.bench.records import record_to_json
     from jaxba.bench.run import record_of
     from jaxba.bench.sources import embedded_sources

@@ -39,14 +39,14 @@ def make_policy(name: str) -> DampingPolicy:
     Raises:
         UnknownPolicyError: no such policy, or a lambda that is not a positive number.
     """
-    base, _, number = name.partition(":")
+    base, colon, number = name.partition(":")
     if base == CONSTANT:
         return Schedule(values=(_damping(name, number),))
     if base not in POLICIES:
         known = ", ".join([*POLICIES, "constant:LAMBDA"])
         raise UnknownPolicyError(f"unknown damping policy {name!r}; known: {known}")
     policy = POLICIES[base][0]()
-    if not number:
+    if not colon:
         return policy
     if isinstance(policy, Schedule):
         raise UnknownPolicyError(f"{base!r} has no first lambda to set; use constant:LAMBDA")

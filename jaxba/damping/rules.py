@@ -19,6 +19,9 @@ from jaxba.lm import StepInfo
 LARGEST = 1e32
 """Upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32."""
 
+SMALLEST = 1e-30
+"""Lower bound of rules whose source has none or zero: no factor brings a lambda of exactly zero back."""
+
 
 def _scalar(value: Any, info: ProblemInfo) -> Array:
     return jnp.asarray(value, info.cost.dtype)
@@ -110,7 +113,7 @@ def nielsen() -> Ceres:
     Source: g2o optimization_algorithm_levenberg.cpp: first lambda 1e-5 times the largest Hessian diagonal, which
     under diagonal scaling is 1e-5 itself; any decrease is accepted.
     """
-    return Ceres(initial=1e-5, shrink_ceiling=2 / 3, min_gain=0.0, minimum=0.0, relative=1.0)
+    return Ceres(initial=1e-5, shrink_ceiling=2 / 3, min_gain=0.0, minimum=SMALLEST, relative=1.0)
 
 
 @jax.tree_util.register_dataclass
@@ -150,12 +153,12 @@ class Geometric:
 
 def gtsam() -> Geometric:
     """GTSAM's legacy rule: divide by 10, multiply by 10, lambda in [0, 1e5]. Source: LevenbergMarquardtParams."""
-    return Geometric(initial=1e-5, success=0.1, failure=10.0, minimum=0.0, maximum=1e5)
+    return Geometric(initial=1e-5, success=0.1, failure=10.0, minimum=SMALLEST, maximum=1e5)
 
 
 def stba() -> Geometric:
     """STBA's rule: divide by 3, multiply by 3. Source: Zhou et al. 2020, authors' main branch (radius 1e4)."""
-    return Geometric(initial=1e-4, success=1 / 3, failure=3.0, minimum=0.0, maximum=LARGEST)
+    return Geometric(initial=1e-4, success=1 / 3, failure=3.0, minimum=SMALLEST, maximum=LARGEST)
 
 
 def theseus() -> Geometric:

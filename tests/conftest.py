@@ -1,0 +1,83 @@
+"""Numbers are float64, types are checked where people call, and what was compiled once is kept for the next session."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import platform
+import tempfile
+from pathlib import Path
+
+import jax
+import jaxtyping
+import pytest
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    jax.config.update("jax_enable_x64", True)
+    jax.tree_util.register_dataclass = _register_dataclass
+    cache = getattr(config, "cache", None)
+    if cache is not None:
+        folder = cache.mkdir(f"xla-{_machine()}")
+    else:  # -p no:cacheprovider
+        config.stash[_TEMPORARY] = tempfile.TemporaryDirectory(prefix="jaxba-tests-")
+        folder = Path(config.stash[_TEMPORARY].name)
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if _TEMPORARY in config.stash:
+        config.stash[_TEMPORARY].cleanup()
+
+
+_TEMPORARY: pytest.StashKey[tempfile.TemporaryDirectory] = pytest.StashKey()
+
+
+def _machine() -> str:
+    """Names this kind of processor: programs compiled for another one must not be run."""
+    facts = platform.machine()
+    cpus = Path("/proc/cpuinfo")
+    if cpus.is_file():
+        facts += "".join(sorted({line for line in cpus.read_text().splitlines() if line.startswith("flags")}))
+    return hashlib.sha256(facts.encode()).hexdigest()[:12]
+
+
+@pytest.fixture
+def unchecked():
+    """Switches the type checks off: what a value of the wrong type does for a user, who has none."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+_original_register_dataclass = jax.tree_util.register_dataclass
+
+
+def _register_dataclass(nodetype: type, *args, **kwargs) -> type:
+    """`jax.tree_util.register_dataclass`, except that putting a tree together checks no types.
+
+    JAX rebuilds pytrees with tracers, with batches, with shapes or with None in place of arrays, and does so through
+    `__init__`. The annotations speak of what people pass, and jaxtyping checks them there.
+    """
+    if args or kwargs or not nodetype.__module__.startswith("jaxba."):
+        return _original_register_dataclass(nodetype, *args, **kwargs)
+    init = nodetype.__init__  # jaxtyping wraps it only later
+    fields = dataclasses.fields(nodetype)
+    data = [field.name for field in fields if not field.metadata.get("static")]
+    static = [field.name for field in fields if field.metadata.get("static")]
+
+    def flatten(node):
+        return [getattr(node, name) for name in data], tuple(getattr(node, name) for name in static)
+
+    def flatten_with_keys(node):
+        children, aux = flatten(node)
+        return [(jax.tree_util.GetAttrKey(n), child) for n, child in zip(data, children, strict=True)], aux
+
+    def unflatten(aux, children):
+        node = object.__new__(nodetype)
+        init(node, **dict(zip(data, children, strict=True)), **dict(zip(static, aux, strict=True)))
+        return node
+
+    jax.tree_util.register_pytree_with_keys(nodetype, flatten_with_keys, unflatten, flatten)
+    return nodetype

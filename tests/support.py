@@ -1,0 +1,310 @@
+"""Problems to test on, and the same mathematics once more: dense, in float64, and by other means than jaxba's.
+
+Nothing of jaxba's camera, loss or linear algebra is used for the truth: rotations are those of Ceres'
+`AngleAxisRotatePoint`, derivatives come from `jax.jacfwd`, steps from a dense QR factorisation.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import solve_triangular
+from scipy.spatial.transform import Rotation
+
+from jaxba import BundleProblem, LMState, StepOptions, build_layout, initial_state, like, lm_step, random_scene
+from jaxba.lm import StepInfo
+
+DATA = os.environ.get("JAXBA_DATA")
+needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
+MINIATURES = ("dubrovnik-3-7-pre", "dubrovnik-3-7-18-pre", "dubrovnik-1-1-pre")
+
+_step = jax.jit(lm_step, static_argnames=("options",))
+
+
+def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0):
+    """`lm_step`, compiled. Called as `solve` does, so that the compilation cache serves both."""
+    number = lambda x: jnp.asarray(x, state.cost.dtype)
+    return _step(layout, state, number(damping), options, number(min_gain))
+
+
+def bal_file(name: str) -> Path:
+    """A real problem of the BAL data set."""
+    assert DATA is not None
+    return Path(DATA) / "bal" / f"{name}.txt.bz2"
+
+
+# Problems
+
+
+@functools.cache
+def tiny() -> BundleProblem:
+    """6 cameras, 40 points, 200 observations: 40 visibilities are missing, so tracks differ."""
+    return random_scene(like("tiny"), 0)
+
+
+@functools.cache
+def paper(seed: int) -> BundleProblem:
+    """10 cameras, 10 points, all visible: every seed has the same shape, so all share one program."""
+    return random_scene(like("paper"), seed)
+
+
+@functools.cache
+def whitened() -> BundleProblem:
+    """`tiny` with correlated covariances, and two points whose weights make the clamp of the diagonal act."""
+    problem = tiny()
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(problem.num_observations, 2, 2)) + 1.5 * np.eye(2)
+    problem = BundleProblem.create(*arrays(problem), covariance=root @ root.transpose(0, 2, 1) + 0.01 * np.eye(2))
+    whitening = np.array(problem.whitening)
+    whitening[problem.point_index == 4] *= 1e-7
+    whitening[problem.point_index == 9] = 0
+    return problem.replace(whitening=whitening)
+
+
+@functools.cache
+def odd() -> BundleProblem:
+    """What files contain: a pair seen twice, cameras and points that nobody observes, a point seen once, points
+    behind a camera, and a camera without rotation."""
+    problem = tiny()
+    rng = np.random.default_rng(5)
+    cameras = np.vstack([problem.cameras, rng.normal(size=(2, 9))])
+    middle = problem.points.mean(axis=0)
+    points = np.vstack([problem.points, middle + rng.normal(size=(4, 3))])
+    # camera 6 is nobody's, camera 7 looks down -z at the middle from 15 away and has point 41 behind it
+    cameras[7] = [0, 0, 0, *(-middle - [0, 0, 15]), 600, -0.02, 0.001]
+    points[41] = middle + np.array([0.4, -0.3, 20.0])
+    at = points[[0, 1, 2, 43, 41]] + cameras[7, 3:6]
+    seen = 600 * -at[:, :2] / at[:, 2:] + rng.normal(size=(5, 2))
+    twice = np.flatnonzero(problem.point_index == 3)[:2]
+    return BundleProblem.create(
+        cameras,
+        points,
+        np.vstack([problem.observations, problem.observations[twice] + 1.0, seen]),
+        np.concatenate([problem.camera_index, problem.camera_index[twice], np.full(5, 7)]),
+        np.concatenate([problem.point_index, problem.point_index[twice], [0, 1, 2, 43, 41]]),
+    )
+
+
+@functools.cache
+def single() -> BundleProblem:
+    """One camera, one point, one observation: two equations for twelve numbers."""
+    camera = [[0.1, -0.2, 0.05, 0.3, 0.2, -4.0, 500, -0.01, 0.002]]
+    return BundleProblem.create(camera, [[0.5, -0.4, 0.7]], [[60.0, -20.0]], [0], [0])
+
+
+def arrays(problem: BundleProblem) -> tuple:
+    """The arguments of `BundleProblem.create`."""
+    return problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index
+
+
+def start(problem: BundleProblem, options: StepOptions | None = None, dtype: str = "float64"):
+    """Layout and state of a problem."""
+    options = options or StepOptions()
+    layout = build_layout(problem, pairs=options.forms_reduced_system)
+    return layout, _initial(layout, problem, options, dtype)
+
+
+@functools.partial(jax.jit, static_argnames=("options", "dtype"))
+def _initial(layout, problem, options, dtype) -> LMState:
+    return initial_state(layout, problem, options, jnp.dtype(dtype))
+
+
+def same_bits(a, b) -> bool:
+    """Whether two pytrees agree in every bit, NaN included."""
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.asarray(x).tobytes() == np.asarray(y).tobytes() for x, y in pairs)
+
+
+def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp.float64, **changes) -> StepInfo:
+    """A record for a damping rule to look at."""
+    number = lambda x: jnp.asarray(x, dtype)
+    values = {
+        "cost": 1.0,
+        "previous_cost": 2.0,
+        "candidate_cost": 1.0,
+        "predicted": 1.0,
+        "gain_ratio": gain,
+        "damping": damping,
+        "gradient_max": 1.0,
+        "step_norm": 1.0,
+        "parameter_norm": 1.0,
+        **changes,
+    }
+    return StepInfo(
+        **{name: number(value) for name, value in values.items()},
+        accepted=jnp.asarray(accepted),
+        cg_iterations=jnp.asarray(0, jnp.int32),
+    )
+
+
+# The camera once more
+
+
+def rotate(vector, point):
+    """Rotates a point by an angle-axis vector as Ceres' `AngleAxisRotatePoint` does, first order at zero."""
+    squared = jnp.sum(vector**2)
+    zero = squared < 1e-30
+    angle = jnp.sqrt(jnp.where(zero, 1.0, squared))
+    axis = vector / angle
+    turned = (
+        point * jnp.cos(angle)
+        + jnp.cross(axis, point) * jnp.sin(angle)
+        + axis * jnp.sum(axis * point) * (1 - jnp.cos(angle))
+    )
+    return jnp.where(zero, point + jnp.cross(vector, point), turned)
+
+
+def project_one(turn, camera, point):
+    """Pixel of one point in one camera, whose rotation is multiplied by exp(turn) from the left."""
+    local = rotate(turn, rotate(camera[:3], point)) + camera[3:6]
+    p = -local[:2] / local[2]
+    squared = jnp.sum(p**2)
+    return camera[6] * (1 + camera[7] * squared + camera[8] * squared**2) * p
+
+
+@jax.jit
+def _projected(cameras, points):
+    zero = jnp.zeros((cameras.shape[0], 3))
+    jacobian = jax.vmap(jax.jacfwd(project_one, argnums=(0, 1, 2)))(zero, cameras, points)
+    return jax.vmap(project_one)(zero, cameras, points), *jacobian
+
+
+# Losses once more: loss_function.h of Ceres, `rho(s)` and `rho'(s)` for scale a
+
+
+def published_loss(name: str, scale: float, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Value and derivative as Ceres defines them."""
+    a, b = scale, scale**2
+    s = np.asarray(s, np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if name == "squared":
+            return s, np.ones_like(s)
+        if name == "huber":
+            inside = s <= b
+            return np.where(inside, s, 2 * a * np.sqrt(s) - b), np.where(inside, 1, a / np.sqrt(s))
+        if name == "soft_l1":
+            root = np.sqrt(1 + s / b)
+            return 2 * b * (root - 1), 1 / root
+        if name == "cauchy":
+            return b * np.log1p(s / b), 1 / (1 + s / b)
+        if name == "tukey":
+            inside = s <= b
+            return np.where(inside, b / 3 * (1 - (1 - s / b) ** 3), b / 3), np.where(inside, (1 - s / b) ** 2, 0)
+    raise AssertionError(name)
+
+
+# The step once more
+
+
+@dataclass(frozen=True)
+class Dense:
+    """The damped normal equations of one linearisation as plain matrices; cameras first, then points."""
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+    diagonal: np.ndarray  # D / lambda
+    damping: float
+    step: np.ndarray
+
+    @property
+    def gradient(self) -> np.ndarray:
+        """`J^T r`."""
+        return self.jacobian.T @ self.residual
+
+    @property
+    def predicted(self) -> float:
+        """`-(g.d + d.H d / 2)`, in the form that does not cancel."""
+        moved = self.jacobian @ self.step
+        return float(-moved @ (self.residual + 0.5 * moved))
+
+    def norm(self, step: np.ndarray) -> float:
+        """Norm in which the damped Hessian is the unit matrix: `sqrt(d.(H + D) d)`, pixels."""
+        damped = self.damping * self.diagonal * step**2
+        return float(np.sqrt(np.sum((self.jacobian @ step) ** 2) + np.sum(damped)))
+
+
+def cost(problem: BundleProblem, options: StepOptions) -> float:
+    """The objective in float64."""
+    residual = _residual(problem)[0]
+    return 0.5 * float(np.sum(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[0]))
+
+
+def _residual(problem: BundleProblem):
+    pixel, *jacobian = _projected(
+        jnp.asarray(problem.cameras)[problem.camera_index], jnp.asarray(problem.points)[problem.point_index]
+    )
+    residual, jacobian = np.asarray(pixel) - problem.observations, [np.array(j) for j in jacobian]
+    if problem.whitening is not None:
+        residual = np.einsum("nij,nj->ni", problem.whitening, residual)
+        jacobian = [np.einsum("nij,njk->nik", problem.whitening, j) for j in jacobian]
+    return residual, jacobian
+
+
+def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals and Jacobian as a vector and a matrix, weighted by the loss; cameras first, then points."""
+    residual, (turn, camera, point) = _residual(problem)
+    if options.rotation == "manifold":
+        camera[:, :, :3] = turn
+    weight = np.sqrt(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[1])
+    count, cameras = problem.num_observations, problem.num_cameras
+    jacobian = np.zeros((count, 2, 9 * cameras + 3 * problem.num_points))
+    rows = np.arange(count)
+    for k in range(9):
+        jacobian[rows, :, 9 * problem.camera_index + k] = weight[:, None] * camera[:, :, k]
+    for k in range(3):
+        jacobian[rows, :, 9 * cameras + 3 * problem.point_index + k] = weight[:, None] * point[:, :, k]
+    return (weight[:, None] * residual).ravel(), jacobian.reshape(2 * count, -1)
+
+
+def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense:
+    """Linearises and solves: the least squares problem `[J; sqrt(D)] d = [-r; 0]` by QR after scaling the columns.
+
+    That is the damped normal equations without squaring the condition number, so that the truth is better than
+    what is compared with it.
+    """
+    residual, jacobian = linear(problem, options)
+    diagonal = np.ones(jacobian.shape[1])
+    if options.scaling == "diagonal":
+        diagonal = np.clip(np.sum(jacobian**2, axis=0), 1e-6, 1e32)
+    stacked = np.vstack([jacobian, np.diag(np.sqrt(damping * diagonal))])
+    scale = 1 / np.linalg.norm(stacked, axis=0)
+    q, r = np.linalg.qr(stacked * scale)
+    found = scale * solve_triangular(r, -q.T @ np.concatenate([residual, np.zeros(len(diagonal))]))
+    return Dense(residual, jacobian, diagonal, damping, found)
+
+
+def moved(problem: BundleProblem, options: StepOptions, change: np.ndarray) -> BundleProblem:
+    """The problem after a step."""
+    cameras = problem.cameras + change[: problem.cameras.size].reshape(-1, 9)
+    if options.rotation == "manifold":
+        turn = Rotation.from_rotvec(change[: problem.cameras.size].reshape(-1, 9)[:, :3])
+        cameras[:, :3] = (turn * Rotation.from_rotvec(problem.cameras[:, :3])).as_rotvec()
+    return problem.replace(cameras=cameras, points=problem.points + change[problem.cameras.size :].reshape(-1, 3))
+
+
+def back(problem: BundleProblem, before: LMState, after: LMState) -> BundleProblem:
+    """The problem at `after`; which column is which point is told by the start, where all points differ."""
+    equal = (np.asarray(before.points).T[:, None, :] == problem.points).all(axis=2)
+    assert (equal.sum(axis=1) <= 1).all()
+    column, row = np.nonzero(equal)
+    points = np.array(problem.points)
+    points[row] = np.asarray(after.points).T[column]
+    return problem.replace(cameras=np.asarray(after.cameras).T, points=points)
+
+
+def difference(problem: BundleProblem, after: BundleProblem, options: StepOptions) -> np.ndarray:
+    """The step between two sets of parameters, in the coordinates of the options."""
+    cameras = np.array(after.cameras - problem.cameras)
+    if options.rotation == "manifold":
+        turned = (
+            Rotation.from_rotvec(np.array(after.cameras[:, :3])) * Rotation.from_rotvec(problem.cameras[:, :3]).inv()
+        )
+        cameras[:, :3] = turned.as_rotvec()
+    return np.concatenate([cameras.ravel(), (after.points - problem.points).ravel()])

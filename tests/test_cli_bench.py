@@ -1,0 +1,287 @@
+"""`jaxba-bench` in this process: result files, continuing, and what happens when something is wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import support
+import yaml
+
+from jaxba import geometry, write_bal
+from jaxba.bench import report
+from jaxba.bench import run as bench_run
+from jaxba.cli.bench import run
+
+KEYS = [
+    *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
+    *("repeat", "setup_s", "compile_s", "total_s", "initial_cost", "final_cost", "iterations", "accepted"),
+    *("cg_iterations", "termination", "trace"),
+]
+TRACE_KEYS = ["iteration", "time_s", "cost", "lambda", "accepted", "cg_iterations", "gain_ratio"]
+
+BRIEF = ["--solvers", "classic,ceres", "--repeats", "1", "--max-iterations", "5"]
+
+
+def lines(folder: Path) -> list[dict]:
+    return [json.loads(line) for line in (folder / "results.jsonl").read_text().splitlines()]
+
+
+def bench(folder: Path, *argv: str) -> int:
+    return run([*argv, "--out", str(folder)])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    """A whole run with everything that it draws."""
+    folder = tmp_path_factory.mktemp("bench") / "run"
+    assert bench(folder, "scene:tiny", *BRIEF) == 0
+    return folder
+
+
+@pytest.fixture
+def folder(finished, tmp_path) -> Path:
+    """A copy of that run to do something to."""
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leaves out the drawing, which has tests of its own and takes seconds."""
+    monkeypatch.setattr(report, "write_all", lambda *_, **__: [])
+
+
+def check_one_line(status: int, error: str, message: str) -> None:
+    assert status == 2
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert message in error
+
+
+# Results
+
+
+def test_every_line_has_exactly_the_keys_of_the_contract_in_order(finished):
+    found = lines(finished)
+    assert [line["solver"] for line in found] == ["classic", "ceres"]
+    for line in found:
+        assert list(line) == KEYS
+        assert all(list(point) == TRACE_KEYS for point in line["trace"])
+
+
+def test_the_numbers_of_a_line_are_those_of_the_solve(finished):
+    problem = support.tiny()
+    for line in lines(finished):
+        assert (line["problem"], line["family"], line["repeat"]) == ("tiny", "scene", 0)
+        assert (line["cameras"], line["points"], line["observations"]) == (6, 40, 200)
+        np.testing.assert_allclose(line["initial_cost"], geometry.cost(problem), rtol=1e-10)
+        trace = line["trace"]
+        start = {"iteration": 0, "time_s": 0.0, "cost": line["initial_cost"], "lambda": None, "accepted": True}
+        assert trace[0] == {**start, "cg_iterations": 0, "gain_ratio": None}
+        assert [point["iteration"] for point in trace] == list(range(line["iterations"] + 1))
+        assert line["iterations"] <= 5
+        assert trace[-1]["cost"] == line["final_cost"]
+        assert sum(point["accepted"] for point in trace[1:]) == line["accepted"]
+        times = [point["time_s"] for point in trace]
+        assert times == sorted(times)
+        assert times[-1] <= line["total_s"]
+        assert trace[1]["lambda"] == {"classic": 0.25, "ceres": 1e-4}[line["solver"]]
+        assert min(line["setup_s"], line["compile_s"], line["total_s"]) >= 0
+        assert line["threads"] >= 1
+
+
+def test_summary_figures_and_report_are_written(finished):
+    summary = json.loads((finished / "summary.json").read_text())
+    assert [solver["solver"] for solver in summary["solvers"]] == ["classic", "ceres"]
+    assert [problem["problem"] for problem in summary["problems"]] == ["tiny"]
+    for stem in ("profile_tau_0.001", "profile_relative", "convergence_tiny", "lambda_tiny"):
+        assert (finished / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
+        assert b"<svg" in (finished / f"{stem}.svg").read_bytes()
+    text = (finished / "report.html").read_text()
+    assert text.startswith("<!DOCTYPE html>")
+    assert "classic" in text
+    assert "http" not in text.replace("http://www.w3.org", ""), "the report loads nothing"
+
+
+# Continuing
+
+
+def test_a_second_run_into_the_folder_adds_nothing(folder, undrawn, capsys):
+    before = (folder / "results.jsonl").read_bytes()
+    assert bench(folder, "scene:tiny", *BRIEF) == 0
+    assert (folder / "results.jsonl").read_bytes() == before
+    assert "2 of 2 runs are already in" in capsys.readouterr().out
+
+
+def test_a_second_run_adds_only_what_is_new(folder, undrawn, capsys):
+    before = (folder / "results.jsonl").read_bytes()
+    argv = ["--solvers", "ceres,gtsam,lm+classic", "--repeats", "1", "--max-iterations", "5"]
+    assert bench(folder, "scene:tiny", *argv) == 0
+    after = (folder / "results.jsonl").read_bytes()
+    assert after.startswith(before)
+    assert [line["solver"] for line in lines(folder)] == ["classic", "ceres", "gtsam"]
+
+
+def test_the_half_line_of_a_killed_run_is_repaired(folder, undrawn, capsys):
+    path = folder / "results.jsonl"
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) - 300])
+    assert bench(folder, "scene:tiny", *BRIEF) == 0
+    found = lines(folder)
+    assert [line["solver"] for line in found] == ["classic", "ceres"]
+    assert path.read_bytes().endswith(b"}\n")
+
+
+@pytest.mark.parametrize(
+    "change", [["--max-iterations", "6"], ["--linear-solver", "implicit"]], ids=["max-iterations", "linear-solver"]
+)
+def test_other_settings_may_not_continue_in_the_folder(change, folder, undrawn, capsys):
+    before = (folder / "results.jsonl").read_bytes()
+    argv = BRIEF if "--linear-solver" in change else BRIEF[:-2]
+    check_one_line(bench(folder, "scene:tiny", *argv, *change), capsys.readouterr().err, "another")
+    assert (folder / "results.jsonl").read_bytes() == before
+
+
+def test_another_problem_of_the_same_name_may_not_continue_in_the_folder(folder, tmp_path, undrawn, capsys):
+    path = tmp_path / "tiny.txt"
+    write_bal(support.paper(0), path)
+    check_one_line(bench(folder, str(path), *BRIEF), capsys.readouterr().err, "another tiny")
+
+
+def test_a_damaged_result_file_is_named_with_its_line(folder, undrawn, capsys):
+    path = folder / "results.jsonl"
+    path.write_bytes(b"no json\n" + path.read_bytes())
+    check_one_line(bench(folder, "scene:tiny", *BRIEF), capsys.readouterr().err, "results.jsonl, line 1")
+
+
+def test_ctrl_c_keeps_what_is_done_and_the_next_run_does_the_rest(tmp_path, undrawn, capsys, monkeypatch):
+    solve_one = bench_run.run_solver
+    done = []
+
+    def interrupted(*args):
+        if done:
+            raise KeyboardInterrupt
+        done.append(1)
+        return solve_one(*args)
+
+    folder = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(bench_run, "run_solver", interrupted)
+        assert bench(folder, "scene:tiny", *BRIEF) == 130
+    assert [line["solver"] for line in lines(folder)] == ["classic"]
+    assert "interrupted" in capsys.readouterr().out
+    assert bench(folder, "scene:tiny", *BRIEF) == 0
+    assert [line["solver"] for line in lines(folder)] == ["classic", "ceres"]
+
+
+def test_repeats_are_lines_of_their_own(tmp_path, undrawn, capsys):
+    argv = ["--solvers", "ceres", "--repeats", "2", "--max-iterations", "5"]
+    assert bench(tmp_path / "run", "scene:tiny", *argv) == 0
+    first, second = lines(tmp_path / "run")
+    assert (first["repeat"], second["repeat"]) == (0, 1)
+    assert [p["cost"] for p in first["trace"]] == [p["cost"] for p in second["trace"]]
+
+
+# Problems and suites
+
+
+def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(tmp_path, undrawn, capsys):
+    good, bad = tmp_path / "good.txt", tmp_path / "bad.txt"
+    write_bal(support.tiny(), good)
+    bad.write_bytes(good.read_bytes()[:500])
+    status = bench(tmp_path / "run", str(bad), str(good), *BRIEF)
+    check_one_line(status, capsys.readouterr().err, "bad.txt")
+    assert [(line["problem"], line["solver"]) for line in lines(tmp_path / "run")] == [
+        ("good", "classic"),
+        ("good", "ceres"),
+    ]
+
+
+def test_two_files_of_one_name_get_two_names(tmp_path, undrawn, capsys):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write_bal(support.tiny(), tmp_path / name / "tiny.txt")
+    argv = ["--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
+    assert bench(tmp_path / "run", *(str(tmp_path / n / "tiny.txt") for n in "ab"), *argv) == 0
+    found = [(line["problem"], line["family"]) for line in lines(tmp_path / "run")]
+    assert found == [("tiny", "a"), ("b-tiny", "b")]
+
+
+def suite(tmp_path: Path, **entries) -> str:
+    path = tmp_path / "suite.yaml"
+    path.write_text(yaml.safe_dump(entries))
+    return str(path)
+
+
+def test_a_suite_names_problems_by_globs_and_variables(tmp_path, undrawn, capsys, monkeypatch):
+    (tmp_path / "data").mkdir()
+    write_bal(support.tiny(), tmp_path / "data" / "one.txt")
+    write_bal(support.tiny(), tmp_path / "data" / "two.txt.gz")
+    monkeypatch.setenv("JAXBA_TEST_FOLDER", str(tmp_path / "data"))
+    entries = {"problems": ["$JAXBA_TEST_FOLDER/*.txt*", "scene:tiny"], "solvers": ["ceres"]}
+    path = suite(tmp_path, **entries, tolerance=0.01, repeats=1, max_iterations=1)
+    assert bench(tmp_path / "run", "--suite", path) == 0
+    assert [line["problem"] for line in lines(tmp_path / "run")] == ["one", "two", "tiny"]
+    assert bench(tmp_path / "other", "scene:tiny", "--suite", path, "--solvers", "classic") == 0
+    assert [(line["problem"], line["solver"]) for line in lines(tmp_path / "other")] == [("tiny", "classic")]
+
+
+BAD = {
+    "unknown solver": (["scene:tiny", "--solvers", "ceres,cerse"], "unknown damping policy 'cerse'"),
+    "unknown method": (["scene:tiny", "--solvers", "sgd+ceres"], "unknown method 'sgd'"),
+    "no solver": (["scene:tiny", "--solvers", ","], "--solvers names no solver"),
+    "missing file": (["no-such-file.txt"], "no-such-file.txt: no such file"),
+    "directory": (["."], "a directory, not a file"),
+    "unknown scene": (["scene:none"], "no scene is called 'none'"),
+    "bad seed": (["scene:tiny:x"], "the seed must be a whole number"),
+    "no repeats": (["scene:tiny", "--repeats", "0"], "--repeats must be positive"),
+    "no iterations": (["scene:tiny", "--max-iterations", "-1"], "--max-iterations must be positive"),
+    "tolerance 0": (["scene:tiny", "--tolerance", "0"], "--tolerance must lie between 0 and 1"),
+    "tolerance 1": (["scene:tiny", "--tolerance", "1"], "--tolerance must lie between 0 and 1"),
+    "missing suite": (["--suite", "no-such-suite.yaml"], "No such file"),
+}
+
+
+@pytest.mark.parametrize("kind", list(BAD))
+def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(kind, tmp_path, capsys):
+    argv, message = BAD[kind]
+    check_one_line(bench(tmp_path / "run", *argv), capsys.readouterr().err, message)
+    assert not (tmp_path / "run").exists()
+
+
+BAD_SUITES = {
+    "unknown key": ({"problem": ["scene:tiny"]}, "unknown key 'problem'; known: problems, solvers"),
+    "wrong type": ({"problems": "scene:tiny"}, "problems is 'scene:tiny', not a list"),
+    "wrong number": ({"problems": ["scene:tiny"], "repeats": 1.5}, "repeats is 1.5"),
+    "truth as number": ({"problems": ["scene:tiny"], "repeats": True}, "repeats is True"),
+    "unset variable": ({"problems": ["$JAXBA_NO_SUCH_VARIABLE/x.txt"]}, "the environment variable is not set"),
+    "glob without match": ({"problems": ["no-such-folder/*.txt"]}, "no such file"),
+    "unknown solver": ({"problems": ["scene:tiny"], "solvers": ["cerse"]}, "unknown damping policy"),
+    "bad tolerance": ({"problems": ["scene:tiny"], "tolerance": 2.0}, "--tolerance must lie between 0 and 1"),
+}
+
+
+@pytest.mark.parametrize("kind", list(BAD_SUITES))
+def test_a_bad_suite_is_one_line_and_status_2(kind, tmp_path, capsys):
+    entries, message = BAD_SUITES[kind]
+    status = bench(tmp_path / "run", "--suite", suite(tmp_path, **entries))
+    check_one_line(status, capsys.readouterr().err, message)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("text", ["problems: [", "- a\n- b\n", "just words", "\x00", ""])
+def test_a_suite_that_is_no_mapping_is_one_line_and_status_2(text, tmp_path, capsys):
+    path = tmp_path / "suite.yaml"
+    path.write_text(text)
+    status = bench(tmp_path / "run", "--suite", str(path))
+    check_one_line(status, capsys.readouterr().err, "--suite")
+
+
+def test_an_output_folder_that_is_a_file_is_one_line_and_status_2(tmp_path, capsys):
+    path = tmp_path / "run"
+    path.write_text("mine")
+    check_one_line(bench(path, "scene:tiny", *BRIEF), capsys.readouterr().err, "--out")
+    assert path.read_text() == "mine"

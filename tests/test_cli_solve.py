@@ -1,0 +1,248 @@
+"""`jaxba-solve` in this process: what it prints, writes and returns."""
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+import support
+
+from jaxba import geometry, read_bal, write_bal
+from jaxba.bench.records import record_from_json
+from jaxba.cli import table
+from jaxba.cli.solve import run
+
+RECORD_KEYS = [
+    *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
+    *("repeat", "setup_s", "compile_s", "total_s", "initial_cost", "final_cost", "iterations", "accepted"),
+    *("cg_iterations", "termination", "trace"),
+]
+
+
+@pytest.fixture
+def tiny(tmp_path) -> Path:
+    path = tmp_path / "in" / "tiny.txt"
+    path.parent.mkdir()
+    write_bal(support.tiny(), path)
+    return path
+
+
+def rows(text: str) -> list[list[str]]:
+    """Lines of the iteration table."""
+    return [line.split() for line in text.splitlines() if line[:4].strip().isdigit()]
+
+
+# What works
+
+
+def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
+    output, log = tmp_path / "out.txt.bz2", tmp_path / "log.json"
+    assert run([str(tiny), "--output", str(output), "--log", str(log)]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    solved, record = read_bal(output), json.loads(log.read_text())
+    assert list(record) == RECORD_KEYS
+    np.testing.assert_allclose(record["initial_cost"], geometry.cost(support.tiny()), rtol=1e-10)
+    np.testing.assert_allclose(record["final_cost"], geometry.cost(solved), rtol=1e-10)
+    for name in ("observations", "camera_index", "point_index"):
+        assert np.array_equal(getattr(solved, name), getattr(support.tiny(), name))
+    assert (record["solver"], record["dtype"], record["termination"]) == ("ceres", "float64", "cost")
+    assert (record["cameras"], record["points"], record["observations"]) == (6, 40, 200)
+    costs = [point["cost"] for point in record["trace"]]
+    assert costs[0] == record["initial_cost"]
+    assert costs[-1] == record["final_cost"]
+    assert [point["iteration"] for point in record["trace"]] == list(range(record["iterations"] + 1))
+    assert record_from_json(record).accepted == record["iterations"]
+    assert "6 cameras, 40 points, 200 observations" in printed.out
+    assert "converged: relative decrease" in printed.out
+    assert f"wrote {output}" in printed.out
+    assert f"wrote {log}" in printed.out
+    lines = rows(printed.out)
+    assert [int(line[0]) for line in lines] == list(range(record["iterations"] + 1))
+    np.testing.assert_allclose([float(line[1]) for line in lines], costs, rtol=1e-6)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["in", "log.json", "out.txt.bz2"]
+
+
+def test_without_a_problem_a_built_in_scene_is_solved(capsys):
+    assert run([]) == 0
+    printed = capsys.readouterr()
+    assert "random scene (30 cameras, 1500 points, seed 0)" in printed.out
+    assert "30 cameras, 1500 points" in printed.out
+    assert "\nconverged: " in printed.out
+    assert printed.err == ""
+
+
+def test_the_iteration_limit_is_no_error_and_is_said(tiny, tmp_path, capsys):
+    output = tmp_path / "out.txt"
+    assert run([str(tiny), "--max-iterations", "2", "--ftol", "0", "--output", str(output)]) == 0
+    printed = capsys.readouterr().out
+    assert "not converged: iteration limit" in printed
+    assert "2 iterations" in printed
+    assert geometry.cost(read_bal(output)) < geometry.cost(support.tiny())
+
+
+def test_a_rejected_step_is_marked(tiny, capsys):
+    assert run([str(tiny), "--damping", "constant:1e30"]) == 0
+    printed = capsys.readouterr().out
+    assert rows(printed)[1][-1] == "rejected"
+    assert "not converged: " in printed
+    assert "1 iterations, 0 accepted" in printed
+
+
+def test_the_point_cloud_has_every_point_and_camera(tiny, tmp_path, capsys):
+    output = tmp_path / "out.ply"
+    assert run([str(tiny), "--max-iterations", "1", "--output", str(output)]) == 0
+    data = output.read_bytes()
+    assert data.startswith(b"ply\n")
+    assert b"element vertex 46\n" in data
+    body = data.split(b"end_header\n", 1)[1]
+    assert len(body) == 46 * (3 * 8 + 3)
+
+
+def test_options_reach_the_solver(tiny, tmp_path, capsys):
+    log = tmp_path / "log.json"
+    options = ["--damping", "classic:0.03", "--refine-points", "3", "--max-iterations", "3", "--log", str(log)]
+    assert run([str(tiny), *options]) == 0
+    record = json.loads(log.read_text())
+    assert record["solver"] == "classic:0.03+refine3"
+    assert [point["lambda"] for point in record["trace"]][:2] == [None, 0.03]
+    assert "damping classic:0.03 + 3 point iterations, float64" in capsys.readouterr().out
+    assert run([str(tiny), "--dtype", "float32", "--max-iterations", "2", "--log", str(log)]) == 0
+    record = json.loads(log.read_text())
+    assert (record["solver"], record["dtype"]) == ("ceres@float32", "float32")
+    assert run([str(tiny), "--linear-solver", "implicit", "--max-iterations", "2", "--log", str(log)]) == 0
+    record = json.loads(log.read_text())
+    assert record["cg_iterations"] > 0
+    assert record["backend"].endswith("(implicit)")
+
+
+def test_what_is_odd_about_the_data_is_counted(tmp_path, capsys):
+    problem = support.odd()
+    path, output = tmp_path / "odd.txt", tmp_path / "out.txt"
+    write_bal(problem, path)
+    assert run([str(path), "--output", str(output)]) == 0
+    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    once = int(np.sum(np.bincount(problem.point_index) == 1))
+    assert once >= 2
+    after = int(np.sum(geometry.depths(read_bal(output)) <= 0))
+    assert notes == [
+        "note: 1 cameras without observations, kept as they are",
+        "note: 2 points without observations, kept as they are",
+        f"note: {once} points seen once; damping alone fixes their depth",
+        f"note: observations behind their camera: 1 at the start, {after} at the end",
+    ]
+
+
+def test_clean_data_needs_no_notes(tiny, capsys):
+    assert run([str(tiny), "--max-iterations", "1"]) == 0
+    assert "note:" not in capsys.readouterr().out
+
+
+def test_an_existing_output_is_replaced(tiny, tmp_path, capsys):
+    output = tmp_path / "out.txt"
+    output.write_text("old")
+    assert run([str(tiny), "--max-iterations", "1", "--output", str(output)]) == 0
+    assert read_bal(output).num_cameras == 6
+
+
+def test_the_input_may_be_the_output(tiny, capsys):
+    assert run([str(tiny), "--max-iterations", "1", "--output", str(tiny)]) == 0
+    assert geometry.cost(read_bal(tiny)) < geometry.cost(support.tiny())
+
+
+def test_a_start_that_is_not_finite_ends_with_an_honest_word(tmp_path, capsys):
+    """A point on its camera's plane: there is nothing to descend from."""
+    problem = support.single().replace(
+        cameras=np.array([[0, 0, 0, 0, 0, 0, 500.0, 0, 0]]), points=np.array([[1.0, 2.0, 0.0]])
+    )
+    path, log = tmp_path / "plane.txt", tmp_path / "log.json"
+    write_bal(problem, path)
+    status = run([str(path), "--log", str(log)])
+    printed = capsys.readouterr()
+    if status == 0:
+        assert "\nnot converged: " in printed.out
+        assert json.loads(log.read_text())["final_cost"] is None
+    else:
+        check_one_line(status, printed.err)
+
+
+def test_ctrl_c_stops_after_the_iteration_and_writes_what_there_is(tiny, tmp_path, capsys, monkeypatch):
+    output = tmp_path / "out.txt"
+    row = table.row
+
+    def interrupted(record, before):
+        if record.iteration == 2:
+            signal.raise_signal(signal.SIGINT)
+        return row(record, before)
+
+    monkeypatch.setattr(table, "row", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    assert run([str(tiny), "--ftol", "0", "--output", str(output)]) == 0
+    printed = capsys.readouterr()
+    assert "not converged: stopped by the caller" in printed.out
+    assert "2 iterations" in printed.out
+    assert "stopping after this iteration" in printed.err
+    assert geometry.cost(read_bal(output)) < geometry.cost(support.tiny())
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+# What does not
+
+
+def check_one_line(status: int, error: str) -> None:
+    assert status == 2
+    assert error.startswith("error: ")
+    assert error.endswith("\n")
+    assert error.count("\n") == 1
+
+
+def cut_short(path: Path, share: float) -> Path:
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+    return path
+
+
+BAD = {
+    "missing file": (lambda tiny: [str(tiny) + ".none"], "No such file"),
+    "directory": (lambda tiny: [str(tiny.parent)], "directory"),
+    "truncated file": (lambda tiny: [str(cut_short(tiny, 0.5))], "tiny.txt"),
+    "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),
+    "unknown damping": (lambda tiny: [str(tiny), "--damping", "cerse"], "unknown damping policy 'cerse'"),
+    "lambda that is no number": (lambda tiny: [str(tiny), "--damping", "constant:x"], "positive number"),
+    "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must not be negative"),
+    "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be positive"),
+    "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be positive"),
+    "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
+    "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
+    "loss without scale": (lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"], "--loss-scale"),
+    "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
+    "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "--output"),
+    "log in a missing folder": (lambda tiny: [str(tiny), "--log", str(tiny.parent / "no" / "log.json")], "--log"),
+    "log is a directory": (lambda tiny: [str(tiny), "--log", str(tiny.parent)], "--log"),
+}
+
+
+@pytest.mark.parametrize("kind", list(BAD))
+def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(kind, tiny, tmp_path, capsys):
+    arguments, message = BAD[kind]
+    argv = arguments(tiny)
+    if "--output" not in argv:
+        argv += ["--output", str(tmp_path / "out.txt")]
+    before = sorted(tmp_path.rglob("*"))
+    status = run(argv)
+    printed = capsys.readouterr()
+    check_one_line(status, printed.err)
+    assert message in printed.err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("argv", [["--dtype", "float16"], ["--max-iterations", "many"], ["--no-such-option", "1"]])
+def test_what_the_parser_refuses_is_status_2_and_nothing_on_stdout(argv, capsys):
+    with pytest.raises(SystemExit) as caught:
+        run(argv)
+    assert caught.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert argv[0] in printed.err

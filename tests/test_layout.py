@@ -1,0 +1,248 @@
+"""Slots, sum trees and pairs: nothing lost, nothing twice, little padding."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import support
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxba import BundleProblem, Layout, build_layout
+from jaxba.layout import CAMERA_CHUNK, MAX_PADDING, TREE_WIDTH, sum_tree
+from jaxba.sums import point_sum, tree_sum
+
+# Problems from track lengths
+
+
+def problem_of(tracks: np.ndarray, cameras: int, seed: int, duplicates: int = 0) -> BundleProblem:
+    """Every point seen by `tracks[i]` different cameras, observations in random order; some are there twice."""
+    rng = np.random.default_rng(seed)
+    point = np.repeat(np.arange(len(tracks)), tracks)
+    camera = np.concatenate([rng.choice(cameras, t, replace=False) for t in tracks] or [np.zeros(0)]).astype(int)
+    again = rng.integers(len(point), size=duplicates)
+    point, camera = np.concatenate([point, point[again]]), np.concatenate([camera, camera[again]])
+    order = rng.permutation(len(point))
+    return BundleProblem.create(
+        rng.normal(size=(cameras, 9)),
+        rng.normal(size=(len(tracks), 3)),
+        rng.normal(size=(len(point), 2)),
+        camera[order],
+        point[order],
+        weight=rng.uniform(0.5, 2, len(point)),
+    )
+
+
+def track_lengths(draw) -> tuple[np.ndarray, int]:
+    """Random lengths of one of several kinds, and a number of cameras that allows them."""
+    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
+    points = draw(st.integers(1, 400))
+    longest = draw(st.sampled_from([1, 2, 5, 30, 200, 600]))
+    kind = draw(st.sampled_from(["equal", "uniform", "geometric", "power law", "few giants", "many zeros"]))
+    lengths = {
+        "equal": np.full(points, longest),
+        "uniform": rng.integers(0, longest + 1, points),
+        "geometric": 1 + rng.geometric(min(1.0, 3 / longest), points),
+        "power law": (rng.pareto(1.0, points) + 1).astype(int),
+        "few giants": np.where(rng.random(points) < 0.02, longest, rng.integers(2, 4, points)),
+        "many zeros": np.where(rng.random(points) < 0.8, 0, rng.integers(1, longest + 1, points)),
+    }[kind]
+    lengths = np.clip(lengths, 0, longest)
+    lengths[0] = max(lengths[0], 1)
+    return lengths, longest + draw(st.integers(0, 5))
+
+
+tracks_and_cameras = st.composite(track_lengths)()
+
+
+def points_of(layout: Layout) -> np.ndarray:
+    """Problem index of every column of the layout; the number of points for padding."""
+    return np.concatenate([np.asarray(members) for members in layout.bucket_points])
+
+
+def rows_of(layout: Layout) -> Counter:
+    """(camera, point, pixel, whitening) of every occupied slot."""
+    mask = np.asarray(layout.slot_mask)
+    point = points_of(layout)[layout.slot_point[mask]]
+    columns = [layout.slot_camera[mask], point, *layout.pixels[:, mask]]
+    if layout.whitening is not None:
+        columns += list(layout.whitening.reshape(4, -1)[:, mask])
+    return Counter(zip(*(np.asarray(c).tolist() for c in columns), strict=True))
+
+
+def rows_of_problem(problem: BundleProblem) -> Counter:
+    columns = [problem.camera_index, problem.point_index, *problem.observations.T]
+    if problem.whitening is not None:
+        columns += list(problem.whitening.reshape(-1, 4).T)
+    return Counter(zip(*(np.asarray(c).tolist() for c in columns), strict=True))
+
+
+# Slots
+
+
+@settings(max_examples=150, deadline=None)
+@given(tracks_and_cameras, st.integers(0, 3))
+def test_every_observation_is_in_exactly_one_slot(case, duplicates):
+    problem = problem_of(*case, seed=0, duplicates=duplicates)
+    layout = build_layout(problem, pairs=False)
+    assert rows_of(layout) == rows_of_problem(problem)
+    empty = ~np.asarray(layout.slot_mask)
+    assert empty.any()
+    assert not np.any(layout.pixels[:, empty])
+    assert not np.any(layout.whitening[:, :, empty])
+    columns = points_of(layout)
+    seen = np.unique(problem.point_index)
+    assert np.array_equal(np.sort(columns[columns < problem.num_points]), seen)
+    assert np.array_equal(layout.camera_seen, np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0)
+    assert layout.num_slots == sum(length * points for length, points in layout.buckets)
+    assert layout.num_points == len(columns)
+
+
+@settings(max_examples=150, deadline=None)
+@given(tracks_and_cameras)
+def test_at_most_a_tenth_is_padding_whatever_the_track_lengths(case):
+    problem = problem_of(*case, seed=0)
+    layout = build_layout(problem, pairs=False)
+    spare = layout.buckets[0][0]  # the one point of padding that is always there
+    assert layout.num_slots - spare <= (1 + MAX_PADDING) * problem.num_observations
+
+
+@pytest.mark.parametrize("longest", [300, 900])
+def test_long_tails_need_few_buckets(longest):
+    """Every bucket costs compilation: a smooth distribution of lengths up to hundreds needs a dozen or two."""
+    lengths = np.clip((np.random.default_rng(0).pareto(1.2, 4000) * 2 + 2).astype(int), 2, longest)
+    layout = build_layout(problem_of(lengths, longest, seed=1), pairs=False)
+    assert len(layout.buckets) <= 25
+    assert layout.num_slots <= (1 + MAX_PADDING) * lengths.sum() + layout.buckets[0][0]
+
+
+def test_the_order_of_the_observations_does_not_matter():
+    problem = support.tiny()
+    order = np.random.default_rng(0).permutation(problem.num_observations)
+    shuffled = BundleProblem.create(
+        problem.cameras,
+        problem.points,
+        problem.observations[order],
+        problem.camera_index[order],
+        problem.point_index[order],
+    )
+    one, other = build_layout(problem), build_layout(shuffled)
+    assert one.buckets == other.buckets
+    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
+
+
+def test_one_observation_is_enough():
+    problem = support.single()
+    layout = build_layout(problem)
+    assert rows_of(layout) == rows_of_problem(problem)
+    assert blocks_by_layout(layout, np.arange(layout.num_slots) + 1.0).shape == (1, 1)
+
+
+# Sums
+
+
+def sum_by_levels(rows: np.ndarray, levels) -> np.ndarray:
+    for level in levels:
+        rows = rows[np.asarray(level)].sum(axis=1)
+    return rows
+
+
+sizes = st.one_of(st.just(0), st.integers(0, 12), st.integers(60, 70), st.integers(0, 1500))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(sizes, min_size=1, max_size=12), st.sampled_from([1, 2, 3, 8, 64]), st.integers(0, 10**6))
+def test_a_sum_tree_sums_every_target_once(counts, width, seed):
+    counts = np.array(counts)
+    rng = np.random.default_rng(seed)
+    items = rng.permutation(counts.sum() + 3)[: counts.sum()]
+    empty = int(counts.sum()) + 3
+    rows = np.append(rng.integers(-1000, 1000, counts.sum() + 3), 0)
+    expected = np.zeros(len(counts), int)
+    np.add.at(expected, np.repeat(np.arange(len(counts)), counts), rows[items])
+    levels = sum_tree(items, counts, empty, width)
+    assert np.array_equal(sum_by_levels(rows, levels), expected)
+    assert levels[0].shape[1] <= width
+    assert all(level.shape[1] <= max(TREE_WIDTH, 1) for level in levels[1:])
+    assert all(level.dtype == np.int32 for level in levels)
+
+
+@pytest.mark.parametrize("make", [support.tiny, support.odd], ids=["tiny", "odd"])
+def test_point_and_camera_sums_equal_add_at(make):
+    problem = make()
+    layout = build_layout(problem)
+    rng = np.random.default_rng(0)
+    values = np.where(layout.slot_mask, rng.normal(size=(4, layout.num_slots)), 0)
+    column = np.zeros((4, layout.num_points))
+    np.add.at(column.T, layout.slot_point, values.T)
+    np.testing.assert_allclose(point_sum(layout, jnp.asarray(values)), column, rtol=1e-12, atol=1e-13)
+    camera = np.zeros((problem.num_cameras, 4))
+    np.add.at(camera, layout.slot_camera, values.T)
+    np.testing.assert_allclose(tree_sum(jnp.asarray(values.T), layout.camera_levels), camera, rtol=1e-12, atol=1e-13)
+
+
+def test_a_camera_with_thousands_of_observations_is_summed_in_chunks():
+    layout = build_layout(problem_of(np.full(5000, 2), 3, seed=2), pairs=False)
+    assert layout.camera_levels[0].shape[1] == CAMERA_CHUNK
+    values = np.where(layout.slot_mask, 1, 0)
+    assert sum_by_levels(values, layout.camera_levels).sum() == 10000
+
+
+# Pairs
+
+
+def blocks_by_layout(layout: Layout, weights: np.ndarray) -> np.ndarray:
+    """Sum over the listed pairs of the product of their slots' weights, per block of the lower triangle."""
+    pairs = layout.pairs
+    weights = np.where(layout.slot_mask, weights, 0)
+    chunks = (weights[pairs.left] * weights[pairs.right]).sum(axis=-1).ravel()
+    return sum_by_levels(chunks, pairs.levels)[np.asarray(pairs.table)]
+
+
+def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.ndarray) -> np.ndarray:
+    """Products of all ordered pairs of observations of one point, kept where row camera >= column camera."""
+    found = np.zeros((problem.num_cameras, problem.num_cameras))
+    slots = np.flatnonzero(layout.slot_mask)
+    camera, point = layout.slot_camera[slots], layout.slot_point[slots]
+    for a in range(len(slots)):
+        for b in np.flatnonzero(point == point[a]):
+            if camera[a] >= camera[b]:
+                found[camera[a], camera[b]] += weights[slots[a]] * weights[slots[b]]
+    return found
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 12), st.integers(1, 25), st.integers(0, 6))
+def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates):
+    """Random whole numbers as weights: a pair that is missing, doubled or in the wrong block changes a sum."""
+    rng = np.random.default_rng(seed)
+    tracks = np.append(1, rng.integers(0, cameras + 1, points))
+    problem = problem_of(tracks, cameras, seed, duplicates)
+    layout = build_layout(problem)
+    weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
+    assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))
+
+
+def test_the_number_of_pairs_is_that_of_the_track_lengths():
+    problem = support.tiny()
+    layout = build_layout(problem)
+    tracks = np.bincount(problem.point_index)
+    listed = np.asarray(layout.slot_mask)[layout.pairs.left] & np.asarray(layout.slot_mask)[layout.pairs.right]
+    assert listed.sum() == (tracks * (tracks + 1) // 2).sum()
+
+
+def test_diagonal_blocks_know_their_camera_and_the_others_know_they_have_none():
+    problem = support.odd()
+    pairs = build_layout(problem).pairs
+    cameras = problem.num_cameras
+    assert np.array_equal(np.asarray(pairs.block_camera)[np.diagonal(pairs.table)], np.arange(cameras))
+    row, column = np.tril_indices(cameras, -1)
+    assert (np.asarray(pairs.block_camera)[np.asarray(pairs.table)[row, column]] == cameras).all()
+
+
+def test_pairs_are_listed_only_on_demand():
+    assert build_layout(support.tiny(), pairs=False).pairs is None

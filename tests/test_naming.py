@@ -1,0 +1,81 @@
+"""Solver names: what is written can be read, and what cannot be read is said in one line."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxba import POLICIES
+from jaxba.damping import UnknownPolicyError
+from jaxba.naming import DTYPES, SolverName, SolverNameError, parse_solver
+
+names = st.builds(
+    SolverName,
+    policy=st.one_of(
+        st.sampled_from(sorted(POLICIES)),
+        st.floats(1e-300, 1e300).map(lambda x: f"constant:{x!r}"),
+        st.floats(1e-20, 1e30).map(lambda x: f"ceres:{x:g}"),
+        st.floats(1e-9, 1e9).map(lambda x: f"classic:{x:e}"),
+    ),
+    refine_points=st.integers(0, 99),
+    dtype=st.sampled_from(DTYPES),
+)
+
+
+@given(names)
+def test_a_name_reads_back_as_itself(name):
+    assert parse_solver(str(name)) == name
+    assert parse_solver(f"  lm+{name} ") == name
+    assert str(parse_solver(str(name))) == str(name)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "shortest"),
+    [
+        ("ceres", SolverName("ceres"), "ceres"),
+        ("lm+ceres", SolverName("ceres"), "ceres"),
+        ("ceres+refine3", SolverName("ceres", 3), "ceres+refine3"),
+        ("ceres+refine0", SolverName("ceres", 0), "ceres"),
+        ("lm+classic:0.03+refine12@float32", SolverName("classic:0.03", 12, "float32"), None),
+        ("ceres@float64", SolverName("ceres"), "ceres"),
+        ("constant:1e-4", SolverName("constant:1e-4"), None),
+        ("constant:1e+2", SolverName("constant:1e+2"), None),
+        ("lm+constant:1.5E+2+refine1", SolverName("constant:1.5E+2", 1), "constant:1.5E+2+refine1"),
+        ("gauss-newton", SolverName("gauss-newton"), "gauss-newton"),
+    ],
+)
+def test_names_of_the_contract(text, name, shortest):
+    assert parse_solver(text) == name
+    assert str(name) == (shortest or text.removeprefix("lm+"))
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("", SolverNameError),
+        ("   ", SolverNameError),
+        ("+ceres", SolverNameError),
+        ("ceres+", SolverNameError),
+        ("ceres+refine", SolverNameError),
+        ("ceres+refine-1", SolverNameError),
+        ("ceres+refine3+refine4", SolverNameError),
+        ("refine3", UnknownPolicyError),
+        ("+refine3", SolverNameError),
+        ("gn+ceres", SolverNameError),
+        ("lm+lm+ceres", SolverNameError),
+        ("ceres@", SolverNameError),
+        ("ceres@float16", SolverNameError),
+        ("ceres@float32@float64", SolverNameError),
+        ("@float32", SolverNameError),
+        ("cerse", UnknownPolicyError),
+        ("constant:zero", UnknownPolicyError),
+        ("schedule:1", UnknownPolicyError),
+        ("ce\nres", UnknownPolicyError),
+    ],
+)
+def test_what_is_no_name_is_one_clear_line(text, error):
+    with pytest.raises(error) as caught:
+        parse_solver(text)
+    assert str(caught.value)
+    assert "\n" not in str(caught.value)

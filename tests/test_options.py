@@ -1,0 +1,52 @@
+"""Step options: constants that select a program, checked when they are made."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from jaxba import Loss, StepOptions
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"linear_solver": "dense"}, "linear_solver must be one of explicit"),
+        ({"linear_solver": "auto"}, "linear_solver must be one of explicit"),
+        ({"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
+        ({"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),
+        ({"refine_points": -1}, "refine_points must not be negative"),
+        ({"cg_max_iterations": 0}, "cg_max_iterations must be at least 1"),
+    ],
+)
+def test_an_option_that_makes_no_sense_is_one_clear_line(change, message, unchecked):
+    with pytest.raises(ValueError, match=message) as caught:
+        StepOptions(**change)
+    assert "\n" not in str(caught.value)
+
+
+def test_equal_options_are_one_key_and_different_ones_are_not():
+    assert StepOptions() == StepOptions()
+    assert hash(StepOptions(loss=Loss("huber", 2.0))) == hash(StepOptions(loss=Loss("huber", 2.0)))
+    different = {
+        StepOptions(),
+        StepOptions(linear_solver="implicit"),
+        StepOptions(scaling="identity"),
+        StepOptions(rotation="manifold"),
+        StepOptions(refine_points=1),
+        StepOptions(loss=Loss("huber")),
+        StepOptions(cg_forcing=0.5),
+    }
+    assert len(different) == 7
+
+
+def test_options_cannot_change_under_a_compiled_program():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        StepOptions().scaling = "identity"  # type: ignore[misc]
+
+
+def test_the_defaults_are_those_of_ceres():
+    options = StepOptions()
+    assert (options.scaling, options.rotation, options.refine_points) == ("diagonal", "angle-axis", 0)
+    assert (options.cg_forcing, options.cg_max_iterations, options.loss.name) == (0.1, 500, "squared")

@@ -1,0 +1,119 @@
+"""The package from outside: its names, its documentation, and what importing it does."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import itertools
+import os
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxba
+from jaxba.damping import registry
+
+
+@pytest.mark.parametrize("name", jaxba.__all__)
+def test_every_public_name_exists_and_is_documented(name):
+    found = getattr(jaxba, name)
+    if isinstance(found, dict):  # a constant: the text below its assignment
+        assert name in documented_constants(registry)
+        return
+    text = inspect.getdoc(found)
+    assert text
+    assert not text.startswith(f"{name}("), "only the text that dataclasses and named tuples make up"
+    if inspect.isclass(found):
+        for member, value in vars(found).items():
+            if inspect.isfunction(value) and not member.startswith("_") and value.__module__.startswith("jaxba"):
+                assert inspect.getdoc(value), f"{name}.{member}"
+
+
+def documented_constants(module) -> set[str]:
+    body = ast.parse(inspect.getsource(module)).body
+    pairs = itertools.pairwise(body)
+    return {
+        target.id
+        for statement, after in pairs
+        if isinstance(statement, ast.Assign | ast.AnnAssign)
+        and isinstance(after, ast.Expr)
+        and isinstance(after.value, ast.Constant)
+        for target in (statement.targets if isinstance(statement, ast.Assign) else [statement.target])
+        if isinstance(target, ast.Name)
+    }
+
+
+def test_the_public_list_is_sorted_and_has_no_name_twice():
+    assert len(set(jaxba.__all__)) == len(jaxba.__all__)
+    upper = [name for name in jaxba.__all__ if name.isupper()]
+    classes = [name for name in jaxba.__all__ if name[0].isupper() and not name.isupper()]
+    functions = [name for name in jaxba.__all__ if name[0].islower()]
+    assert jaxba.__all__ == sorted(upper) + sorted(classes) + sorted(functions)
+
+
+@pytest.mark.parametrize("module", [m.name for m in pkgutil.walk_packages(jaxba.__path__, "jaxba.")])
+def test_every_module_can_be_imported_and_says_what_it_is_for(module):
+    assert inspect.getdoc(importlib.import_module(module))
+
+
+def test_the_version_is_that_of_the_installed_package():
+    from importlib.metadata import version
+
+    assert version("jaxba") == jaxba.__version__
+
+
+def in_a_new_process(code: str, **environment: str) -> subprocess.CompletedProcess:
+    root = Path(jaxba.__file__).resolve().parent.parent
+    path = os.pathsep.join([str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
+    env = {**os.environ, "PYTHONPATH": path, **environment}
+    command = [sys.executable, "-W", "error::DeprecationWarning:jaxba", "-c", code]
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
+
+
+def test_importing_starts_no_backend_and_does_not_switch_to_64_bits():
+    """A platform that does not exist is noticed only when a backend is started."""
+    code = (
+        "import jaxba, jaxba.solve, jaxba.cli.solve, jaxba.cli.bench, jax\n"
+        "assert not jax.config.jax_enable_x64\n"
+        "try:\n"
+        "    jax.devices()\n"
+        "except RuntimeError:\n"
+        "    print('only now')\n"
+    )
+    done = in_a_new_process(code, JAX_PLATFORMS="none_such", JAX_ENABLE_X64="0")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "only now\n"
+    assert done.stderr == ""
+
+
+def test_solving_in_float64_leaves_the_rest_of_the_process_in_32_bits():
+    code = (
+        "import jax, jax.numpy as jnp, numpy as np, jaxba\n"
+        "problem = jaxba.random_scene(jaxba.like('paper'), 0)\n"
+        "solution = jaxba.solve(problem, max_iterations=1)\n"
+        "assert not jax.config.jax_enable_x64\n"
+        "assert jnp.asarray(1.0).dtype == jnp.float32\n"
+        "assert solution.problem.cameras.dtype == np.float64\n"
+        "assert solution.history.cost.dtype == np.float64\n"
+    )
+    done = in_a_new_process(code, JAX_ENABLE_X64="0", JAX_PLATFORMS="cpu")
+    assert done.returncode == 0, done.stderr
+
+
+def test_help_starts_no_backend():
+    """`--help` should come at once."""
+    code = (
+        "import sys, jaxba.cli.solve\n"
+        "try:\n"
+        "    jaxba.cli.solve.run(['--help'])\n"
+        "except SystemExit as end:\n"
+        "    assert not end.code\n"
+    )
+    done = in_a_new_process(code, JAX_PLATFORMS="none_such")
+    assert done.returncode == 0, done.stderr
+    assert "--damping" in done.stdout
+    assert "--refine-points" in done.stdout

@@ -1,0 +1,130 @@
+"""Embedded point iterations: every point by itself, never worse than before, and at the end where SciPy ends.
+
+A step with a lambda of 1e30 moves no camera and no point by itself, so that all that it does is the refinement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import support
+from scipy.optimize import least_squares
+from support import published_loss, same_bits, start, step
+
+from jaxba import BundleProblem, Loss, StepOptions, geometry
+
+STILL = 1e30
+"""A lambda under which the linear solve moves nothing."""
+
+TO_THE_END = 60
+
+
+def thrown(seed: int, size: float) -> BundleProblem:
+    """`tiny` with points far from where they belong; the shape stays, so the program does too."""
+    problem = support.tiny()
+    noise = np.random.default_rng(seed).normal(size=problem.points.shape)
+    return problem.replace(points=problem.points + size * noise)
+
+
+def refined(problem: BundleProblem, iterations: int, loss: Loss | None = None):
+    """The problem after refinement alone, and the record of it."""
+    options = StepOptions(refine_points=iterations, loss=loss or Loss())
+    layout, before = start(problem, options)
+    after, info = step(layout, before, STILL, options)
+    return support.back(problem, before, after), info
+
+
+def point_costs(problem: BundleProblem, loss: Loss) -> np.ndarray:
+    """Cost of each point's observations."""
+    squared = np.sum(geometry.residuals(problem) ** 2, axis=1)
+    values = 0.5 * published_loss(loss.name, loss.scale, squared)[0]
+    return np.bincount(problem.point_index, values, minlength=problem.num_points)
+
+
+@pytest.mark.parametrize("loss", [Loss(), Loss("huber", 2.0)], ids=["squared", "huber"])
+@pytest.mark.parametrize(("seed", "size"), [(0, 0.0), (1, 0.3), (2, 1.0), (3, 3.0), (4, 10.0)])
+def test_no_point_gets_worse_and_the_total_is_their_sum(seed, size, loss):
+    problem = thrown(seed, size)
+    before = point_costs(problem, loss)
+    after, info = refined(problem, 3, loss)
+    assert info.accepted
+    assert (point_costs(after, loss) <= before * (1 + 1e-12) + 1e-12).all()
+    np.testing.assert_allclose(info.cost, point_costs(after, loss).sum(), rtol=1e-10)
+    assert info.cost <= info.previous_cost
+
+
+def test_more_iterations_never_cost_more():
+    for seed, size in ((0, 0.1), (1, 2.0)):
+        problem = thrown(seed, size)
+        costs = [float(refined(problem, k)[1].cost) for k in (1, 3, TO_THE_END)]
+        assert costs[0] >= costs[1] >= costs[2]
+        assert geometry.cost(problem) >= costs[0]
+
+
+def test_cameras_are_not_touched():
+    after, _ = refined(thrown(0, 0.3), 3)
+    # the step itself is below 1e-25; it only shows where a number is exactly zero, such as k2
+    np.testing.assert_allclose(after.cameras, support.tiny().cameras, rtol=0, atol=1e-25)
+
+
+@pytest.mark.parametrize("loss", [Loss(), Loss("huber", 2.0)], ids=["squared", "huber"])
+def test_every_point_ends_where_scipy_ends_on_that_point_alone(loss):
+    problem = thrown(5, 0.05)
+    found, _ = refined(problem, TO_THE_END, loss)
+    rotations = geometry.rotation_matrices(problem.cameras[:, :3])
+    for point in range(problem.num_points):
+        own = problem.point_index == point
+        cameras, seen = problem.camera_index[own], problem.observations[own]
+
+        def residuals(x: np.ndarray, cameras=cameras, seen=seen) -> np.ndarray:
+            local = rotations[cameras] @ x + problem.cameras[cameras, 3:6]
+            r = geometry.distort(local[:, :2] / -local[:, 2:], problem.cameras[cameras, 6:]) - seen
+            if loss.trivial:
+                return r.ravel()
+            squared = np.sum(r**2, axis=1)
+            # the same direction with the length sqrt(rho), so that the sum of squares is the sum of rho
+            return (r * np.sqrt(published_loss(loss.name, loss.scale, squared)[0] / squared)[:, None]).ravel()
+
+        best = least_squares(residuals, problem.points[point], method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        np.testing.assert_allclose(found.points[point], best.x, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(point_costs(found, loss)[point], best.cost, rtol=1e-9)
+
+
+@pytest.mark.parametrize("damping", [1e-12, 1e-6, 1e-2, 1.0])
+def test_refinement_never_makes_the_candidate_of_a_step_worse(damping):
+    for seed, size in ((0, 0.0), (1, 0.3), (2, 2.0)):
+        layout, before = start(thrown(seed, size))
+        plain = step(layout, before, damping, StepOptions())[1]
+        with_points = step(layout, before, damping, StepOptions(refine_points=3))[1]
+        assert not with_points.candidate_cost > plain.candidate_cost
+        np.testing.assert_allclose(with_points.predicted, plain.predicted, rtol=1e-12)
+
+
+def test_a_bold_step_that_fails_alone_is_saved_by_its_points():
+    """Points thrown far, next to no damping: the plain step must be rejected, the refined one is taken."""
+    problem = thrown(0, 2.0)
+    layout, before = start(problem)
+    after, plain = step(layout, before, 1e-8, StepOptions())
+    assert not plain.accepted
+    assert same_bits(after, before)
+    _, info = step(layout, before, 1e-8, StepOptions(refine_points=3))
+    assert info.accepted
+    assert info.cost < 0.1 * plain.previous_cost
+
+
+def test_points_whose_rays_are_parallel_stay_finite():
+    """Two cameras at one place leave the depth of their points open."""
+    rng = np.random.default_rng(0)
+    camera = [0.1, 0.2, -0.1, 0.3, 0.1, -5.0, 700.0, 0.0, 0.0]
+    points = rng.normal(size=(6, 3))
+    problem = BundleProblem.create(
+        [camera, camera], points, rng.normal(scale=80, size=(12, 2)), np.tile([0, 1], 6), np.repeat(np.arange(6), 2)
+    )
+    options = replace(StepOptions(), refine_points=3)
+    layout, before = start(problem, options)
+    for damping in (STILL, 1e-2, 1e-8, 1e-16):
+        after, info = step(layout, before, damping, options)
+        assert all(np.isfinite(leaf).all() for leaf in after)
+        assert info.cost <= info.previous_cost

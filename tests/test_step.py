@@ -1,0 +1,268 @@
+"""One Levenberg-Marquardt step against dense float64 algebra, and what happens to steps that must be rejected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import support
+from support import MINIATURES, bal_file, needs_data, same_bits, start, step
+
+from jaxba import BundleProblem, Loss, StepOptions, lm_step, read_bal
+
+DAMPINGS = (1e-8, 1e-4, 1e-2, 1.0, 100.0)
+EXACT = StepOptions()
+TO_THE_END = StepOptions(linear_solver="implicit", cg_forcing=0.0, cg_tolerance=1e-14, cg_max_iterations=5000)
+"""Conjugate gradients until nothing changes any more."""
+
+KINDS = {
+    f"{solver}-{rotation}-{scaling}": replace(options, rotation=rotation, scaling=scaling)
+    for solver, options in (("explicit", EXACT), ("implicit", TO_THE_END))
+    for rotation in ("angle-axis", "manifold")
+    for scaling in ("diagonal", "identity")
+}
+SOLVERS = {
+    "sparse": replace(TO_THE_END, linear_solver="sparse"),
+    "implicit-jacobi": replace(TO_THE_END, preconditioner="jacobi"),
+    "implicit-power-series": replace(TO_THE_END, preconditioner="power-series"),
+}
+LOSSES = {name: replace(EXACT, loss=Loss(name, 1.7)) for name in ("huber", "soft_l1", "cauchy", "tukey")}
+PROBLEMS = {
+    "paper-0": lambda: support.paper(0),
+    "paper-1": lambda: support.paper(1),
+    "paper-2": lambda: support.paper(2),
+    "odd": support.odd,
+    "single": support.single,
+}
+CASES = [
+    *(pytest.param(support.tiny, options, id=f"tiny-{kind}") for kind, options in KINDS.items()),
+    *(pytest.param(support.tiny, options, id=f"tiny-{solver}") for solver, options in SOLVERS.items()),
+    *(pytest.param(support.tiny, options, id=f"tiny-{loss}") for loss, options in LOSSES.items()),
+    *(pytest.param(make, EXACT, id=name) for name, make in PROBLEMS.items()),
+    pytest.param(support.odd, TO_THE_END, id="odd-implicit"),
+    pytest.param(support.odd, SOLVERS["sparse"], id="odd-sparse"),
+    pytest.param(support.whitened, EXACT, id="whitened"),
+    pytest.param(support.whitened, replace(TO_THE_END, loss=Loss("cauchy", 0.8)), id="whitened-implicit-cauchy"),
+    *(
+        pytest.param(lambda name=name: read_bal(bal_file(name)), options, id=f"{name}-{kind}", marks=needs_data)
+        for name in MINIATURES
+        for kind, options in (("explicit", EXACT), ("implicit", TO_THE_END))
+        if kind == "explicit" or name == "dubrovnik-3-7-18-pre"
+    ),
+]
+
+
+def check_step(problem: BundleProblem, options: StepOptions, damping: float) -> None:
+    """Everything that a step says and does, against the dense solution of the damped normal equations.
+
+    Parameters are compared in the norm of the damped Hessian. With seven gauge freedoms its condition number is
+    about 1 / lambda under diagonal scaling and 1e15 for the smallest lambda under identity scaling, so that
+    float64 does not define the gauge part of the step to 1e-8 in any other norm; in this one it always does.
+    Where the condition number allows it, every kind of parameter and the cost behind the step are
+    compared too.
+    """
+    layout, before = start(problem, options)
+    after, info = step(layout, before, damping, options)
+    truth = support.dense(problem, options, damping)
+    cost = support.cost(problem, options)
+    well_conditioned = damping >= 1e-4 and options.scaling == "diagonal"
+
+    np.testing.assert_allclose(before.cost, cost, rtol=1e-12)
+    np.testing.assert_allclose(info.previous_cost, cost, rtol=1e-12)
+    np.testing.assert_allclose(info.predicted, truth.predicted, rtol=1e-8)
+    np.testing.assert_allclose(info.gradient_max, np.max(np.abs(truth.gradient)), rtol=1e-10)
+    np.testing.assert_allclose(info.gain_ratio, (cost - info.candidate_cost) / truth.predicted, rtol=1e-7)
+    assert bool(info.accepted) == (info.candidate_cost < cost)
+    assert float(info.damping) == damping
+    if well_conditioned:
+        there = support.cost(support.moved(problem, options, truth.step), options)
+        np.testing.assert_allclose(info.candidate_cost, there, rtol=1e-8, atol=1e-10 * cost)
+        np.testing.assert_allclose(info.step_norm, np.linalg.norm(truth.step), rtol=1e-8)
+    if not info.accepted:
+        assert same_bits(after, before)
+        return
+    end = support.back(problem, before, after)
+    np.testing.assert_allclose(after.cost, support.cost(end, options), rtol=1e-9, atol=1e-12 * cost)
+    found = support.difference(problem, end, options)
+    assert truth.norm(found - truth.step) <= 1e-8 * truth.norm(truth.step)
+    if well_conditioned:
+        size = problem.cameras.size
+        cameras, expected = found[:size].reshape(-1, 9), truth.step[:size].reshape(-1, 9)
+        for part in (slice(0, 3), slice(3, 6), 6, 7, 8):
+            assert np.linalg.norm((cameras - expected)[:, part]) <= 1e-8 * np.linalg.norm(expected[:, part])
+        assert np.linalg.norm(found[size:] - truth.step[size:]) <= 1e-8 * np.linalg.norm(truth.step[size:])
+
+
+@pytest.mark.parametrize("damping", DAMPINGS)
+@pytest.mark.parametrize(("make", "options"), CASES)
+def test_schur_step_equals_dense_normal_equation_step(make, options, damping):
+    check_step(make(), options, damping)
+
+
+@pytest.mark.parametrize("damping", [1.0, 100.0])
+def test_a_long_power_series_ends_at_the_dense_step(damping):
+    """It converges for every lambda, the slower the smaller it is."""
+    check_step(support.tiny(), StepOptions(linear_solver="power", power_order=300), damping)
+
+
+# Many problems at once
+
+
+@pytest.fixture(scope="module")
+def sixty_four():
+    """Scenes of one shape, stacked: layouts, states, and a lambda for each."""
+    pairs = [start(support.paper(seed)) for seed in range(64)]
+    dampings = jnp.asarray(10.0 ** np.linspace(-4, 1, 64))
+    return pairs, jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs), dampings
+
+
+def test_a_batch_of_steps_equals_a_loop_of_steps(sixty_four):
+    pairs, (layouts, states), dampings = sixty_four
+    batched = jax.jit(jax.vmap(lambda layout, state, damping: lm_step(layout, state, damping, EXACT)))
+    together = batched(layouts, states, dampings)
+    apart = [step(layout, state, damping, EXACT) for (layout, state), damping in zip(pairs, dampings, strict=True)]
+    apart = jax.tree.map(lambda *leaves: np.stack(leaves), *apart)
+    assert 0 < np.sum(together[1].accepted) <= 64
+    np.testing.assert_array_equal(together[1].accepted, apart[1].accepted)
+    for one, other in zip(together[0], apart[0], strict=True):
+        size = np.abs(other).max(axis=tuple(range(1, other.ndim)), keepdims=True)
+        assert (np.abs(one - other) <= 1e-10 * size).all()
+    for name in ("cost", "candidate_cost", "predicted", "gradient_max", "step_norm", "parameter_norm"):
+        np.testing.assert_allclose(getattr(together[1], name), getattr(apart[1], name), rtol=1e-10, err_msg=name)
+
+
+# Compilation
+
+
+def test_the_step_is_traced_once_for_all_dampings_states_and_thresholds():
+    traces = []
+
+    @jax.jit
+    def counted(layout, state, damping, min_gain):
+        traces.append(1)
+        return lm_step(layout, state, damping, EXACT, min_gain)
+
+    for seed in range(3):
+        layout, state = start(support.paper(seed))
+        for damping in (1e-6, jnp.asarray(1e-2), 3.0):
+            state, _ = counted(layout, state, damping, 0.0)
+            state, _ = counted(layout, state, jnp.asarray(damping), jnp.asarray(0.25))
+    # a Python float is weakly typed, an array is not: two signatures of one program
+    assert len(traces) <= 4
+
+
+def test_shapes_depend_on_sizes_alone_for_scenes_where_all_is_visible():
+    shapes = lambda seed: [(x.shape, x.dtype) for x in jax.tree.leaves(start(support.paper(seed)))]
+    assert shapes(0) == shapes(1) == shapes(17)
+
+
+# Acceptance
+
+
+@pytest.mark.parametrize("damping", [np.nan, np.inf, -np.inf, -2.0])
+@pytest.mark.parametrize("options", [EXACT, replace(EXACT, linear_solver="implicit")], ids=["explicit", "implicit"])
+def test_a_damping_without_meaning_is_a_rejected_step_that_changes_no_bit(options, damping):
+    layout, before = start(support.tiny(), options)
+    after, info = step(layout, before, damping, options)
+    assert not info.accepted
+    assert same_bits(after, before)
+    assert info.cost == before.cost == info.previous_cost
+
+
+@pytest.mark.parametrize("damping", [0.0, 1e-300, 1e-18, 1e-14, 1e-10, 1e-6, 1e-2, 1e2, 1e6, 1e20, 1e300])
+def test_no_damping_lets_the_cost_rise_or_a_nan_in(damping):
+    """At zero the seven gauge freedoms leave the system singular: whatever the factorisation makes of it."""
+    for problem in (support.tiny(), support.odd(), support.single(), support.whitened()):
+        layout, before = start(problem)
+        after, info = step(layout, before, damping, EXACT)
+        assert all(np.isfinite(leaf).all() for leaf in after)
+        if info.accepted:
+            assert after.cost < before.cost
+            assert info.cost == after.cost == info.candidate_cost
+        else:
+            assert same_bits(after, before)
+
+
+@pytest.mark.parametrize("refine_points", [0, 3])
+def test_a_candidate_that_overflows_is_a_rejected_step(refine_points):
+    """A pixel at 1e150 asks for steps of that size, and the distortion raises them to the fifth power."""
+    problem = BundleProblem.create([[0, 0, 0, 0, 0, 0, 1.0, 0.0, 1.0]], [[0.1, 0, -1]], [[1e150, 0]], [0], [0])
+    options = replace(EXACT, refine_points=refine_points)
+    layout, before = start(problem, options)
+    assert np.isfinite(before.cost)
+    after, info = step(layout, before, 1e-4, options)
+    assert not np.isfinite(info.candidate_cost)
+    assert not info.accepted
+    assert same_bits(after, before)
+
+
+def test_a_start_that_is_not_finite_stays_as_it_is():
+    """A point on its camera's plane."""
+    problem = support.single()
+    on_plane = problem.replace(cameras=np.array([[0, 0, 0, 0, 0, 0, 500.0, 0, 0]]), points=np.array([[1.0, 2.0, 0.0]]))
+    layout, before = start(on_plane)
+    assert not np.isfinite(before.cost)
+    after, info = step(layout, before, 1e-4, EXACT)
+    assert not info.accepted
+    assert same_bits(after, before)
+
+
+def test_a_step_is_taken_only_if_its_gain_exceeds_the_threshold():
+    layout, before = start(support.tiny())
+    _, info = step(layout, before, 1e-2, EXACT, 0.0)
+    gain = float(info.gain_ratio)
+    assert 0.5 < gain < 2
+    for threshold, expected in ((gain * (1 - 1e-9), True), (gain, False), (gain * (1 + 1e-9), False), (np.nan, False)):
+        after, info = step(layout, before, 1e-2, EXACT, threshold)
+        assert bool(info.accepted) == expected
+        assert same_bits(after, before) != expected
+
+
+def test_a_step_that_does_not_lower_the_cost_is_rejected_whatever_the_threshold():
+    """Next to no damping far from the minimum: the model promises much and the cost rises."""
+    problem = support.tiny()
+    rng = np.random.default_rng(0)
+    thrown = problem.replace(points=problem.points + 3.0 * rng.normal(size=problem.points.shape))
+    layout, before = start(thrown)
+    _, info = step(layout, before, 1e-8, EXACT, 0.0)
+    assert info.candidate_cost > info.previous_cost
+    for threshold in (0.0, -np.inf):
+        after, info = step(layout, before, 1e-8, EXACT, threshold)
+        assert not info.accepted
+        assert same_bits(after, before)
+
+
+# Properties of the step
+
+
+def test_cameras_and_points_that_nobody_observes_do_not_move():
+    problem = support.odd()
+    layout, before = start(problem)
+    after, info = step(layout, before, 1e-2, EXACT)
+    assert info.accepted
+    assert np.asarray(after.cameras)[:, 6].tobytes() == np.asarray(before.cameras)[:, 6].tobytes()
+    assert np.asarray(before.points).shape == np.asarray(after.points).shape
+
+
+@pytest.mark.parametrize("name", ["explicit", "implicit"])
+def test_float32_steps_agree_with_float64_to_single_precision(name):
+    options = replace(EXACT if name == "explicit" else TO_THE_END, cg_tolerance=1e-6, cg_max_iterations=200)
+    layout, before = start(support.tiny(), options)
+    after, info = step(layout, before, 1e-2, options)
+    with jax.enable_x64(False):
+        layout32, before32 = start(support.tiny(), options, "float32")
+        after32, info32 = step(layout32, before32, 1e-2, options)
+    assert after32.cost.dtype == after32.cameras.dtype == after32.points.dtype == jnp.float32
+    np.testing.assert_allclose(info32.previous_cost, info.previous_cost, rtol=1e-5)
+    np.testing.assert_allclose(info32.predicted, info.predicted, rtol=1e-3)
+    np.testing.assert_allclose(after32.cost, after.cost, rtol=1e-3)
+    assert info32.accepted
+
+
+def test_the_explicit_solver_refuses_a_layout_without_pairs():
+    layout, state = start(support.tiny(), replace(EXACT, linear_solver="implicit"))
+    with pytest.raises(ValueError, match="pairs=True"):
+        step(layout, state, 1e-2, EXACT)
