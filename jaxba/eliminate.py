@@ -22,7 +22,7 @@ from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
-from jaxba.sums import point_sum, take, take_rows, tree_sum
+from jaxba.sums import outer_sum, point_sum, take, take_rows, tree_sum
 
 
 class Coordinates(NamedTuple):
@@ -92,7 +92,7 @@ def camera_system(
         rows += [*linear.camera_jacobian[k], linear.residual[k], reduced]
     level, *levels = layout.camera_levels
     gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 11)
-    products = tree_sum(jnp.einsum("kla,klb->kab", gathered, gathered), tuple(levels))
+    products = tree_sum(outer_sum(gathered, gathered), tuple(levels))
     blocks, gradient, right = products[:, :9, :9], products[:, :9, 9], -products[:, :9, 10]
     rotation = jnp.einsum("cji,cjk,ckl->cil", coordinates.forward, blocks[:, :3, :3], coordinates.forward)
     diagonal = jnp.concatenate(

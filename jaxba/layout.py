@@ -23,17 +23,17 @@ from jaxba.problem import AnyArray, BundleProblem
 MAX_PADDING = 0.10
 """Largest share of slots that may be empty because track lengths share a bucket (design, section 3)."""
 
-CAMERA_CHUNK = 64
-"""Observations summed at once for a camera; 64 rows of 20 float64 values fill a third of a 32 KiB cache."""
+CAMERA_CHUNK = 8
+"""Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
 
 TREE_WIDTH = 8
 """Partial sums added at once on the higher levels of a tree."""
 
-PAIR_CHUNKS = (4, 8, 16, 32)
+PAIR_CHUNKS = (4, 8)
 """Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
 
-PAIR_BATCH = 1024
-"""Most chunks multiplied at once: bounds the gathered operands to a few MiB, which stay in cache."""
+PAIR_BATCH = 2048
+"""Most chunks multiplied at once: bounds the gathered operands to 7 MB, which stay in cache."""
 
 PAIR_ITEM_COST = 1.5
 """Cost of one partial 9 x 9 block, in pairs; decides between few long and many short chunks."""

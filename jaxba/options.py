@@ -52,8 +52,9 @@ class StepOptions:
     loss: Loss = field(default_factory=Loss)
     """Robust loss of the squared whitened residual."""
 
-    cg_forcing: float = 0.1
-    """Conjugate gradients stop when i (Q_i - Q_(i-1)) / Q_i falls below this. Source: Ceres eta."""
+    cg_forcing: float = 0.01
+    """Conjugate gradients stop when i (Q_i - Q_(i-1)) / Q_i falls below this. Source: the experiments of rootba and
+    Power Bundle Adjustment; Ceres' own default, 0.1, ended 1e-4 above the best cost on one real problem."""
 
     cg_tolerance: float = 0.0
     """... or when the residual is below this share of the right-hand side; 0 switches it off."""

@@ -22,7 +22,7 @@ from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_r
 from jaxba.layout import Layout, PairLayout
 from jaxba.linearize import Linearization
 from jaxba.options import StepOptions
-from jaxba.sums import take_rows, tree_sum
+from jaxba.sums import outer_sum, take_rows, tree_sum
 
 Vector = Float[Array, "cameras 9"]
 
@@ -60,7 +60,7 @@ def reduced_blocks(
 
     def multiply(sides: tuple[Array, Array]) -> Array:
         left, right = (take_rows(coupling, side).reshape(side.shape[0], -1, 9) for side in sides)
-        return jnp.einsum("kla,klb->kab", left, right)
+        return outer_sum(left, right)
 
     # one batch after the other, so that the gathered operands stay small
     chunks = lax.map(multiply, (pairs.left, pairs.right)).reshape(-1, 81)
@@ -126,7 +126,7 @@ def _preconditioner(
     if options.preconditioner == "schur-jacobi":
         level, *levels = layout.camera_levels
         gathered = take_rows(coupling_rows(linear, points), level).reshape(level.shape[0], -1, 9)
-        products = tree_sum(jnp.einsum("kla,klb->kab", gathered, gathered), tuple(levels))
+        products = tree_sum(outer_sum(gathered, gathered), tuple(levels))
         return _block_inverse(system.blocks - products)
     inverse = _block_inverse(system.blocks)
     if options.preconditioner == "jacobi":

@@ -184,13 +184,12 @@ def _with_suite(args: Arguments) -> Arguments:
             raise common.UsageError(f"--suite {args.suite}: unknown key {key!r}; known: {', '.join(kinds)}")
         if not isinstance(value, kinds[key]) or isinstance(value, bool):
             raise common.UsageError(f"--suite {args.suite}: {key} is {value!r}, not a {kinds[key][0].__name__}")
+        suite[key] = float(value) if key == "tolerance" else value
     problems = args.problems or tuple(
         place for entry in suite.get("problems", ()) for place in _expand(args, str(entry))
     )
     solvers = args.solvers or (",".join(map(str, suite["solvers"])) if "solvers" in suite else None)
     rest = {k: suite.get(k) for k in ("tolerance", "repeats", "max_iterations") if getattr(args, k) is None}
-    if isinstance(rest.get("tolerance"), int):
-        rest["tolerance"] = float(rest["tolerance"])
     return replace(args, problems=problems, solvers=solvers, **rest)
 
 
