@@ -13,7 +13,7 @@ import numpy as np
 from jaxba.options import LinearSolver
 from jaxba.problem import BundleProblem
 
-SECONDS_PER_PAIR = 9e-8
+SECONDS_PER_PAIR = 7e-8
 """Forming the blocks, per pair of observations of one point."""
 
 SECONDS_PER_BLOCK = 6e-8
