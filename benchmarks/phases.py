@@ -63,7 +63,7 @@ def main() -> None:
     problem = sources([args.problem])[0].read()
     options = StepOptions(linear_solver=args.solver)
     started = time.perf_counter()
-    arrays = build_layout(problem, pairs=options.forms_reduced_system)
+    arrays = build_layout(problem, pairs=options.forms_reduced_system, factor=options.factors_reduced_system)
     print(f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations")
     print(f"layout on the host {1e3 * (time.perf_counter() - started):.2f} ms; {arrays.num_slots} slots")
     layout = jax.device_put(arrays)
@@ -92,7 +92,7 @@ def main() -> None:
         if args.solver == "explicit":
             phase(
                 "factor",
-                lambda b, x: reduced.factor_and_solve(reduced.dense_system(layout, b), x),
+                lambda b, x: reduced.factor_blocks(layout, b, x),
                 blocks,
                 system.right,
             )

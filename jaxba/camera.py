@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
+from jaxba.barrier import materialized
 from jaxba.problem import AnyArray
 
 SMALL_ANGLE_SQUARED = 1e-6
@@ -33,8 +34,12 @@ class Frames(NamedTuple):
 
     def at(self, index: AnyArray) -> Frames:
         """The frames of the cameras in `index`, one column an entry."""
-        take = lambda x: x.at[..., index].get(mode="promise_in_bounds")
-        return Frames(*(take(field) for field in self))
+        rows = [*self.rotation.reshape(9, -1), *self.translation, self.focal, self.k1, self.k2]
+        # one gather a component, from a table that exists: see `materialized`
+        table = materialized(jnp.stack(rows))
+        at = [row.at[index].get(mode="promise_in_bounds") for row in table]
+        rotation = jnp.stack([jnp.stack(at[k : k + 3]) for k in (0, 3, 6)])
+        return Frames(rotation, jnp.stack(at[9:12]), *at[12:])
 
 
 class Projection(NamedTuple):

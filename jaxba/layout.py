@@ -18,55 +18,15 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxba.pairs import PairLayout, pair_layout
 from jaxba.problem import AnyArray, BundleProblem
+from jaxba.trees import sum_tree
 
 MAX_PADDING = 0.10
 """Largest share of slots that may be empty because track lengths share a bucket (design, section 3)."""
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
-
-TREE_WIDTH = 8
-"""Partial sums added at once on the higher levels of a tree."""
-
-PAIR_CHUNKS = (4, 8)
-"""Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
-
-PAIR_BATCH = 2048
-"""Most chunks multiplied at once: bounds the gathered operands to 7 MB, which stay in cache."""
-
-PAIR_ITEM_COST = 1.5
-"""Cost of one partial 9 x 9 block, in pairs; decides between few long and many short chunks."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class PairLayout:
-    """Which slots multiply into which block of the reduced camera system (lower triangle)."""
-
-    left: Int[AnyArray, "batches chunks width"]
-    """Slot of the block row's camera."""
-
-    right: Int[AnyArray, "batches chunks width"]
-    """Slot of the block column's camera, seen by the same point."""
-
-    levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Tree from chunks to blocks; the last block is always zero."""
-
-    block_camera: Int[AnyArray, " blocks"]
-    """Camera of a block on the diagonal; the number of cameras for the others."""
-
-    block_row: Int[AnyArray, " blocks"]
-    """Camera of a block's rows."""
-
-    block_column: Int[AnyArray, " blocks"]
-    """Camera of a block's columns."""
-
-    product_levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Tree to cameras from the products of blocks with their columns, then of mirrored blocks with their rows."""
-
-    table: Int[AnyArray, "cameras cameras"]
-    """Block number of (row, column) in the lower triangle; the zero block elsewhere."""
 
 
 @jax.tree_util.register_dataclass
@@ -118,13 +78,14 @@ class Layout:
         return self.camera_seen.shape[-1]
 
 
-def build_layout(problem: BundleProblem, *, pairs: bool = True) -> Layout:
+def build_layout(problem: BundleProblem, *, pairs: bool = True, factor: bool = True) -> Layout:
     """Sorts a problem's observations into slots.
 
     Args:
         problem: a checked problem; host arrays.
         pairs: whether to list the pairs that form the explicit reduced camera system. Their number is
             the sum of t (t + 1) / 2 over track lengths t.
+        factor: whether that system will be factored, which takes a table of its blocks, dense or banded.
 
     Returns:
         A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths.
@@ -184,39 +145,9 @@ def build_layout(problem: BundleProblem, *, pairs: bool = True) -> Layout:
         bucket_points=tuple(bucket_points),
         camera_levels=sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK),
         camera_seen=seen > 0,
-        pairs=_pair_layout(camera, slot, tracks, start, problem.num_cameras, empty) if pairs else None,
+        pairs=pair_layout(camera, slot, tracks, start, problem.num_cameras, empty, factor) if pairs else None,
         buckets=tuple((int(length), len(members)) for length, members in zip(lengths, bucket_points, strict=True)),
     )
-
-
-def sum_tree(items: np.ndarray, counts: np.ndarray, empty: int, width: int) -> tuple[np.ndarray, ...]:
-    """Index arrays that sum `items` into targets, `width` at a time, then `TREE_WIDTH` at a time.
-
-    Args:
-        items: row numbers, those of target 0 first, then those of target 1, ...
-        counts: number of items of each target; zero is allowed.
-        empty: a row that is known to be zero, for padding.
-        width: items summed at once on the first level.
-
-    Returns:
-        Arrays [targets, width]; level l + 1 indexes the sums of level l. Every level but the last ends with
-        an all-padding row; the last has exactly one row a target, in order.
-    """
-    levels = []
-    while True:
-        width = max(1, min(width, int(counts.max(initial=1))))
-        chunks = -(-counts // width)
-        last = bool((chunks <= 1).all())
-        rows = np.arange(len(counts)) if last else np.cumsum(chunks) - chunks
-        total = len(counts) if last else int(chunks.sum()) + 1
-        target = np.repeat(np.arange(len(counts)), counts)
-        rank = np.arange(len(items)) - np.repeat(np.cumsum(counts) - counts, counts)
-        level = np.full((total, width), empty, np.int32)
-        level[rows[target] + rank // width, rank % width] = items
-        levels.append(level)
-        if last:
-            return tuple(levels)
-        items, counts, empty, width = np.arange(total - 1), chunks, total - 1, TREE_WIDTH
 
 
 def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
@@ -243,56 +174,3 @@ def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
         if best[-1] - price * len(ends) <= (1 + MAX_PADDING) * total:
             return values[ends[::-1]]
         price /= 2
-
-
-def _pair_layout(
-    camera: np.ndarray, slot: np.ndarray, tracks: np.ndarray, start: np.ndarray, cameras: int, empty: int
-) -> PairLayout:
-    """Lists all pairs of observations of one point, sorted by the block they add to."""
-    lefts, rights = [], []
-    for length in np.unique(tracks[tracks > 0]):
-        first = start[np.flatnonzero(tracks == length)]
-        a, b = np.tril_indices(length)
-        lefts.append((first[:, None] + a).ravel())
-        rights.append((first[:, None] + b).ravel())
-    left, right = np.concatenate(lefts), np.concatenate(rights)
-    # a camera that sees a point twice: both orders add to the same diagonal block
-    twice = (camera[left] == camera[right]) & (left != right)
-    left, right = np.concatenate([left, right[twice]]), np.concatenate([right, left[twice]])
-    diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
-    block = camera[left].astype(np.int64) * cameras + camera[right]
-    order = np.argsort(block, kind="stable")
-    names = np.union1d(block, diagonal)
-    counts = np.bincount(np.searchsorted(names, block), minlength=len(names))
-    width = min(PAIR_CHUNKS, key=lambda w: int((-(-counts // w)).sum()) * (w + PAIR_ITEM_COST))
-    width = max(1, min(width, int(counts.max())))
-    chunks = -(-counts // width)
-    row = np.repeat(np.cumsum(chunks) - chunks, counts)
-    rank = np.arange(len(left)) - np.repeat(np.cumsum(counts) - counts, counts)
-    total = int(chunks.sum()) + 1  # at least one chunk is all padding
-    batches = -(-total // PAIR_BATCH)
-    batch = -(-total // batches)
-    padded = []
-    for side in (left, right):
-        array = np.full((batches * batch, width), empty, np.int32)
-        array[row + rank // width, rank % width] = slot[side[order]]
-        padded.append(array.reshape(batches, batch, width))
-    table = np.full(cameras * cameras, len(names), np.int32)
-    table[names] = np.arange(len(names))
-    block_camera = np.full(len(names) + 1, cameras, np.int32)
-    block_camera[np.searchsorted(names, diagonal)] = np.arange(cameras)
-    block_row, block_column = (np.append(part, 0).astype(np.int32) for part in np.divmod(names, cameras))
-    mirrored = np.flatnonzero(block_row[:-1] != block_column[:-1])
-    targets = np.concatenate([block_row[:-1], block_column[mirrored]])
-    items = np.concatenate([np.arange(len(names)), len(names) + 1 + mirrored])
-    by_target = np.argsort(targets, kind="stable")
-    return PairLayout(
-        left=padded[0],
-        right=padded[1],
-        levels=sum_tree(np.arange(total - 1), np.append(chunks, 0), total - 1, TREE_WIDTH),
-        block_camera=block_camera,
-        block_row=block_row,
-        block_column=block_column,
-        product_levels=sum_tree(items[by_target], np.bincount(targets, minlength=cameras), len(names), TREE_WIDTH),
-        table=table.reshape(cameras, cameras),
-    )

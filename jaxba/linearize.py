@@ -9,6 +9,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxba import camera
+from jaxba.barrier import materialized
 from jaxba.layout import Layout
 from jaxba.losses import Loss
 from jaxba.sums import take
@@ -62,6 +63,8 @@ def point_normal_equations(
 ) -> list[Array]:
     """Per slot: the six lower entries of `J_p^T J_p` (row by row), then the three of `J_p^T r`."""
     by_point = _whiten_columns(layout, camera.derivatives(frames, projection).point)
+    rows = list(materialized(jnp.stack([*by_point[0], *by_point[1], *residual])))
+    by_point, residual = [rows[:3], rows[3:6]], rows[6:]
     entries = normal_entries(by_point, residual)
     if loss.trivial:
         return entries

@@ -83,3 +83,8 @@ class StepOptions:
     def forms_reduced_system(self) -> bool:
         """Whether the layout must list pairs."""
         return self.linear_solver in ("explicit", "sparse")
+
+    @property
+    def factors_reduced_system(self) -> bool:
+        """Whether the layout must say where the blocks of a factored system go."""
+        return self.linear_solver == "explicit"

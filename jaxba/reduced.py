@@ -1,6 +1,6 @@
 """Solvers of the reduced camera system `S x = b`.
 
-- `explicit`: S formed from chunked products over co-visible pairs, made dense, factored.
+- `explicit`: S formed from chunked products over co-visible pairs, factored: dense, or as a band where it is one.
 - `sparse`: S formed in blocks, conjugate gradients on the blocks.
 - `implicit`: conjugate gradients with two passes over the observations a product; S is never formed.
 - `power`: the power series `sum_i (B^-1 W)^i B^-1 b`, `S = B - W`, without inner products.
@@ -17,6 +17,7 @@ from jax import Array, lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float, Int
 
+from jaxba.band import band_factor_and_solve
 from jaxba.cg import conjugate_gradients
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_rows
 from jaxba.layout import Layout, PairLayout
@@ -43,10 +44,10 @@ def solve_reduced(
         return _iterate(apply, _preconditioner(layout, linear, points, system, apply, options), system, options)
     blocks = reduced_blocks(layout, linear, points, system)
     if options.linear_solver == "explicit":
-        return factor_and_solve(dense_system(layout, blocks), system.right), jnp.zeros((), jnp.int32)
+        return factor_blocks(layout, blocks, system.right), jnp.zeros((), jnp.int32)
     apply = lambda x: apply_blocks(layout, blocks, x)
     if options.preconditioner == "schur-jacobi":
-        diagonal = take_rows(blocks, jnp.diagonal(jnp.asarray(_pairs(layout).table)))
+        diagonal = take_rows(blocks, _pairs(layout).diagonal)
         return _iterate(apply, _block_inverse(diagonal), system, options)
     return _iterate(apply, _preconditioner(layout, linear, points, system, apply, options), system, options)
 
@@ -70,10 +71,20 @@ def reduced_blocks(
     return blocks.reshape(-1, 9, 9)
 
 
+def factor_blocks(layout: Layout, blocks: Array, right: Array) -> Array:
+    band = _pairs(layout).band
+    if band is not None:
+        return band_factor_and_solve(band, blocks, right)
+    return factor_and_solve(dense_system(layout, blocks), right)
+
+
 def dense_system(layout: Layout, blocks: Float[Array, "blocks 9 9"]) -> Float[Array, "unknowns unknowns"]:
     """The reduced camera system as a dense matrix; only its lower triangle is filled."""
     cameras = layout.num_cameras
-    dense = take_rows(blocks.reshape(-1, 81), _pairs(layout).table).reshape(cameras, cameras, 9, 9)
+    table = _pairs(layout).table
+    if table is None:
+        raise ValueError("this layout has no table of blocks: build it with factor=True to factor the system")
+    dense = take_rows(blocks.reshape(-1, 81), table).reshape(cameras, cameras, 9, 9)
     return dense.transpose(0, 2, 1, 3).reshape(9 * cameras, 9 * cameras)
 
 

@@ -146,7 +146,9 @@ def solve(
     tolerances = tolerances or Tolerances()
     with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
-        layout = jax.device_put(build_layout(problem, pairs=options.forms_reduced_system))
+        layout = jax.device_put(
+            build_layout(problem, pairs=options.forms_reduced_system, factor=options.factors_reduced_system)
+        )
         state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
         setup_s = time.perf_counter() - started
         if not np.isfinite(float(state.cost)):

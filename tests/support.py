@@ -107,7 +107,7 @@ def arrays(problem: BundleProblem) -> tuple:
 def start(problem: BundleProblem, options: StepOptions | None = None, dtype: str = "float64"):
     """Layout and state of a problem."""
     options = options or StepOptions()
-    layout = build_layout(problem, pairs=options.forms_reduced_system)
+    layout = build_layout(problem, pairs=options.forms_reduced_system, factor=options.factors_reduced_system)
     return layout, _initial(layout, problem, options, dtype)
 
 

@@ -1,0 +1,139 @@
+"""Which pairs of observations multiply into which block of the reduced camera system."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxba.ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
+from jaxba.problem import AnyArray
+from jaxba.trees import TREE_WIDTH, sum_tree
+
+PAIR_CHUNKS = (4, 8)
+"""Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
+
+PAIR_BATCH = 2048
+"""Most chunks multiplied at once: bounds the gathered operands to 7 MB, which stay in cache."""
+
+PAIR_ITEM_COST = 1.5
+"""Cost of one partial 9 x 9 block, in pairs; decides between few long and many short chunks."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PairLayout:
+    """Which slots multiply into which block of the reduced camera system (lower triangle)."""
+
+    left: Int[AnyArray, "batches chunks width"]
+    """Slot of the block row's camera."""
+
+    right: Int[AnyArray, "batches chunks width"]
+    """Slot of the block column's camera, seen by the same point."""
+
+    levels: tuple[Int[AnyArray, "_ _"], ...]
+    """Tree from chunks to blocks; the last block is always zero."""
+
+    block_camera: Int[AnyArray, " blocks"]
+    """Camera of a block on the diagonal; the number of cameras for the others."""
+
+    block_row: Int[AnyArray, " blocks"]
+    """Camera of a block's rows."""
+
+    block_column: Int[AnyArray, " blocks"]
+    """Camera of a block's columns."""
+
+    product_levels: tuple[Int[AnyArray, "_ _"], ...]
+    """Tree to cameras from the products of blocks with their columns, then of mirrored blocks with their rows."""
+
+    diagonal: Int[AnyArray, " cameras"]
+    """Number of each camera's block on the diagonal."""
+
+    table: Int[AnyArray, "cameras cameras"] | None
+    """Block number of (row, column) in the lower triangle, the zero block elsewhere; for a dense factorisation."""
+
+    band: Band | None
+    """Where a band is factored instead."""
+
+
+def pair_layout(
+    camera: np.ndarray, slot: np.ndarray, tracks: np.ndarray, start: np.ndarray, cameras: int, empty: int, factor: bool
+) -> PairLayout:
+    """Lists all pairs of observations of one point, sorted by the block they add to.
+
+    Args:
+        camera: of each observation; those of one point stand together.
+        slot: of each observation.
+        tracks: observations of each point.
+        start: number of each point's first observation.
+        cameras: number of cameras.
+        empty: a slot that holds no observation.
+        factor: whether the system will be factored, as a band where that is cheaper.
+    """
+    lefts, rights = [], []
+    for length in np.unique(tracks[tracks > 0]):
+        first = start[np.flatnonzero(tracks == length)]
+        a, b = np.tril_indices(length)
+        lefts.append((first[:, None] + a).ravel())
+        rights.append((first[:, None] + b).ravel())
+    left, right = np.concatenate(lefts), np.concatenate(rights)
+    # a camera that sees a point twice: both orders add to the same diagonal block
+    twice = (camera[left] == camera[right]) & (left != right)
+    left, right = np.concatenate([left, right[twice]]), np.concatenate([right, left[twice]])
+    diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
+    block = camera[left].astype(np.int64) * cameras + camera[right]
+    names = np.union1d(block, diagonal)
+    rank, reach, banded = np.arange(cameras), 0, False
+    if factor and cameras >= MIN_BAND_CAMERAS:
+        rank, reach = camera_order(*np.divmod(names, cameras), cameras)
+        banded = is_banded(cameras, reach)
+    if banded:  # from here on cameras go by their rank, and the lower triangle is that of the ranks
+        swap = rank[camera[left]] < rank[camera[right]]
+        left, right = np.where(swap, right, left), np.where(swap, left, right)
+        block = rank[camera[left]] * cameras + rank[camera[right]]
+        names = np.union1d(block, diagonal)
+    else:
+        rank = np.arange(cameras)
+    order = np.argsort(block, kind="stable")
+    counts = np.bincount(np.searchsorted(names, block), minlength=len(names))
+    width = min(PAIR_CHUNKS, key=lambda w: int((-(-counts // w)).sum()) * (w + PAIR_ITEM_COST))
+    width = max(1, min(width, int(counts.max())))
+    chunks = -(-counts // width)
+    row = np.repeat(np.cumsum(chunks) - chunks, counts)
+    position = np.arange(len(left)) - np.repeat(np.cumsum(counts) - counts, counts)
+    total = int(chunks.sum()) + 1  # at least one chunk is all padding
+    batches = -(-total // PAIR_BATCH)
+    batch = -(-total // batches)
+    padded = []
+    for side in (left, right):
+        array = np.full((batches * batch, width), empty, np.int32)
+        array[row + position // width, position % width] = slot[side[order]]
+        padded.append(array.reshape(batches, batch, width))
+    table = None
+    if factor and not banded:
+        table = np.full(cameras * cameras, len(names), np.int32)
+        table[names] = np.arange(len(names))
+        table = table.reshape(cameras, cameras)
+    by_rank = np.argsort(rank)
+    on_diagonal = np.searchsorted(names, diagonal)[rank]
+    block_camera = np.full(len(names) + 1, cameras, np.int32)
+    block_camera[on_diagonal] = np.arange(cameras)
+    block_row, block_column = (np.append(by_rank[part], 0).astype(np.int32) for part in np.divmod(names, cameras))
+    mirrored = np.flatnonzero(block_row[:-1] != block_column[:-1])
+    targets = np.concatenate([block_row[:-1], block_column[mirrored]])
+    items = np.concatenate([np.arange(len(names)), len(names) + 1 + mirrored])
+    by_target = np.argsort(targets, kind="stable")
+    return PairLayout(
+        left=padded[0],
+        right=padded[1],
+        levels=sum_tree(np.arange(total - 1), np.append(chunks, 0), total - 1, TREE_WIDTH),
+        block_camera=block_camera,
+        block_row=block_row,
+        block_column=block_column,
+        product_levels=sum_tree(items[by_target], np.bincount(targets, minlength=cameras), len(names), TREE_WIDTH),
+        diagonal=on_diagonal.astype(np.int32),
+        table=table,
+        band=band_of(names, rank, reach) if banded else None,
+    )
