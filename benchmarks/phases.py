@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import eliminate, host, lm, reduced
+from jaxba import camera, eliminate, host, lm, reduced
 from jaxba.bench.sources import sources
-from jaxba.layout import build_layout
+from jaxba.coarse import Anchor, coarse_preconditioner
+from jaxba.layout import layout_for
 from jaxba.linearize import linearize, residuals, slot_costs, slot_frames
 from jaxba.options import StepOptions
 from jaxba.refine import refine_points
@@ -63,7 +64,7 @@ def main() -> None:
     problem = sources([args.problem])[0].read()
     options = StepOptions(linear_solver=args.solver)
     started = time.perf_counter()
-    arrays = build_layout(problem, pairs=options.forms_reduced_system, factor=options.factors_reduced_system)
+    arrays = layout_for(problem, options)
     print(f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations")
     print(f"layout on the host {1e3 * (time.perf_counter() - started):.2f} ms; {arrays.num_slots} slots")
     layout = jax.device_put(arrays)
@@ -107,8 +108,23 @@ def main() -> None:
             system,
             system.right,
         )
+    frames = camera.frames(state.cameras)
+    anchor = Anchor(frames.rotation, frames.translation, state.points)
+    if options.uses_clusters:
+        phase(
+            "coarse system",
+            lambda li, po, sy, x: coarse_preconditioner(layout, li, po, sy, anchor)(x),
+            linear,
+            points,
+            system,
+            system.right,
+        )
     phase(
-        "reduced solve", lambda li, po, sy: reduced.solve_reduced(layout, li, po, sy, options), linear, points, system
+        "reduced solve",
+        lambda li, po, sy: reduced.solve_reduced(layout, li, po, sy, anchor, options),
+        linear,
+        points,
+        system,
     )
     phase(
         "back-substitute", lambda li, po, x: eliminate.back_substitute(layout, li, po, x), linear, points, system.right

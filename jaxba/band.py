@@ -44,20 +44,23 @@ def band_factor_and_solve(
     entering = jnp.concatenate([rows[held:], jnp.zeros((held, size, columns), rows.dtype)])
     entering_sides = jnp.concatenate([sides[held:], jnp.zeros((held, size), rows.dtype)])
 
+    unit = jnp.eye(size, dtype=rows.dtype)
+
     def eliminate(carry: tuple[Array, Array], new: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple]:
         window, side = carry
         factor = jnp.linalg.cholesky(window[:size, :size], symmetrize_input=False)
-        below = solve_triangular(factor, window[size:, :size].T, lower=True).T
-        solved = solve_triangular(factor, side[:size], lower=True)
+        inverse = solve_triangular(factor, unit, lower=True)
+        below = jnp.matmul(window[size:, :size], inverse.T, precision="highest")
+        solved = jnp.matmul(inverse, side[:size], precision="highest")
         update = jnp.matmul(below, below.T, precision="highest")
         shifted = jnp.concatenate([window[size:, size:] - update, jnp.zeros((rest, size), rows.dtype)], axis=1)
         side = jnp.concatenate([side[size:] - jnp.matmul(below, solved, precision="highest"), new[1]])
-        return (jnp.concatenate([shifted, new[0]]), side), (factor, below, solved)
+        return (jnp.concatenate([shifted, new[0]]), side), (inverse, below, solved)
 
     def substitute(after: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        factor, below, solved = row
+        inverse, below, solved = row
         known = jnp.matmul(below.T, after, precision="highest")
-        x = solve_triangular(factor, solved - known, lower=True, trans="T")
+        x = jnp.matmul(inverse.T, solved - known, precision="highest")
         return jnp.concatenate([x, after])[:rest], x
 
     start = (window, sides[:held].reshape(-1))

@@ -11,23 +11,30 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxba.options import LinearSolver
+from jaxba.ordering import camera_order, is_banded
 from jaxba.problem import BundleProblem
 
-SECONDS_PER_PAIR = 7e-8
-"""Forming the blocks, per pair of observations of one point."""
+SECONDS_PER_PAIR = 1e-7
+"""Forming the blocks, per pair of observations of one point: 6e-8 on small problems, 1e-7 with 2.5 million pairs."""
 
 SECONDS_PER_BLOCK = 6e-8
 """One product with the formed blocks, per block."""
 
-SECONDS_PER_OBSERVATION = 4.5e-8
+SECONDS_PER_OBSERVATION = 4e-8
 """One implicit product, per observation."""
 
-SECONDS_PER_CUBE = 6e-12
-"""Cholesky factorisation, per cube of the number of unknowns."""
+COARSE_SECONDS_PER_OBSERVATION = 2e-7
+"""Forming the coarse system of the two-level preconditioner, per observation."""
 
-CAUTIOUS_PRODUCTS = 250
-"""Conjugate gradient iterations assumed for one step. Photo collections take 10 to 60, but a long sequence of frames
-takes hundreds (kitti00vo: 420 on average), so that in doubt the system is factored."""
+SECONDS_PER_CUBE = 4.5e-12
+"""Dense Cholesky factorisation, per cube of the number of unknowns."""
+
+SECONDS_PER_BAND = 3.3e-11
+"""Band factorisation, per unknown times the square of the band's unknowns."""
+
+ASSUMED_PRODUCTS = 12
+"""Conjugate gradient iterations assumed for one step with the two-level preconditioner, which takes 6 to 20 on the
+problems at hand."""
 
 MAX_BYTES = 4e9
 """A solver that would need more memory than this is not chosen."""
@@ -56,27 +63,37 @@ class SolverCosts(NamedTuple):
 
 def predict(problem: BundleProblem) -> SolverCosts:
     """Costs from the numbers of cameras, observations, pairs and co-visible blocks."""
-    pairs, blocks = count_pairs(problem)
-    unknowns = 9.0 * problem.num_cameras
-    forming = pairs * SECONDS_PER_PAIR
-    formed_bytes = pairs * BYTES_PER_PAIR + blocks * BYTES_PER_BLOCK
+    counts = count_pairs(problem)
+    unknowns, band = 9.0 * problem.num_cameras, 9.0 * counts.reach
+    forming = counts.pairs * SECONDS_PER_PAIR
+    formed_bytes = counts.pairs * BYTES_PER_PAIR + counts.blocks * BYTES_PER_BLOCK
+    if is_banded(problem.num_cameras, counts.reach):
+        factoring, factor_bytes = SECONDS_PER_BAND * unknowns * band**2, 3 * 8 * unknowns * band
+    else:
+        factoring, factor_bytes = SECONDS_PER_CUBE * unknowns**3, 4 * 8 * unknowns**2
+    coarse = COARSE_SECONDS_PER_OBSERVATION * problem.num_observations
     return SolverCosts(
-        explicit=_within(formed_bytes + 4 * 8 * unknowns**2, forming + SECONDS_PER_CUBE * unknowns**3),
-        sparse=_within(formed_bytes, forming + CAUTIOUS_PRODUCTS * SECONDS_PER_BLOCK * blocks),
-        implicit=CAUTIOUS_PRODUCTS * SECONDS_PER_OBSERVATION * problem.num_observations,
+        explicit=_within(formed_bytes + factor_bytes, forming + factoring),
+        sparse=_within(formed_bytes, forming + coarse + ASSUMED_PRODUCTS * SECONDS_PER_BLOCK * counts.blocks),
+        implicit=coarse + ASSUMED_PRODUCTS * SECONDS_PER_OBSERVATION * problem.num_observations,
     )
 
 
-def count_pairs(problem: BundleProblem) -> tuple[int, int]:
-    """Pairs of observations of one point, and pairs of cameras that share a point; a camera pairs with itself.
+class PairCounts(NamedTuple):
+    """What the size of the reduced camera system follows from."""
 
-    The second number is exact up to `MAX_COUNTED_PAIRS` pairs, else the upper bound that the first one gives.
-    """
+    pairs: int  # pairs of observations of one point
+    blocks: int  # pairs of cameras that share a point; a camera pairs with itself
+    reach: int  # in the better order of cameras, the largest distance of two that share a point
+
+
+def count_pairs(problem: BundleProblem) -> PairCounts:
+    """Counts pairs; blocks and reach are exact up to `MAX_COUNTED_PAIRS` pairs, else upper bounds."""
     point, cameras = np.asarray(problem.point_index), problem.num_cameras
     tracks = np.bincount(point, minlength=problem.num_points)
     pairs = int(np.sum(tracks * (tracks + 1) // 2))
     if pairs > MAX_COUNTED_PAIRS or cameras > MAX_COUNTED_CAMERAS:
-        return pairs, min(pairs, cameras * (cameras + 1) // 2)
+        return PairCounts(pairs, min(pairs, cameras * (cameras + 1) // 2), cameras)
     order = np.argsort(point.astype(np.int64) * cameras + problem.camera_index, kind="stable")
     camera = np.asarray(problem.camera_index)[order]
     start = np.cumsum(tracks) - tracks
@@ -85,7 +102,8 @@ def count_pairs(problem: BundleProblem) -> tuple[int, int]:
         first = start[tracks == length][:, None]
         row, column = np.tril_indices(length)
         shared[camera[first + row], camera[first + column]] = True
-    return pairs, int(shared.sum())
+    rows, columns = np.nonzero(shared)
+    return PairCounts(pairs, len(rows), camera_order(rows, columns, cameras)[1])
 
 
 def choose(problem: BundleProblem) -> LinearSolver:

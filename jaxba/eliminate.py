@@ -18,11 +18,12 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba import camera
+from jaxba.barrier import materialized
 from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
-from jaxba.sums import outer_sum, point_sum, take, take_rows, tree_sum
+from jaxba.sums import outer_sum, point_sum, take, take_each, take_rows, tree_sum
 
 
 class Coordinates(NamedTuple):
@@ -55,6 +56,7 @@ class CameraSystem(NamedTuple):
     """What is left for the cameras, except the sum of Y Y^T."""
 
     blocks: Float[Array, "cameras 9 9"]  # B + D_c, manifold coordinates
+    only_damping: Float[Array, "cameras 9 9"]  # D_c, manifold coordinates
     gradient: Float[Array, "cameras 9"]  # g_c, manifold coordinates
     right: Float[Array, "cameras 9"]  # right-hand side of the reduced system
     damping: Float[Array, "cameras 9"]  # D_c, diagonal in the options' coordinates
@@ -102,9 +104,9 @@ def camera_system(
     # a camera that nobody uses gets a unit block and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     turned = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
-    damped = blocks + extra[:, :, None] * jnp.eye(9, dtype=extra.dtype)
-    damped = damped.at[:, :3, :3].set(blocks[:, :3, :3] + turned)
-    return CameraSystem(damped, gradient, right, extra)
+    added = extra[:, :, None] * jnp.eye(9, dtype=extra.dtype)
+    added = added.at[:, :3, :3].set(turned)
+    return CameraSystem(blocks + added, added, gradient, right, extra)
 
 
 def back_substitute(
@@ -120,8 +122,8 @@ def apply_reduced(
 ) -> Float[Array, "cameras 9"]:
     """`S x` without forming S: two passes over the observations."""
     inner = project_to_points(layout, linear, points, x)
-    at_slot = take(jnp.stack(inner), layout.slot_point)
-    lifted = [sum(points.projected[k][i] * at_slot[i] for i in range(3)) for k in range(2)]
+    at_slot = take_each(inner, layout.slot_point)
+    lifted = materialized(jnp.stack([sum(points.projected[k][i] * at_slot[i] for i in range(3)) for k in range(2)]))
     first, second = linear.camera_jacobian
     columns = jnp.stack([first[a] * lifted[0] + second[a] * lifted[1] for a in range(9)])
     return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(columns.T, layout.camera_levels)
@@ -139,8 +141,8 @@ def project_to_points(
     layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras 9"]
 ) -> list[Array]:
     """`sum Y^T x` over each point's slots."""
-    at_slot = take(x.T, layout.slot_camera)
-    moved = [sum(row[a] * at_slot[a] for a in range(9)) for row in linear.camera_jacobian]
+    at_slot = take_each(x.T, layout.slot_camera)
+    moved = materialized(jnp.stack([sum(row[a] * at_slot[a] for a in range(9)) for row in linear.camera_jacobian]))
     inner = jnp.stack([points.projected[0][i] * moved[0] + points.projected[1][i] * moved[1] for i in range(3)])
     return list(point_sum(layout, inner))
 

@@ -18,6 +18,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxba.clusters import ClusterLayout, cluster_layout
+from jaxba.options import StepOptions
 from jaxba.pairs import PairLayout, pair_layout
 from jaxba.problem import AnyArray, BundleProblem
 from jaxba.trees import sum_tree
@@ -59,6 +61,9 @@ class Layout:
     pairs: PairLayout | None
     """None where the reduced camera system is never formed."""
 
+    clusters: ClusterLayout | None
+    """None where nothing asks for a coarse system."""
+
     buckets: tuple[tuple[int, int], ...] = field(metadata={"static": True})
     """(slots per point, points) of each bucket."""
 
@@ -78,7 +83,7 @@ class Layout:
         return self.camera_seen.shape[-1]
 
 
-def build_layout(problem: BundleProblem, *, pairs: bool = True, factor: bool = True) -> Layout:
+def build_layout(problem: BundleProblem, *, pairs: bool = True, factor: bool = True, clusters: bool = False) -> Layout:
     """Sorts a problem's observations into slots.
 
     Args:
@@ -86,6 +91,7 @@ def build_layout(problem: BundleProblem, *, pairs: bool = True, factor: bool = T
         pairs: whether to list the pairs that form the explicit reduced camera system. Their number is
             the sum of t (t + 1) / 2 over track lengths t.
         factor: whether that system will be factored, which takes a table of its blocks, dense or banded.
+        clusters: whether to group cameras for the two-level preconditioner.
 
     Returns:
         A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths.
@@ -145,8 +151,19 @@ def build_layout(problem: BundleProblem, *, pairs: bool = True, factor: bool = T
         bucket_points=tuple(bucket_points),
         camera_levels=sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK),
         camera_seen=seen > 0,
-        pairs=pair_layout(camera, slot, tracks, start, problem.num_cameras, empty, factor) if pairs else None,
+        pairs=pair_layout(camera, slot, tracks, start, problem.num_cameras, empty, factor=factor) if pairs else None,
+        clusters=cluster_layout(camera, point, slot, len(seen), len(tracks), slot_point, empty) if clusters else None,
         buckets=tuple((int(length), len(members)) for length, members in zip(lengths, bucket_points, strict=True)),
+    )
+
+
+def layout_for(problem: BundleProblem, options: StepOptions) -> Layout:
+    """The layout that a step with these options needs, and nothing more."""
+    return build_layout(
+        problem,
+        pairs=options.forms_reduced_system,
+        factor=options.linear_solver == "explicit",
+        clusters=options.uses_clusters,
     )
 
 

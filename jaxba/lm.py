@@ -83,7 +83,7 @@ def lm_step(
     """
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
-    step = solve_step(layout, linear, state.cameras, damping, options)
+    step = solve_step(layout, linear, state.cameras, state.points, damping, options)
     cameras = move_cameras(state.cameras, step.cameras, options)
     points = state.points + step.points
     frames = slot_frames(layout, cameras)

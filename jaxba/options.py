@@ -9,7 +9,7 @@ from jaxba.losses import Loss
 
 LinearSolver = Literal["explicit", "sparse", "implicit", "power"]
 LinearSolverChoice = Literal["auto", "explicit", "sparse", "implicit", "power"]
-Preconditioner = Literal["schur-jacobi", "jacobi", "power-series"]
+Preconditioner = Literal["two-level", "schur-jacobi", "jacobi", "power-series"]
 Scaling = Literal["diagonal", "identity"]
 Rotation = Literal["angle-axis", "manifold"]
 
@@ -28,9 +28,9 @@ class StepOptions:
     """`explicit`: form the reduced camera system and factor it. `sparse`: form its blocks, conjugate gradients.
     `implicit`: conjugate gradients without forming it. `power`: a power series, without forming it."""
 
-    preconditioner: Preconditioner = "schur-jacobi"
-    """Of conjugate gradients: the block diagonal of the reduced system, that of the camera blocks, or a short power
-    series."""
+    preconditioner: Preconditioner = "two-level"
+    """Of conjugate gradients. `schur-jacobi`: the block diagonal of the reduced system. `two-level`: the same and a
+    coarse system for the motion of clusters of cameras. `jacobi`: the camera blocks. `power-series`: a short series."""
 
     preconditioner_order: int = 5
     """Terms of a power series as preconditioner. Source: Ceres max_num_spse_iterations."""
@@ -52,9 +52,8 @@ class StepOptions:
     loss: Loss = field(default_factory=Loss)
     """Robust loss of the squared whitened residual."""
 
-    cg_forcing: float = 0.01
-    """Conjugate gradients stop when i (Q_i - Q_(i-1)) / Q_i falls below this. Source: the experiments of rootba and
-    Power Bundle Adjustment; Ceres' own default, 0.1, ended 1e-4 above the best cost on one real problem."""
+    cg_forcing: float = 0.1
+    """Conjugate gradients stop when i (Q_i - Q_(i-1)) / Q_i falls below this. Source: Ceres' default."""
 
     cg_tolerance: float = 0.0
     """... or when the residual is below this share of the right-hand side; 0 switches it off."""
@@ -85,6 +84,6 @@ class StepOptions:
         return self.linear_solver in ("explicit", "sparse")
 
     @property
-    def factors_reduced_system(self) -> bool:
-        """Whether the layout must say where the blocks of a factored system go."""
-        return self.linear_solver == "explicit"
+    def uses_clusters(self) -> bool:
+        """Whether the layout must group cameras."""
+        return self.linear_solver in ("sparse", "implicit") and self.preconditioner == "two-level"

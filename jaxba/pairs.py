@@ -59,7 +59,15 @@ class PairLayout:
 
 
 def pair_layout(
-    camera: np.ndarray, slot: np.ndarray, tracks: np.ndarray, start: np.ndarray, cameras: int, empty: int, factor: bool
+    camera: np.ndarray,
+    slot: np.ndarray,
+    tracks: np.ndarray,
+    start: np.ndarray,
+    cameras: int,
+    empty: int,
+    *,
+    factor: bool,
+    banded: bool = True,
 ) -> PairLayout:
     """Lists all pairs of observations of one point, sorted by the block they add to.
 
@@ -70,7 +78,8 @@ def pair_layout(
         start: number of each point's first observation.
         cameras: number of cameras.
         empty: a slot that holds no observation.
-        factor: whether the system will be factored, as a band where that is cheaper.
+        factor: whether the system will be factored.
+        banded: whether it may be factored as a band, where that is cheaper.
     """
     lefts, rights = [], []
     for length in np.unique(tracks[tracks > 0]):
@@ -85,10 +94,10 @@ def pair_layout(
     diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
     block = camera[left].astype(np.int64) * cameras + camera[right]
     names = np.union1d(block, diagonal)
-    rank, reach, banded = np.arange(cameras), 0, False
-    if factor and cameras >= MIN_BAND_CAMERAS:
+    rank, reach = np.arange(cameras), cameras
+    if factor and banded and cameras >= MIN_BAND_CAMERAS:
         rank, reach = camera_order(*np.divmod(names, cameras), cameras)
-        banded = is_banded(cameras, reach)
+    banded = is_banded(cameras, reach)
     if banded:  # from here on cameras go by their rank, and the lower triangle is that of the ranks
         swap = rank[camera[left]] < rank[camera[right]]
         left, right = np.where(swap, right, left), np.where(swap, left, right)

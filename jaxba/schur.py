@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxba import camera
+from jaxba.coarse import Anchor
 from jaxba.eliminate import CameraSystem, Coordinates, PointSystem, back_substitute, camera_system, eliminate_points
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization
@@ -33,6 +35,7 @@ def solve_step(
     layout: Layout,
     linear: Linearization,
     cameras: Float[Array, "9 cameras"],
+    points: Float[Array, "3 points"],
     damping: Float[Array, ""],
     options: StepOptions,
 ) -> Step:
@@ -42,6 +45,7 @@ def solve_step(
         layout: slots; must hold pairs unless the options never form the reduced system.
         linear: Jacobians and residuals at the current parameters.
         cameras: current cameras, for the rotation coordinates.
+        points: current points, for the directions of the coarse system.
         damping: lambda, dimensionless for diagonal scaling.
         options: solver, scaling, coordinates.
 
@@ -49,20 +53,22 @@ def solve_step(
         The step; not finite where the factorisation failed, which the caller treats as a rejection.
     """
     coordinates = Coordinates.of(cameras, options)
-    points = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, points, coordinates, damping, options)
-    step, iterations = solve_reduced(layout, linear, points, system, options)
+    frames = camera.frames(cameras)
+    anchor = Anchor(frames.rotation, frames.translation, points)
+    eliminated = eliminate_points(layout, linear, damping, options)
+    system = camera_system(layout, linear, eliminated, coordinates, damping, options)
+    step, iterations = solve_reduced(layout, linear, eliminated, system, anchor, options)
     step = jnp.where(layout.camera_seen[:, None], step, jnp.zeros_like(step))
-    point_step = back_substitute(layout, linear, points, step)
+    point_step = back_substitute(layout, linear, eliminated, step)
     turned = jnp.einsum("cij,cj->ci", coordinates.inverse, step[:, :3])
     camera_step = jnp.concatenate([turned, step[:, 3:]], axis=1)
     turned = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
     gradient = jnp.concatenate([turned, system.gradient[:, 3:]], axis=1)
-    gradient_max = jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.max(jnp.abs(jnp.stack(points.gradient))))
+    gradient_max = jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.max(jnp.abs(jnp.stack(eliminated.gradient))))
     return Step(
         camera_step.T,
         jnp.stack(point_step),
-        _predicted_decrease(points, system, step, camera_step, point_step),
+        _predicted_decrease(eliminated, system, step, camera_step, point_step),
         gradient_max,
         iterations,
     )

@@ -22,7 +22,7 @@ from jaxba import geometry, host
 from jaxba.choose import choose
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, ProblemInfo, make_policy
-from jaxba.layout import Layout, build_layout
+from jaxba.layout import Layout, layout_for
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.options import StepOptions
@@ -146,9 +146,7 @@ def solve(
     tolerances = tolerances or Tolerances()
     with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
-        layout = jax.device_put(
-            build_layout(problem, pairs=options.forms_reduced_system, factor=options.factors_reduced_system)
-        )
+        layout = jax.device_put(layout_for(problem, options))
         state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
         setup_s = time.perf_counter() - started
         if not np.isfinite(float(state.cost)):

@@ -18,6 +18,11 @@ def take(values: Array, index: Int[AnyArray, "..."]) -> Array:
     return values.at[..., index].get(mode="promise_in_bounds")
 
 
+def take_each(rows: Array | list[Array], index: Int[AnyArray, " n"]) -> list[Array]:
+    """`take` of every row by itself: contiguous vectors, where one gather of all rows would interleave them."""
+    return [row.at[index].get(mode="promise_in_bounds") for row in rows]
+
+
 def take_rows(values: Array, index: Int[AnyArray, "..."]) -> Array:
     """Rows (first axis) of `values` at `index`, which is known to be in range."""
     return values.at[index].get(mode="promise_in_bounds")

@@ -18,7 +18,8 @@ import pytest
 from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
-from jaxba import BundleProblem, LMState, StepOptions, build_layout, initial_state, like, lm_step, random_scene
+from jaxba import BundleProblem, LMState, StepOptions, initial_state, like, lm_step, random_scene
+from jaxba.layout import layout_for
 from jaxba.lm import StepInfo
 
 DATA = os.environ.get("JAXBA_DATA")
@@ -107,7 +108,7 @@ def arrays(problem: BundleProblem) -> tuple:
 def start(problem: BundleProblem, options: StepOptions | None = None, dtype: str = "float64"):
     """Layout and state of a problem."""
     options = options or StepOptions()
-    layout = build_layout(problem, pairs=options.forms_reduced_system, factor=options.factors_reduced_system)
+    layout = layout_for(problem, options)
     return layout, _initial(layout, problem, options, dtype)
 
 

@@ -46,7 +46,7 @@ def test_options_cannot_change_under_a_compiled_program():
         StepOptions().scaling = "identity"  # type: ignore[misc]
 
 
-def test_the_defaults_are_those_of_ceres_but_for_the_tighter_forcing_term():
+def test_the_defaults_are_those_of_ceres():
     options = StepOptions()
     assert (options.scaling, options.rotation, options.refine_points) == ("diagonal", "angle-axis", 0)
-    assert (options.cg_forcing, options.cg_max_iterations, options.loss.name) == (0.01, 500, "squared")
+    assert (options.cg_forcing, options.cg_max_iterations, options.loss.name) == (0.1, 500, "squared")
