@@ -8,6 +8,8 @@ Cholesky), with the blocked right-looking update of LAPACK's pbtrf.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.scipy.linalg import solve_triangular
@@ -27,43 +29,69 @@ def band_rows(band: Band, blocks: Float[Array, "blocks 9 9"]) -> Float[Array, "t
     return rows.at[:, :, -9 * m :].add(unit)
 
 
-def band_factor_and_solve(
-    band: Band, blocks: Float[Array, "blocks 9 9"], right: Float[Array, "cameras 9"]
-) -> Float[Array, "cameras 9"]:
-    """Solves `S x = b`; not finite where S is not positive definite."""
-    rows = band_rows(band, blocks)
-    tiles, size, columns = rows.shape
-    held = columns // size  # tiles in the window
-    rest = columns - size
-    zero = jnp.zeros((1, 9), right.dtype)
-    sides = take_rows(jnp.concatenate([right, zero]), band.camera).reshape(tiles, size)
+class BandFactor(NamedTuple):
+    """A Cholesky factor by tiles."""
 
+    band: Band
+    inverses: Float[Array, "tiles size size"]  # of the diagonal tiles
+    below: Float[Array, "tiles rest size"]  # what stands below them within the band
+
+    def solve(self, right: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
+        """Solves `L L^T x = b`."""
+        tiles, rest, size = self.below.shape
+        zero = jnp.zeros((1, 9), right.dtype)
+        sides = take_rows(jnp.concatenate([right, zero]), self.band.camera).reshape(tiles, size)
+
+        def forward(before: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            side, inverse, below = row
+            half = jnp.matmul(inverse, side - before[:size], precision="highest")
+            after = jnp.concatenate([before, jnp.zeros(size, right.dtype)])[size:]
+            return after + jnp.matmul(below, half, precision="highest"), half
+
+        def backward(after: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+            half, inverse, below = row
+            known = jnp.matmul(below.T, after, precision="highest")
+            x = jnp.matmul(inverse.T, half - known, precision="highest")
+            return jnp.concatenate([x, after])[:rest], x
+
+        nothing = jnp.zeros(rest, right.dtype)
+        # before its turn a tile has no more than `rest` rows to subtract from; with no tile below there is none
+        padded = nothing if rest else jnp.zeros(size, right.dtype)
+        _, halves = lax.scan(forward if rest else _alone, padded, (sides, self.inverses, self.below))
+        _, x = lax.scan(backward, nothing, (halves, self.inverses, self.below), reverse=True)
+        return take_rows(x.reshape(-1, 9), self.band.place)
+
+
+def _alone(nothing: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    side, inverse, _ = row
+    return nothing, jnp.matmul(inverse, side, precision="highest")
+
+
+def band_factor(band: Band, blocks: Float[Array, "blocks 9 9"]) -> BandFactor:
+    """Factors S; not finite where it is not positive definite."""
+    rows = band_rows(band, blocks)
+    _, size, columns = rows.shape
+    held, rest = columns // size, columns - size  # tiles in the window, rows below its first tile
     window = jnp.zeros((columns, columns), rows.dtype)
     for k in range(held):  # row k of the window ends on the diagonal
         window = window.at[k * size : (k + 1) * size, : (k + 1) * size].set(rows[k, :, columns - (k + 1) * size :])
     entering = jnp.concatenate([rows[held:], jnp.zeros((held, size, columns), rows.dtype)])
-    entering_sides = jnp.concatenate([sides[held:], jnp.zeros((held, size), rows.dtype)])
-
     unit = jnp.eye(size, dtype=rows.dtype)
 
-    def eliminate(carry: tuple[Array, Array], new: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple]:
-        window, side = carry
+    def eliminate(window: Array, new: Array) -> tuple[Array, tuple[Array, Array]]:
         factor = jnp.linalg.cholesky(window[:size, :size], symmetrize_input=False)
         inverse = solve_triangular(factor, unit, lower=True)
         below = jnp.matmul(window[size:, :size], inverse.T, precision="highest")
-        solved = jnp.matmul(inverse, side[:size], precision="highest")
         update = jnp.matmul(below, below.T, precision="highest")
         shifted = jnp.concatenate([window[size:, size:] - update, jnp.zeros((rest, size), rows.dtype)], axis=1)
-        side = jnp.concatenate([side[size:] - jnp.matmul(below, solved, precision="highest"), new[1]])
-        return (jnp.concatenate([shifted, new[0]]), side), (inverse, below, solved)
+        return jnp.concatenate([shifted, new]), (inverse, below)
 
-    def substitute(after: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-        inverse, below, solved = row
-        known = jnp.matmul(below.T, after, precision="highest")
-        x = jnp.matmul(inverse.T, solved - known, precision="highest")
-        return jnp.concatenate([x, after])[:rest], x
+    _, (inverses, below) = lax.scan(eliminate, window, entering)
+    return BandFactor(band, inverses, below)
 
-    start = (window, sides[:held].reshape(-1))
-    _, factored = lax.scan(eliminate, start, (entering, entering_sides))
-    _, x = lax.scan(substitute, jnp.zeros(rest, rows.dtype), factored, reverse=True)
-    return take_rows(x.reshape(-1, 9), band.place)
+
+def band_factor_and_solve(
+    band: Band, blocks: Float[Array, "blocks 9 9"], right: Float[Array, "cameras 9"]
+) -> Float[Array, "cameras 9"]:
+    """Solves `S x = b`; not finite where S is not positive definite."""
+    return band_factor(band, blocks).solve(right)

@@ -12,7 +12,7 @@ from jaxba import camera
 from jaxba.barrier import materialized
 from jaxba.layout import Layout
 from jaxba.losses import Loss
-from jaxba.sums import take
+from jaxba.sums import take, total
 
 
 class Linearization(NamedTuple):
@@ -24,6 +24,7 @@ class Linearization(NamedTuple):
     residual: list[Array]  # [2] of (slots,), pixels
     camera_jacobian: list[list[Array]]  # [2][9] of (slots,)
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
+    costs: Array  # (slots,), pixels squared
 
 
 def slot_frames(layout: Layout, cameras: Float[Array, "9 cameras"]) -> camera.Frames:
@@ -55,7 +56,7 @@ def cost(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Float[Array, ""]:
     """The objective `1/2 sum rho(|Sigma^(-1/2) r|^2)`, pixels squared (design, section 2)."""
-    return jnp.sum(slot_costs(loss, residuals(layout, slot_frames(layout, cameras), points)[1]))
+    return total(slot_costs(loss, residuals(layout, slot_frames(layout, cameras), points)[1]))
 
 
 def point_normal_equations(
@@ -90,13 +91,14 @@ def linearize(
     jacobians = camera.derivatives(frames, projection)
     by_camera = _whiten_columns(layout, jacobians.camera)
     by_point = _whiten_columns(layout, jacobians.point)
+    costs = slot_costs(loss, residual)
     if not loss.trivial:
         slope = loss(residual[0] * residual[0] + residual[1] * residual[1])[1]
         root = jnp.sqrt(slope)
         residual = [root * r for r in residual]
         by_camera = [[root * column for column in row] for row in by_camera]
         by_point = [[root * column for column in row] for row in by_point]
-    return Linearization(residual, by_camera, by_point)
+    return Linearization(residual, by_camera, by_point, costs)
 
 
 def _whiten(layout: Layout, pair: list[Array]) -> list[Array]:

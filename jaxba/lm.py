@@ -20,6 +20,7 @@ from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.refine import refine_points
 from jaxba.schur import solve_step
+from jaxba.sums import point_sum, total
 
 
 class LMState(NamedTuple):
@@ -89,12 +90,16 @@ def lm_step(
     frames = slot_frames(layout, cameras)
     if options.refine_points:
         points, costs = refine_points(layout, frames, points, options.loss, options.refine_points)
-        candidate = jnp.sum(costs)
+        before = point_sum(layout, linear.costs[None])[0]
     else:
-        candidate = jnp.sum(slot_costs(options.loss, residuals(layout, frames, points)[1]))
-    decrease = state.cost - candidate
+        costs = slot_costs(options.loss, residuals(layout, frames, points)[1])
+        before = linear.costs
+    candidate = total(costs)
+    decrease = total(before - costs)  # term by term: the two sums would cancel in float32
     gain = decrease / step.predicted
-    accepted = (decrease > 0) & (step.predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
+    accepted = (
+        (decrease > 0) & (candidate <= state.cost) & (step.predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
+    )
     choose = lambda new, old: jnp.where(accepted, new, old)
     moved = points - state.points
     after = LMState(choose(cameras, state.cameras), choose(points, state.points), choose(candidate, state.cost))

@@ -10,7 +10,7 @@ from jaxba.damping import make_policy
 METHODS = ("lm",)
 """Known methods; `lm` is understood where none is named."""
 
-DTYPES = ("float64", "float32")
+DTYPES = ("float64", "float32", "mixed")
 """Known floating point types; the first is understood where none is named."""
 
 

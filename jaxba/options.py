@@ -12,6 +12,7 @@ LinearSolverChoice = Literal["auto", "explicit", "sparse", "implicit", "power"]
 Preconditioner = Literal["two-level", "schur-jacobi", "jacobi", "power-series"]
 Scaling = Literal["diagonal", "identity"]
 Rotation = Literal["angle-axis", "manifold"]
+Algebra = Literal["full", "mixed"]
 
 DIAGONAL_MINIMUM = 1e-6
 """Smallest diagonal entry that damping multiplies. Source: Ceres min_lm_diagonal."""
@@ -52,6 +53,11 @@ class StepOptions:
     loss: Loss = field(default_factory=Loss)
     """Robust loss of the squared whitened residual."""
 
+    algebra: Algebra = "full"
+    """`full`: everything in the type of the parameters. `mixed`: residuals, gradient and elimination of the points in
+    it, the reduced camera system in float32; a factorisation is then the preconditioner of conjugate gradients in full
+    precision, which repair what rounding lost."""
+
     cg_forcing: float = 0.1
     """Conjugate gradients stop when i (Q_i - Q_(i-1)) / Q_i falls below this. Source: Ceres' default."""
 
@@ -67,6 +73,7 @@ class StepOptions:
             ("preconditioner", get_args(Preconditioner)),
             ("scaling", get_args(Scaling)),
             ("rotation", get_args(Rotation)),
+            ("algebra", get_args(Algebra)),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")

@@ -11,16 +11,19 @@ Source: Agarwal et al. 2010 (implicit and explicit), Weber et al. 2023, "Power B
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxba.band import band_factor_and_solve
+from jaxba.band import band_factor, band_factor_and_solve
 from jaxba.blocks import dense_blocks, pair_products
 from jaxba.cg import conjugate_gradients
 from jaxba.coarse import Anchor
-from jaxba.dense import factor_and_solve
+from jaxba.dense import factor_and_solve, factor_panels
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_rows
 from jaxba.layout import Layout, PairLayout
 from jaxba.linearize import Linearization
@@ -28,7 +31,13 @@ from jaxba.options import StepOptions
 from jaxba.precondition import block_inverse, preconditioner, series
 from jaxba.sums import take_rows, tree_sum
 
-Vector = Float[Array, "cameras 9"]
+SINGLE_LIFT = 64.0
+"""Rounding units added to the scaled diagonal of a system formed in float32, which may have lost its sign."""
+
+REPAIR_FORCING = 1e-3
+"""Forcing term of the full-precision iteration around a float32 factorisation: two or three products."""
+
+T = TypeVar("T")
 
 
 def solve_reduced(
@@ -45,17 +54,46 @@ def solve_reduced(
         The step, and the number of iterations (0 after a factorisation, the order of a power series). Not finite where
         a factorisation failed.
     """
+    product = lambda x: apply_reduced(layout, linear, points, system, x)
+    if options.linear_solver == "power":
+        return _power_series(product, system, options)
+    if options.algebra == "full":
+        if options.linear_solver == "explicit":
+            return factor_blocks(layout, reduced_blocks(layout, linear, points, system), system.right), _no_iterations()
+        return _iterate_reduced(layout, linear, points, system, anchor, options)
+    rough_linear, rough_points, rough_system, rough_anchor = to_single((linear, points, system, anchor))
+    if options.linear_solver == "explicit":
+        solve = factored(layout, reduced_blocks(layout, rough_linear, rough_points, rough_system))
+        precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
+        return _iterate(product, precondition, system, replace(options, cg_forcing=REPAIR_FORCING))
+    step, iterations = _iterate_reduced(layout, rough_linear, rough_points, rough_system, rough_anchor, options)
+    return step.astype(system.right.dtype), iterations
+
+
+def to_single(tree: T) -> T:
+    """The same numbers in float32."""
+    return jax.tree.map(lambda x: x.astype(jnp.float32), tree)
+
+
+def _iterate_reduced(
+    layout: Layout,
+    linear: Linearization,
+    points: PointSystem,
+    system: CameraSystem,
+    anchor: Anchor,
+    options: StepOptions,
+) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
     blocks = None
     apply = lambda x: apply_reduced(layout, linear, points, system, x)
-    if options.forms_reduced_system:
+    if options.linear_solver == "sparse":
         formed = blocks = reduced_blocks(layout, linear, points, system)
-        if options.linear_solver == "explicit":
-            return factor_blocks(layout, formed, system.right), jnp.zeros((), jnp.int32)
         apply = lambda x: apply_blocks(layout, formed, x)
-    if options.linear_solver == "power":
-        return _power_series(apply, system, options)
     precondition = preconditioner(layout, linear, points, system, anchor, blocks, apply, options)
     return _iterate(apply, precondition, system, options)
+
+
+def _no_iterations() -> Int[Array, ""]:
+    return jnp.zeros((), jnp.int32)
 
 
 def reduced_blocks(
@@ -79,6 +117,22 @@ def factor_blocks(
     return factor_and_solve(dense_blocks(_pairs(layout), blocks.reshape(-1, 81), 9), right.reshape(-1)).reshape(
         right.shape
     )
+
+
+def factored(layout: Layout, blocks: Float[Array, "blocks 9 9"]) -> Callable[[Array], Array]:
+    """The inverse of a system known to rounding only, for a preconditioner: its scaled diagonal is lifted a little."""
+    pairs = _pairs(layout)
+    diagonal = jnp.diagonal(take_rows(blocks, pairs.diagonal), axis1=1, axis2=2)  # [cameras, 9]
+    scale = lax.rsqrt(diagonal)
+    lift = SINGLE_LIFT * float(jnp.finfo(blocks.dtype).eps)
+    scaled = blocks * take_rows(scale, pairs.block_row)[:, :, None] * take_rows(scale, pairs.block_column)[:, None, :]
+    own = (pairs.block_camera < layout.num_cameras).astype(blocks.dtype)
+    scaled = scaled + lift * own[:, None, None] * jnp.eye(9, dtype=blocks.dtype)
+    if pairs.band is not None:
+        band = band_factor(pairs.band, scaled)
+        return lambda r: scale * band.solve(scale * r)
+    panels = factor_panels(dense_blocks(pairs, scaled.reshape(-1, 81), 9))
+    return lambda r: scale * panels.solve((scale * r).reshape(-1)).reshape(r.shape)
 
 
 def apply_blocks(

@@ -25,6 +25,7 @@ from jaxba.damping import DampingPolicy, ProblemInfo, make_policy
 from jaxba.layout import Layout, layout_for
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
+from jaxba.naming import DTYPES
 from jaxba.options import StepOptions
 from jaxba.problem import AnyArray, BundleProblem, ProblemError
 from jaxba.schur import largest_diagonal
@@ -126,7 +127,8 @@ def solve(
         linear_solver: overrides that of the options; `auto` asks the cost model in choose.py.
         max_iterations: limit of linear solves.
         tolerances: convergence tests.
-        dtype: `float64` or `float32`, the type of all arithmetic.
+        dtype: `float64` or `float32`, the type of all arithmetic; `mixed` is float64 with the reduced camera system
+            in float32 (`StepOptions.algebra`).
         callback: called after every iteration, which then run one by one; a true return value stops the
             solve.
 
@@ -137,13 +139,15 @@ def solve(
         ValueError: unknown names, or limits that make no sense.
         ProblemError: the cost at the start is not finite.
     """
-    if dtype not in ("float64", "float32"):
-        raise ValueError(f"dtype must be float64 or float32, not {dtype!r}")
+    if dtype not in DTYPES:
+        raise ValueError(f"dtype must be one of {', '.join(DTYPES)}, not {dtype!r}")
     if max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, is {max_iterations}")
     policy = make_policy(damping) if isinstance(damping, str) else damping
     options = choose_linear_solver(problem, options or StepOptions(), linear_solver)
     tolerances = tolerances or Tolerances()
+    if dtype == "mixed":
+        options, dtype = replace(options, algebra="mixed"), "float64"
     with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
         layout = jax.device_put(layout_for(problem, options))

@@ -6,6 +6,7 @@ import functools
 import operator
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
@@ -38,6 +39,13 @@ def outer_sum(left: Float[Array, "n terms a"], right: Float[Array, "n terms b"])
     for k in range(1, left.shape[1]):
         total = total + left[:, k, :, None] * right[:, k, None, :]
     return total
+
+
+def total(values: Float[Array, " n"]) -> Float[Array, ""]:
+    """The sum, by way of partial sums, so that float32 loses digits with the square root of n instead of with n."""
+    width = int(np.sqrt(values.shape[0])) + 1
+    padded = jnp.concatenate([values, jnp.zeros((-values.shape[0]) % width, values.dtype)])
+    return jnp.sum(jnp.sum(padded.reshape(-1, width), axis=1))
 
 
 def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:

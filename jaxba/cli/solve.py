@@ -37,7 +37,7 @@ class Arguments:
     """explicit: form and factor the reduced camera system. sparse: form it, conjugate gradients. implicit: conjugate
     gradients without forming it. power: a power series. auto chooses by size."""
 
-    dtype: Literal["float64", "float32"] = "float64"
+    dtype: Literal["float64", "float32", "mixed"] = "float64"
     """Type of all arithmetic."""
 
     max_iterations: int = 100
