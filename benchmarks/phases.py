@@ -1,6 +1,6 @@
 """Time of every phase of one LM step, beside the bytes it must move.
 
-    python benchmarks/phases.py PROBLEM [--solver explicit|sparse|implicit] [--refine 3] [--repeats 30]
+    python -m benchmarks.phases PROBLEM [--solver explicit|sparse|implicit] [--refine 3] [--repeats 30]
 
 PROBLEM is a file or a random scene (`scene:random-150`). `least` is the time that the measured copy bandwidth needs
 for the phase's inputs and outputs, each moved once; `share` is that over the measured time.
@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import argparse
 import time
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,9 +21,11 @@ import numpy as np
 from jaxba import camera, eliminate, host, lm, reduced
 from jaxba.bench.sources import sources
 from jaxba.coarse import Anchor, coarse_preconditioner
-from jaxba.layout import layout_for
-from jaxba.linearize import linearize, residuals, slot_costs, slot_frames
+from jaxba.dense import factor_and_solve
+from jaxba.layout import Layout, layout_for
+from jaxba.linearize import cost, linearize, slot_frames
 from jaxba.options import StepOptions
+from jaxba.problem import BundleProblem
 from jaxba.refine import refine_points
 
 
@@ -51,6 +55,83 @@ def bandwidth() -> float:
     return 2 * x.nbytes / least
 
 
+class Phase(NamedTuple):
+    """One row of the table."""
+
+    name: str
+    least_s: float
+    median_s: float
+    floor_s: float  # time that the copy bandwidth needs for inputs and outputs, each moved once
+    compile_s: float
+
+    def __str__(self) -> str:
+        times = f"{1e3 * self.least_s:8.2f} {1e3 * self.median_s:8.2f} {1e3 * self.floor_s:9.2f}"
+        return f"{self.name:14s} {times} {self.floor_s / self.least_s:6.0%} {self.compile_s:9.2f}"
+
+
+HEADING = f"{'phase':14s} {'min ms':>8s} {'median':>8s} {'least ms':>9s} {'share':>6s} {'compile s':>9s}"
+
+
+def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: float, repeats: int) -> Iterator[Phase]:
+    """Times every phase of a step, one compiled program each, then whole steps.
+
+    Args:
+        layout: made for these options, on the device.
+        problem: the problem.
+        options: of the step; `refine_points` only matters where refinement is timed.
+        rate: copy bandwidth, bytes per second.
+        repeats: runs of each phase.
+    """
+    done: dict[str, Any] = {}
+
+    def phase(name: str, function: Any, *arguments: Any) -> Phase:
+        done[name], least, median, compile_s = timed(function, *arguments, repeats=repeats)
+        return Phase(name, least, median, (size(arguments) + size(done[name])) / rate, compile_s)
+
+    plain = replace(options, refine_points=0)
+    state = lm.initial_state(layout, problem, plain)
+    index = (layout.slot_camera, layout.slot_point, layout.slot_mask, layout.pixels)
+    damping = jnp.asarray(1e-4)
+    yield phase("linearise", lambda s, _: linearize(layout, s.cameras, s.points, plain.loss), state, index)
+    linear = done["linearise"]
+    yield phase("eliminate", lambda li, d: eliminate.eliminate_points(layout, li, d, plain), linear, damping)
+    points = done["eliminate"]
+    turn = eliminate.Coordinates.of(state.cameras, plain)
+    by_camera = lambda li, po: eliminate.camera_system(layout, li, po, turn, damping, plain)
+    yield phase("camera sums", by_camera, linear, points)
+    system = done["camera sums"]
+    if layout.grid is not None:
+        grid = layout.grid
+        yield phase("form", lambda li, po, sy: reduced.dense_system(grid, li, po, sy), linear, points, system)
+        factor = lambda m, x: factor_and_solve(m, x.reshape(-1))
+        yield phase("factor", factor, done["form"], system.right)
+    elif plain.forms_reduced_system:
+        yield phase("form", lambda li, po, sy: reduced.reduced_blocks(layout, li, po, sy), linear, points, system)
+        solve = reduced.factor_blocks if plain.linear_solver == "explicit" else reduced.apply_blocks
+        name = "factor" if plain.linear_solver == "explicit" else "one product"
+        yield phase(name, lambda b, x: solve(layout, b, x), done["form"], system.right)
+    else:
+        product = lambda li, po, sy, x: eliminate.apply_reduced(layout, li, po, sy, x)
+        yield phase("one product", product, linear, points, system, system.right)
+    frames = camera.frames(state.cameras)
+    anchor = Anchor(frames.rotation, frames.translation, state.points)
+    if plain.uses_clusters:
+        coarse = lambda li, po, sy, x: coarse_preconditioner(layout, li, po, sy, anchor)(x)
+        yield phase("coarse system", coarse, linear, points, system, system.right)
+    whole = lambda li, po, sy: reduced.solve_reduced(layout, li, po, sy, anchor, plain)
+    yield phase("reduced solve", whole, linear, points, system)
+    back = lambda li, po, x: eliminate.back_substitute(layout, li, po, x)
+    yield phase("back-substitute", back, linear, points, system.right)
+    yield phase("cost", lambda s: cost(layout, s.cameras, s.points, plain.loss), state)
+    count = options.refine_points
+    if count:
+        refine = lambda s: refine_points(layout, slot_frames(layout, s.cameras), s.points, plain.loss, count)
+        yield phase(f"refine {count}", refine, state)
+    yield phase("whole step", lambda la, s: lm.lm_step(la, s, damping, plain), layout, state)
+    if count:
+        yield phase(f"step, refine {count}", lambda la, s: lm.lm_step(la, s, damping, options), layout, state)
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
@@ -62,89 +143,16 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     host.keep_memory()
     problem = sources([args.problem])[0].read()
-    options = StepOptions(linear_solver=args.solver)
+    options = StepOptions(linear_solver=args.solver, refine_points=args.refine)
     started = time.perf_counter()
     arrays = layout_for(problem, options)
     print(f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations")
     print(f"layout on the host {1e3 * (time.perf_counter() - started):.2f} ms; {arrays.num_slots} slots")
-    layout = jax.device_put(arrays)
     rate = bandwidth()
     print(f"copy bandwidth {rate / 1e9:.1f} GB/s, device {jax.devices()[0].device_kind}")
-    print(f"{'phase':14s} {'min ms':>8s} {'median':>8s} {'least ms':>9s} {'share':>6s} {'compile s':>9s}")
-
-    def phase(name: str, function: Any, *arguments: Any) -> Any:
-        result, least, median, compile_s = timed(function, *arguments, repeats=args.repeats)
-        floor = (size(arguments) + size(result)) / rate
-        times = f"{1e3 * least:8.2f} {1e3 * median:8.2f} {1e3 * floor:9.2f} {floor / least:6.0%} {compile_s:9.2f}"
-        print(f"{name:14s} {times}")
-        return result
-
-    state = lm.initial_state(layout, problem, options)
-    index = (layout.slot_camera, layout.slot_point, layout.slot_mask, layout.pixels)
-    damping = jnp.asarray(1e-4)
-    linear = phase("linearise", lambda s, _: linearize(layout, s.cameras, s.points, options.loss), state, index)
-    points = phase("eliminate", lambda li, d: eliminate.eliminate_points(layout, li, d, options), linear, damping)
-    turn = eliminate.Coordinates.of(state.cameras, options)
-    system = phase(
-        "camera sums", lambda li, po: eliminate.camera_system(layout, li, po, turn, damping, options), linear, points
-    )
-    if options.forms_reduced_system:
-        blocks = phase("form", lambda li, po, sy: reduced.reduced_blocks(layout, li, po, sy), linear, points, system)
-        if args.solver == "explicit":
-            phase(
-                "factor",
-                lambda b, x: reduced.factor_blocks(layout, b, x),
-                blocks,
-                system.right,
-            )
-        else:
-            phase("one product", lambda b, x: reduced.apply_blocks(layout, b, x), blocks, system.right)
-    else:
-        phase(
-            "one product",
-            lambda li, po, sy, x: eliminate.apply_reduced(layout, li, po, sy, x),
-            linear,
-            points,
-            system,
-            system.right,
-        )
-    frames = camera.frames(state.cameras)
-    anchor = Anchor(frames.rotation, frames.translation, state.points)
-    if options.uses_clusters:
-        phase(
-            "coarse system",
-            lambda li, po, sy, x: coarse_preconditioner(layout, li, po, sy, anchor)(x),
-            linear,
-            points,
-            system,
-            system.right,
-        )
-    phase(
-        "reduced solve",
-        lambda li, po, sy: reduced.solve_reduced(layout, li, po, sy, anchor, options),
-        linear,
-        points,
-        system,
-    )
-    phase(
-        "back-substitute", lambda li, po, x: eliminate.back_substitute(layout, li, po, x), linear, points, system.right
-    )
-
-    def cost(state: Any) -> Any:
-        frames = slot_frames(layout, state.cameras)
-        return jnp.sum(slot_costs(options.loss, residuals(layout, frames, state.points)[1]))
-
-    phase("cost", cost, state)
-    if args.refine:
-
-        def refine(state: Any) -> Any:
-            return refine_points(layout, slot_frames(layout, state.cameras), state.points, options.loss, args.refine)
-
-        phase(f"refine {args.refine}", refine, state)
-    phase("whole step", lambda la, s: lm.lm_step(la, s, damping, options), layout, state)
-    if args.refine:
-        refined = StepOptions(linear_solver=args.solver, refine_points=args.refine)
-        phase(f"step, refine {args.refine}", lambda la, s: lm.lm_step(la, s, damping, refined), layout, state)
+    print(HEADING)
+    for phase in measure(jax.device_put(arrays), problem, options, rate, args.repeats):
+        print(phase, flush=True)
 
 
 if __name__ == "__main__":

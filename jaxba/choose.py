@@ -39,12 +39,15 @@ problems at hand."""
 MAX_BYTES = 4e9
 """A solver that would need more memory than this is not chosen."""
 
+BYTES_PER_OBSERVATION = 1000.0
+"""Device memory of one implicit step in float64: arguments, results and temporaries. Half of it in float32. A scene of
+Ladybug-1197's size takes 931 (tests/test_memory.py, docs/performance.md)."""
+
 BYTES_PER_PAIR = 16.0
 """Index and padding; the products themselves are made in batches."""
 
 BYTES_PER_BLOCK = 3 * 81 * 8.0
 """A block, its chunks and their sums."""
-
 
 MAX_COUNTED_PAIRS = 20_000_000
 """Up to this many pairs the blocks are counted, which takes under a second."""

@@ -29,6 +29,7 @@ from jaxba.layout import Layout, PairLayout
 from jaxba.linearize import Linearization
 from jaxba.options import StepOptions
 from jaxba.precondition import block_inverse, preconditioner, series
+from jaxba.problem import AnyArray
 from jaxba.sums import take_rows, tree_sum
 
 SINGLE_LIFT = 64.0
@@ -58,12 +59,18 @@ def solve_reduced(
     if options.linear_solver == "power":
         return _power_series(product, system, options)
     if options.algebra == "full":
+        if options.linear_solver == "explicit" and layout.grid is not None:
+            matrix = dense_system(layout.grid, linear, points, system)
+            return factor_and_solve(matrix, system.right.reshape(-1)).reshape(system.right.shape), _no_iterations()
         if options.linear_solver == "explicit":
             return factor_blocks(layout, reduced_blocks(layout, linear, points, system), system.right), _no_iterations()
         return _iterate_reduced(layout, linear, points, system, anchor, options)
     rough_linear, rough_points, rough_system, rough_anchor = to_single((linear, points, system, anchor))
     if options.linear_solver == "explicit":
-        solve = factored(layout, reduced_blocks(layout, rough_linear, rough_points, rough_system))
+        if layout.grid is None:
+            solve = factored(layout, reduced_blocks(layout, rough_linear, rough_points, rough_system))
+        else:
+            solve = factored_dense(dense_system(layout.grid, rough_linear, rough_points, rough_system))
         precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
         return _iterate(product, precondition, system, replace(options, cg_forcing=REPAIR_FORCING))
     step, iterations = _iterate_reduced(layout, rough_linear, rough_points, rough_system, rough_anchor, options)
@@ -107,6 +114,18 @@ def reduced_blocks(
     return blocks.reshape(-1, 9, 9)
 
 
+def dense_system(
+    grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
+) -> Float[Array, "unknowns unknowns"]:
+    """The reduced camera system as one product `diag(B) - W W^T`; W has a column per coordinate of each point."""
+    count, cameras = grid.shape
+    rows = take_rows(coupling_rows(linear, points), grid).reshape(count, cameras, 3, 9)
+    wide = rows.transpose(1, 3, 0, 2).reshape(9 * cameras, 3 * count)
+    product = jnp.matmul(wide, wide.T, precision="highest")
+    own = system.blocks[:, :, None, :] * jnp.eye(cameras, dtype=product.dtype)[:, None, :, None]
+    return own.reshape(9 * cameras, 9 * cameras) - product
+
+
 def factor_blocks(
     layout: Layout, blocks: Float[Array, "blocks 9 9"], right: Float[Array, "cameras 9"]
 ) -> Float[Array, "cameras 9"]:
@@ -119,20 +138,27 @@ def factor_blocks(
     )
 
 
+def factored_dense(matrix: Float[Array, "n n"]) -> Callable[[Array], Array]:
+    """As `factored`, of a dense matrix."""
+    scale = lax.rsqrt(jnp.diagonal(matrix))
+    lift = SINGLE_LIFT * float(jnp.finfo(matrix.dtype).eps)
+    panels = factor_panels(matrix * scale[:, None] * scale + lift * jnp.eye(matrix.shape[0], dtype=matrix.dtype))
+    return lambda r: (scale * panels.solve(scale * r.reshape(-1))).reshape(r.shape)
+
+
 def factored(layout: Layout, blocks: Float[Array, "blocks 9 9"]) -> Callable[[Array], Array]:
     """The inverse of a system known to rounding only, for a preconditioner: its scaled diagonal is lifted a little."""
     pairs = _pairs(layout)
+    if pairs.band is None:
+        return factored_dense(dense_blocks(pairs, blocks.reshape(-1, 81), 9))
     diagonal = jnp.diagonal(take_rows(blocks, pairs.diagonal), axis1=1, axis2=2)  # [cameras, 9]
     scale = lax.rsqrt(diagonal)
     lift = SINGLE_LIFT * float(jnp.finfo(blocks.dtype).eps)
     scaled = blocks * take_rows(scale, pairs.block_row)[:, :, None] * take_rows(scale, pairs.block_column)[:, None, :]
     own = (pairs.block_camera < layout.num_cameras).astype(blocks.dtype)
     scaled = scaled + lift * own[:, None, None] * jnp.eye(9, dtype=blocks.dtype)
-    if pairs.band is not None:
-        band = band_factor(pairs.band, scaled)
-        return lambda r: scale * band.solve(scale * r)
-    panels = factor_panels(dense_blocks(pairs, scaled.reshape(-1, 81), 9))
-    return lambda r: scale * panels.solve((scale * r).reshape(-1)).reshape(r.shape)
+    band = band_factor(pairs.band, scaled)
+    return lambda r: scale * band.solve(scale * r)
 
 
 def apply_blocks(

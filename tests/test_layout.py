@@ -138,7 +138,7 @@ def test_the_order_of_the_observations_does_not_matter():
 
 def test_one_observation_is_enough():
     problem = support.single()
-    layout = build_layout(problem)
+    layout = build_layout(problem, grid=False)
     assert rows_of(layout) == rows_of_problem(problem)
     assert blocks_by_layout(layout, np.arange(layout.num_slots) + 1.0).shape == (1, 1)
 
@@ -223,14 +223,14 @@ def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points,
     rng = np.random.default_rng(seed)
     tracks = np.append(1, rng.integers(0, cameras + 1, points))
     problem = problem_of(tracks, cameras, seed, duplicates)
-    layout = build_layout(problem)
+    layout = build_layout(problem, grid=False)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))
 
 
 def test_the_number_of_pairs_is_that_of_the_track_lengths():
     problem = support.tiny()
-    layout = build_layout(problem)
+    layout = build_layout(problem, grid=False)
     tracks = np.bincount(problem.point_index)
     listed = np.asarray(layout.slot_mask)[layout.pairs.left] & np.asarray(layout.slot_mask)[layout.pairs.right]
     assert listed.sum() == (tracks * (tracks + 1) // 2).sum()
@@ -238,7 +238,7 @@ def test_the_number_of_pairs_is_that_of_the_track_lengths():
 
 def test_diagonal_blocks_know_their_camera_and_the_others_know_they_have_none():
     problem = support.odd()
-    pairs = build_layout(problem).pairs
+    pairs = build_layout(problem, grid=False).pairs
     cameras = problem.num_cameras
     assert np.array_equal(np.asarray(pairs.block_camera)[np.diagonal(pairs.table)], np.arange(cameras))
     row, column = np.tril_indices(cameras, -1)
@@ -247,3 +247,23 @@ def test_diagonal_blocks_know_their_camera_and_the_others_know_they_have_none():
 
 def test_pairs_are_listed_only_on_demand():
     assert build_layout(support.tiny(), pairs=False).pairs is None
+
+
+def test_a_grid_names_the_slot_of_every_view_and_an_empty_one_elsewhere():
+    problem = support.tiny()
+    layout = build_layout(problem)
+    assert layout.grid is not None
+    assert layout.pairs is None
+    column = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    seen = {(int(p), int(c)) for p, c in zip(problem.point_index, problem.camera_index, strict=True)}
+    for row, views in enumerate(np.asarray(layout.grid)):
+        for camera, slot in enumerate(views):
+            assert bool(layout.slot_mask[slot]) == ((int(column[row]), camera) in seen)
+            if layout.slot_mask[slot]:
+                assert (layout.slot_point[slot], layout.slot_camera[slot]) == (row, camera)
+
+
+def test_a_camera_that_sees_a_point_twice_has_no_grid():
+    problem = problem_of(np.full(30, 4), 4, seed=0, duplicates=3)
+    assert build_layout(problem).grid is None
+    assert build_layout(problem_of(np.full(30, 4), 4, seed=0)).grid is not None

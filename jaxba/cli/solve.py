@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxba.cli import common
-from jaxba.options import LinearSolverChoice
+from jaxba.options import LinearSolverChoice, Preconditioner
 
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
 """What is solved where no problem is named."""
@@ -37,8 +37,11 @@ class Arguments:
     """explicit: form and factor the reduced camera system. sparse: form it, conjugate gradients. implicit: conjugate
     gradients without forming it. power: a power series. auto chooses by size."""
 
+    preconditioner: Preconditioner = "two-level"
+    """Of conjugate gradients (sparse, implicit). two-level: block diagonal and the motion of clusters of cameras."""
+
     dtype: Literal["float64", "float32", "mixed"] = "float64"
-    """Type of all arithmetic."""
+    """Type of all arithmetic. mixed: float64, but the reduced camera system in float32."""
 
     max_iterations: int = 100
     """Linear solves before giving up."""
@@ -110,6 +113,7 @@ def _solve(args: Arguments) -> int:
         scaling=args.scaling,
         rotation=args.rotation,
         refine_points=args.refine_points,
+        preconditioner=args.preconditioner,
         loss=Loss(args.loss, args.loss_scale),
     )
     print(table.heading(args.problem or DEFAULT_SCENE, problem, args))

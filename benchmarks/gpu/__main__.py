@@ -1,0 +1,125 @@
+"""One LM step on a GPU: every phase, types of arithmetic, throughput of small scenes, memory.
+
+    python -m benchmarks.gpu [--problems scene:ladybug-1197,...] [--out benchmarks/gpu/results.json] [--any-device]
+
+Without a GPU it says so and measures nothing, unless `--any-device` asks for a trial run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import jaxba
+from benchmarks.phases import HEADING, bandwidth, measure, timed
+from jaxba.bench.sources import sources
+from jaxba.choose import choose
+from jaxba.layout import layout_for
+from jaxba.options import StepOptions
+
+PROBLEMS = "scene:ladybug-49,scene:random-150,scene:ladybug-1197,scene:venice-1778"
+"""Built-in scenes, since the machine with the GPU need not have any data."""
+
+BATCHES = (256, 4096, 16384)
+"""Numbers of small scenes stepped at once."""
+
+
+def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, Any]]:
+    """Seconds per iteration of whole solves, for every type of arithmetic."""
+    for dtype in ("float64", "mixed", "float32"):
+        for refine in (0, 3):
+            options = StepOptions(refine_points=refine)
+            run = lambda dtype=dtype, options=options: jaxba.solve(
+                problem, options=options, linear_solver="auto", dtype=dtype, max_iterations=iterations
+            )
+            first, second = run(), run()
+            yield {
+                "dtype": dtype,
+                "refine": refine,
+                "solver": second.linear_solver,
+                "compile_s": first.compile_s,
+                "setup_s": second.setup_s,
+                "seconds_per_iteration": second.total_s / second.iterations,
+                "cost": second.final_cost,
+                "cg": float(second.history.cg_iterations.mean()),
+            }
+
+
+def scene_throughput(count: int, dtype: Any) -> float:
+    """LM steps a second on `count` scenes of 10 cameras and 10 points in one program."""
+    options = StepOptions()
+    problems = [jaxba.random_scene(jaxba.like("paper"), seed) for seed in range(min(count, 256))]
+    layouts = [jaxba.build_layout(problem) for problem in problems]
+    states = [jaxba.initial_state(la, p, options, dtype) for la, p in zip(layouts, problems, strict=True)]
+    tile = lambda x: jnp.tile(x, (-(-count // len(problems)),) + (1,) * (x.ndim - 1))[:count]
+    stack = lambda trees: jax.tree.map(lambda *leaves: tile(jnp.stack(leaves)), *trees)
+    step = lambda la, s, d: jaxba.lm_step(la, s, d, options)
+    damping = jnp.full(count, 1e-3, dtype)
+    _, _, median, _ = timed(jax.vmap(step), stack(layouts), stack(states), damping, repeats=10)
+    return count / median
+
+
+def peak_bytes() -> int | None:
+    """Most memory in use so far, where the device tells."""
+    stats = jax.devices()[0].memory_stats()
+    return None if stats is None else int(stats.get("peak_bytes_in_use", 0))
+
+
+def main() -> int:
+    """Prints and writes the results; status 3 without a GPU."""
+    parser = argparse.ArgumentParser(description="One LM step on a GPU.")
+    parser.add_argument("--problems", default=PROBLEMS)
+    parser.add_argument("--batches", default=",".join(map(str, BATCHES)))
+    parser.add_argument("--repeats", type=int, default=20)
+    parser.add_argument("--iterations", type=int, default=10)
+    parser.add_argument("--out", default="")
+    parser.add_argument("--any-device", action="store_true", help="run on whatever JAX has")
+    args = parser.parse_args()
+    device = jax.devices()[0]
+    if device.platform != "gpu" and not args.any_device:
+        print(f"no GPU: JAX has only {device.device_kind!r}; nothing was measured", file=sys.stderr)
+        return 3
+    jax.config.update("jax_enable_x64", True)
+    results: dict[str, Any] = {"device": device.device_kind, "jax": jax.__version__, "problems": {}, "scenes": {}}
+    rate = bandwidth()
+    results["copy_bytes_per_s"] = rate
+    print(f"{device.device_kind}, copy bandwidth {rate / 1e9:.0f} GB/s")
+    for source in sources(args.problems.split(",")):
+        problem = source.read()
+        print(f"\n{source.name}: {problem.num_cameras} cameras, {problem.num_observations} observations\n{HEADING}")
+        options = StepOptions(linear_solver=choose(problem), refine_points=3)
+        started = time.perf_counter()
+        layout = jax.device_put(layout_for(problem, options))
+        entry: dict[str, Any] = {"solver": options.linear_solver, "layout_s": time.perf_counter() - started}
+        entry["phases"] = []
+        for phase in measure(layout, problem, options, rate, args.repeats):
+            print(phase, flush=True)
+            entry["phases"].append(phase._asdict())
+        entry["steps"] = []
+        for step in steps(problem, args.iterations):
+            print(step, flush=True)
+            entry["steps"].append(step)
+        entry["peak_bytes"] = peak_bytes()
+        results["problems"][source.name] = entry
+    for count in map(int, args.batches.split(",")):
+        for dtype in (jnp.float64, jnp.float32):
+            rates = [scene_throughput(count, dtype) for _ in range(3)]
+            name = f"{count} x {jnp.dtype(dtype).name}"
+            results["scenes"][name] = statistics.median(rates)
+            print(f"scenes 10 x 10, {name}: {results['scenes'][name]:.0f} steps/s", flush=True)
+    if args.out:
+        Path(args.out).write_text(json.dumps(results, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
