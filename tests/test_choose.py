@@ -1,0 +1,122 @@
+"""The choice of the linear solver: what it counts, and what it makes of a sequence."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import support
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from jaxba import BundleProblem, build_layout
+from jaxba.choose import count_pairs, predict
+from jaxba.options import StepOptions
+from jaxba.scenes import SceneConfig, random_scene
+from jaxba.solve import choose_linear_solver
+
+SEQUENCE = SceneConfig(
+    cameras=300, points=6000, observations=24000, max_depth=10.0, gap_share=0.0, trajectory="lateral"
+)
+"""A point is seen by up to 18 cameras in a row."""
+
+
+def problem_of(cameras: int, points: int, seed: int, duplicates: int = 0) -> BundleProblem:
+    """Random views in random order; some are there twice, some cameras and points have none."""
+    rng = np.random.default_rng(seed)
+    seen = rng.random((cameras, points)) < rng.uniform(0.05, 0.5)
+    seen[rng.integers(cameras), rng.integers(points)] = True
+    views = rng.permutation(np.argwhere(seen))
+    views = np.concatenate([views, views[rng.integers(len(views), size=duplicates)]])
+    pixels = rng.normal(size=(len(views), 2))
+    return BundleProblem.create(
+        rng.normal(size=(cameras, 9)), rng.normal(size=(points, 3)), pixels, views[:, 0], views[:, 1]
+    )
+
+
+def renumbered(problem: BundleProblem, seed: int) -> BundleProblem:
+    """The same problem with its cameras in random order."""
+    order = np.random.default_rng(seed).permutation(problem.num_cameras)
+    cameras = np.empty_like(problem.cameras)
+    cameras[order] = problem.cameras
+    return problem.replace(cameras=cameras, camera_index=order[problem.camera_index].astype(np.int32))
+
+
+# Counts
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 25), st.integers(1, 15), st.integers(0, 10**6), st.integers(0, 4))
+def test_pairs_blocks_and_reach_are_those_of_brute_force(cameras, points, seed, duplicates):
+    problem = problem_of(cameras, points, seed, duplicates)
+    pairs, shared = 0, np.zeros((cameras, cameras), bool)
+    for point in range(points):
+        track = problem.camera_index[problem.point_index == point]
+        for i, a in enumerate(track):
+            for b in track[: i + 1]:
+                pairs += 1
+                shared[a, b] = shared[b, a] = True
+    row, column = np.nonzero(shared)
+    rank = np.argsort(reverse_cuthill_mckee(csr_matrix(shared), symmetric_mode=True))
+    reach = min(np.abs(row - column).max(initial=0), np.abs(rank[row] - rank[column]).max(initial=0))
+    assert count_pairs(problem) == (pairs, np.tril(shared).sum(), reach)
+
+
+def test_the_counted_reach_is_that_of_the_layout():
+    """Within a tile of 11 cameras, the size in which a band is stored."""
+    problem = renumbered(random_scene(SEQUENCE, 0), 1)
+    pairs = build_layout(problem).pairs
+    assert pairs is not None
+    assert pairs.band is not None
+    _, tile, columns = pairs.band.blocks.shape
+    assert columns == tile * (1 + -(-count_pairs(problem).reach // tile))
+
+
+@pytest.mark.parametrize("limit", ["MAX_COUNTED_PAIRS", "MAX_COUNTED_CAMERAS"])
+def test_what_is_not_counted_is_bounded_from_above(monkeypatch, limit):
+    problem = random_scene(SEQUENCE, 0)
+    exact = count_pairs(problem)
+    monkeypatch.setattr("jaxba.choose." + limit, 10)
+    bound = count_pairs(problem)
+    assert bound.pairs == exact.pairs
+    assert exact.blocks < bound.blocks <= 300 * 301 // 2
+    assert exact.reach < bound.reach == 300
+
+
+# The choice
+
+
+@pytest.mark.parametrize("numbered", ["in order", "at random"])
+def test_a_banded_sequence_of_hundreds_of_cameras_is_factored(numbered):
+    problem = random_scene(SEQUENCE, 0)
+    if numbered == "at random":
+        problem = renumbered(problem, 2)
+    assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "explicit"
+    costs = predict(problem)
+    assert 0 < costs.explicit < min(costs.sparse, costs.implicit)
+
+
+def test_a_system_of_hundreds_of_cameras_without_a_band_is_not_factored():
+    """As many cameras and observations, but every point is seen from anywhere."""
+    problem = random_scene(SEQUENCE, 0)
+    rng = np.random.default_rng(0)
+    anywhere = problem.replace(camera_index=rng.integers(300, size=problem.num_observations).astype(np.int32))
+    assert count_pairs(anywhere).reach > 200
+    assert predict(anywhere).explicit > 5 * predict(problem).explicit
+    assert choose_linear_solver(anywhere, StepOptions(), "auto").linear_solver != "explicit"
+
+
+def test_a_few_cameras_are_factored():
+    for problem in (support.tiny(), support.single(), random_scene(replace(SEQUENCE, cameras=50), 0)):
+        assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "explicit"
+
+
+def test_a_solver_without_the_memory_for_it_is_not_chosen(monkeypatch):
+    problem = random_scene(SEQUENCE, 0)
+    monkeypatch.setattr("jaxba.choose.MAX_BYTES", 1e6)
+    costs = predict(problem)
+    assert costs.explicit == costs.sparse == np.inf
+    assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "implicit"

@@ -1,0 +1,92 @@
+"""Steps on a sequence long enough for a band and for several clusters, against the dense normal equations."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import support
+from support import start, step
+
+from jaxba import BundleProblem, StepOptions
+from jaxba.host import calm_blas
+from jaxba.layout import layout_for
+from jaxba.scenes import SceneConfig, random_scene
+
+EXACT = StepOptions()
+TO_THE_END = StepOptions(linear_solver="implicit", cg_forcing=0.0, cg_tolerance=1e-12, cg_max_iterations=3000)
+OPTIONS = {
+    "explicit": EXACT,
+    "sparse": replace(TO_THE_END, linear_solver="sparse"),
+    "implicit": TO_THE_END,
+    "schur-jacobi": replace(TO_THE_END, preconditioner="schur-jacobi"),
+}
+DAMPING = 1e-4
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_blas_thread():
+    """Beside another busy process several threads make a dense factorisation fifty times slower."""
+    with calm_blas():
+        yield
+
+
+@functools.cache
+def sequence() -> BundleProblem:
+    """70 cameras in a row, numbered at random; no point is seen by more than eight."""
+    scene = random_scene(SceneConfig(70, 200, 800, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0)
+    order = np.random.default_rng(0).permutation(70)
+    cameras = np.empty_like(scene.cameras)
+    cameras[order] = scene.cameras
+    return scene.replace(cameras=cameras, camera_index=order[scene.camera_index].astype(np.int32))
+
+
+@functools.cache
+def truth(damping: float) -> support.Dense:
+    return support.dense(sequence(), EXACT, damping)
+
+
+@functools.cache
+def taken(name: str, damping: float):
+    layout, before = start(sequence(), OPTIONS[name])
+    return before, *step(layout, before, damping, OPTIONS[name])
+
+
+def test_the_sequence_is_factored_as_a_band_and_has_several_clusters():
+    pairs = layout_for(sequence(), OPTIONS["explicit"]).pairs
+    assert pairs is not None
+    assert pairs.band is not None
+    assert pairs.table is None
+    clusters = layout_for(sequence(), OPTIONS["sparse"]).clusters
+    assert clusters is not None
+    assert len(clusters.members) == 8
+
+
+@pytest.mark.parametrize("damping", [DAMPING, 1.0])
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_solver_takes_the_dense_normal_equation_step(name, damping):
+    before, after, info = taken(name, damping)
+    expected = truth(damping)
+    np.testing.assert_allclose(info.predicted, expected.predicted, rtol=1e-8)
+    np.testing.assert_allclose(info.gradient_max, np.max(np.abs(expected.gradient)), rtol=1e-10)
+    np.testing.assert_allclose(info.step_norm, np.linalg.norm(expected.step), rtol=1e-8)
+    assert info.accepted
+    problem = sequence()
+    found = support.difference(problem, support.back(problem, before, after), OPTIONS[name])
+    assert expected.norm(found - expected.step) <= 1e-8 * expected.norm(expected.step)
+    size = problem.cameras.size
+    cameras, wanted = found[:size].reshape(-1, 9), expected.step[:size].reshape(-1, 9)
+    for part in (slice(0, 3), slice(3, 6), 6, 7, 8):
+        assert np.linalg.norm((cameras - wanted)[:, part]) <= 1e-8 * np.linalg.norm(wanted[:, part])
+    assert np.linalg.norm(found[size:] - expected.step[size:]) <= 1e-8 * np.linalg.norm(expected.step[size:])
+
+
+def test_two_levels_need_at_most_half_the_iterations_of_one():
+    one_level = int(taken("schur-jacobi", DAMPING)[2].cg_iterations)
+    for name in ("sparse", "implicit"):
+        two_level = int(taken(name, DAMPING)[2].cg_iterations)
+        assert 0 < two_level <= one_level / 2
+    assert one_level < TO_THE_END.cg_max_iterations
+    assert taken("explicit", DAMPING)[2].cg_iterations == 0
