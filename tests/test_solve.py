@@ -394,7 +394,7 @@ def test_the_automatic_choice_of_the_linear_solver_is_told():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dtype": "float16"}, "dtype must be float64 or float32"),
+        ({"dtype": "float16"}, "dtype must be one of float64, float32, mixed"),
         ({"max_iterations": 0}, "max_iterations must be at least 1"),
         ({"damping": "cerse"}, "unknown damping policy"),
         ({"linear_solver": "dense"}, "linear_solver must be one of"),
