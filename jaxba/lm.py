@@ -13,14 +13,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba import camera
 from jaxba.layout import Layout
-from jaxba.linearize import cost, linearize, residuals, slot_costs, slot_frames
+from jaxba.linearize import cost, linearize
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
-from jaxba.refine import refine_points
 from jaxba.schur import solve_step
-from jaxba.sums import point_sum, total
+from jaxba.trial import best_trial
 
 
 class LMState(NamedTuple):
@@ -45,6 +43,7 @@ class StepInfo(NamedTuple):
     step_norm: Float[Array, ""]  # of the proposed step, refined points included
     parameter_norm: Float[Array, ""]  # before the step
     cg_iterations: Int[Array, ""]
+    damping_share: Float[Array, ""]  # share of the step's curvature that is damping's, 0 (Gauss-Newton) to 1
 
 
 def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
@@ -85,44 +84,23 @@ def lm_step(
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     step = solve_step(layout, linear, state.cameras, state.points, damping, options)
-    cameras = move_cameras(state.cameras, step.cameras, options)
-    points = state.points + step.points
-    frames = slot_frames(layout, cameras)
-    if options.refine_points:
-        points, costs = refine_points(layout, frames, points, options.loss, options.refine_points)
-        before = point_sum(layout, linear.costs[None])[0]
-    else:
-        costs = slot_costs(options.loss, residuals(layout, frames, points)[1])
-        before = linear.costs
-    candidate = total(costs)
-    decrease = total(before - costs)  # term by term: the two sums would cancel in float32
-    gain = decrease / step.predicted
-    accepted = (
-        (decrease > 0) & (candidate <= state.cost) & (step.predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
-    )
+    trial = best_trial(layout, state.cameras, state.points, state.cost, linear, step, options, min_gain)
+    accepted = trial.accepted
     choose = lambda new, old: jnp.where(accepted, new, old)
-    moved = points - state.points
-    after = LMState(choose(cameras, state.cameras), choose(points, state.points), choose(candidate, state.cost))
+    moved = [trial.cameras - state.cameras, trial.points - state.points]
+    after = LMState(*(choose(*pair) for pair in zip(trial[:3], state, strict=True)))
     return after, StepInfo(
         cost=after.cost,
         previous_cost=state.cost,
-        candidate_cost=candidate,
-        predicted=step.predicted,
-        gain_ratio=gain,
+        candidate_cost=trial.cost,
+        predicted=trial.predicted,
+        gain_ratio=trial.gain,
         accepted=accepted,
         damping=damping,
         gradient_max=step.gradient_max,
-        step_norm=jnp.sqrt(jnp.sum(step.cameras**2) + jnp.sum(moved**2)),
+        step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in moved)),
         parameter_norm=jnp.sqrt(jnp.sum(state.cameras**2) + jnp.sum(state.points**2)),
         cg_iterations=step.cg_iterations,
+        damping_share=step.damped / step.slope,
     )
 
-
-def move_cameras(
-    cameras: Float[Array, "9 cameras"], step: Float[Array, "9 cameras"], options: StepOptions
-) -> Float[Array, "9 cameras"]:
-    """Adds a step; on the manifold the rotation becomes `exp(step) R`."""
-    moved = cameras + step
-    if options.rotation == "angle-axis":
-        return moved
-    return moved.at[:3].set(camera.compose_left(step[:3], cameras[:3]))

@@ -1,11 +1,13 @@
-"""Solver names, the same in every command, table and file: `[method+]policy[+refineK][@dtype]`."""
+"""Solver names, the same in every command, table and file: `[method+]policy[+refineK|+embedded][@dtype]`."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
 
-from jaxba.damping import make_policy
+from jaxba.damping import LEARNED, LEARNED_PLAIN, DampingPolicy, Learned, is_learned, make_policy
+from jaxba.damping.agent import AgentConfig
+from jaxba.options import StepOptions
 
 METHODS = ("lm",)
 """Known methods; `lm` is understood where none is named."""
@@ -25,8 +27,9 @@ class SolverName:
     policy: str
     """Damping policy, see `jaxba.damping.make_policy`."""
 
-    refine_points: int = 0
-    """Embedded point iterations."""
+    refine_points: int | None = 0
+    """Embedded point iterations and nothing else. None: all embedded iterations; a learned policy brings those that it was
+    trained with, a rule gets the default ones under the name `RULE+embedded`."""
 
     dtype: str = DTYPES[0]
     """Floating point type."""
@@ -36,9 +39,25 @@ class SolverName:
 
     def __str__(self) -> str:
         method = "" if self.method == METHODS[0] else f"{self.method}+"
-        refine = f"+refine{self.refine_points}" if self.refine_points else ""
+        if self.refine_points is None:
+            refine = "" if is_learned(self.policy) else "+embedded"
+        else:
+            refine = f"+refine{self.refine_points}" if self.refine_points or is_learned(self.policy) else ""
         dtype = "" if self.dtype == DTYPES[0] else f"@{self.dtype}"
         return f"{method}{self.policy}{refine}{dtype}"
+
+    def build(self) -> tuple[DampingPolicy, StepOptions]:
+        """The policy, and the options of the step that it drives.
+
+        Raises:
+            UnknownPolicyError, PolicyFileError: as `make_policy`.
+        """
+        plain = self.policy == LEARNED and self.refine_points == 0
+        policy = make_policy(LEARNED_PLAIN if plain else self.policy)
+        if self.refine_points is not None:
+            return policy, StepOptions(refine_points=self.refine_points)
+        agent = policy.config if isinstance(policy, Learned) else AgentConfig()
+        return policy, agent.step_options(StepOptions())
 
 
 def parse_solver(name: str) -> SolverName:
@@ -57,16 +76,24 @@ def parse_solver(name: str) -> SolverName:
             merged[-1] += "+" + part
         else:
             merged.append(part)
-    refine = 0
+    refine: int | None = 0
+    stated = True
     if len(merged) > 1 and (match := re.fullmatch(r"refine(\d+)", merged[-1])):
         refine = int(match[1])
         merged.pop()
+    elif len(merged) > 1 and merged[-1] == "embedded":
+        refine = None
+        merged.pop()
+    else:
+        stated = False
     method = merged.pop(0) if len(merged) > 1 else METHODS[0]
     if len(merged) != 1 or not merged[0]:
-        raise SolverNameError(f"{name!r} is no solver; the form is [method+]policy[+refineK][@dtype]")
+        raise SolverNameError(f"{name!r} is no solver; the form is [method+]policy[+refineK|+embedded][@dtype]")
     if method not in METHODS:
         raise SolverNameError(f"unknown method {method!r} in {name!r}; known: {', '.join(METHODS)}")
     if at and dtype not in DTYPES:
         raise SolverNameError(f"unknown type {dtype!r} in {name!r}; known: {', '.join(DTYPES)}")
     make_policy(merged[0])
+    if is_learned(merged[0]) and not stated:
+        refine = None
     return SolverName(merged[0], refine, dtype or DTYPES[0], method)

@@ -50,6 +50,13 @@ class StepOptions:
     refine_points: int = 0
     """Embedded point iterations after each camera step."""
 
+    trials: int = 1
+    """How often a step is tried before it is rejected, each time a quarter as long; see `trial.py`."""
+
+    camera_rounds: int = 0
+    """Rounds in which first every camera, then every point is re-optimised alone, where a step did much less than the
+    linear model promised; see `trial.py`."""
+
     loss: Loss = field(default_factory=Loss)
     """Robust loss of the squared whitened residual."""
 
@@ -77,8 +84,9 @@ class StepOptions:
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
-        if self.refine_points < 0:
-            raise ValueError(f"refine_points must not be negative, is {self.refine_points}")
+        for name, least in (("refine_points", 0), ("camera_rounds", 0), ("trials", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, is {getattr(self, name)}")
         for name in ("preconditioner_order", "power_order"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")

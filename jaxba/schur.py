@@ -26,9 +26,14 @@ class Step(NamedTuple):
 
     cameras: Float[Array, "9 cameras"]  # in the coordinates of the options
     points: Float[Array, "3 points"]
-    predicted: Float[Array, ""]  # decrease of the cost promised by the linear model, pixels^2
+    slope: Float[Array, ""]  # -g.d = d.(H + D) d, pixels^2
+    damped: Float[Array, ""]  # d.D d, pixels^2
     gradient_max: Float[Array, ""]  # largest entry of the gradient before the step
     cg_iterations: Int[Array, ""]  # 0 when the system was factored
+
+    def predicted(self, share: Array) -> Float[Array, ""]:
+        """Decrease of the cost that the linear model promises at a share of the step, pixels^2."""
+        return share * (0.5 * share * self.damped + (1 - 0.5 * share) * self.slope)
 
 
 def solve_step(
@@ -65,27 +70,30 @@ def solve_step(
     turned = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
     gradient = jnp.concatenate([turned, system.gradient[:, 3:]], axis=1)
     gradient_max = jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.max(jnp.abs(jnp.stack(eliminated.gradient))))
+    slope, damped = _slope_and_damping(eliminated, system, step, camera_step, point_step)
     return Step(
         camera_step.T,
         jnp.stack(point_step),
-        _predicted_decrease(eliminated, system, step, camera_step, point_step),
+        slope,
+        damped,
         gradient_max,
         iterations,
     )
 
 
-def _predicted_decrease(
+def _slope_and_damping(
     points: PointSystem, system: CameraSystem, step: Array, camera_step: Array, point_step: list[Array]
-) -> Float[Array, ""]:
-    """`-(g.d + d.H d / 2)` written as sums that do not cancel.
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """`-g.d` and `d.D d`, from which the linear model's decrease follows as a sum that does not cancel.
 
-    `(H + D) d = -g - rest` turns it into `(d.D d - g.d - d.rest) / 2`. The rest is zero for a factored system,
-    and orthogonal to the step for conjugate gradients started at zero. Both kept terms are positive.
+    The decrease is `-(g.d + d.H d / 2)`. `(H + D) d = -g - rest` turns it into `(d.D d - g.d - d.rest) / 2`. The rest is
+    zero for a factored system, and orthogonal to the step for conjugate gradients started at zero. Both kept terms are
+    positive.
     """
     moves = jnp.stack(point_step)
     slope = jnp.sum(system.gradient * step) + jnp.sum(jnp.stack(points.gradient) * moves)
     damped = jnp.sum(system.damping * camera_step**2) + jnp.sum(jnp.stack(points.damping) * moves**2)
-    return 0.5 * (damped - slope)
+    return -slope, damped
 
 
 def largest_diagonal(layout: Layout, linear: Linearization) -> Float[Array, ""]:

@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from jaxba import geometry, host
 from jaxba.choose import choose
 from jaxba.clock import CompileClock
-from jaxba.damping import DampingPolicy, ProblemInfo, make_policy
+from jaxba.damping import DampingPolicy, Learned, ProblemInfo, make_policy
 from jaxba.layout import Layout, layout_for
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
@@ -123,7 +123,7 @@ def solve(
     Args:
         problem: start of the optimisation.
         damping: a policy, or the name of one (`jaxba.make_policy`).
-        options: how a step is made.
+        options: how a step is made; if left out, with the embedded iterations that a learned policy was trained with.
         linear_solver: overrides that of the options; `auto` asks the cost model in choose.py.
         max_iterations: limit of linear solves.
         tolerances: convergence tests.
@@ -144,7 +144,9 @@ def solve(
     if max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, is {max_iterations}")
     policy = make_policy(damping) if isinstance(damping, str) else damping
-    options = choose_linear_solver(problem, options or StepOptions(), linear_solver)
+    if options is None:
+        options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
+    options = choose_linear_solver(problem, options, linear_solver)
     tolerances = tolerances or Tolerances()
     if dtype == "mixed":
         options, dtype = replace(options, algebra="mixed"), "float64"
@@ -212,6 +214,7 @@ def _start(layout: Layout, state: LMState, policy: DampingPolicy, options: StepO
         cameras=count(layout.num_cameras),
         points=count(layout.num_points),
         unit=unit,
+        focal=jnp.median(jnp.abs(state.cameras[6])),
         max_iterations=count(max_iterations),
     )
     policy_state, damping = policy.init(info)

@@ -14,6 +14,10 @@ from jaxba.lm import StepInfo
 DAMPING_LIMIT = 1e32
 """A step rejected with this lambda ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
 
+HIDDEN_DECREASE = 100.0
+"""A small decrease ends a solve only if, without damping, it would be estimated at no more than this times as large. A
+step that lambda made short says nothing about how far the minimum is."""
+
 
 class Termination(enum.IntEnum):
     """Why a solve ended."""
@@ -54,7 +58,7 @@ class Tolerances(NamedTuple):
     """Convergence tests, on accepted steps only (design, section 2)."""
 
     ftol: float = 1e-6
-    """`|f - f'| <= ftol f`."""
+    """`|f - f'| <= ftol f`, by a step that is not short for its damping (`converged_in_cost`)."""
 
     xtol: float = 1e-8
     """`|step| <= xtol (|x| + xtol)`."""
@@ -63,11 +67,23 @@ class Tolerances(NamedTuple):
     """Largest gradient entry."""
 
 
+def converged_in_cost(step: StepInfo, ftol: Any) -> Bool[Array, ""]:
+    """An accepted step lowered the cost by at most `ftol f`, and not because damping made it short.
+
+    Let s be the share of the step's curvature `d.(H + D) d` that is damping's. In a direction of curvature h,
+    `s = lambda / (h + lambda)`, and the undamped model would promise `1 / (1 - s^2)` times the decrease. That may not
+    exceed `HIDDEN_DECREASE` times the tolerance.
+    """
+    decrease, share = step.previous_cost - step.cost, step.damping_share
+    hidden = decrease > HIDDEN_DECREASE * (1 - share) * (1 + share) * ftol * step.previous_cost
+    return step.accepted & (decrease <= ftol * step.previous_cost) & ~hidden
+
+
 def termination_of(
     step: StepInfo, stuck: Bool[Array, ""], iteration: Int[Array, ""], tolerances: Tolerances, max_iterations: Any
 ) -> Int[Array, ""]:
     """First stop rule that applies. Only an accepted step, or a zero gradient, ends a solve as converged."""
-    by_cost = step.accepted & (step.previous_cost - step.cost <= tolerances.ftol * step.previous_cost)
+    by_cost = converged_in_cost(step, tolerances.ftol)
     by_step = step.accepted & (step.step_norm <= tolerances.xtol * (step.parameter_norm + tolerances.xtol))
     by_gradient = step.gradient_max <= tolerances.gtol
     limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)

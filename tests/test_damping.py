@@ -25,6 +25,7 @@ def info(unit: float = 1.0, dtype=jnp.float64) -> ProblemInfo:
         cameras=count(4),
         points=count(30),
         unit=jnp.asarray(unit, dtype),
+        focal=jnp.asarray(500.0, dtype),
         max_iterations=count(100),
     )
 

@@ -17,7 +17,6 @@ from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import Source
 from jaxba.bench.summary import write_text
 from jaxba.naming import SolverName, parse_solver
-from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.solve import MAX_ITERATIONS, IterationRecord, Solution, Tolerances, solve
 
@@ -67,10 +66,11 @@ def run_solver(
         if on_iteration:
             on_iteration(step)
 
+    policy, options = solver.build()
     solution = solve(
         problem,
-        solver.policy,
-        StepOptions(refine_points=solver.refine_points),
+        policy,
+        options,
         linear_solver=settings.linear_solver,
         max_iterations=settings.max_iterations,
         tolerances=Tolerances(ftol=settings.ftol),

@@ -14,8 +14,8 @@ import tyro
 from jaxba.cli import common
 from jaxba.options import LinearSolverChoice
 
-DEFAULT_SOLVERS = "classic,ceres,gauss-newton,schedule,ceres+refine3"
-"""Both yardsticks, the extremes, and the best hand-written rule."""
+DEFAULT_SOLVERS = "learned,classic,ceres,ceres+refine3,ceres+embedded"
+"""The shipped policy, both yardsticks, and the better of them with the policy's embedded iterations."""
 
 FILE_WIDTH = 180
 """Columns of the tables where the output is no terminal."""
@@ -37,8 +37,8 @@ class Arguments:
     max_iterations."""
 
     solvers: str | None = None
-    """Comma-separated names, [method+]policy[+refineK][@dtype]. Default:
-    classic,ceres,gauss-newton,schedule,ceres+refine3."""
+    """Comma-separated names, [method+]policy[+refineK|+embedded][@dtype]. Default:
+    learned,classic,ceres,ceres+refine3,ceres+embedded."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default 1e-3."""

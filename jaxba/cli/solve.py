@@ -6,7 +6,7 @@ import json
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -26,12 +26,13 @@ class Arguments:
     problem: Annotated[str | None, tyro.conf.Positional] = None
     """BAL file or Bundler .out file, plain or .bz2, .gz, .xz. Without it a built-in random scene is solved."""
 
-    damping: str = "ceres"
-    """Who chooses lambda: ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4;
+    damping: str = "learned"
+    """Who chooses lambda: learned (the shipped policy), a .safetensors file of jaxba-train, ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4;
     most take a first lambda, as in classic:0.03."""
 
-    refine_points: int = 0
-    """Embedded point iterations after each camera step; 3 is a good number."""
+    refine_points: int | None = None
+    """Embedded point iterations after each camera step, and no other embedded iterations. If left out: those that a learned
+    policy was trained with, none for a rule."""
 
     linear_solver: LinearSolverChoice = "auto"
     """explicit: form and factor the reduced camera system. sparse: form it, conjugate gradients. implicit: conjugate
@@ -88,7 +89,7 @@ def _solve(args: Arguments) -> int:
     common.check_positive(
         max_iterations=args.max_iterations, ftol=args.ftol, xtol=args.xtol, gtol=args.gtol, loss_scale=args.loss_scale
     )
-    if args.refine_points < 0:
+    if args.refine_points is not None and args.refine_points < 0:
         raise common.UsageError(f"--refine-points must not be negative, is {args.refine_points}")
     common.check_writable("--output", args.output)
     common.check_writable("--log", args.log)
@@ -99,24 +100,25 @@ def _solve(args: Arguments) -> int:
     from jaxba.bench.sources import embedded_sources
     from jaxba.bench.summary import write_text
     from jaxba.cli import table
-    from jaxba.damping import make_policy
+    from jaxba.damping import is_learned
     from jaxba.io import read_problem, write_problem
     from jaxba.losses import Loss
     from jaxba.naming import SolverName
-    from jaxba.options import StepOptions
     from jaxba.solve import IterationRecord, Tolerances, solve
 
-    policy = make_policy(args.damping)
+    refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
+    name = SolverName(args.damping, refine, args.dtype)
+    policy, options = name.build()
     problem = read_problem(args.problem) if args.problem else embedded_sources()[0].read()
     common.prepare_process()
-    options = StepOptions(
+    options = replace(
+        options,
         scaling=args.scaling,
         rotation=args.rotation,
-        refine_points=args.refine_points,
         preconditioner=args.preconditioner,
         loss=Loss(args.loss, args.loss_scale),
     )
-    print(table.heading(args.problem or DEFAULT_SCENE, problem, args))
+    print(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
     steps: list[IterationRecord] = []
     with _Interrupt() as interrupt:
 
@@ -145,7 +147,6 @@ def _solve(args: Arguments) -> int:
             raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
         print(f"wrote {args.output}")
     if args.log:
-        name = SolverName(args.damping, args.refine_points, args.dtype)
         record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
         try:
             write_text(Path(args.log), json.dumps(record_to_json(record), allow_nan=False) + "\n")

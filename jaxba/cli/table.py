@@ -7,15 +7,20 @@ from typing import Any
 import numpy as np
 
 from jaxba import geometry
+from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.solve import IterationRecord, Solution
 
 _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
 
 
-def heading(name: str, problem: BundleProblem, args: Any) -> str:
+def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
     """What is about to be solved, and how."""
-    refine = f" + {args.refine_points} point iterations" if args.refine_points else ""
+    refine = f" + {options.refine_points} point iterations" if options.refine_points else ""
+    if options.camera_rounds:
+        refine += f", up to {options.camera_rounds} camera rounds"
+    if options.trials > 1:
+        refine += f", up to {options.trials} trials"
     sizes = f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations"
     return f"{name}: {sizes}\ndamping {args.damping}{refine}, {args.dtype}, linear solver {args.linear_solver}"
 

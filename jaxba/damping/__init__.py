@@ -1,19 +1,27 @@
 """Damping policies: who chooses lambda."""
 
+from jaxba.damping.learned import Learned, PolicyFileError, load_policy, save_policy
 from jaxba.damping.policy import DampingPolicy, ProblemInfo
-from jaxba.damping.registry import POLICIES, UnknownPolicyError, make_policy
+from jaxba.damping.registry import LEARNED, LEARNED_PLAIN, POLICIES, UnknownPolicyError, is_learned, make_policy
 from jaxba.damping.rules import Ceres, Classic, Geometric, Schedule
 from jaxba.damping.safeguard import Safeguard
 
 __all__ = [
+    "LEARNED",
+    "LEARNED_PLAIN",
     "POLICIES",
     "Ceres",
     "Classic",
     "DampingPolicy",
     "Geometric",
+    "Learned",
+    "PolicyFileError",
     "ProblemInfo",
     "Safeguard",
     "Schedule",
     "UnknownPolicyError",
+    "is_learned",
+    "load_policy",
     "make_policy",
+    "save_policy",
 ]

@@ -18,6 +18,7 @@ class ProblemInfo(NamedTuple):
     cameras: Int[Array, ""]
     points: Int[Array, ""]
     unit: Float[Array, ""]  # largest Hessian diagonal under identity scaling, 1 under diagonal scaling
+    focal: Float[Array, ""]  # median focal length, pixels
     max_iterations: Int[Array, ""]
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
+from jaxba.damping.learned import load_policy
 from jaxba.damping.policy import DampingPolicy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
 
@@ -21,6 +23,18 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
 }
 """Factory and one line of description by name."""
 
+LEARNED, LEARNED_PLAIN = "learned", "learned-plain"
+"""The shipped policies: for a step with embedded iterations, and for lambda alone (`learned+refine0`)."""
+
+SHIPPED = {
+    LEARNED: "default.safetensors",
+    LEARNED_PLAIN: "plain.safetensors",
+}
+"""Their files in `jaxba/policies`, made by `jaxba-train --config default` and `plain`."""
+
+SUFFIX = ".safetensors"
+"""Ending by which a name is the path of a policy file."""
+
 CONSTANT = "constant"
 """Prefix of `constant:VALUE`."""
 
@@ -33,17 +47,22 @@ def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
     Args:
-        name: a key of `POLICIES`, optionally `name:FIRST_LAMBDA` for the rules that have one, or
-            `constant:LAMBDA`.
+        name: `learned`, the path of a policy file, a key of `POLICIES`, optionally `name:FIRST_LAMBDA` for the rules
+            that have one, or `constant:LAMBDA`.
 
     Raises:
         UnknownPolicyError: no such policy, or a lambda that is not a positive number.
+        PolicyFileError: a path, but not of a policy file.
     """
+    if name in SHIPPED:
+        return load_policy(Path(__file__).parent.parent / "policies" / SHIPPED[name])
+    if is_learned(name):
+        return load_policy(name)
     base, colon, number = name.partition(":")
     if base == CONSTANT:
         return Schedule(values=(_damping(name, number),))
     if base not in POLICIES:
-        known = ", ".join([*POLICIES, "constant:LAMBDA"])
+        known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}"])
         raise UnknownPolicyError(f"unknown damping policy {name!r}; known: {known}")
     policy = POLICIES[base][0]()
     if not colon:
@@ -51,6 +70,11 @@ def make_policy(name: str) -> DampingPolicy:
     if isinstance(policy, Schedule):
         raise UnknownPolicyError(f"{base!r} has no first lambda to set; use constant:LAMBDA")
     return replace(policy, initial=_damping(name, number))  # type: ignore[type-var]
+
+
+def is_learned(name: str) -> bool:
+    """Whether a policy of this name has a network and brings its own embedded iterations."""
+    return name in SHIPPED or name.endswith(SUFFIX)
 
 
 def _damping(name: str, number: str) -> float:

@@ -1,0 +1,240 @@
+"""`jaxba-train`: from a configuration to a policy file."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from jaxba.cli import common
+
+DEFAULT_CONFIG = "default"
+"""Preset of a new run where none is named."""
+
+POLICY = "policy.safetensors"
+CURVE = "curve"
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of `jaxba-train`."""
+
+    config: str | None = None
+    """default, fast, paper, or the path of a YAML file. A resumed run takes that of its folder."""
+
+    overrides: Annotated[
+        tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="KEY=VALUE ...")
+    ] = ()
+    """Settings that win over the file, such as sac.width=128 seed=3; values are YAML."""
+
+    out: str | None = None
+    """Folder of the run; runs/NAME of the configuration if left out."""
+
+    resume: bool = False
+    """Go on with the run in the folder, from its last checkpoint, with the same numbers as if it had never stopped."""
+
+
+def main() -> None:
+    """Entry point of `jaxba-train`."""
+    common.exit_with(run())
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; status 0 when the policy is written, 2 for bad input, 130 after Ctrl-C (the run is saved)."""
+    return common.run_command(Arguments, _train, "Trains a damping policy on random scenes.", argv)
+
+
+def _train(args: Arguments) -> int:
+    import jax
+    from rich.console import Console
+
+    from jaxba import host
+    from jaxba.game import config as configs
+    from jaxba.game import task, train
+
+    jax.config.update("jax_enable_x64", True)  # the game counts in float64, the agent's networks in float32
+    overrides = tuple(item for group in args.overrides for item in group)
+    name = args.config or DEFAULT_CONFIG
+    folder = Path(args.out or Path("runs") / Path(name).stem)
+    try:
+        config = None if args.resume and args.config is None else configs.load(name, overrides)
+        config = train.prepare_folder(folder, config, args.resume, overrides)
+    except (configs.SettingsError, train.TrainError) as error:
+        raise common.UsageError(str(error)) from None
+    common.prepare_process()
+    console = Console(soft_wrap=True, highlight=False)
+    with host.calm_blas(), _Interrupt() as interrupt, _Progress(console, config) as progress:
+        try:
+            work = task.build(config, folder, progress.stage)
+            progress.rules = work.rules
+            interrupt.gentle = True
+
+            def keep(best: train.Best) -> None:
+                _write_policy(folder, config, work, best)
+
+            hooks = train.Hooks(progress.stage, progress.row, keep, lambda: interrupt.asked)
+            outcome = train.train(config, work.game, work.evaluate, folder, hooks)
+            interrupt.gentle = False
+        except KeyboardInterrupt:
+            console.print(f"interrupted; go on from the last checkpoint with {_again(folder)}")
+            return common.INTERRUPTED
+        except ValueError as error:
+            raise common.UsageError(str(error)) from None
+        if not outcome.finished:
+            console.print(f"interrupted and saved; go on with {_again(folder)}")
+            return common.INTERRUPTED
+        return _finish(folder, work, outcome.best, console, progress)
+
+
+def _again(folder: Path) -> str:
+    return f"jaxba-train --out {folder} --resume"
+
+
+def _write_policy(folder: Path, config: Any, work: Any, best: Any) -> None:
+    from jaxba import __version__
+    from jaxba.damping.learned import save_policy
+    from jaxba.game.config import to_yaml
+
+    facts = {
+        "jaxba": __version__,
+        "config": to_yaml(config),
+        "agent_number": str(best.seed),
+        "chunk": str(best.chunk),
+        "held_out_iterations": f"{best.score:.4f}",
+    }
+    save_policy(folder / POLICY, work.policy(best.actor), facts)
+
+
+def _finish(folder: Path, work: Any, best: Any, console: Any, progress: _Progress) -> int:
+    """Policy file, curve and table."""
+    from jaxba.bench.plots import save_figure
+    from jaxba.game import curve, metrics
+
+    _write_policy(folder, work.config, work, best)
+    rules = {name: {**score._asdict(), "score": score.mean} for name, score in work.rules.items()}
+    figure = curve.plot_curve(metrics.read(folder), rules, work.config.game.tolerance)
+    files = [folder / POLICY, *save_figure(figure, folder / CURVE)]
+    progress.stage("comparing with the rules")
+    scores = work.compare(best.actor)
+    progress.__exit__()
+    count = sum(len(bank.initial_cost) for bank in work.held_out)
+    console.print(_table(scores, work.config.game.tolerance, count))
+    console.print(f"best: agent {best.seed + 1} after chunk {best.chunk}")
+    console.print(f"wrote {', '.join(str(file) for file in files)}")
+    return 0
+
+
+def _table(scores: Mapping[str, Any], tolerance: float, count: int) -> Any:
+    from rich.table import Table
+
+    table = Table(
+        title=f"iterations to f*(1 + {tolerance:g}) on {count} held-out scenes",
+        title_justify="left",
+        title_style="bold",
+    )
+    table.add_column("policy")
+    for name in ("mean", "geom. mean", "median", "p90", "failures", "to convergence", "final gap"):
+        table.add_column(name, justify="right")
+    for name, score in scores.items():
+        numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
+        table.add_row(
+            name, *numbers, f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}"
+        )
+    return table
+
+
+class _Interrupt:
+    """Ctrl-C ends at once while things are built; in training it asks for an end after the chunk, the second time it
+    is real."""
+
+    def __init__(self) -> None:
+        self.asked, self.gentle = False, False
+
+    def __enter__(self) -> _Interrupt:
+        self._before = signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _handle(self, *_: object) -> None:
+        if self.asked or not self.gentle:
+            raise KeyboardInterrupt
+        self.asked = True
+        print("stopping after this chunk; Ctrl-C again stops at once", file=sys.stderr)
+
+
+class _Progress:
+    """A live line on a terminal, plain lines elsewhere."""
+
+    def __init__(self, console: Any, config: Any) -> None:
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self.console, self.config = console, config
+        self.rules: Mapping[str, Any] = {}
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            TimeElapsedColumn(),
+            TextColumn("ETA"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[now]}"),
+            console=console,
+            transient=True,
+            speed_estimate_period=600,
+            disable=not console.is_terminal,
+        )
+        self._task: Any = None
+        self._best = float("inf")
+
+    def __enter__(self) -> _Progress:
+        self._bar.start()
+        self._task = self._bar.add_task("starting", total=None, now="")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def stage(self, words: str) -> None:
+        """Something begins that takes a while."""
+        self._bar.update(self._task, description=words, now="")
+        if not self.console.is_terminal:
+            self.console.print(words)
+
+    def row(self, row: Mapping[str, Any]) -> None:
+        """A chunk is done."""
+        config = self.config
+        done = row["seed"] * config.chunks + row["chunk"]
+        total = config.seeds * config.chunks
+        now = (
+            f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s, "
+            f"{row.get('episode/length') or 0:.1f} iterations"
+        )
+        if "episode/ceres" in row:
+            now += f" (Ceres' rule {row['episode/ceres']:.1f})"
+        description = f"agent {row['seed'] + 1}/{config.seeds}, chunk {row['chunk']}/{config.chunks}"
+        if self._bar.tasks[0].total is None:
+            self._bar.reset(self._task, total=total, completed=done - 1)
+        self._bar.update(self._task, description=description, total=total, completed=done, now=now)
+        if not self.console.is_terminal:
+            self.console.print(f"{description}: {now}, {row['wall_s']:.0f} s")
+        if row.get("held_out/score") is not None:
+            self.console.print(f"{description}: {self._held_out(row)}")
+
+    def _held_out(self, row: Mapping[str, Any]) -> str:
+        score = row["held_out/score"]
+        text = f"held out {score:.2f} iterations"
+        if row.get("held_out/p90") is not None:
+            text += f", p90 {row['held_out/p90']:.0f}, failures {100 * row['held_out/failures']:.1f} %"
+        rules = [f"{name} {self.rules[name].mean:.2f}" for name in ("ceres", "ceres+embedded") if name in self.rules]
+        if rules:
+            text += f" ({', '.join(rules)})"
+        if score < self._best:
+            self._best = score
+            text += ", best so far"
+        return text

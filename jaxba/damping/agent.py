@@ -1,0 +1,316 @@
+"""The agent's side of an iteration: what it sees, and what its action means.
+
+The game and the learned policy share this, so that a policy meets in a solve exactly what it met in training: the same
+observation, the same map from an action in (-1, 1) to lambda, the same guard around it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxba.damping.policy import ProblemInfo
+from jaxba.damping.rules import LARGEST, Ceres
+from jaxba.lm import StepInfo
+from jaxba.options import StepOptions
+
+Observation = Literal["scale-free", "paper", "released-code"]
+ActionMode = Literal["absolute", "relative"]
+GuardMode = Literal["off", "pause", "hand-over"]
+
+FLOOR = 1e-9
+"""Smallest relative decrease that a feature tells from none."""
+
+PAPER_LIMIT = 1000.0
+"""Upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023."""
+
+RELATIVE_REACH = 3.0
+"""Decades by which a relative action changes lambda at most."""
+
+FIRST_DAMPING = -4.0
+"""log10 of the lambda that a first relative action starts from, with twice the reach. Source: Ceres' first lambda."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """How an agent is wired to the solver. Hashable; stored in a policy's file."""
+
+    observation: Observation = "scale-free"
+    """`scale-free`: decreases, gain ratios and lambdas of the last steps as ratios and logarithms. `paper`: the last
+    errors. `released-code`: the decrease that the linear model promised, as in the authors' code."""
+
+    history: int = 5
+    """Steps that an observation goes back; the paper's state size."""
+
+    low: float = -10.0
+    """log10 of the smallest lambda."""
+
+    high: float = 2.0
+    """log10 of the largest lambda."""
+
+    action: ActionMode = "absolute"
+    """`absolute`: an action is a lambda, linear in its logarithm. `relative`: it is a factor on the last one."""
+
+    guard: GuardMode = "hand-over"
+    """After `patience` rejections in a row Ceres' rule decides: until a step is accepted (`pause`), or to the end
+    (`hand-over`)."""
+
+    patience: int = 2
+    """Rejections in a row that call the guard."""
+
+    max_rejections: int = 8
+    """Rejections in a solve after which the guard decides to the end, in either mode."""
+
+    escalate: float = 0.5
+    """Decades by which lambda must rise after a rejection at least; 0 switches it off, as does guard `off`."""
+
+    refine_points: int = 3
+    """Embedded point iterations of the step that it drives."""
+
+    trials: int = 4
+    """Trials of the step that it drives, see `StepOptions`."""
+
+    camera_rounds: int = 3
+    """Camera rounds of the step that it drives, see `StepOptions`."""
+
+    def __post_init__(self) -> None:
+        for name, known in (("observation", Observation), ("action", ActionMode), ("guard", GuardMode)):
+            if getattr(self, name) not in get_args(known):
+                raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
+        if not 1 <= self.history <= 20:
+            raise ValueError(f"history must be 1 to 20, is {self.history}")
+        if not -15 <= self.low < self.high <= 10:
+            raise ValueError(f"lambda must range over decades within -15 to 10, not {self.low} to {self.high}")
+        if self.patience < 1 or self.max_rejections < 1:
+            raise ValueError("patience and max_rejections must be at least 1")
+        if self.escalate < 0:
+            raise ValueError(f"escalate must not be negative, is {self.escalate}")
+        self.step_options(StepOptions())
+
+    def step_options(self, options: StepOptions) -> StepOptions:
+        """The options with the embedded iterations that the agent was trained with."""
+        return replace(
+            options, refine_points=self.refine_points, trials=self.trials, camera_rounds=self.camera_rounds
+        )
+
+    @property
+    def guarded(self) -> bool:
+        """Whether anything is done to the agent's choices."""
+        return self.guard != "off"
+
+    @property
+    def observation_size(self) -> int:
+        """Numbers in an observation."""
+        if self.observation == "scale-free":
+            return len(StepFacts._fields) * self.history + len(_GLOBALS)
+        return self.history
+
+
+def config_from(values: dict[str, Any]) -> AgentConfig:
+    """The inverse of `dataclasses.asdict`.
+
+    Raises:
+        ValueError: unknown names or impossible values.
+    """
+    known = {field.name: field for field in fields(AgentConfig)}
+    for name, value in values.items():
+        if name not in known:
+            raise ValueError(f"unknown setting {name!r}")
+        kind = type(known[name].default)
+        if not isinstance(value, (int, float) if kind is float else kind) or isinstance(value, bool):
+            raise ValueError(f"{name} must be of type {kind.__name__}, is {value!r}")
+    return AgentConfig(**values)
+
+
+class StepFacts(NamedTuple):
+    """Features of one step, all within [-2, 2]."""
+
+    present: Array  # 0 where there was no such step yet
+    decrease: Array  # log10 of cost before over cost after
+    small_decrease: Array  # log10 of the relative decrease, for the last digits
+    promised: Array  # log10 of the decrease that the linear model promised, relative to the cost
+    gain: Array  # gain ratio, squashed
+    candidate: Array  # log10 of the candidate's cost over the cost, for rejected steps
+    damping: Array  # log10 of lambda
+    accepted: Array
+    share: Array  # share of the step's curvature that was damping's
+
+
+_GLOBALS = (
+    "progress",  # log10 of the first cost over the present one
+    "error_angle",  # log10 of the rms error over the focal length
+    "tracks",  # observations per point
+    "redundancy",  # equations per unknown
+    "cameras",
+    "rejections",  # in a row
+    "all_rejections",
+    "remaining",  # share of the budget, which makes its end foreseeable
+    "worked",  # log10 of the last lambda that was accepted
+    "smallest_worked",  # log10 of the smallest one
+    "failed",  # log10 of the largest lambda rejected since
+)
+
+
+class Memory(NamedTuple):
+    """What is kept between iterations."""
+
+    info: ProblemInfo
+    facts: Float[Array, "history features"]  # newest first
+    errors: Float[Array, " history"]  # of `paper` and `released-code`, newest first
+    cost: Float[Array, ""]
+    damping: Float[Array, ""]  # log10 of the last lambda
+    iteration: Int[Array, ""]
+    row: Int[Array, ""]  # rejections in a row
+    rejections: Int[Array, ""]  # in all
+    worked: Float[Array, ""]
+    smallest_worked: Float[Array, ""]
+    failed: Float[Array, ""]
+    growth: Float[Array, ""]  # of the guard's rule after the next rejection
+    gain: Float[Array, ""]  # of the last step
+    hand_over: Bool[Array, ""]  # the guard decides to the end
+    capped: Bool[Array, ""]  # the last step was short because of its lambda
+
+
+def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
+    """Before the first iteration."""
+    dtype = info.cost.dtype
+    number = lambda x: jnp.asarray(x, dtype)
+    zero = jnp.zeros((), jnp.int32)
+    no = jnp.zeros((), bool)
+    error = _error(info, info.cost) if config.observation == "paper" else number(0.0)
+    return Memory(
+        info=info,
+        facts=jnp.zeros((config.history, len(StepFacts._fields)), dtype),
+        errors=jnp.zeros((config.history,), dtype).at[0].set(error),
+        cost=info.cost,
+        damping=number(FIRST_DAMPING),
+        iteration=zero,
+        row=zero,
+        rejections=zero,
+        worked=number(FIRST_DAMPING),
+        smallest_worked=number(FIRST_DAMPING),
+        failed=number(config.low),
+        growth=number(Ceres().reject_growth),
+        gain=number(0.0),
+        hand_over=no,
+        capped=no,
+    )
+
+
+def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
+    """What the network sees, float32."""
+    if config.observation != "scale-free":
+        return memory.errors.astype(jnp.float32)
+    info = memory.info
+    unknowns = 9.0 * info.cameras + 3.0 * info.points
+    whole = [
+        _log(info.cost / memory.cost) / 3,
+        _log(_error(info, memory.cost) / info.focal) + 3,
+        _log(info.observations / info.points),
+        _log(2.0 * info.observations / unknowns),
+        _log(info.cameras) - 1,
+        memory.row / 3.0,
+        memory.rejections / 5.0,
+        1 - memory.iteration / info.max_iterations,
+        _decades(memory.worked),
+        _decades(memory.smallest_worked),
+        _decades(memory.failed),
+    ]
+    features = jnp.concatenate([memory.facts.reshape(-1), jnp.stack([jnp.asarray(x) for x in whole])])
+    return jnp.clip(jnp.nan_to_num(features), -2, 2).astype(jnp.float32)
+
+
+def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) -> Float[Array, ""]:
+    """Lambda for an action in (-1, 1), the guard's word included."""
+    action = action.astype(memory.cost.dtype)
+    middle, half = 0.5 * (config.low + config.high), 0.5 * (config.high - config.low)
+    wanted = middle + half * action
+    if config.action == "relative":
+        reach = jnp.where(memory.iteration == 0, 2 * RELATIVE_REACH, RELATIVE_REACH)
+        wanted = jnp.clip(memory.damping + reach * action, config.low, config.high)
+    if not config.guarded:
+        return 10**wanted
+    rejected = memory.row > 0
+    wanted = jnp.where(rejected, jnp.maximum(wanted, memory.damping + config.escalate), wanted)
+    wanted = jnp.where(memory.capped, jnp.minimum(wanted, memory.damping - 1), wanted)
+    rule = Ceres()
+    shrink = jnp.clip(1 - (2 * memory.gain - 1) ** 3, rule.shrink_floor, rule.shrink_ceiling)
+    guard = memory.damping + jnp.log10(jnp.where(rejected, memory.growth, shrink))
+    # what is smaller than the rule's own first lambda is not where a rescue starts
+    guard = jnp.where(memory.row == config.patience, jnp.maximum(guard, FIRST_DAMPING), guard)
+    guarded = memory.hand_over | (memory.row >= config.patience)
+    return jnp.clip(10 ** jnp.where(guarded, guard, wanted), 10**config.low, LARGEST)
+
+
+def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
+    """After an iteration."""
+    dtype = memory.cost.dtype
+    damping = jnp.log10(step.damping)
+    decrease = (step.previous_cost - step.cost) / step.previous_cost
+    tiny = lambda x: (_log(x + FLOOR) + 4.5) / 4.5
+    gain = jnp.where(jnp.isfinite(step.gain_ratio), step.gain_ratio, -1.0)
+    facts = StepFacts(
+        present=jnp.ones((), dtype),
+        decrease=_log(step.previous_cost / step.cost),
+        small_decrease=tiny(decrease),
+        promised=tiny(step.predicted / step.previous_cost),
+        gain=gain / (1 + jnp.abs(gain)),
+        candidate=jnp.where(step.accepted, 0.0, _log(step.candidate_cost / step.previous_cost)),
+        damping=_decades(damping),
+        accepted=jnp.where(step.accepted, 1.0, -1.0),
+        share=step.damping_share,
+    )
+    row = jnp.clip(jnp.nan_to_num(jnp.stack(facts), nan=2.0), -2, 2).astype(dtype)
+    error = {
+        "paper": lambda: jnp.minimum(_error(memory.info, step.cost), PAPER_LIMIT),
+        "released-code": lambda: jnp.nan_to_num(step.predicted),
+        "scale-free": lambda: jnp.zeros((), dtype),
+    }[config.observation]()
+    shifted = lambda old, new: jnp.concatenate([new[None].astype(dtype), old[:-1]])
+    in_row = jnp.where(step.accepted, 0, memory.row + 1).astype(jnp.int32)
+    rejections = (memory.rejections + ~step.accepted).astype(jnp.int32)
+    over = rejections >= config.max_rejections
+    if config.guard == "hand-over":
+        over = over | (in_row >= config.patience)
+    guarding = memory.hand_over | (memory.row >= config.patience)
+    growth = jnp.where(step.accepted | ~guarding, Ceres().reject_growth, 2 * memory.growth).astype(dtype)
+    pick = lambda yes, no: jnp.where(step.accepted, yes, no).astype(dtype)
+    return Memory(
+        info=memory.info,
+        facts=shifted(memory.facts, row),
+        errors=shifted(memory.errors, error),
+        cost=step.cost,
+        damping=damping.astype(dtype),
+        iteration=(memory.iteration + 1).astype(jnp.int32),
+        row=in_row,
+        rejections=rejections,
+        worked=pick(damping, memory.worked),
+        smallest_worked=pick(jnp.minimum(damping, memory.smallest_worked), memory.smallest_worked),
+        failed=pick(config.low, jnp.maximum(damping, memory.failed)),
+        growth=growth,
+        gain=gain.astype(dtype),
+        hand_over=memory.hand_over | over,
+        capped=step.accepted & (decrease < HEAVY_DECREASE) & (step.damping_share > HEAVY_SHARE),
+    )
+
+
+HEAVY_DECREASE, HEAVY_SHARE = 1e-4, 0.5
+"""A step that lowers the cost by less, and is short for damping more than this share, must be followed by a lambda ten
+times smaller: else a solve could stand still without having converged."""
+
+
+def _log(x: Any) -> Array:
+    return jnp.log10(jnp.maximum(x, 1e-30))
+
+
+def _decades(x: Array) -> Array:
+    return (x + 4) / 6
+
+
+def _error(info: ProblemInfo, cost: Array) -> Array:
+    """Root mean square error of an observation in pixels."""
+    return jnp.sqrt(2 * cost / info.observations)

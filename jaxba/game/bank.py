@@ -1,0 +1,235 @@
+"""The bank of scenes that the game is played on, and the best cost known for each.
+
+Scenes are made in one compiled program, solved by a portfolio of hand-written rules with embedded point iterations, run
+long, and sieved: what no rule brings to an end, what is solved at the start and what is numerically absurd teaches nothing.
+The best cost of a scene ends its episodes in training. Nothing that a policy sees depends on it.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxba.damping import ProblemInfo, make_policy
+from jaxba.game.play import Trajectories, play
+from jaxba.game.scenes import SceneClass, Scenes, make_scenes
+from jaxba.layout import Layout, build_layout
+from jaxba.linearize import cost
+from jaxba.losses import Loss
+from jaxba.options import StepOptions
+from jaxba.problem import BundleProblem
+
+PORTFOLIO = ("ceres", "gtsam", "theseus")
+"""Rules whose best cost counts, each with point iterations."""
+
+PORTFOLIO_ITERATIONS = 50
+"""Linear solves of each rule."""
+
+PORTFOLIO_FTOL = 1e-7
+"""Relative decrease of an accepted step that ends a rule's run, a decade below the solver's own."""
+
+MIN_RATIO, MAX_RATIO = 1.1, 1e6
+"""Initial over best cost of a scene that is kept (issue 3)."""
+
+SMALLEST_COST_SHARE = 1e-9
+"""... and its best cost over the cost of one pixel an observation: below, rounding decides."""
+
+MIN_OBSERVATIONS = 30
+"""Smaller scenes are not even tried ..."""
+
+MAX_ERROR_ANGLE = 0.2
+"""... nor those whose start is off by more, root mean square, relative to the focal length: points near the cameras' planes."""
+
+EASY_ENOUGH = 40
+"""Iterations in which at least one rule must come within 1e-3 of the best cost."""
+
+
+class Bank(NamedTuple):
+    """Scenes with what is known of them. A row is a scene."""
+
+    scenes: Scenes
+    initial_cost: Float[Array, " scenes"]
+    best_cost: Float[Array, " scenes"]
+    info: ProblemInfo  # a field per scene
+    effort: Float[Array, " scenes"]  # iterations of Ceres' rule to 1e-3 of the best cost
+
+
+@functools.cache
+def class_layout(kind: SceneClass) -> Layout:
+    """Slots for every pair of a camera and a point; scenes put their own pixels and mask in (`with_scene`)."""
+    count = kind.cameras * kind.points
+    camera, point = np.tile(np.arange(kind.cameras), kind.points), np.repeat(np.arange(kind.points), kind.cameras)
+    cameras = np.zeros((kind.cameras, 9))
+    problem = BundleProblem.create(cameras, np.zeros((kind.points, 3)), np.zeros((count, 2)), camera, point)
+    layout = build_layout(problem)
+    if layout.grid is None:
+        raise AssertionError("scenes of the game are dense")
+    return layout
+
+
+def with_scene(layout: Layout, pixels: Float[Array, "2 slots"], mask: Bool[Array, " slots"]) -> Layout:
+    """The class's layout with one scene's observations."""
+    cameras = layout.num_cameras
+    seen = jnp.any(mask.reshape(cameras, -1), axis=1)
+    return replace(layout, pixels=pixels, slot_mask=mask, camera_seen=seen)
+
+
+def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
+    """What a policy may know of each scene before the first iteration."""
+    count = len(scenes.mask)
+    grid = scenes.mask.reshape(count, kind.cameras, kind.points + 1)
+    whole = lambda x: x.astype(jnp.int32)
+    seen = jnp.any(grid, axis=2)
+    focal = jnp.nanmedian(jnp.where(seen, scenes.cameras[:, 6], jnp.nan), axis=1)
+    return ProblemInfo(
+        cost=initial,
+        observations=whole(jnp.sum(scenes.mask, axis=1)),
+        cameras=whole(jnp.sum(seen, axis=1)),
+        points=whole(jnp.sum(jnp.any(grid, axis=1), axis=1)),
+        unit=jnp.ones_like(initial),
+        focal=focal,
+        max_iterations=jnp.full((count,), limit, jnp.int32),
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("kind",))
+def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
+    """The cost of every start, pixels squared."""
+    layout = class_layout(kind)
+
+    def one(scene: Scenes) -> Array:
+        return cost(with_scene(layout, scene.pixels, scene.mask), scene.cameras, scene.points, Loss())
+
+    return jax.lax.map(one, scenes, batch_size=256)
+
+
+@dataclass(frozen=True)
+class BankConfig:
+    """How many scenes of which kind."""
+
+    classes: tuple[SceneClass, ...] = field(default_factory=lambda: (SceneClass(10, 40),))
+    """Shapes of scenes; each is a program of its own."""
+
+    scenes: tuple[int, ...] = (12000,)
+    """Scenes drawn in each class, before sieving."""
+
+    refine_points: int = 3
+    """Embedded point iterations of the portfolio."""
+
+    dtype: str = "float64"
+    """Arithmetic of the game's solves."""
+
+    def __post_init__(self) -> None:
+        if len(self.classes) != len(self.scenes) or not self.classes:
+            raise ValueError(f"{len(self.classes)} classes of scenes but {len(self.scenes)} numbers of scenes")
+        if min(self.scenes) < 1:
+            raise ValueError("every class needs at least one scene")
+
+
+class Draft(NamedTuple):
+    """Scenes of one class with the runs of the portfolio, before sieving."""
+
+    bank: Bank
+    runs: dict[str, Trajectories]
+    useful: np.ndarray
+
+
+def draft(
+    kind: SceneClass,
+    key: Array,
+    count: int,
+    options: StepOptions,
+    limit: int,
+    dtype: str = "float64",
+    rules: Sequence[str] = PORTFOLIO,
+    on_rule: Callable[[str], None] = lambda _: None,
+) -> Draft:
+    """Makes scenes and solves them with every rule.
+
+    Args:
+        kind: class of scenes.
+        key: random key.
+        count: scenes drawn.
+        options: of the steps.
+        limit: iterations of an episode, for the scenes' `ProblemInfo`.
+        dtype: arithmetic.
+        rules: the portfolio.
+        on_rule: told when a rule begins.
+    """
+    scenes = make_scenes(kind, key, count, dtype)
+    initial = initial_costs(kind, scenes)
+    info = info_of(kind, scenes, initial, limit)
+    error = jnp.sqrt(2 * initial / jnp.maximum(info.observations, 1))
+    keep = np.flatnonzero((error < MAX_ERROR_ANGLE * info.focal) & (info.observations >= MIN_OBSERVATIONS))
+    scenes, initial, info = jax.tree.map(lambda x: x[keep], (scenes, initial, info))
+    bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
+    runs = {}
+    for rule in rules:
+        on_rule(rule)
+        runs[rule] = play(kind, bank, make_policy(rule), options, PORTFOLIO_ITERATIONS, PORTFOLIO_FTOL)
+    best = np.min([run.costs[:, -1] for run in runs.values()], axis=0)
+    bank = bank._replace(best_cost=jnp.asarray(best), effort=jnp.asarray(reach(runs[rules[0]].costs, best, 1e-3)))
+    ratio = np.asarray(initial) / best
+    soonest = np.min([reach(run.costs, best, 1e-3) for run in runs.values()], axis=0)
+    floor = SMALLEST_COST_SHARE * np.asarray(info.observations)
+    useful = (ratio > MIN_RATIO) & (ratio < MAX_RATIO) & (soonest <= EASY_ENOUGH) & (best > floor)
+    return Draft(bank, runs, useful)
+
+
+class Split(NamedTuple):
+    """Scenes to train on, and scenes that training never sees."""
+
+    train: Bank
+    held_out: Bank
+
+
+def make_banks(
+    config: BankConfig,
+    key: Array,
+    options: StepOptions,
+    limit: int,
+    on_progress: Callable[[str], None] = lambda _: None,
+) -> list[Split]:
+    """Draws, solves, sieves and splits the scenes of every class.
+
+    Args:
+        config: which and how many.
+        key: the same key gives the same banks.
+        options: of the portfolio's steps.
+        limit: iterations of an episode.
+        on_progress: told in words what begins.
+    """
+    splits = []
+    for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
+        where = f"{kind.cameras} cameras x {kind.points} points"
+        say = lambda rule, where=where, count=count: on_progress(f"{count} scenes of {where}: {rule}")
+        made = draft(kind, jax.random.fold_in(key, number), count, options, limit, config.dtype, on_rule=say)
+        rows = np.flatnonzero(made.useful)
+        held = max(1, round(HELD_OUT * len(rows)))
+        if len(rows) <= held:
+            raise ValueError(f"only {len(rows)} of {count} scenes of {where} are of use: draw more")
+        splits.append(Split(sieve(made.bank, rows[held:]), sieve(made.bank, rows[:held])))
+    return splits
+
+
+HELD_OUT = 0.1
+"""Share of the useful scenes that training never sees."""
+
+
+def reach(costs: Float[np.ndarray, "scenes iterations"], best: Float[np.ndarray, " scenes"], share: float) -> np.ndarray:
+    """Iterations until the accepted cost is at most `best (1 + share)`; infinite where it never is."""
+    there = costs <= best[:, None] * (1 + share)
+    return np.where(there.any(axis=1), there.argmax(axis=1), np.inf)
+
+
+def sieve(bank: Bank, rows: Int[np.ndarray, " kept"] | Bool[np.ndarray, " scenes"]) -> Bank:
+    """The scenes of some rows."""
+    return jax.tree.map(lambda x: x[jnp.asarray(rows)], bank)

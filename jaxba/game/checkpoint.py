@@ -1,0 +1,114 @@
+"""Checkpoints: a tree of arrays and a few facts, written whole or not at all.
+
+Orbax writes into a temporary folder and renames it, so that a checkpoint that has its name is complete. A tree is
+stored as a flat mapping from paths to NumPy arrays: what is restored must fit what the program expects, leaf by leaf.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+_PREFIX = "step_"
+_FACTS = "facts"
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that cannot be used. The message is one line for a person."""
+
+
+def pack(tree: Any) -> dict[str, np.ndarray]:
+    """Leaves of a tree by path, copied to the host; random keys as their data."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {_name(path): np.array(jax.random.key_data(x) if _is_key(x) else x) for path, x in leaves}
+
+
+def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
+    """The inverse of `pack`, on the device and in memory of its own.
+
+    Args:
+        arrays: leaves by path.
+        like: a tree of that structure, of arrays or of `jax.ShapeDtypeStruct`.
+
+    Raises:
+        CheckpointError: a leaf is missing, or is of another shape or type.
+    """
+
+    def leaf(path: Any, expected: Any) -> Any:
+        name = _name(path)
+        if name not in arrays:
+            raise CheckpointError(f"{name} is missing")
+        value = jnp.array(arrays[name], copy=True)  # of its own, since training donates it
+        if _is_key(expected):
+            value = jax.random.wrap_key_data(value)
+        if (value.shape, value.dtype) != (expected.shape, expected.dtype):
+            found, wanted = (f"{x.dtype}{list(x.shape)}" for x in (value, expected))
+            raise CheckpointError(f"{name} is {found}, not {wanted}")
+        return value
+
+    return jax.tree_util.tree_map_with_path(leaf, like)
+
+
+def _name(path: Any) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".") or "all"
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def steps(folder: Path) -> list[int]:
+    """Numbers of the complete checkpoints in a folder, in order."""
+    if not folder.is_dir():
+        return []
+    names = [item.name.removeprefix(_PREFIX) for item in folder.iterdir() if item.name.startswith(_PREFIX)]
+    return sorted(int(name) for name in names if name.isdigit())
+
+
+def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any], keep: int) -> None:
+    """Writes a checkpoint, then removes those before the last `keep`, and what a kill left half-written.
+
+    Args:
+        folder: of all checkpoints; is made.
+        step: number of this one; one of the same number is replaced.
+        arrays: see `pack`.
+        facts: must be JSON; they are part of the checkpoint.
+        keep: checkpoints that stay, this one included.
+    """
+    import orbax.checkpoint as ocp
+
+    folder.mkdir(parents=True, exist_ok=True)
+    content = {**arrays, _FACTS: np.frombuffer(json.dumps(facts).encode(), np.uint8)}
+    with ocp.StandardCheckpointer() as checkpointer:
+        checkpointer.save((folder / f"{_PREFIX}{step}").absolute(), content, force=True)
+        checkpointer.wait_until_finished()
+    complete = {f"{_PREFIX}{number}" for number in steps(folder)[-keep:]}
+    for item in folder.iterdir():
+        if item.name.startswith(_PREFIX) and item.name not in complete:
+            shutil.rmtree(item, ignore_errors=True)
+
+
+def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and facts of a checkpoint.
+
+    Raises:
+        CheckpointError: it cannot be read.
+    """
+    import orbax.checkpoint as ocp
+
+    path = (folder / f"{_PREFIX}{step}").absolute()
+    try:
+        with ocp.PyTreeCheckpointer() as checkpointer:
+            content = checkpointer.restore(path)
+    except (OSError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
+    arrays = {name: np.asarray(value) for name, value in content.items()}
+    facts = json.loads(arrays.pop(_FACTS).tobytes())
+    return arrays, facts

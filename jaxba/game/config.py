@@ -1,0 +1,170 @@
+"""Everything that a training run depends on, and the YAML files that say it.
+
+A file states differences to the defaults of the classes; a run writes all of it into its folder. The presets lie in
+`jaxba/presets/train` as package data, where an installed jaxba finds them; `configs/train` in the repository is a link
+to that folder, so that there is one copy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from jaxba.game import settings
+from jaxba.game.bank import BankConfig
+from jaxba.game.env import GameConfig
+from jaxba.game.loop import LoopConfig
+from jaxba.game.sac import SacConfig
+from jaxba.game.settings import SettingsError
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run."""
+
+    seed: int = 0
+    """Decides the scenes and, with the number of the agent, all of its training."""
+
+    seeds: int = 1
+    """Agents trained one after the other on the same scenes with one compiled program; the best on held-out scenes is
+    kept. One after the other, since on a CPU neither the small matrix products of several agents nor the LM steps of
+    their scenes gain anything from a further batch axis, while replay buffers would all be held at once."""
+
+    chunks: int = 40
+    """Length of the training of each agent: calls of the compiled loop, of `loop.steps_per_chunk` vector steps."""
+
+    evaluate_every: int = 4
+    """Chunks from one evaluation on held-out scenes to the next; after the last chunk there always is one."""
+
+    checkpoint_every: int = 4
+    """Chunks from one checkpoint to the next: what a kill loses at most."""
+
+    keep: int = 2
+    """Checkpoints kept. Each holds the best policy so far too."""
+
+    envs: tuple[int, ...] = (64,)
+    """Environments of each class of scenes."""
+
+    bank: BankConfig = field(default_factory=BankConfig)
+    """Scenes."""
+
+    game: GameConfig = field(default_factory=GameConfig)
+    """Rules of the game, and what the agent sees and does."""
+
+    sac: SacConfig = field(default_factory=SacConfig)
+    """The agent."""
+
+    loop: LoopConfig = field(default_factory=LoopConfig)
+    """Sizes of the training loop."""
+
+    def __post_init__(self) -> None:
+        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.seed < 2**31:
+            raise ValueError(f"seed must lie in 0 to 2147483647, not {self.seed}")
+        if len(self.envs) != len(self.bank.classes):
+            raise ValueError(f"envs: {len(self.envs)} numbers for {len(self.bank.classes)} classes of scenes")
+        if min(self.envs) < 1:
+            raise ValueError(f"envs: every class needs at least one environment, not {min(self.envs)}")
+        if sum(self.envs) > self.loop.replay_capacity:
+            raise ValueError(f"loop.replay_capacity must be at least the {sum(self.envs)} environments")
+        if self.bank.dtype not in ("float64", "float32"):
+            raise ValueError(f"bank.dtype must be float64 or float32, not {self.bank.dtype!r}")
+        _check_agent(self.sac)
+        if self.game.shaping and self.game.discount != self.sac.gamma:
+            raise ValueError(f"game.discount must be sac.gamma, {self.sac.gamma}, where there is shaping")
+
+
+def _check_agent(sac: SacConfig) -> None:
+    """Numbers of `sac` that make no sense would otherwise show as a program that cannot be traced, or as nan."""
+    for name in ("width", "layers", "batch", "target_every"):
+        if getattr(sac, name) < 1:
+            raise ValueError(f"sac.{name} must be at least 1, not {getattr(sac, name)}")
+    for name in ("learning_rate", "initial_temperature", "reward_scale", "log_std_max"):
+        if not getattr(sac, name) > 0:
+            raise ValueError(f"sac.{name} must be positive, not {getattr(sac, name)}")
+    for name in ("gamma", "tau"):
+        if not 0 < getattr(sac, name) <= 1:
+            raise ValueError(f"sac.{name} must lie in (0, 1], not {getattr(sac, name)}")
+    if not sac.log_std_min < 0:
+        raise ValueError(f"sac.log_std_min must be negative, not {sac.log_std_min}")
+    if sac.max_grad_norm is not None and not sac.max_grad_norm > 0:
+        raise ValueError(f"sac.max_grad_norm must be positive or null, not {sac.max_grad_norm}")
+
+
+def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
+    """The configuration of a preset or a file.
+
+    Args:
+        name: a preset (`preset_names`), or the path of a YAML file: anything with a slash or an ending.
+        overrides: `key.key=value` each, the value in YAML; they win over the file.
+
+    Raises:
+        SettingsError: no such file, not YAML, an unknown key or an impossible value.
+    """
+    text = _text(name)
+    data = _parse(text, name)
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise SettingsError(f"{name}: must be a mapping with keys such as {', '.join(_KEYS)}")
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if not equals or not key:
+            raise SettingsError(f"--set {override}: must be key=value")
+        try:
+            settings.assign(data, key.strip(), _parse(value, "the value"), TrainConfig)
+        except SettingsError as error:
+            raise SettingsError(f"--set {override}: {error}") from None
+    try:
+        return settings.read(TrainConfig, data)
+    except SettingsError as error:
+        raise SettingsError(f"{name}{' with --set' if overrides else ''}: {error}") from None
+
+
+_KEYS = tuple(settings.field_types(TrainConfig))
+
+
+def to_yaml(config: TrainConfig) -> str:
+    """All settings, defaults included; `load` of it gives the same configuration."""
+    import yaml
+
+    return yaml.safe_dump(settings.plain(config), sort_keys=False)
+
+
+def preset_names() -> list[str]:
+    """Names that `load` finds without a path."""
+    return sorted(Path(item.name).stem for item in _presets().iterdir() if item.name.endswith(".yaml"))
+
+
+def _presets() -> Any:
+    return resources.files("jaxba") / "presets" / "train"
+
+
+def _text(name: str) -> str:
+    path: Any = Path(name)
+    if len(path.parts) == 1 and not path.suffix:
+        path = _presets() / f"{name}.yaml"
+        if not path.is_file():
+            raise SettingsError(f"no configuration {name!r}; known: {', '.join(preset_names())}, or the path of a file")
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SettingsError(f"{name}: {error.strerror or 'cannot be read'}") from None
+    except UnicodeDecodeError:
+        raise SettingsError(f"{name}: not text") from None
+
+
+def _parse(text: str, name: str) -> Any:
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
+        raise SettingsError(f"{name}{where}: not YAML") from None

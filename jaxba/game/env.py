@@ -1,0 +1,270 @@
+"""The game: bundle adjustment as a vectorised environment. A step is one LM iteration of every scene.
+
+| | |
+| --- | --- |
+| state | a scene of the bank, its cameras and points, the agent's memory of the episode |
+| observation | `damping.agent.observe` |
+| action | one number in (-1, 1), lambda by `damping.agent.damping_of`, the guard included |
+| terminated | accepted cost within `tolerance` of the scene's best known; or the limit, where that counts as failure |
+| truncated | the limit, where it does not |
+| reward | `GameConfig.reward` |
+
+Everything is traced once. Episodes that end are followed by another scene of the bank, gathered by number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxba.damping.agent import AgentConfig, Memory, begin, damping_of, observe, record
+from jaxba.damping.rules import Ceres
+from jaxba.game.bank import Bank, class_layout, with_scene
+from jaxba.game.play import step_groups
+from jaxba.game.protocol import Step
+from jaxba.game.scenes import SceneClass
+from jaxba.lm import LMState, StepInfo, lm_step
+from jaxba.options import StepOptions
+
+Reward = Literal["duration", "constant", "reduction", "reversed"]
+
+POINT_ITERATION_COST = 0.1
+"""Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
+Ladybug-49: three take 3.9 of 12.6 ms (docs/performance.md)."""
+
+BONUS_DECAY = 0.01
+"""Share of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023, ablation."""
+
+SHAPING_FLOOR = 1e-4
+"""Distance to the best cost, relative to it, below which the shaping potential is flat."""
+
+
+@dataclass(frozen=True)
+class GameConfig:
+    """Rules of the game. Hashable: static in compiled programs."""
+
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    """What the agent sees and does."""
+
+    reward: Reward = "duration"
+    """`duration`: minus a deterministic cost of the iteration. `constant`: -1. `reduction`: nothing, and a bonus that shrinks.
+    `reversed`: the error as reward (the paper's ablation)."""
+
+    bonus: float = 10.0
+    """Added where the episode ends in success. Source: Belder et al. 2023."""
+
+    scale: float = 0.1
+    """Factor on every reward, so that returns stay within a few units."""
+
+    shaping: float = 0.0
+    """Reward per decade of distance to the best cost that an iteration takes off; a potential, which leaves the best
+    policy what it is (Ng, Harada, Russell 1999)."""
+
+    discount: float = 0.99
+    """Of the shaping's potential; must be the agent's."""
+
+    tolerance: float = 1e-3
+    """Success: accepted cost at most (1 + tolerance) times the best known."""
+
+    max_iterations: int = 40
+    """Limit of an episode."""
+
+    limit_is_failure: bool = True
+    """Whether the limit ends an episode for good, as the paper counts it, or cuts it off."""
+
+    def __post_init__(self) -> None:
+        if self.reward not in get_args(Reward):
+            raise ValueError(f"reward must be one of {', '.join(get_args(Reward))}, not {self.reward!r}")
+        if self.max_iterations < 1 or self.tolerance <= 0 or self.scale <= 0:
+            raise ValueError("max_iterations, tolerance and scale must be positive")
+
+
+class Episode(NamedTuple):
+    """One environment."""
+
+    scene: Int[Array, ""]
+    state: LMState
+    memory: Memory
+
+
+class GameState(NamedTuple):
+    """All environments; a tuple entry per class of scenes."""
+
+    episodes: tuple[Episode, ...]
+    key: Array
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Game:
+    """Satisfies `protocol.Environment`."""
+
+    banks: tuple[Bank, ...]
+    """Scenes to play, a bank per class."""
+
+    kinds: tuple[SceneClass, ...] = field(metadata={"static": True})
+    """Classes of the banks."""
+
+    envs: tuple[int, ...] = field(metadata={"static": True})
+    """Environments of each class."""
+
+    config: GameConfig = field(metadata={"static": True})
+    """Rules."""
+
+    options: StepOptions = field(metadata={"static": True})
+    """Of the LM step, embedded iterations included."""
+
+    @property
+    def num_envs(self) -> int:
+        """Environments that step together."""
+        return sum(self.envs)
+
+    @property
+    def observation_size(self) -> int:
+        """Features of an observation."""
+        return self.config.agent.observation_size
+
+    @property
+    def action_size(self) -> int:
+        """Numbers of an action."""
+        return 1
+
+    def reset(self, key: Array) -> tuple[GameState, Float[Array, "envs features"]]:
+        """New episodes everywhere."""
+        key, *keys = jax.random.split(key, 1 + len(self.kinds))
+        episodes = tuple(
+            jax.vmap(lambda k, bank=bank: self._fresh(bank, k))(jax.random.split(k, count))
+            for bank, k, count in zip(self.banks, keys, self.envs, strict=True)
+        )
+        return GameState(episodes, key), self._observe(episodes)
+
+    def _observe(self, episodes: tuple[Episode, ...]) -> Array:
+        see = jax.vmap(lambda episode: observe(self.config.agent, episode.memory))
+        return jnp.concatenate([see(part) for part in episodes])
+
+    def _fresh(self, bank: Bank, key: Array) -> Episode:
+        count = bank.initial_cost.shape[0]
+        return self.start(bank, jax.random.randint(key, (), 0, count, jnp.int32))
+
+    def start(self, bank: Bank, scene: Int[Array, ""]) -> Episode:
+        """The episode of one scene before its first iteration."""
+        scenes, initial, info = jax.tree.map(lambda x: x[scene], (bank.scenes, bank.initial_cost, bank.info))
+        info = info._replace(max_iterations=jnp.asarray(self.config.max_iterations, jnp.int32))
+        state = LMState(scenes.cameras, scenes.points, initial)
+        return Episode(scene, state, begin(self.config.agent, info))
+
+    def iterate(self, kind: SceneClass, bank: Bank, episode: Episode, action: Array) -> tuple[Episode, StepInfo]:
+        """One LM iteration of one scene."""
+        own = with_scene(class_layout(kind), bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
+        damping = damping_of(self.config.agent, episode.memory, action)
+        state, step = lm_step(own, episode.state, damping, self.options)
+        return Episode(episode.scene, state, record(self.config.agent, episode.memory, step)), step
+
+    def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
+        """Plays one action everywhere."""
+        key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
+        parts, after, start = [], [], 0
+        for kind, bank, episodes, k, count in zip(
+            self.kinds, self.banks, state.episodes, keys, self.envs, strict=True
+        ):
+            own, start = action[start : start + count, 0], start + count
+
+            def one(episode: Episode, action: Array, key: Array, kind=kind, bank=bank) -> tuple[Episode, Step]:
+                return self._play(kind, bank, episode, action, key)
+
+            episodes, step = step_groups(one, episodes, own, jax.random.split(k, count))
+            parts.append(step)
+            after.append(episodes)
+        return GameState(tuple(after), key), jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+    def _play(
+        self, kind: SceneClass, bank: Bank, episode: Episode, action: Array, key: Array
+    ) -> tuple[Episode, Step]:
+        rules = self.config
+        best = bank.best_cost[episode.scene]
+        after, step = self.iterate(kind, bank, episode, action)
+        success = step.cost <= best * (1 + rules.tolerance)
+        limit = after.memory.iteration >= rules.max_iterations
+        terminated = success | (limit & rules.limit_is_failure)
+        truncated = limit & ~terminated
+        reward = self._reward(step, after.memory, best, success, terminated)
+        fresh = self._fresh(bank, key)
+        following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
+        single = lambda x: jnp.asarray(x, jnp.float32)
+        metrics = {
+            "length": single(after.memory.iteration),
+            "success": single(success),
+            "rejections": single(after.memory.rejections),
+            "ceres": single(jnp.minimum(bank.effort[episode.scene], rules.max_iterations)),
+        }
+        see = lambda episode: observe(rules.agent, episode.memory)
+        return following, Step(see(following), single(reward), terminated, truncated, see(after), metrics)
+
+    def _reward(
+        self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""], terminated: Bool[Array, ""]
+    ) -> Array:
+        rules = self.config
+        bonus = jnp.where(success, rules.bonus, 0.0)
+        if rules.reward == "duration":
+            reward = bonus - (1 + POINT_ITERATION_COST * self.options.refine_points)
+        elif rules.reward == "constant":
+            reward = bonus - 1
+        elif rules.reward == "reduction":
+            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.iteration - 1))
+        else:
+            reward = bonus - jnp.log10(step.cost / best)
+        if rules.shaping:
+            height = lambda cost: -jnp.log10(jnp.maximum(cost / best - 1, SHAPING_FLOOR))
+            reward += rules.shaping * (
+                jnp.where(terminated, 0.0, rules.discount) * height(step.cost) - height(step.previous_cost)
+            )
+        return rules.scale * reward
+
+    def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
+        """Uniform actions on half of the environments; on the others Ceres' rule, with random boldness."""
+        agent = self.config.agent
+        uniform = jax.random.uniform(key, (self.num_envs,), minval=-1.0, maxval=1.0)
+        memory = [jax.vmap(lambda m: _rule_damping(agent, m))(part.memory) for part in state.episodes]
+        rule = jnp.concatenate(memory) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
+        middle, half = 0.5 * (agent.low + agent.high), 0.5 * (agent.high - agent.low)
+        action = jnp.clip((rule - middle) / half, -0.99, 0.99).astype(jnp.float32)
+        chosen = jnp.where(jnp.arange(self.num_envs) % 2 == 0, uniform, action)
+        if agent.action == "relative":
+            chosen = uniform
+        return chosen[:, None]
+
+
+def _rule_damping(agent: AgentConfig, memory: Memory) -> Array:
+    """log10 of the lambda that Ceres' rule would use next."""
+    rule = Ceres()
+    shrink = jnp.clip(1 - (2 * memory.gain - 1) ** 3, rule.shrink_floor, rule.shrink_ceiling)
+    factor = jnp.where(memory.iteration == 0, 1.0, jnp.where(memory.row > 0, 2.0**memory.row, shrink))
+    return memory.damping + jnp.log10(factor)
+
+
+def make_game(
+    config: GameConfig,
+    kinds: Sequence[SceneClass],
+    banks: Sequence[Bank],
+    envs: Sequence[int],
+    options: StepOptions | None = None,
+) -> Game:
+    """A game on banks of scenes.
+
+    Args:
+        config: rules.
+        kinds: classes of the banks.
+        banks: scenes.
+        envs: environments of each class.
+        options: of the LM step; its embedded iterations are those of the agent.
+    """
+    for kind in kinds:
+        class_layout(kind)  # on the host, before anything is traced
+    options = config.agent.step_options(options or StepOptions())
+    return Game(tuple(banks), tuple(kinds), tuple(envs), config, options)

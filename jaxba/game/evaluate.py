@@ -1,0 +1,102 @@
+"""How good a policy is on a bank: iterations, their tail, failures and final costs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.damping import DampingPolicy
+from jaxba.game.bank import Bank, reach
+from jaxba.game.play import Trajectories, play
+from jaxba.game.scenes import SceneClass
+from jaxba.options import StepOptions
+
+
+class Score(NamedTuple):
+    """Iterations to within a tolerance of the best known cost; a failure counts as the limit."""
+
+    mean: float
+    geometric_mean: float
+    median: float
+    p90: float
+    failures: float
+    """Share of the scenes that never get there."""
+
+    to_convergence: float
+    """Mean iterations until the solver's own stop rule, the limit where it never fires."""
+
+    end: float
+    """Median of the final cost over the best known, less one."""
+
+
+def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int) -> Score:
+    """Of runs on several banks, all scenes alike."""
+    there = np.concatenate([reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)])
+    counted = np.minimum(np.maximum(there, 1), limit)
+    ends = np.concatenate([run.costs[:, -1] / b - 1 for run, b in zip(runs, best, strict=True)])
+    length = np.concatenate([np.where(run.converged, run.iterations, limit) for run in runs])
+    return Score(
+        mean=float(counted.mean()),
+        geometric_mean=float(np.exp(np.log(counted).mean())),
+        median=float(np.median(counted)),
+        p90=float(np.percentile(counted, 90)),
+        failures=float(np.mean(~(there <= limit))),
+        to_convergence=float(length.mean()),
+        end=float(np.median(ends)),
+    )
+
+
+def evaluate(
+    kinds: Sequence[SceneClass],
+    banks: Sequence[Bank],
+    policy: DampingPolicy,
+    options: StepOptions,
+    tolerance: float = 1e-3,
+    limit: int = 40,
+) -> Score:
+    """Plays a policy on every scene of the banks.
+
+    Args:
+        kinds: classes of the banks.
+        banks: scenes.
+        policy: what chooses lambda.
+        options: of the step; embedded iterations are the caller's choice.
+        tolerance: relative to the best known cost.
+        limit: linear solves of a scene at most.
+    """
+    runs = [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
+    return score(runs, [np.asarray(bank.best_cost) for bank in banks], tolerance, limit)
+
+
+def compare(
+    kinds: Sequence[SceneClass],
+    banks: Sequence[Bank],
+    policies: Mapping[str, tuple[DampingPolicy, StepOptions]],
+    tolerance: float = 1e-3,
+    limit: int = 40,
+) -> dict[str, Score]:
+    """The score of every policy, and under `virtual best` that of the best one of each scene.
+
+    Best costs are the lowest that the bank knew or any of the policies found.
+    """
+    runs = {
+        name: [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
+        for name, (policy, options) in policies.items()
+    }
+    best = [
+        np.min([np.asarray(bank.best_cost), *(run[k].costs[:, -1] for run in runs.values())], axis=0)
+        for k, bank in enumerate(banks)
+    ]
+    scores = {name: score(run, best, tolerance, limit) for name, run in runs.items()}
+    lowest = []
+    for k in range(len(banks)):
+        together = [run[k] for run in runs.values()]
+        pick = lambda name, choose, together=together: choose([getattr(run, name) for run in together], axis=0)
+        ended = np.min([np.where(run.converged, run.iterations, limit) for run in together], axis=0)
+        lowest.append(
+            Trajectories(pick("costs", np.min), together[0].dampings, ended, pick("converged", np.any))
+        )
+    return {**scores, "virtual best": score(lowest, best, tolerance, limit)}

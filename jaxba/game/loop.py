@@ -1,0 +1,180 @@
+"""Training as one compiled program: act, play, store, sample, update, in one scan.
+
+Nothing leaves the device between two chunks. A chunk compiles once per configuration and environment; a Python loop
+over chunks is the place for evaluation, checkpoints and logs.
+"""
+
+from __future__ import annotations
+
+import collections
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.game import replay as ring
+from jaxba.game import sac as agent
+from jaxba.game.protocol import Environment, Step
+from jaxba.game.replay import Replay, Transition
+from jaxba.game.sac import Learner, SacConfig
+
+TRACES: collections.Counter[str] = collections.Counter()
+"""How often each compiled function was traced in this process; a test holds it at one per configuration."""
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """Sizes of the training loop. Hashable: it is static in compiled programs."""
+
+    replay_capacity: int = 100_000
+    """Transitions in the replay buffer; the oldest go first."""
+
+    warmup_steps: int = 500
+    """Environment steps over all environments that `Environment.demonstrate` plays before the agent does; rounded up to
+    whole vector steps. Source of the default: Belder et al. 2023."""
+
+    updates_per_step: int = 1
+    """Gradient updates after each vector step. Updates per environment step are this over the environments."""
+
+    steps_per_chunk: int = 1000
+    """Vector steps in one call of `run_chunk`."""
+
+    def __post_init__(self) -> None:
+        """Every number counts something that there must be."""
+        for name in ("replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+
+
+class LoopState(NamedTuple):
+    """All of a run: with it and the configurations a run goes on, bit for bit."""
+
+    learner: Learner
+    replay: Replay
+    env_state: Any
+    observation: Float[Array, "envs features"]  # to act on next
+    key: Array
+    env_steps: Int[Array, ""]  # over all environments, warm-up included
+    updates: Int[Array, ""]
+
+
+def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions"]) -> tuple[LoopState, Step]:
+    """One vector step into the buffer. A truncated episode keeps its discount and its true last observation."""
+    env_state, step = env.step(state.env_state, action)
+    transitions = Transition(
+        state.observation, action, step.reward, step.final_observation, 1.0 - jnp.asarray(step.terminated, jnp.float32)
+    )
+    after = state._replace(
+        replay=ring.add(state.replay, transitions),
+        env_state=env_state,
+        observation=jnp.asarray(step.observation, jnp.float32),
+        env_steps=state.env_steps + env.num_envs,
+    )
+    return after, step
+
+
+def _start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
+    TRACES["start"] += 1
+    key, learner_key, reset_key, warmup_key = jax.random.split(key, 4)
+    env_state, observation = env.reset(reset_key)
+    zero = lambda: jnp.zeros((), jnp.int32)
+    state = LoopState(
+        learner=agent.init(sac, learner_key, env.observation_size, env.action_size),
+        replay=ring.init(loop.replay_capacity, env.observation_size, env.action_size),
+        env_state=env_state,
+        observation=jnp.asarray(observation, jnp.float32),
+        key=key,
+        env_steps=zero(),
+        updates=zero(),
+    )
+
+    def body(state: LoopState, key: Array) -> tuple[LoopState, None]:
+        action = jnp.asarray(env.demonstrate(state.env_state, key), jnp.float32)
+        return _play(env, state, action)[0], None
+
+    steps = -(-loop.warmup_steps // env.num_envs)
+    return jax.lax.scan(body, state, jax.random.split(warmup_key, steps))[0]
+
+
+def _run_chunk(
+    sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
+) -> tuple[LoopState, dict[str, Float[Array, ""]]]:
+    TRACES["run_chunk"] += 1
+
+    def body(state: LoopState, _: None) -> tuple[LoopState, tuple[dict[str, Array], dict[str, Array], Array]]:
+        key, act_key, sample_key = jax.random.split(state.key, 3)
+        action = agent.act(sac, state.learner.actor, state.observation, act_key)
+        state, step = _play(env, state._replace(key=key), action)
+        learn = lambda learner, key: agent.update(sac, learner, ring.sample(state.replay, key, sac.batch))
+        keys = jax.random.split(sample_key, loop.updates_per_step)
+        learner, learned = jax.lax.scan(learn, state.learner, keys)
+        state = state._replace(learner=learner, updates=state.updates + loop.updates_per_step)
+        means = {name: jnp.mean(values) for name, values in learned.items()}
+        means["reward"] = jnp.mean(jnp.asarray(step.reward, jnp.float32))
+        means["action_mean"] = jnp.mean(action)
+        means["action_square"] = jnp.mean(action**2)
+        ended = step.terminated | step.truncated
+        sums = {name: jnp.sum(jnp.where(ended, x, 0), dtype=jnp.float32) for name, x in step.metrics.items()}
+        return state, (means, sums, jnp.sum(ended, dtype=jnp.float32))
+
+    dropped = state.replay.dropped
+    state, (means, sums, ended) = jax.lax.scan(body, state, None, length=loop.steps_per_chunk)
+    metrics = {name: jnp.mean(values) for name, values in means.items()}
+    variance = metrics.pop("action_square") - metrics["action_mean"] ** 2
+    metrics["action_std"] = jnp.sqrt(jnp.maximum(variance, 0))
+    metrics["dropped"] = jnp.asarray(state.replay.dropped - dropped, jnp.float32)
+    metrics["episodes"] = jnp.sum(ended)
+    for name, values in sums.items():
+        metrics[f"episode/{name}"] = jnp.sum(values) / jnp.maximum(metrics["episodes"], 1)
+    return state, metrics
+
+
+@functools.partial(jax.jit, static_argnames=("sac", "loop"))
+def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
+    """A fresh agent, and a replay buffer with `warmup_steps` demonstrated transitions.
+
+    Args:
+        sac: static.
+        loop: static.
+        env: a pytree; its arrays are traced.
+        key: decides everything: the same key gives the same numbers, bit for bit, on the same machine.
+    """
+    return _start(sac, loop, env, key)
+
+
+@functools.partial(jax.jit, static_argnames=("sac", "loop"), donate_argnames=("state",))
+def run_chunk(
+    sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
+) -> tuple[LoopState, dict[str, Float[Array, ""]]]:
+    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step` updates.
+
+    Args:
+        sac: static.
+        loop: static.
+        env: the one of `start`.
+        state: is used up: its memory becomes the result's.
+
+    Returns:
+        The state after, and means over the chunk: those of `sac.update`; `reward` of a step; `action_mean`,
+        `action_std`; `episodes`, the number of episodes that ended, and `episode/NAME`, the mean over those of what
+        the environment says about them (0 where none ended); `dropped`, transitions with numbers that are not finite.
+    """
+    return _run_chunk(sac, loop, env, state)
+
+
+@functools.partial(jax.jit, static_argnames=("sac", "loop"))
+def start_seeds(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
+    """`start` for every key along the first axis. The environment is shared."""
+    return jax.vmap(lambda key: _start(sac, loop, env, key))(keys)
+
+
+@functools.partial(jax.jit, static_argnames=("sac", "loop"), donate_argnames=("states",))
+def run_chunk_seeds(
+    sac: SacConfig, loop: LoopConfig, env: Environment, states: LoopState
+) -> tuple[LoopState, dict[str, Float[Array, " seeds"]]]:
+    """`run_chunk` for every state along the first axis, as one program: agents of several seeds side by side."""
+    return jax.vmap(lambda state: _run_chunk(sac, loop, env, state))(states)

@@ -1,0 +1,146 @@
+"""Plays a damping policy on every scene of a bank, many at a time, each to its end.
+
+A compiled loop over lanes: where a scene ends, its lane takes the next one, so that no lane waits for the slowest scene.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Bool, Float, Int
+
+from jaxba.damping import DampingPolicy
+from jaxba.game.scenes import SceneClass
+from jaxba.lm import LMState, StepInfo, lm_step
+from jaxba.options import StepOptions
+from jaxba.termination import converged_in_cost
+
+T = TypeVar("T")
+
+LANES = 128
+"""Scenes in play at a time."""
+
+GROUP = 8
+"""Scenes that step together. Trials and camera rounds last as long as the slowest scene of a group needs them, and arrays of
+this size stay in a core's cache: 8 scenes of 10 x 40 took no longer a scene than 64 did."""
+
+
+def step_groups(function: Callable[..., T], *arguments: Any) -> T:
+    """`jax.vmap(function)` in groups of `GROUP`, one after the other, on a CPU; at once elsewhere."""
+    if jax.default_backend() != "cpu":
+        return jax.vmap(function)(*arguments)
+    return lax.map(lambda a: function(*a), arguments, batch_size=GROUP)
+
+
+class Trajectories(NamedTuple):
+    """What a policy did on every scene; NumPy arrays."""
+
+    costs: Float[np.ndarray, "scenes iterations"]
+    """Accepted cost after each iteration, the start first; constant after the end."""
+
+    dampings: Float[np.ndarray, "scenes iterations"]
+    """Lambda of each iteration; zero after the end."""
+
+    iterations: Int[np.ndarray, " scenes"]
+    """Linear solves until the end."""
+
+    converged: Bool[np.ndarray, " scenes"]
+    """Whether it ended by its own stop rule and not by the limit."""
+
+
+class _Lane(NamedTuple):
+    scene: Int[Array, " lanes"]
+    state: LMState
+    policy: Any
+    damping: Float[Array, " lanes"]
+    iteration: Int[Array, " lanes"]
+
+
+class _Loop(NamedTuple):
+    lane: _Lane
+    next_scene: Int[Array, ""]
+    costs: Array
+    dampings: Array
+    iterations: Array
+    converged: Array
+
+
+def play(
+    kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: float = 1e-6
+) -> Trajectories:
+    """Solves every scene of the bank.
+
+    Args:
+        kind: the bank's class.
+        bank: scenes with their `ProblemInfo`.
+        policy: chooses lambda; a pytree, so that policies of one class share a program.
+        options: of the steps.
+        limit: linear solves a scene at most.
+        ftol: an accepted step that lowers the cost by less, and is not short for its damping, ends a scene.
+    """
+    loop = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
+    found = jax.tree.map(np.asarray, (loop.costs, loop.dampings, loop.iterations, loop.converged))
+    costs, dampings, iterations, converged = found
+    costs = np.concatenate([np.asarray(bank.initial_cost)[:, None], costs[:-1]], axis=1)
+    past = np.arange(limit + 1) > iterations[:-1, None]
+    last = np.take_along_axis(costs, iterations[:-1, None], axis=1)
+    return Trajectories(np.where(past, last, costs), dampings[:-1], iterations[:-1], converged[:-1])
+
+
+@functools.partial(jax.jit, static_argnames=("kind", "options", "limit"))
+def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: Array) -> _Loop:
+    from jaxba.game.bank import class_layout, with_scene
+
+    layout = class_layout(kind)
+    count = bank.initial_cost.shape[0]
+    lanes = min(LANES, count)
+
+    def fresh(scene: Int[Array, ""]) -> _Lane:
+        at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)
+        start = at(bank.scenes)
+        policy_state, damping = policy.init(at(bank.info))
+        state = LMState(start.cameras, start.points, at(bank.initial_cost))
+        return _Lane(scene, state, policy_state, damping, jnp.zeros((), jnp.int32))
+
+    def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:
+        row = jnp.minimum(lane.scene, count - 1)
+        own = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
+        state, step = lm_step(own, lane.state, lane.damping, options, policy.min_gain)
+        policy_state, damping = policy.propose(lane.policy, step)
+        return _Lane(lane.scene, state, policy_state, damping, lane.iteration + 1), step
+
+    def body(loop: _Loop) -> _Loop:
+        lane, step = step_groups(advance, loop.lane)
+        row = jnp.minimum(lane.scene, count)  # idle lanes write to a row that nobody reads
+        converged = converged_in_cost(step, ftol)
+        done = converged | (lane.iteration >= limit)
+        costs = loop.costs.at[row, lane.iteration - 1].set(step.cost)
+        dampings = loop.dampings.at[row, lane.iteration - 1].set(step.damping)
+        upcoming = loop.next_scene + jnp.cumsum(done) - 1
+        new = jax.vmap(fresh)(upcoming.astype(jnp.int32))
+        pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+        return _Loop(
+            jax.tree.map(pick, new, lane),
+            (loop.next_scene + jnp.sum(done)).astype(jnp.int32),
+            costs,
+            dampings,
+            loop.iterations.at[row].set(lane.iteration),
+            loop.converged.at[row].set(converged),
+        )
+
+    dtype = bank.initial_cost.dtype
+    loop = _Loop(
+        jax.vmap(fresh)(jnp.arange(lanes, dtype=jnp.int32)),
+        jnp.asarray(lanes, jnp.int32),
+        jnp.zeros((count + 1, limit), dtype),
+        jnp.zeros((count + 1, limit), dtype),
+        jnp.zeros((count + 1,), jnp.int32),
+        jnp.zeros((count + 1,), bool),
+    )
+    return lax.while_loop(lambda loop: jnp.any(loop.lane.scene < count), body, loop)

@@ -1,0 +1,337 @@
+"""Scenes for the game, made by one compiled program: thousands of small problems of equal shape.
+
+A *class* of scenes shares a shape: C cameras and P points at most, a slot for every pair of them, and a mask that says
+which pairs were observed. Smaller scenes leave cameras and points unobserved. What is random inside a class is in
+`SceneFamily`; sizes, motion, depth, noise, wrong matches and how far off the start is are all drawn per scene.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Bool, Float, Int
+
+from jaxba import camera
+
+SceneFamily = Literal["wide", "paper"]
+"""`wide`: every motion, depth, noise and start below. `paper`: 10 cameras that see 10 points, all of them."""
+
+KINDS = ("forward", "lateral", "orbit", "photos")
+"""Motions of the cameras of a wide scene, equally often."""
+
+MIN_VIEWS = 5
+"""Cameras with fewer observations are dropped: nine unknowns need five."""
+
+NOISE = (0.05, 3.0)
+"""Sigma of a measurement in pixels, log-uniform (issue 3)."""
+
+OUTLIERS = (0.4, 1e-3, 0.03)
+"""Share of the scenes with wrong matches, and the smallest and largest share of wrong matches in them."""
+
+WRONG = (5.0, 100.0)
+"""Largest error of a wrong match in pixels, log-uniform per scene."""
+
+FOCAL = (300.0, 4000.0)
+"""Focal length in pixels, log-uniform."""
+
+CANDIDATES = 3
+"""Points drawn for each one kept, since many are seen only once."""
+
+START_ROTATION, START_CENTER, START_DEPTH = (1e-5, 0.03), (1e-3, 0.3), (1e-3, 0.25)
+"""Sigmas of the start, log-uniform: rotations in radians, centres in steps, depths of points relative to them."""
+
+
+@dataclass(frozen=True)
+class SceneClass:
+    """Scenes of equal shape."""
+
+    cameras: int = 10
+    """Largest number of cameras; a wide scene has a random number from 4 on."""
+
+    points: int = 40
+    """Largest number of points; a wide scene has a random number from a quarter of it on."""
+
+    family: SceneFamily = "wide"
+    """What is random in them."""
+
+    def __post_init__(self) -> None:
+        if self.cameras < 4 or self.points < 10 or 9 * self.cameras > 512:
+            raise ValueError(
+                f"a class of scenes has 4 to 56 cameras and at least 10 points, not {self.cameras} and {self.points}"
+            )
+
+
+class Scenes(NamedTuple):
+    """A batch of scenes of one class, in the order of its layout (`bank.class_layout`)."""
+
+    cameras: Float[Array, "scenes 9 cameras"]  # the start
+    points: Float[Array, "scenes 3 points"]  # the last point is the layout's empty one
+    pixels: Float[Array, "scenes 2 slots"]
+    mask: Bool[Array, "scenes slots"]
+
+
+class _Rig(NamedTuple):
+    """True cameras of one scene."""
+
+    rotation: Float[Array, "cameras 3 3"]  # world to camera
+    center: Float[Array, "cameras 3"]
+    intrinsics: Float[Array, "3 cameras"]  # f, k1, k2
+
+
+@functools.partial(jax.jit, static_argnames=("kind", "count", "dtype"))
+def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
+    """Random scenes; some are useless, which is for the bank to find out.
+
+    Args:
+        kind: shape and family.
+        key: the same key gives the same scenes.
+        count: how many.
+        dtype: of everything.
+    """
+    one = _paper_scene if kind.family == "paper" else _wide_scene
+    scenes = lax.map(lambda k: one(kind, k), jax.random.split(key, count), batch_size=256)
+    return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(dtype), scenes)
+
+
+def _log_uniform(key: Array, low: float, high: float, shape: tuple[int, ...] = ()) -> Array:
+    return jnp.exp(jax.random.uniform(key, shape, minval=jnp.log(low), maxval=jnp.log(high)))
+
+
+def _look_at(forward: Array, up: Array) -> Float[Array, "n 3 3"]:
+    """Rotations world to camera of cameras that look along `forward`: -z ahead, y up."""
+    unit = lambda v: v / jnp.linalg.norm(v, axis=-1, keepdims=True)
+    back = -unit(forward)
+    right = unit(jnp.cross(up, back))
+    return jnp.stack([right, jnp.cross(back, right), back], axis=-2)
+
+
+def _turns(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
+    return jnp.moveaxis(camera.rotation_matrix(vectors.T), -1, 0)
+
+
+def _path(kind: Array, key: Array, cameras: int) -> tuple[Array, Array]:
+    """Centres and viewing directions of the four motions, chosen by number; a step is the unit of length."""
+    keys = iter(jax.random.split(key, 12))
+    i = jnp.arange(cameras)
+    bend = jax.random.uniform(next(keys), minval=-0.12, maxval=0.12)
+    yaw = bend * i + 0.05 * jnp.cumsum(jax.random.normal(next(keys), (cameras,)))
+    ahead = jnp.stack([jnp.sin(yaw), jnp.zeros(cameras), -jnp.cos(yaw)], axis=1)
+    pace = jnp.exp(0.3 * jax.random.normal(next(keys), (cameras, 1)))
+    street = jnp.cumsum(ahead * pace, axis=0) + 0.05 * jax.random.normal(next(keys), (cameras, 3))
+    aside = jnp.stack([-ahead[:, 2], jnp.zeros(cameras), ahead[:, 0]], axis=1)
+    radius = _log_uniform(next(keys), 2.0, 30.0)
+    span = _log_uniform(next(keys), 0.15, 2 * jnp.pi)
+    angle = span * (i / cameras - 0.5)
+    wave = 0.25 * radius * jnp.sin(3 * angle + 1)
+    ring = jnp.stack([radius * jnp.sin(angle), wave, radius * jnp.cos(angle)], axis=1)
+    ring = ring + 0.05 * radius * jax.random.normal(next(keys), (cameras, 3))
+    away = radius * jnp.exp(0.3 * jax.random.normal(next(keys), (cameras,)))
+    side = jax.random.uniform(next(keys), (cameras,), minval=-0.8, maxval=0.8)
+    height = 0.1 * radius * jax.random.normal(next(keys), (cameras,))
+    crowd = jnp.stack([away * jnp.sin(side), height, away * jnp.cos(side)], axis=1)
+    gaze = 0.15 * radius * jax.random.normal(next(keys), (cameras, 3))
+    center = jnp.stack([street, street, ring, crowd])[kind]
+    forward = jnp.stack([ahead, aside, -ring + 0.3 * gaze, gaze - crowd])[kind]
+    return center, forward / jnp.linalg.norm(forward, axis=1, keepdims=True)
+
+
+def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
+    keys = iter(jax.random.split(key, 24))
+    uniform = lambda low, high, shape=(): jax.random.uniform(next(keys), shape, minval=low, maxval=high)
+    number = jax.random.randint(next(keys), (), 0, len(KINDS))
+    cameras = jnp.floor(_log_uniform(next(keys), 4, kind.cameras + 1)).astype(int)
+    points = jnp.floor(_log_uniform(next(keys), max(10, kind.points // 4), kind.points + 1)).astype(int)
+    used = jnp.arange(kind.cameras) < cameras
+
+    center, forward = _path(number, next(keys), kind.cameras)
+    up = jnp.array([0.0, 1.0, 0.0]) + 0.05 * jax.random.normal(next(keys), (kind.cameras, 3))
+    focal = _log_uniform(next(keys), *FOCAL) * jnp.exp(
+        jnp.where(number == 3, 0.25, 0.0) * jax.random.normal(next(keys), (kind.cameras,))
+    )
+    half = jax.random.uniform(next(keys), (2,), minval=0.15, maxval=0.9)  # tangents of half the angles of view
+    square = jnp.sum(half**2)
+    bent = jax.random.bernoulli(next(keys), 0.7)
+    k1 = bent * uniform(-0.2, 0.1) / square
+    k2 = bent * uniform(-0.03, 0.03) / square**2
+    lens = jnp.stack([focal, jnp.full_like(focal, k1), jnp.full_like(focal, k2)])
+    rig = _Rig(_look_at(forward, up), center, lens)
+
+    reference, world = _points(kind, rig, number, cameras, half, next(keys))
+    seen = _visible(rig, world, half) & used[:, None] & _matched(kind, number, reference, next(keys))
+    first = jnp.argsort(jnp.sum(seen, axis=0) < 2, stable=True)[: kind.points]  # tracks before single views
+    reference, world = reference[first], world[first]
+    seen = _enough(seen[:, first] & (jnp.arange(kind.points) < points))
+
+    wrong = jax.random.bernoulli(next(keys), OUTLIERS[0]) * _log_uniform(next(keys), *OUTLIERS[1:])
+    pixels = _measure(rig, world, _log_uniform(next(keys), *NOISE), wrong, next(keys))
+    start = _wide_start(rig, reference, world, next(keys))
+    return _assemble(start, pixels, seen)
+
+
+def _points(
+    kind: SceneClass, rig: _Rig, number: Array, cameras: Array, half: Array, key: Array
+) -> tuple[Int[Array, " candidates"], Float[Array, "candidates 3"]]:
+    """Points on random rays of a random camera each; depths over up to two decades, or around an object."""
+    a, b, c, d, e = jax.random.split(key, 5)
+    count = CANDIDATES * kind.points
+    reference = jax.random.randint(a, (count,), 0, cameras)
+    ray = jax.random.uniform(b, (count, 2), minval=-0.9, maxval=0.9) * half
+    near = _log_uniform(c, 0.7, 12.0)
+    spread = _log_uniform(d, 1.3, 100.0)
+    along = jax.random.uniform(e, (count,))
+    focus = jnp.linalg.norm(rig.center[reference], axis=1)
+    around = focus * jnp.exp((along - 0.5) * jnp.minimum(jnp.log(spread), 1.5))
+    depth = jnp.where(number >= 2, around, near * spread**along)
+    local = depth[:, None] * jnp.concatenate([ray, -jnp.ones((count, 1))], axis=1)
+    return reference, rig.center[reference] + jnp.einsum("nji,nj->ni", rig.rotation[reference], local)
+
+
+def _local(rig: _Rig, world: Array) -> Float[Array, "cameras points 3"]:
+    return jnp.einsum("cij,cpj->cpi", rig.rotation, world - rig.center[:, None])
+
+
+def _project(rig: _Rig, world: Float[Array, "points 3"]) -> Float[Array, "2 cameras points"]:
+    """Pixels of every point in every camera."""
+    local = _local(rig, world)
+    p = -local[..., :2] / local[..., 2:]
+    r = jnp.sum(p * p, axis=-1)
+    f, k1, k2 = rig.intrinsics[:, :, None]
+    return jnp.moveaxis((f * (1 + r * (k1 + k2 * r)))[..., None] * p, -1, 0)
+
+
+def _visible(rig: _Rig, world: Float[Array, "points 3"], half: Array) -> Bool[Array, "cameras points"]:
+    """In front of the camera, not at its nose, and inside the image."""
+    local = _local(rig, world)
+    depth = -local[..., 2]
+    inside = jnp.all(jnp.abs(local[..., :2]) <= half * depth[..., None], axis=-1)
+    return (depth > 0.3) & inside
+
+
+def _matched(kind: SceneClass, number: Array, reference: Array, key: Array) -> Bool[Array, "cameras _"]:
+    """Which of the possible views were matched: tracks of random length along a path, random ones of photos."""
+    a, b, c, d = jax.random.split(key, 4)
+    window = _log_uniform(a, 1.0, float(kind.cameras))
+    reach = jnp.maximum(1.0, window * _log_uniform(b, 0.5, 2.0, reference.shape))
+    near = jnp.abs(jnp.arange(kind.cameras)[:, None] - reference) <= reach
+    keep = jax.random.uniform(c, near.shape) < jax.random.uniform(d, minval=0.35, maxval=1.0)
+    own = jnp.arange(kind.cameras)[:, None] == reference
+    return (near | (number >= 2)) & (keep | own)
+
+
+def _enough(seen: Bool[Array, "cameras points"]) -> Bool[Array, "cameras points"]:
+    """Drops points that one camera sees and cameras that see too little, until nothing changes."""
+
+    def prune(_: Array, seen: Array) -> Array:
+        seen = seen & (jnp.sum(seen, axis=0) >= 2)
+        return seen & (jnp.sum(seen, axis=1, keepdims=True) >= MIN_VIEWS)
+
+    seen = lax.fori_loop(0, 6, prune, seen)
+    return seen & (jnp.sum(seen, axis=0) >= 2)
+
+
+def _measure(rig: _Rig, world: Array, noise: Array, wrong: Array, key: Array) -> Float[Array, "2 cameras points"]:
+    a, b, c, d = jax.random.split(key, 4)
+    pixels = _project(rig, world)
+    pixels = pixels + noise * jax.random.normal(a, pixels.shape)
+    moved = _log_uniform(b, *WRONG) * jax.random.uniform(c, pixels.shape, minval=-1.0, maxval=1.0)
+    return pixels + moved * jax.random.bernoulli(d, wrong, pixels.shape[1:])
+
+
+def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[Array, Array]:
+    """Cameras and points off the truth: drift along the path, own errors, a wrong lens, wrong depths."""
+    keys = iter(jax.random.split(key, 24))
+    cameras = rig.center.shape[0]
+    sometimes = lambda share, low, high: (
+        jax.random.bernoulli(next(keys), share) * _log_uniform(next(keys), low, high)
+    )
+    turn = jnp.cumsum(sometimes(0.5, 1e-5, 0.02) * jax.random.normal(next(keys), (cameras, 3)), axis=0)
+    turns = _turns(turn)
+    pace = jnp.exp(jnp.cumsum(sometimes(0.3, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras, 1)), axis=0))
+    steps = jnp.einsum("nij,nj->ni", turns[:-1], jnp.diff(rig.center, axis=0)) * pace[1:]
+    moved = rig.center[0] + jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(steps, axis=0)])
+    follow = jax.random.bernoulli(next(keys), 0.8)  # points made with the drifted cameras
+    carried = moved[reference] + jnp.einsum(
+        "nij,nj->ni", turns[reference], (world - rig.center[reference]) * pace[reference]
+    )
+    points = jnp.where(follow, carried, world)
+    ray = points - moved[reference]
+    depth = jnp.exp(_log_uniform(next(keys), *START_DEPTH) * jax.random.normal(next(keys), (len(points), 1)))
+    size = jnp.linalg.norm(ray, axis=1, keepdims=True)
+    across = sometimes(0.7, 1e-5, 0.01) * size * jax.random.normal(next(keys), points.shape)
+    points = moved[reference] + ray * depth + across
+
+    noise = _log_uniform(next(keys), *START_ROTATION) * jax.random.normal(next(keys), (cameras, 3))
+    rotation = _turns(noise) @ rig.rotation @ jnp.swapaxes(turns, 1, 2)
+    center = moved + _log_uniform(next(keys), *START_CENTER) * jax.random.normal(next(keys), moved.shape)
+    common = sometimes(0.5, 0.01, 0.4) * jax.random.uniform(next(keys), minval=-1.0, maxval=1.0)
+    own = sometimes(0.5, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras,))
+    flat = jax.random.bernoulli(next(keys), 0.6)
+    focal, k1, k2 = rig.intrinsics
+    lens = jnp.stack([focal * jnp.exp(common + own), k1 * (1 - flat), k2 * (1 - flat)])
+    return _camera_columns(rotation, center, lens), points
+
+
+def _camera_columns(rotation: Array, center: Array, lens: Array) -> Float[Array, "9 cameras"]:
+    translation = -jnp.einsum("nij,nj->ni", rotation, center)
+    return jnp.concatenate([_angle_axis(rotation).T, translation.T, lens])
+
+
+def _angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
+    """Angle-axis vectors with angles in [0, pi], by way of the quaternion's largest entry (Shepperd 1978)."""
+    m = rotation
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    squares = jnp.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
+    antisymmetric = [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]]
+    symmetric = lambda i, j: m[:, i, j] + m[:, j, i]
+    x, y, z = antisymmetric
+    two = 2 * squares[:, 1:] - trace[:, None]
+    rows = jnp.stack(
+        [
+            jnp.stack([1 + trace, x, y, z], axis=1),
+            jnp.stack([x, 1 + two[:, 0], symmetric(0, 1), symmetric(0, 2)], axis=1),
+            jnp.stack([y, symmetric(0, 1), 1 + two[:, 1], symmetric(1, 2)], axis=1),
+            jnp.stack([z, symmetric(0, 2), symmetric(1, 2), 1 + two[:, 2]], axis=1),
+        ],
+        axis=1,
+    )
+    best = jnp.take_along_axis(rows, jnp.argmax(squares, axis=1)[:, None, None], axis=1)[:, 0]
+    best = best / jnp.linalg.norm(best, axis=1, keepdims=True)
+    best = jnp.where(best[:, :1] < 0, -best, best)
+    sine = jnp.linalg.norm(best[:, 1:], axis=1)
+    angle = 2 * jnp.arctan2(sine, best[:, 0])
+    scale = jnp.where(sine > 1e-12, angle / jnp.maximum(sine, 1e-12), 2.0)
+    return best[:, 1:] * scale[:, None]
+
+
+def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
+    """Cameras on a line before a cloud of points, all seen by all; half a pixel of noise at 500 pixels of focal length.
+
+    Source: the released code of Belder et al. 2023 (cameras on x in [-2, 2], identity rotation; errors of the start
+    0.005 on quaternions, 0.05 on centres, 0.01 on points), but unbiased, and with the Gaussian noise of the paper's
+    equation 1, without which the best cost is zero and no relative tolerance makes sense.
+    """
+    a, b, c, d, e, f = jax.random.split(key, 6)
+    center = jnp.zeros((kind.cameras, 3)).at[:, 0].set(jax.random.uniform(a, (kind.cameras,), minval=-2, maxval=2))
+    low, high = jnp.array([-2.0, -2.0, -10.0]), jnp.array([2.0, 2.0, -4.0])
+    world = jax.random.uniform(b, (kind.points, 3), minval=low, maxval=high)
+    lens = jnp.zeros((3, kind.cameras)).at[0].set(500.0)
+    rig = _Rig(jnp.broadcast_to(jnp.eye(3), (kind.cameras, 3, 3)), center, lens)
+    pixels = _measure(rig, world, jnp.asarray(0.5), jnp.asarray(0.0), c)
+    half = lambda k, shape: jax.random.uniform(k, shape, minval=-0.5, maxval=0.5)
+    rotation = _turns(2 * 0.01 * half(d, (kind.cameras, 3)))
+    cameras = _camera_columns(rotation, center + 0.05 * half(e, center.shape), lens)
+    start = cameras, world + 0.01 * half(f, world.shape)
+    return _assemble(start, pixels, jnp.ones((kind.cameras, kind.points), bool))
+
+
+def _assemble(start: tuple[Array, Array], pixels: Array, seen: Bool[Array, "cameras points"]) -> Scenes:
+    """Slot order: camera by camera, a column per point, the last one empty."""
+    cameras, points = start
+    pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, 1)])
+    mask = pad(seen).reshape(-1)
+    return Scenes(cameras, pad(points.T), pad(pixels).reshape(2, -1) * mask, mask)

@@ -1,0 +1,157 @@
+"""Strict reading of nested frozen dataclasses from plain data, as a YAML file holds it, and the way back.
+
+Nothing is guessed: an unknown key, a value of another type and a value that the class refuses are each one line that
+names the key by its path.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+Settings = TypeVar("Settings")
+
+_SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
+"""Numbers such as 3e-4, which YAML 1.1 takes for text."""
+
+
+class SettingsError(ValueError):
+    """Settings that cannot be used. The message is one line for a person."""
+
+
+def read(kind: type[Settings], data: Any, path: str = "") -> Settings:
+    """An instance of a dataclass; keys that are left out keep their defaults.
+
+    Args:
+        kind: dataclass of numbers, strings, literals, tuples, optional values and further dataclasses.
+        data: mapping by field name.
+        path: of the mapping inside a larger one, for messages.
+
+    Raises:
+        SettingsError: naming the key and what it should be.
+    """
+    if not isinstance(data, Mapping):
+        raise SettingsError(f"{path or 'settings'} must be a mapping, is {_show(data)}")
+    types_by_name = field_types(kind)
+    for key in data:
+        if key not in types_by_name:
+            raise SettingsError(f"unknown key {_join(path, key)}; {_hint(str(key), types_by_name)}")
+    values = {key: _value(types_by_name[key], value, _join(path, key)) for key, value in data.items()}
+    try:
+        return kind(**values)
+    except ValueError as error:
+        raise SettingsError(f"{path}: {error}" if path else str(error)) from None
+    except TypeError as error:  # a field without default
+        raise SettingsError(f"{path or 'settings'}: {str(error).rpartition('() ')[2]}") from None
+
+
+def field_types(kind: type) -> dict[str, Any]:
+    """Types of the fields of a dataclass by name."""
+    hints = typing.get_type_hints(kind)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+def plain(value: Any) -> Any:
+    """The inverse of `read`: mappings and lists only."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return [plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+def assign(data: dict[str, Any], path: str, value: Any, kind: type) -> None:
+    """Sets one value inside nested mappings, which are made where they are missing.
+
+    Args:
+        data: is changed.
+        path: keys with dots between them.
+        value: plain data.
+        kind: the dataclass that `data` describes.
+
+    Raises:
+        SettingsError: there is no such key, or the path goes on below a value.
+    """
+    *above, last = path.split(".")
+    for depth, key in enumerate(above):
+        known = field_types(kind)
+        if key not in known:
+            raise SettingsError(f"unknown key {path}; {_hint(key, known)}")
+        kind = known[key]
+        if not dataclasses.is_dataclass(kind):
+            raise SettingsError(f"unknown key {path}; {'.'.join(above[: depth + 1])} has no parts")
+        inner = data.setdefault(key, {})
+        data = {} if inner is None else inner
+        if not isinstance(data, dict):
+            raise SettingsError(f"{'.'.join(above[: depth + 1])} must be a mapping, is {_show(data)}")
+    known = field_types(kind)
+    if last not in known:
+        raise SettingsError(f"unknown key {path}; {_hint(last, known)}")
+    data[last] = value
+
+
+def differences(one: Any, other: Any, path: str = "") -> list[str]:
+    """Paths of the fields in which two settings of one class differ."""
+    if dataclasses.is_dataclass(one) and type(one) is type(other):
+        names = [field.name for field in dataclasses.fields(one)]
+        return [x for n in names for x in differences(getattr(one, n), getattr(other, n), _join(path, n))]
+    return [] if one == other else [path]
+
+
+def _value(kind: Any, value: Any, path: str) -> Any:
+    origin, inside = get_origin(kind), get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in inside:
+            return None
+        rest = [x for x in inside if x is not type(None)]
+        return _value(rest[0], value, path)
+    if origin is Literal:
+        if value is False and "off" in inside:
+            value = "off"  # YAML 1.1 takes the word for a truth value
+        if value not in inside or isinstance(value, bool) != any(isinstance(x, bool) for x in inside):
+            raise SettingsError(f"{path} must be one of {', '.join(map(str, inside))}, is {_show(value)}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, (list, tuple)):
+            raise SettingsError(f"{path} must be a list, is {_show(value)}")
+        return tuple(_value(inside[0], item, f"{path}[{k}]") for k, item in enumerate(value))
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        return read(kind, value, path)
+    if kind is float:
+        if isinstance(value, str) and _SCIENTIFIC.fullmatch(value):
+            value = float(value)
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < float("inf"):
+            return float(value)
+        raise SettingsError(f"{path} must be a number, is {_show(value)}")
+    if kind is int:
+        if isinstance(value, int) and not isinstance(value, bool):
+            return value
+        raise SettingsError(f"{path} must be a whole number, is {_show(value)}")
+    if kind is bool:
+        if isinstance(value, bool):
+            return value
+        raise SettingsError(f"{path} must be true or false, is {_show(value)}")
+    if kind is str:
+        if isinstance(value, str):
+            return value
+        raise SettingsError(f"{path} must be text, is {_show(value)}")
+    raise AssertionError(f"{path}: no rule for fields of type {kind}")
+
+
+def _join(path: str, key: Any) -> str:
+    return f"{path}.{key}" if path else str(key)
+
+
+def _hint(key: str, known: Mapping[str, Any]) -> str:
+    near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+    return f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
+
+
+def _show(value: Any, longest: int = 40) -> str:
+    if isinstance(value, Mapping):
+        return "a mapping"
+    text = repr(value)
+    return text if len(text) <= longest else text[: longest - 3] + "..."

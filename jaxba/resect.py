@@ -1,0 +1,74 @@
+"""Embedded camera iterations: every camera re-optimised alone while the points stand still (resection)."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxba import camera
+from jaxba.layout import Layout
+from jaxba.linearize import linearize, residuals, slot_costs, slot_frames
+from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
+from jaxba.sums import outer_sum, take_rows, tree_sum
+
+DAMPINGS = (1e-6, 1e-2)
+"""Relative damping of a camera's step, and of a second one where the first did not help."""
+
+
+def move_cameras(
+    cameras: Float[Array, "9 cameras"], step: Float[Array, "9 cameras"], options: StepOptions
+) -> Float[Array, "9 cameras"]:
+    """Adds a step; on the manifold the rotation becomes `exp(step) R`."""
+    moved = cameras + step
+    if options.rotation == "angle-axis":
+        return moved
+    return moved.at[:3].set(camera.compose_left(step[:3], cameras[:3]))
+
+
+def refine_cameras(
+    layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], options: StepOptions
+) -> Float[Array, "9 cameras"]:
+    """One damped Gauss-Newton step of every camera by itself, kept only where that camera's own cost falls.
+
+    Args:
+        layout: slots.
+        cameras: where to start.
+        points: they stand still.
+        options: only the loss matters.
+
+    Returns:
+        Cameras; the total cost is never larger than before.
+    """
+    linear = linearize(layout, cameras, points, options.loss)
+    rows = [entry for k in range(2) for entry in (*linear.camera_jacobian[k], linear.residual[k])]
+    level, *levels = layout.camera_levels
+    gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 10)
+    products = tree_sum(outer_sum(gathered, gathered), tuple(levels))
+    blocks, gradient = products[:, :9, :9], products[:, :9, 9]
+    diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
+    own_cost = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
+    before = own_cost(linear.costs)
+    best, done = cameras, ~layout.camera_seen
+    for damping in DAMPINGS:
+        damped = blocks + (damping * diagonal)[:, :, None] * jnp.eye(9, dtype=blocks.dtype)
+        step = -solve_positive(damped, gradient).T
+        # on the manifold, in which the Jacobian is written
+        moved = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
+        costs = slot_costs(options.loss, residuals(layout, slot_frames(layout, moved), points)[1])
+        better = (own_cost(costs) < before) & ~done
+        best, done = jnp.where(better, moved, best), done | better
+    return best
+
+
+def solve_positive(matrix: Float[Array, "n k k"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """Solves many small positive definite systems by Gauss-Jordan elimination without pivoting.
+
+    Written out instead of calling LAPACK: a batch of such calls inside nested loops never returned on a CPU (jax 0.10.2,
+    two threads, 64 scenes of 10 cameras).
+    """
+    table = jnp.concatenate([matrix, right[:, :, None]], axis=2)
+    for k in range(matrix.shape[-1]):
+        row = table[:, k] / table[:, k, k, None]
+        table = (table - table[:, :, k, None] * row[:, None]).at[:, k].set(row)
+    return table[:, :, -1]

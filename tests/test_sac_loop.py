@@ -1,0 +1,239 @@
+"""The compiled training loop on games whose answer is known, and its promises: one trace, the same numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toys
+
+from jaxba.game import loop as training
+from jaxba.game import sac
+from jaxba.game.loop import TRACES, LoopConfig, LoopState, run_chunk, start
+from jaxba.game.sac import SacConfig
+
+GAMMA = 0.8
+TWIN = SacConfig(
+    width=16,
+    batch=64,
+    gamma=GAMMA,
+    tau=0.05,
+    learning_rate=1e-2,
+    initial_temperature=1e-3,
+    learn_temperature=False,
+)
+"""Quick to learn. The entropy bonus is at most 1e-3 log 2 / (1 - gamma) = 0.004 and lies within every tolerance."""
+
+VALUE = dataclasses.replace(TWIN, variant="value", layer_norm=False, tau=1.0, target_every=5)
+AGENTS = {"twin": TWIN, "value": VALUE}
+LONG = LoopConfig(replay_capacity=10_000, warmup_steps=201, updates_per_step=1, steps_per_chunk=250)
+LEARNS = dataclasses.replace(TWIN, learn_temperature=True, initial_temperature=1.0)
+SHORT = LoopConfig(replay_capacity=3000, warmup_steps=16, updates_per_step=2, steps_per_chunk=5)
+CHUNKS = 4
+
+
+@functools.cache
+def trained(agent: str, toy: toys.Toy) -> tuple[LoopState, dict[str, float]]:
+    """State and last metrics after 1000 vector steps."""
+    state, metrics = start(AGENTS[agent], LONG, toy, jax.random.key(0)), {}
+    for _ in range(CHUNKS):
+        state, metrics = run_chunk(AGENTS[agent], LONG, toy, state)
+    return state, {name: float(value) for name, value in metrics.items()}
+
+
+def opinions(agent: str, toy: toys.Toy, sign: float, clock: float = 0.0, action: float | None = None) -> np.ndarray:
+    """What both critics say, at the policy's own action when None."""
+    config, learner = AGENTS[agent], trained(agent, toy)[0].learner
+    observation = jnp.asarray([[sign, clock]], jnp.float32)
+    chosen = sac.act(config, learner.actor, observation, None) if action is None else jnp.full((1, 1), action)
+    return np.asarray(sac._critic(config).apply(learner.critic, observation, jnp.asarray(chosen, jnp.float32)))[:, 0]
+
+
+def copied(state: LoopState) -> LoopState:
+    return jax.tree.map(jnp.copy, state)
+
+
+def plain(tree):
+    """The tree with keys as numbers."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree)
+
+
+def assert_equal(one, other) -> None:
+    jax.tree.map(np.testing.assert_array_equal, plain(one), plain(other))
+
+
+# games with a known answer
+
+both_agents = pytest.mark.parametrize("agent", AGENTS)
+
+
+@both_agents
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_constant_reward(agent: str, sign: float) -> None:
+    np.testing.assert_allclose(opinions(agent, toys.CONSTANT, sign), 1, atol=0.05)
+
+
+@both_agents
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_reward_that_is_seen(agent: str, sign: float) -> None:
+    np.testing.assert_allclose(opinions(agent, toys.SEEN, sign), sign, atol=0.05)
+
+
+@both_agents
+@pytest.mark.parametrize(("clock", "expected"), [(0.0, GAMMA), (1.0, 1.0)])
+def test_a_delayed_reward(agent: str, clock: float, expected: float) -> None:
+    for sign in (-1.0, 1.0):
+        np.testing.assert_allclose(opinions(agent, toys.DELAYED, sign, clock), expected, atol=0.1)
+
+
+@both_agents
+def test_a_reward_that_depends_on_the_action(agent: str) -> None:
+    learner = trained(agent, toys.ACTION)[0].learner
+    observation = jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])
+    np.testing.assert_allclose(sac.act(AGENTS[agent], learner.actor, observation, None), 0.3, atol=0.1)
+    np.testing.assert_allclose(opinions(agent, toys.ACTION, 1.0), 0, atol=0.05)
+    for action in (0.0, 0.3, 0.6):
+        np.testing.assert_allclose(opinions(agent, toys.ACTION, 1.0, action=action), -((action - 0.3) ** 2), atol=0.1)
+
+
+@both_agents
+def test_a_reward_that_depends_on_both(agent: str) -> None:
+    learner = trained(agent, toys.BOTH)[0].learner
+    observation = jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])
+    actions = sac.act(AGENTS[agent], learner.actor, observation, None)
+    np.testing.assert_allclose(actions[:, 0], [-0.5, 0.5], atol=0.1)
+    for sign in (-1.0, 1.0):
+        np.testing.assert_allclose(opinions(agent, toys.BOTH, sign), sign, atol=0.1)
+
+
+@both_agents
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_truncated_episode_has_the_value_of_its_true_last_observation(agent: str, sign: float) -> None:
+    truth, mistaken = 1 / (1 - GAMMA), 1 / (1 - GAMMA / 2)
+    assert truth > 2 * mistaken
+    np.testing.assert_allclose(opinions(agent, toys.ENDLESS, sign), sign * truth, atol=1)
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_toy_tells_a_wrong_last_observation_and_a_wrong_terminal_apart(sign: float) -> None:
+    for wrong in ({"forgets": True}, {"truncates": False}):
+        toy = dataclasses.replace(toys.ENDLESS, **wrong)
+        np.testing.assert_allclose(opinions("twin", toy, sign), sign / (1 - GAMMA / 2), atol=0.6)
+
+
+def test_the_entropy_reaches_what_is_wanted() -> None:
+    state, entropy = start(LEARNS, SHORT, toys.ACTION, jax.random.key(0)), []
+    for _ in range(150):
+        state, metrics = run_chunk(LEARNS, SHORT, toys.ACTION, state)
+        entropy.append(metrics["entropy"])
+    assert entropy[0] > 0
+    np.testing.assert_allclose(np.mean(entropy[-50:]), -1, atol=0.2)
+    assert 0 < jnp.exp(state.learner.log_temperature) < 0.2
+
+
+# promises
+
+
+def test_numbers_that_are_not_finite_are_kept_out() -> None:
+    toy = dataclasses.replace(toys.SEEN, breaks=True)
+    state, metrics = trained("twin", toy)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(plain((state.learner, state.replay))))
+    assert metrics["dropped"] == LONG.steps_per_chunk * toy.num_envs / 2
+    for sign in (-1.0, 1.0):
+        np.testing.assert_allclose(opinions("twin", toy, sign), sign, atol=0.05)
+
+
+def test_what_is_counted() -> None:
+    state, metrics = trained("twin", toys.ENDLESS)
+    warmup = 26 * 8  # 201 steps of 8 environments, rounded up
+    assert int(state.env_steps) == warmup + CHUNKS * LONG.steps_per_chunk * 8
+    assert int(state.updates) == int(state.learner.updates) == CHUNKS * LONG.steps_per_chunk
+    assert int(state.replay.size) == warmup + CHUNKS * LONG.steps_per_chunk * 8
+    assert metrics["episodes"] == LONG.steps_per_chunk * 8 / 2
+    assert metrics["episode/length"] == 2
+    assert metrics["dropped"] == 0
+    np.testing.assert_allclose(metrics["reward"], 0, atol=0.15)  # signs of 1000 episodes, five standard deviations
+
+
+def test_a_chunk_without_an_end_has_no_means_of_episodes() -> None:
+    toy = dataclasses.replace(toys.ENDLESS, length=1_000_000)
+    state = start(LEARNS, SHORT, toy, jax.random.key(0))
+    _, metrics = run_chunk(LEARNS, SHORT, toy, state)
+    assert metrics["episodes"] == 0
+    assert metrics["episode/length"] == 0
+
+
+def test_the_warm_up_holds_the_demonstrations() -> None:
+    state = start(TWIN, LONG, toys.ACTION, jax.random.key(3))
+    actions, rewards = state.replay.rows[:208, 2], state.replay.rows[:208, 5]
+    assert np.ptp(actions) > 1.8
+    np.testing.assert_allclose(rewards, -((actions - 0.3) ** 2), atol=1e-6)
+    assert int(state.updates) == 0
+
+
+def test_compiles_once() -> None:
+    start.clear_cache()
+    run_chunk.clear_cache()
+    before = TRACES.copy()
+    for seed, slope in enumerate((1.0, 2.0, -1.0)):  # other numbers, other keys, several chunks: the same program
+        game = dataclasses.replace(toys.SEEN, slope=slope)
+        state = start(LEARNS, SHORT, game, jax.random.key(seed))
+        for _ in range(3):
+            state, _ = run_chunk(LEARNS, SHORT, game, state)
+    assert TRACES - before == {"start": 1, "run_chunk": 1}
+    assert int(state.updates) == 3 * 5 * 2
+
+
+def test_nothing_leaves_the_device() -> None:
+    toy = jax.device_put(toys.ACTION)
+    state = start(LEARNS, SHORT, toy, jax.random.key(0))
+    with jax.transfer_guard("disallow"):
+        state, metrics = run_chunk(LEARNS, SHORT, toy, state)
+    assert np.isfinite(metrics["critic_loss"])
+
+
+def test_everything_learned_is_float32() -> None:
+    state = trained("twin", toys.SEEN)[0]
+    kept = state._replace(env_state=None)
+    for leaf in jax.tree.leaves(plain(kept)):
+        assert leaf.dtype in (jnp.float32, jnp.int32, jnp.uint32)
+
+
+def test_the_same_key_gives_the_same_numbers_and_a_run_goes_on_from_its_state() -> None:
+    one, _ = trained("twin", toys.BOTH)
+    again = start(TWIN, LONG, toys.BOTH, jax.random.key(0))
+    for _ in range(CHUNKS - 1):
+        again, _ = run_chunk(TWIN, LONG, toys.BOTH, again)
+    stored = jax.tree.map(np.asarray, plain(again))
+    restored = jax.tree.map(
+        lambda x, y: jax.random.wrap_key_data(x) if jnp.issubdtype(y.dtype, jax.dtypes.prng_key) else jnp.asarray(x),
+        stored,
+        again,
+    )
+    again, _ = run_chunk(TWIN, LONG, toys.BOTH, restored)
+    assert_equal(one, again)
+    other = start(TWIN, LONG, toys.BOTH, jax.random.key(1))
+    assert not np.array_equal(other.replay.rows, start(TWIN, LONG, toys.BOTH, jax.random.key(0)).replay.rows)
+
+
+def test_seeds_side_by_side_are_the_single_runs() -> None:
+    keys = jax.random.split(jax.random.key(5), 2)
+    states = training.start_seeds(LEARNS, SHORT, toys.BOTH, keys)
+    after, metrics = training.run_chunk_seeds(LEARNS, SHORT, toys.BOTH, copied(states))
+    for i in range(2):
+        single = start(LEARNS, SHORT, toys.BOTH, keys[i])
+        close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
+        jax.tree.map(close, plain(single), plain(jax.tree.map(lambda x, i=i: x[i], states)))
+        single, means = run_chunk(LEARNS, SHORT, toys.BOTH, single)
+        jax.tree.map(close, plain(single), plain(jax.tree.map(lambda x, i=i: x[i], after)))
+        jax.tree.map(close, means, {name: value[i] for name, value in metrics.items()})
+
+
+@pytest.mark.parametrize("name", ["replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"])
+def test_a_loop_needs_something_of_everything(name: str) -> None:
+    with pytest.raises(ValueError, match=name):
+        LoopConfig(**{name: 0})

@@ -1,0 +1,174 @@
+"""Configurations of training: presets, files, overrides, and what is refused and how."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from jaxba.damping.agent import AgentConfig
+from jaxba.game import config, settings
+from jaxba.game.config import SettingsError, TrainConfig, load, to_yaml
+from jaxba.game.sac import SacConfig
+from jaxba.game.scenes import SceneClass
+
+REPOSITORY = Path(__file__).parent.parent
+
+
+def written(folder: Path, text: str) -> str:
+    path = folder / "some.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+def refused(*overrides: str, name: str = "default") -> str:
+    with pytest.raises(SettingsError) as error:
+        load(name, overrides)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+# Presets
+
+
+def test_the_presets_are_those_that_the_documentation_names():
+    assert config.preset_names() == ["default", "fast", "paper"]
+
+
+@pytest.mark.parametrize("name", ["default", "fast", "paper"])
+def test_what_is_written_reads_as_the_same_configuration(name, tmp_path):
+    found = load(name)
+    assert load(written(tmp_path, to_yaml(found))) == found
+    assert hash(found) == hash(load(name))
+
+
+def test_the_repository_shows_the_presets_of_the_package():
+    for name in config.preset_names():
+        assert load(str(REPOSITORY / "configs" / "train" / f"{name}.yaml")) == load(name)
+
+
+def test_the_preset_of_the_paper_is_the_papers_setting():
+    found = load("paper")
+    assert found.sac == SacConfig.paper()
+    assert found.bank.classes == (SceneClass(10, 10, "paper"),)
+    agent = found.game.agent
+    assert (agent.observation, agent.action, agent.guard, agent.refine_points) == ("paper", "absolute", "off", 0)
+    assert (agent.low, agent.high, agent.history) == (-10.0, 2.0, 5)
+    assert (found.game.reward, found.game.bonus, found.loop.warmup_steps) == ("duration", 10.0, 500)
+
+
+def test_an_empty_file_is_the_defaults_of_the_classes(tmp_path):
+    assert load(written(tmp_path, "# nothing\n")) == TrainConfig()
+
+
+# Overrides
+
+
+def test_overrides_win_over_the_file_and_reach_every_level():
+    found = load("default", ["seed=7", "sac.width=128", "game.agent.history=3", "sac.learning_rate=3e-4"])
+    assert (found.seed, found.sac.width, found.game.agent.history) == (7, 128, 3)
+    assert found.sac.learning_rate == 3e-4
+    assert found.sac == dataclasses.replace(load("default").sac, width=128, learning_rate=3e-4)
+
+
+def test_overrides_are_yaml():
+    found = load(
+        "default",
+        [
+            "bank.classes=[{cameras: 6, points: 20}, {cameras: 8, points: 30, family: wide}]",
+            "bank.scenes=[10, 20]",
+            "envs=[3, 4]",
+            "sac.max_grad_norm=null",
+            "sac.learn_temperature=false",
+            "sac.gamma=1",
+        ],
+    )
+    assert found.bank.classes == (SceneClass(6, 20), SceneClass(8, 30))
+    assert (found.envs, found.sac.max_grad_norm, found.sac.learn_temperature) == ((3, 4), None, False)
+    assert isinstance(found.sac.gamma, float)
+
+
+def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
+    assert load("default", ["game.agent.guard=off"]).game.agent.guard == "off"
+    assert load(written(tmp_path, "game: {agent: {guard: off}}")).game.agent == AgentConfig(guard="off")
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("sac.lerning_rate=1", "unknown key sac.lerning_rate; did you mean learning_rate"),
+        ("zzz=1", "unknown key zzz; known: seed, seeds"),
+        ("lop.updates_per_step=1", "did you mean loop"),
+        ("seed.deep=1", "seed has no parts"),
+        ("bank.classes=[{camras: 6}]", "unknown key bank.classes[0].camras; did you mean cameras"),
+        ("sac=3", "sac must be a mapping, is 3"),
+        ("sac.width=1.5", "sac.width must be a whole number, is 1.5"),
+        ("sac.width=true", "sac.width must be a whole number, is True"),
+        ("sac.gamma=true", "sac.gamma must be a number, is True"),
+        ("sac.gamma=.inf", "sac.gamma must be a number, is inf"),
+        ("sac.gamma=much", "sac.gamma must be a number, is 'much'"),
+        ("sac.layer_norm=1", "sac.layer_norm must be true or false, is 1"),
+        ("bank.dtype=64", "bank.dtype must be text, is 64"),
+        ("envs=64", "envs must be a list, is 64"),
+        ("envs=[a]", "envs[0] must be a whole number, is 'a'"),
+        ("game.reward=fun", "game.reward must be one of duration, constant, reduction, reversed, is 'fun'"),
+        ("sac.width=[", "not YAML"),
+        ("sac.width", "must be key=value"),
+        ("chunks=0", "chunks must be at least 1, not 0"),
+        ("seed=-1", "seed must lie in"),
+        ("envs=[1, 2]", "envs: 2 numbers for 1 classes"),
+        ("envs=[0]", "at least one environment"),
+        ("envs=[10000000]", "loop.replay_capacity must be at least the 10000000 environments"),
+        ("loop.replay_capacity=0", "loop: replay_capacity must be at least 1"),
+        ("game.agent.history=30", "game.agent: history must be 1 to 20"),
+        ("sac.width=0", "sac.width must be at least 1"),
+        ("sac.gamma=1.5", "sac.gamma must lie in (0, 1]"),
+        ("sac.learning_rate=0", "sac.learning_rate must be positive"),
+        ("sac.log_std_min=1", "sac.log_std_min must be negative"),
+        ("sac.max_grad_norm=-1", "sac.max_grad_norm must be positive or null"),
+        ("bank.dtype=float16", "bank.dtype must be float64 or float32"),
+    ],
+)
+def test_impossible_settings_are_one_line_that_names_the_key(override, message):
+    assert message in refused(override)
+
+
+def test_shaping_must_discount_as_the_agent_does():
+    load("default", ["game.shaping=0.1", "game.discount=0.9", "sac.gamma=0.9"])
+    assert "game.discount must be sac.gamma" in refused("game.shaping=0.1", "game.discount=0.9", "sac.gamma=0.95")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("- 1\n- 2\n", "must be a mapping with keys such as seed"),
+        ("seed: 1\nsac: [\n", "line 3: not YAML"),
+        ("seed: 1\nsac:\n  with: 3\n", "unknown key sac.with; did you mean width"),
+    ],
+)
+def test_a_bad_file_is_named(text, message, tmp_path):
+    path = written(tmp_path, text)
+    found = refused(name=path)
+    assert found.startswith(path)
+    assert message in found
+
+
+def test_files_that_are_not_there_or_no_text(tmp_path):
+    assert refused(name="fastest") == (
+        "no configuration 'fastest'; known: default, fast, paper, or the path of a file"
+    )
+    assert "No such file" in refused(name=str(tmp_path / "none.yaml"))
+    assert "directory" in refused(name=f"{tmp_path}/").lower()
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00")
+    assert "not text" in refused(name=str(tmp_path / "binary.yaml"))
+
+
+def test_differences_name_the_fields():
+    one = load("default")
+    other = load("default", ["seed=5", "game.agent.history=3"])
+    assert settings.differences(one, one) == []
+    assert settings.differences(one, other) == ["seed", "game.agent.history"]
