@@ -40,7 +40,7 @@ class StepInfo(NamedTuple):
     accepted: Bool[Array, ""]
     damping: Float[Array, ""]  # lambda that was used
     gradient_max: Float[Array, ""]  # largest gradient entry before the step
-    step_norm: Float[Array, ""]  # of the proposed step, refined points included
+    step_norm: Float[Array, ""]  # of the proposed step as long as it was tried, refined points included
     parameter_norm: Float[Array, ""]  # before the step
     cg_iterations: Int[Array, ""]
     damping_share: Float[Array, ""]  # share of the step's curvature that is damping's, 0 (Gauss-Newton) to 1
@@ -87,7 +87,7 @@ def lm_step(
     trial = best_trial(layout, state.cameras, state.points, state.cost, linear, step, options, min_gain)
     accepted = trial.accepted
     choose = lambda new, old: jnp.where(accepted, new, old)
-    moved = [trial.cameras - state.cameras, trial.points - state.points]
+    moved = [trial.share * step.cameras, trial.points - state.points]
     after = LMState(*(choose(*pair) for pair in zip(trial[:3], state, strict=True)))
     return after, StepInfo(
         cost=after.cost,
@@ -103,4 +103,3 @@ def lm_step(
         cg_iterations=step.cg_iterations,
         damping_share=step.damped / step.slope,
     )
-

@@ -28,8 +28,8 @@ class SolverName:
     """Damping policy, see `jaxba.damping.make_policy`."""
 
     refine_points: int | None = 0
-    """Embedded point iterations and nothing else. None: all embedded iterations; a learned policy brings those that it was
-    trained with, a rule gets the default ones under the name `RULE+embedded`."""
+    """Embedded point iterations and nothing else. None: all embedded iterations; a learned policy brings those that it
+    was trained with, a rule gets the default ones under the name `RULE+embedded`."""
 
     dtype: str = DTYPES[0]
     """Floating point type."""

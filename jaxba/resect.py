@@ -64,8 +64,8 @@ def refine_cameras(
 def solve_positive(matrix: Float[Array, "n k k"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
     """Solves many small positive definite systems by Gauss-Jordan elimination without pivoting.
 
-    Written out instead of calling LAPACK: a batch of such calls inside nested loops never returned on a CPU (jax 0.10.2,
-    two threads, 64 scenes of 10 cameras).
+    Written out instead of calling LAPACK: a batch of such calls inside nested loops never returned on a CPU (jax
+    0.10.2, two threads, 64 scenes of 10 cameras).
     """
     table = jnp.concatenate([matrix, right[:, :, None]], axis=2)
     for k in range(matrix.shape[-1]):

@@ -86,9 +86,9 @@ def _slope_and_damping(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`-g.d` and `d.D d`, from which the linear model's decrease follows as a sum that does not cancel.
 
-    The decrease is `-(g.d + d.H d / 2)`. `(H + D) d = -g - rest` turns it into `(d.D d - g.d - d.rest) / 2`. The rest is
-    zero for a factored system, and orthogonal to the step for conjugate gradients started at zero. Both kept terms are
-    positive.
+    The decrease is `-(g.d + d.H d / 2)`. `(H + D) d = -g - rest` turns it into `(d.D d - g.d - d.rest) / 2`. The rest
+    is zero for a factored system, and orthogonal to the step for conjugate gradients started at zero. Both kept terms
+    are positive.
     """
     moves = jnp.stack(point_step)
     slope = jnp.sum(system.gradient * step) + jnp.sum(jnp.stack(points.gradient) * moves)

@@ -1,16 +1,16 @@
 """What becomes of a step: the candidate it leads to, embedded iterations around it, and whether it is accepted.
 
-The linear model is wrong far from where it was made, and mostly wrong locally: points fly off, cameras turn away from what
-they see. Repairing that locally is cheap beside a linear solve, and lets bolder steps pass:
+The linear model is wrong far from where it was made, and mostly wrong locally: points fly off, cameras turn away from
+what they see. Repairing that locally is cheap beside a linear solve, and lets bolder steps pass:
 
 1. `refine_points`: every point re-optimised alone at the new cameras.
-2. `camera_rounds`: where the step did less than half of what the model promised and is not hopeless, cameras alone, then
-   points alone again, a few times over. A step along a curved valley comes back to its floor.
+2. `camera_rounds`: where the step did less than half of what the model promised and is not hopeless, cameras alone,
+   then points alone again, a few times over. A step along a curved valley comes back to its floor.
 3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 but without 2.
 
 None of it takes another linear solve, so it is all one iteration (design, section 2). Source: 1 is Jeong et al. 2012,
-"embedded point iterations", and Ceres' inner iterations; 2 is resection and intersection (Chen, Chen, Wang 2019, "Bundle
-adjustment revisited"), here as a repair of second-order steps; 3 is a backtracking line search.
+"embedded point iterations", and Ceres' inner iterations; 2 is resection and intersection (Chen, Chen, Wang 2019,
+"Bundle adjustment revisited"), here as a repair of second-order steps; 3 is a backtracking line search.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ HOPELESS = 1.5
 after them. On Ladybug-49 under lambda 1e-6 a limit of 10 led into a minimum 19% above, 1.5 did not."""
 
 NEGLIGIBLE = 1e-6
-"""Promised decrease relative to the cost that is not worth repairs or further trials. Source: Ceres function_tolerance."""
+"""Promised decrease relative to the cost that is not worth repairs or further trials. Source: Ceres
+function_tolerance."""
 
 
 class Trial(NamedTuple):
@@ -85,9 +86,7 @@ def best_trial(
     def judge(cameras: Array, points: Array, costs: Array, share: Array) -> Trial:
         candidate, decrease, predicted = total(costs), total(before - costs), step.predicted(share)
         gain = decrease / predicted
-        accepted = (
-            (decrease > 0) & (candidate <= cost) & (predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
-        )
+        accepted = (decrease > 0) & (candidate <= cost) & (predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
         return Trial(cameras, points, candidate, predicted, gain, accepted, share)
 
     def settle(cameras: Array, points: Array, share: Array) -> Trial:

@@ -1,4 +1,4 @@
-"""The training driver on a toy game: the same numbers after a kill, a log without gaps, and runs that are not mixed up."""
+"""The training driver on a toy game: the same numbers after a kill, a log without gaps, no two runs mixed up."""
 
 from __future__ import annotations
 
@@ -321,7 +321,7 @@ def test_banks_survive_their_file(tmp_path):
 
     splits = [Split(bank(5), bank(2)), Split(bank(3), bank(1))]
     task._write_banks(tmp_path / "bank.npz", splits)
-    found = task._read_banks(tmp_path / "bank.npz")
+    found = task.read_banks(tmp_path / "bank.npz")
     assert jax.tree.structure(found) == jax.tree.structure(splits)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(splits), strict=True):
         assert a.dtype == b.dtype

@@ -27,12 +27,12 @@ class Arguments:
     """BAL file or Bundler .out file, plain or .bz2, .gz, .xz. Without it a built-in random scene is solved."""
 
     damping: str = "learned"
-    """Who chooses lambda: learned (the shipped policy), a .safetensors file of jaxba-train, ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4;
-    most take a first lambda, as in classic:0.03."""
+    """Who chooses lambda: learned (the shipped policy), a .safetensors file of jaxba-train, ceres, classic, gtsam,
+    nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4; most take a first lambda, as in classic:0.03."""
 
     refine_points: int | None = None
-    """Embedded point iterations after each camera step, and no other embedded iterations. If left out: those that a learned
-    policy was trained with, none for a rule."""
+    """Embedded point iterations after each camera step, and no other embedded iterations. If left out: those that a
+    learned policy was trained with, none for a rule."""
 
     linear_solver: LinearSolverChoice = "auto"
     """explicit: form and factor the reduced camera system. sparse: form it, conjugate gradients. implicit: conjugate

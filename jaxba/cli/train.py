@@ -19,13 +19,16 @@ DEFAULT_CONFIG = "default"
 POLICY = "policy.safetensors"
 CURVE = "curve"
 
+FILE_WIDTH = 120
+"""Columns of the table where the output is no terminal."""
+
 
 @dataclass(frozen=True)
 class Arguments:
     """Options of `jaxba-train`."""
 
     config: str | None = None
-    """default, fast, paper, or the path of a YAML file. A resumed run takes that of its folder."""
+    """A preset (default, plain, fast, paper) or the path of a YAML file. A resumed run takes that of its folder."""
 
     overrides: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="KEY=VALUE ...")
@@ -68,6 +71,8 @@ def _train(args: Arguments) -> int:
         raise common.UsageError(str(error)) from None
     common.prepare_process()
     console = Console(soft_wrap=True, highlight=False)
+    if not console.is_terminal:
+        console = Console(soft_wrap=True, highlight=False, width=FILE_WIDTH)
     with host.calm_blas(), _Interrupt() as interrupt, _Progress(console, config) as progress:
         try:
             work = task.build(config, folder, progress.stage)
@@ -137,8 +142,8 @@ def _table(scores: Mapping[str, Any], tolerance: float, count: int) -> Any:
         title_justify="left",
         title_style="bold",
     )
-    table.add_column("policy")
-    for name in ("mean", "geom. mean", "median", "p90", "failures", "to convergence", "final gap"):
+    table.add_column("policy", no_wrap=True)
+    for name in ("mean", "geom. mean", "median", "p90", "failures", "converged", "final gap"):
         table.add_column(name, justify="right")
     for name, score in scores.items():
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
@@ -211,12 +216,9 @@ class _Progress:
         config = self.config
         done = row["seed"] * config.chunks + row["chunk"]
         total = config.seeds * config.chunks
-        now = (
-            f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s, "
-            f"{row.get('episode/length') or 0:.1f} iterations"
-        )
-        if "episode/ceres" in row:
-            now += f" (Ceres' rule {row['episode/ceres']:.1f})"
+        now = f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s"
+        if row["episodes"]:
+            now += f", {row['episode/length']:.1f} iterations (Ceres' rule {row['episode/ceres']:.1f})"
         description = f"agent {row['seed'] + 1}/{config.seeds}, chunk {row['chunk']}/{config.chunks}"
         if self._bar.tasks[0].total is None:
             self._bar.reset(self._task, total=total, completed=done - 1)

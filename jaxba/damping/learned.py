@@ -1,7 +1,7 @@
 """A trained agent as a damping policy, and the file that it lives in.
 
-A policy file is one `.safetensors`: the weights of the actor, and in its metadata how the agent is wired (`AgentConfig`)
-and where it comes from. It is read without flax.
+A policy file is one `.safetensors`: the weights of the actor, and in its metadata how the agent is wired
+(`AgentConfig`) and where it comes from. It is read without flax.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Learned:
 
     @property
     def min_gain(self) -> float:
-        """Any decrease is accepted."""
-        return 0.0
+        """Gain ratio that a step must exceed."""
+        return self.config.min_gain
 
     def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
         """The action in (-1, 1) for an observation."""
@@ -133,7 +133,8 @@ def load_policy(path: str | Path) -> Learned:
     for k, layer in enumerate(layers):
         if layer.kernel.ndim != 2 or layer.kernel.shape[0] != size or layer.bias.shape != layer.kernel.shape[1:]:
             raise PolicyFileError(
-                f"{path}: layer {k} takes {layer.kernel.shape} for an observation ({config.observation}) or layer of {size}"
+                f"{path}: layer {k} has the shape {layer.kernel.shape}, which does not take {size} numbers "
+                f"(observation {config.observation!r}, history {config.history})"
             )
         if not (np.isfinite(layer.kernel).all() and np.isfinite(layer.bias).all()):
             raise PolicyFileError(f"{path}: layer {k} holds numbers that are not finite")

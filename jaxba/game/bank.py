@@ -1,8 +1,8 @@
 """The bank of scenes that the game is played on, and the best cost known for each.
 
 Scenes are made in one compiled program, solved by a portfolio of hand-written rules with embedded point iterations, run
-long, and sieved: what no rule brings to an end, what is solved at the start and what is numerically absurd teaches nothing.
-The best cost of a scene ends its episodes in training. Nothing that a policy sees depends on it.
+long, and sieved: what no rule brings to an end, what is solved at the start and what is numerically absurd teaches
+nothing. The best cost of a scene ends its episodes in training. Nothing that a policy sees depends on it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ MIN_OBSERVATIONS = 30
 """Smaller scenes are not even tried ..."""
 
 MAX_ERROR_ANGLE = 0.2
-"""... nor those whose start is off by more, root mean square, relative to the focal length: points near the cameras' planes."""
+"""... nor those whose start is off by more, root mean square, relative to the focal length: points near the cameras'
+planes."""
 
 EASY_ENOUGH = 40
 """Iterations in which at least one rule must come within 1e-3 of the best cost."""
@@ -224,7 +225,9 @@ HELD_OUT = 0.1
 """Share of the useful scenes that training never sees."""
 
 
-def reach(costs: Float[np.ndarray, "scenes iterations"], best: Float[np.ndarray, " scenes"], share: float) -> np.ndarray:
+def reach(
+    costs: Float[np.ndarray, "scenes iterations"], best: Float[np.ndarray, " scenes"], share: float
+) -> np.ndarray:
     """Iterations until the accepted cost is at most `best (1 + share)`; infinite where it never is."""
     there = costs <= best[:, None] * (1 + share)
     return np.where(there.any(axis=1), there.argmax(axis=1), np.inf)

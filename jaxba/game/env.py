@@ -53,8 +53,8 @@ class GameConfig:
     """What the agent sees and does."""
 
     reward: Reward = "duration"
-    """`duration`: minus a deterministic cost of the iteration. `constant`: -1. `reduction`: nothing, and a bonus that shrinks.
-    `reversed`: the error as reward (the paper's ablation)."""
+    """`duration`: minus a deterministic cost of the iteration. `constant`: -1. `reduction`: nothing, and a bonus that
+    shrinks. `reversed`: the error as reward (the paper's ablation)."""
 
     bonus: float = 10.0
     """Added where the episode ends in success. Source: Belder et al. 2023."""
@@ -163,16 +163,14 @@ class Game:
         """One LM iteration of one scene."""
         own = with_scene(class_layout(kind), bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
         damping = damping_of(self.config.agent, episode.memory, action)
-        state, step = lm_step(own, episode.state, damping, self.options)
+        state, step = lm_step(own, episode.state, damping, self.options, self.config.agent.min_gain)
         return Episode(episode.scene, state, record(self.config.agent, episode.memory, step)), step
 
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
         """Plays one action everywhere."""
         key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
         parts, after, start = [], [], 0
-        for kind, bank, episodes, k, count in zip(
-            self.kinds, self.banks, state.episodes, keys, self.envs, strict=True
-        ):
+        for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
             own, start = action[start : start + count, 0], start + count
 
             def one(episode: Episode, action: Array, key: Array, kind=kind, bank=bank) -> tuple[Episode, Step]:
@@ -183,9 +181,7 @@ class Game:
             after.append(episodes)
         return GameState(tuple(after), key), jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
-    def _play(
-        self, kind: SceneClass, bank: Bank, episode: Episode, action: Array, key: Array
-    ) -> tuple[Episode, Step]:
+    def _play(self, kind: SceneClass, bank: Bank, episode: Episode, action: Array, key: Array) -> tuple[Episode, Step]:
         rules = self.config
         best = bank.best_cost[episode.scene]
         after, step = self.iterate(kind, bank, episode, action)

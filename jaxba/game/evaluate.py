@@ -96,7 +96,5 @@ def compare(
         together = [run[k] for run in runs.values()]
         pick = lambda name, choose, together=together: choose([getattr(run, name) for run in together], axis=0)
         ended = np.min([np.where(run.converged, run.iterations, limit) for run in together], axis=0)
-        lowest.append(
-            Trajectories(pick("costs", np.min), together[0].dampings, ended, pick("converged", np.any))
-        )
+        lowest.append(Trajectories(pick("costs", np.min), together[0].dampings, ended, pick("converged", np.any)))
     return {**scores, "virtual best": score(lowest, best, tolerance, limit)}

@@ -1,6 +1,7 @@
 """Plays a damping policy on every scene of a bank, many at a time, each to its end.
 
-A compiled loop over lanes: where a scene ends, its lane takes the next one, so that no lane waits for the slowest scene.
+A compiled loop over lanes: where a scene ends, its lane takes the next one, so that no lane waits for the slowest
+scene.
 """
 
 from __future__ import annotations
@@ -27,15 +28,22 @@ LANES = 128
 """Scenes in play at a time."""
 
 GROUP = 8
-"""Scenes that step together. Trials and camera rounds last as long as the slowest scene of a group needs them, and arrays of
-this size stay in a core's cache: 8 scenes of 10 x 40 took no longer a scene than 64 did."""
+"""Scenes that step together. Trials and camera rounds last as long as the slowest scene of a group needs them, and
+arrays of this size stay in a core's cache: 8 scenes of 10 x 40 took no longer a scene than 64 did."""
 
 
 def step_groups(function: Callable[..., T], *arguments: Any) -> T:
     """`jax.vmap(function)` in groups of `GROUP`, one after the other, on a CPU; at once elsewhere."""
     if jax.default_backend() != "cpu":
         return jax.vmap(function)(*arguments)
-    return lax.map(lambda a: function(*a), arguments, batch_size=GROUP)
+    count = jax.tree.leaves(arguments)[0].shape[0]
+    if count <= GROUP:
+        return jax.vmap(function)(*arguments)
+    # whole groups only: `lax.map` would run what is left over beside the others, and two batched factorisations at a
+    # time wait for each other for ever where XLA has two threads
+    rows = jnp.minimum(jnp.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
+    found = lax.map(lambda a: jax.vmap(function)(*a), jax.tree.map(lambda x: x[rows], arguments))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
 
 
 class Trajectories(NamedTuple):
@@ -118,7 +126,7 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
     def body(loop: _Loop) -> _Loop:
         lane, step = step_groups(advance, loop.lane)
         row = jnp.minimum(lane.scene, count)  # idle lanes write to a row that nobody reads
-        converged = converged_in_cost(step, ftol)
+        converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, ftol)
         done = converged | (lane.iteration >= limit)
         costs = loop.costs.at[row, lane.iteration - 1].set(step.cost)
         dampings = loop.dampings.at[row, lane.iteration - 1].set(step.damping)

@@ -246,9 +246,7 @@ def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[
     """Cameras and points off the truth: drift along the path, own errors, a wrong lens, wrong depths."""
     keys = iter(jax.random.split(key, 24))
     cameras = rig.center.shape[0]
-    sometimes = lambda share, low, high: (
-        jax.random.bernoulli(next(keys), share) * _log_uniform(next(keys), low, high)
-    )
+    sometimes = lambda share, low, high: jax.random.bernoulli(next(keys), share) * _log_uniform(next(keys), low, high)
     turn = jnp.cumsum(sometimes(0.5, 1e-5, 0.02) * jax.random.normal(next(keys), (cameras, 3)), axis=0)
     turns = _turns(turn)
     pace = jnp.exp(jnp.cumsum(sometimes(0.3, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras, 1)), axis=0))

@@ -90,7 +90,7 @@ def build(config: TrainConfig, folder: Path, say: Callable[[str], None] = lambda
     path = folder / BANK
     if path.is_file():
         say("reading the scenes")
-        splits = _read_banks(path)
+        splits = read_banks(path)
     else:
         options = StepOptions(refine_points=config.bank.refine_points)
         splits = make_banks(config.bank, jax.random.key(config.seed), options, config.game.max_iterations, say)
@@ -132,7 +132,8 @@ def _write_banks(path: Path, splits: list[Split]) -> None:
     part.replace(path)
 
 
-def _read_banks(path: Path) -> list[Split]:
+def read_banks(path: Path) -> list[Split]:
+    """The scenes of a run's folder."""
     with np.load(path) as file:
         classes = sorted({int(name.split("/")[0]) for name in file.files})
         return [_named_tuple(Split, f"{number}/", file) for number in classes]

@@ -1,0 +1,96 @@
+"""A look-ahead oracle: beam search over lambda, the floor that no policy of one lambda an iteration should be expected
+to beat.
+
+It plays every lambda of a grid from every state of the beam and keeps the best, which takes `width x grid` times the
+work of a solve. With a beam of one it is the greedy choice, which loses: the best next cost is not the way to the best
+end.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Float
+
+from jaxba.game.bank import Bank, class_layout, with_scene
+from jaxba.game.play import Trajectories, step_groups
+from jaxba.game.scenes import SceneClass
+from jaxba.lm import LMState, StepInfo, lm_step
+from jaxba.options import StepOptions
+
+GRID = tuple(10.0**decade for decade in (-8, -7, -6, -5, -4, -3, -2, -1, 0))
+"""Lambdas that are tried in every state."""
+
+WIDTH = 4
+"""States that are kept (issue 3)."""
+
+
+def beam_search(
+    step: Callable[[LMState, Array], tuple[LMState, StepInfo]],
+    start: LMState,
+    iterations: int,
+    width: int = WIDTH,
+    grid: tuple[float, ...] = GRID,
+) -> Float[Array, " _"]:
+    """Lowest accepted cost after each number of iterations, the start first.
+
+    Args:
+        step: one LM iteration from a state with a lambda; pure.
+        start: first state.
+        iterations: linear solves in a row.
+        width: states kept after each.
+        grid: lambdas.
+    """
+    pairs = [(state, damping) for state in range(width) for damping in range(len(grid))]
+    parent = jnp.array([pair[0] for pair in pairs])
+    dampings = jnp.asarray(grid, start.cost.dtype)[jnp.array([pair[1] for pair in pairs])]
+    beam = jax.tree.map(lambda x: jnp.broadcast_to(x, (width, *x.shape)), start)
+    beam = beam._replace(cost=beam.cost.at[1:].set(jnp.inf))
+
+    def body(beam: LMState, _: None) -> tuple[LMState, Array]:
+        origin = jax.tree.map(lambda x: x[parent], beam)
+        after, info = step_groups(step, origin, dampings)
+        alive = info.accepted & jnp.isfinite(origin.cost)
+        costs = jnp.concatenate([jnp.where(alive, after.cost, jnp.inf), beam.cost])
+        order = jnp.argsort(costs)
+        twin = jnp.concatenate([jnp.zeros(1, bool), jnp.diff(costs[order]) <= 0])
+        best = order[jnp.argsort(jnp.where(twin, jnp.inf, costs[order]))[:width]]
+        together = jax.tree.map(lambda new, old: jnp.concatenate([new, old])[best], after, beam)
+        beam = together._replace(cost=costs[best])
+        return beam, beam.cost[0]
+
+    costs = lax.scan(body, beam, None, length=iterations)[1]
+    return jnp.concatenate([start.cost[None], costs])
+
+
+@functools.partial(jax.jit, static_argnames=("kind", "options", "iterations", "width", "grid"))
+def _search(
+    kind: SceneClass, bank: Bank, options: StepOptions, iterations: int, width: int, grid: tuple[float, ...]
+) -> Array:
+    layout = class_layout(kind)
+
+    def one(scene: Bank) -> Array:
+        own = with_scene(layout, scene.scenes.pixels, scene.scenes.mask)
+        start = LMState(scene.scenes.cameras, scene.scenes.points, scene.initial_cost)
+        return beam_search(lambda state, damping: lm_step(own, state, damping, options), start, iterations, width, grid)
+
+    return lax.map(one, bank)
+
+
+def oracle(
+    kind: SceneClass,
+    bank: Bank,
+    options: StepOptions,
+    iterations: int,
+    width: int = WIDTH,
+    grid: tuple[float, ...] = GRID,
+) -> Trajectories:
+    """The search on every scene of a bank; the lambdas of the winning line are not kept."""
+    costs = np.asarray(_search(kind, bank, options, iterations, width, grid))
+    count = len(costs)
+    return Trajectories(costs, np.zeros_like(costs[:, 1:]), np.full(count, iterations), np.zeros(count, bool))

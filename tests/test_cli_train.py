@@ -1,0 +1,177 @@
+"""`jaxba-train` in this process on a tiny bank: what it writes, Ctrl-C, going on, and one-line errors."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from safetensors import safe_open
+
+from jaxba.cli.train import run
+from jaxba.damping.learned import load_policy
+from jaxba.game import metrics, play, task
+from jaxba.game.config import load
+
+TINY = [
+    *("chunks=4", "evaluate_every=2", "checkpoint_every=1", "envs=[8]"),
+    *("bank.classes=[{cameras: 4, points: 12, family: paper}]", "bank.scenes=[160]", "bank.refine_points=0"),
+    *("game.max_iterations=12", "game.agent.refine_points=0", "game.agent.trials=1", "game.agent.camera_rounds=0"),
+    *("sac.width=8", "sac.batch=16", "loop.replay_capacity=500", "loop.warmup_steps=16", "loop.steps_per_chunk=8"),
+]
+COMMAND = ["--config", "fast", "--set", *TINY]
+CLOCKS = ("wall_s", "chunk_s", "steps_per_s", "updates_per_s", "cpu_per_wall", "evaluate_s")
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    """Few lanes and rules, since every rule is a program of its own."""
+    monkeypatch.setattr(play, "LANES", play.GROUP)
+    monkeypatch.setattr(task, "YARDSTICKS", ("ceres",))
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory) -> Path:
+    """A folder whose run was interrupted after the first chunk."""
+    folder = tmp_path_factory.mktemp("train") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(play, "LANES", play.GROUP)
+        patch.setattr(task, "YARDSTICKS", ("ceres",))
+        interrupt_at(1, patch)
+        assert run([*COMMAND, "--out", str(folder)]) == 130
+    return folder
+
+
+@pytest.fixture
+def folder(scenes, tmp_path) -> Path:
+    return Path(shutil.copytree(scenes, tmp_path / "run"))
+
+
+@pytest.fixture(scope="module")
+def finished(scenes, tmp_path_factory) -> Path:
+    folder = Path(shutil.copytree(scenes, tmp_path_factory.mktemp("done") / "run"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(play, "LANES", play.GROUP)
+        patch.setattr(task, "YARDSTICKS", ("ceres",))
+        assert run(["--out", str(folder), "--resume"]) == 0
+    return folder
+
+
+def interrupt_at(chunk: int, patch: pytest.MonkeyPatch, times: int = 1) -> None:
+    """Presses Ctrl-C while a chunk is being written down."""
+    write = metrics.Log.write
+
+    def pressed(self, row):
+        done = write(self, row)
+        if row["chunk"] == chunk:
+            for _ in range(times):
+                os.kill(os.getpid(), signal.SIGINT)
+        return done
+
+    patch.setattr(metrics.Log, "write", pressed)
+
+
+def error_of(capsys, *argv: str) -> str:
+    assert run(list(argv)) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    return error
+
+
+# Results
+
+
+def test_a_run_leaves_policy_curve_log_and_configuration(finished):
+    names = {path.name for path in finished.iterdir()}
+    assert names == {
+        *("config.yaml", "bank.npz", "rules.json", "metrics.jsonl", "tensorboard", "checkpoints"),
+        *("policy.safetensors", "curve.png", "curve.svg"),
+    }
+    assert load(str(finished / "config.yaml")) == load("fast", TINY)
+    assert [row["chunk"] for row in metrics.read(finished)] == [1, 2, 3, 4]
+    assert metrics.read(finished)[1]["episode/ceres"] > 0
+
+
+def test_the_policy_file_is_the_best_policy_and_says_where_it_comes_from(finished):
+    policy = load_policy(finished / "policy.safetensors")
+    assert policy.config == load("fast", TINY).game.agent
+    scored = [row for row in metrics.read(finished) if "held_out/score" in row]
+    best = min(scored, key=lambda row: row["held_out/score"])
+    with safe_open(finished / "policy.safetensors", framework="numpy") as file:
+        facts = file.metadata()
+    assert facts["chunk"] == str(best["chunk"])
+    assert facts["held_out_iterations"] == f"{best['held_out/score']:.4f}"
+    assert "cameras: 4" in facts["config"]
+    actor = {"params": {"MLP_0": {f"Dense_{k}": x._asdict() for k, x in enumerate(policy.layers)}}}
+    work = task.build(load("fast", TINY), finished)
+    assert work.compare(actor)["learned"].mean == pytest.approx(best["held_out/score"], abs=1)
+
+
+def test_a_finished_run_resumed_prints_the_table_again(finished, capsys):
+    before = (finished / "metrics.jsonl").read_bytes()
+    assert run(["--out", str(finished), "--resume"]) == 0
+    output = capsys.readouterr().out
+    for name in ("learned", "ceres", "virtual best", "policy.safetensors"):
+        assert name in output
+    assert (finished / "metrics.jsonl").read_bytes() == before
+
+
+# Interruptions
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(folder, capsys, monkeypatch):
+    interrupt_at(3, monkeypatch)
+    assert run(["--out", str(folder), "--resume"]) == 130
+    captured = capsys.readouterr()
+    assert f"interrupted and saved; go on with jaxba-train --out {folder} --resume" in captured.out
+    assert "stopping after this chunk" in captured.err
+    assert [row["chunk"] for row in metrics.read(folder)] == [1, 2, 3]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interrupted_run_goes_on_as_if_it_had_not_been(folder, finished, capsys, monkeypatch):
+    with monkeypatch.context() as patch:
+        interrupt_at(3, patch, times=2)
+        assert run(["--out", str(folder), "--resume"]) == 130
+    assert "go on from the last checkpoint" in capsys.readouterr().out
+    assert run(["--out", str(folder), "--resume"]) == 0
+    plain = lambda row: {k: v for k, v in row.items() if k not in CLOCKS}
+    assert list(map(plain, metrics.read(folder))) == list(map(plain, metrics.read(finished)))
+    ours, theirs = (load_policy(place / "policy.safetensors") for place in (folder, finished))
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+# Errors
+
+
+def test_a_folder_with_a_run_is_refused(folder, capsys):
+    assert "holds a run already; --resume goes on with it" in error_of(capsys, *COMMAND, "--out", str(folder))
+
+
+def test_errors_of_the_configuration_are_one_line(capsys, tmp_path):
+    out = str(tmp_path / "run")
+    assert "did you mean width" in error_of(capsys, "--set", "sac.with=3", "--out", out)
+    assert "unknown key zzz" in error_of(capsys, "--set", "seed=1", "--set", "zzz=1", "seeds=2", "--out", out)
+    assert "known: default, fast" in error_of(capsys, "--config", "fastest", "--out", out)
+    assert "No such file" in error_of(capsys, "--config", "some/where.yaml", "--out", out)
+    assert "holds no run to resume" in error_of(capsys, "--resume", "--out", out)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_resumed_run_of_other_settings_is_refused(folder, capsys):
+    error = error_of(capsys, "--out", str(folder), "--resume", "--set", "sac.width=9")
+    assert "begun with another sac.width" in error
+
+
+def test_a_bank_without_useful_scenes_is_one_line(capsys, tmp_path, monkeypatch):
+    def none(*_args, **_kwargs):
+        raise ValueError("only 0 of 9 scenes are of use: draw more")
+
+    monkeypatch.setattr(task, "make_banks", none)
+    assert "draw more" in error_of(capsys, *COMMAND, "--out", str(tmp_path / "run"))

@@ -1,0 +1,493 @@
+"""The game: its scenes, playing policies on them, its contract as an environment, and the scores.
+
+Costs come from NumPy (`jaxba.geometry`), solves from `jaxba.solve`, rewards are written down once more.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support import same_bits
+from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
+
+from jaxba import BundleProblem, StepOptions, geometry, make_policy, solve
+from jaxba.damping.agent import begin, damping_of, observe
+from jaxba.damping.learned import Layer, Learned
+from jaxba.game.bank import Bank, info_of, initial_costs, reach, sieve
+from jaxba.game.env import POINT_ITERATION_COST, SHAPING_FLOOR, Game, GameConfig
+from jaxba.game.evaluate import compare, evaluate, score
+from jaxba.game.play import Trajectories, play
+from jaxba.game.protocol import Environment
+from jaxba.game.scenes import MIN_VIEWS, SceneClass, Scenes, _angle_axis, make_scenes
+
+LIMIT = 25
+
+
+def grid(kind: SceneClass, scenes: Scenes) -> np.ndarray:
+    """Which camera sees which point, a matrix per scene, without the empty point."""
+    return np.asarray(scenes.mask).reshape(-1, kind.cameras, kind.points + 1)[:, :, :-1]
+
+
+def problem_of(kind: SceneClass, scenes: Scenes, k: int) -> BundleProblem:
+    """One scene on the host."""
+    seen = grid(kind, scenes)[k]
+    pixels = np.asarray(scenes.pixels[k]).reshape(2, kind.cameras, kind.points + 1)[:, :, :-1]
+    camera, point = np.nonzero(seen)
+    return BundleProblem.create(
+        np.asarray(scenes.cameras[k]).T,
+        np.asarray(scenes.points[k]).T[:-1],
+        pixels[:, camera, point].T,
+        camera,
+        point,
+    )
+
+
+# Scenes
+
+
+@pytest.mark.parametrize("kind", [KIND, SceneClass(6, 10, "paper")], ids=["wide", "paper"])
+def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
+    scenes = make_scenes(kind, jax.random.key(1), 40)
+    slots = kind.cameras * (kind.points + 1)
+    shapes = [x.shape for x in scenes]
+    assert shapes == [(40, 9, kind.cameras), (40, 3, kind.points + 1), (40, 2, slots), (40, slots)]
+    assert all(np.isfinite(x).all() for x in scenes[:3])
+    mask = np.asarray(scenes.mask)
+    assert (np.asarray(scenes.pixels)[np.broadcast_to(~mask[:, None], scenes.pixels.shape)] == 0).all()
+    assert not mask.reshape(40, kind.cameras, -1)[:, :, -1].any()  # the empty point
+    seen = grid(kind, scenes)
+    views, observed = seen.sum(axis=1), seen.sum(axis=2)
+    assert (views[views > 0] >= 2).all()
+    assert (observed[observed > 0] >= MIN_VIEWS).all()
+    if kind.family == "paper":
+        assert seen.all()
+    else:
+        assert len({s.sum() for s in seen}) > 5  # sizes differ
+
+
+@pytest.mark.parametrize("kind", [KIND, SceneClass(6, 10, "paper")], ids=["wide", "paper"])
+def test_the_cost_of_a_start_is_what_numpy_says(kind):
+    scenes = make_scenes(kind, jax.random.key(2), 12)
+    found = np.asarray(initial_costs(kind, scenes))
+    tried = 0
+    for k in range(12):
+        if not grid(kind, scenes)[k].any():
+            assert found[k] == 0
+            continue
+        np.testing.assert_allclose(found[k], geometry.cost(problem_of(kind, scenes, k)), rtol=1e-9)
+        tried += 1
+    assert tried >= 6
+
+
+def test_the_paper_s_starts_are_off_by_what_its_code_says():
+    """Cameras next to the line x in [-2, 2] without rotation, points in a box before them, focal length 500."""
+    scenes = make_scenes(SceneClass(6, 10, "paper"), jax.random.key(3), 40)
+    cameras, points = np.asarray(scenes.cameras), np.asarray(scenes.points)[:, :, :-1]
+    assert (np.linalg.norm(cameras[:, :3], axis=1) < 0.03).all()
+    centers = np.stack([geometry.camera_centers(c.T) for c in cameras])
+    assert (np.abs(centers[..., 0]) < 2.03).all()
+    assert (np.abs(centers[..., 1:]) < 0.03).all()
+    assert (cameras[:, 6:] == np.array([500, 0, 0])[:, None]).all()
+    low, high = np.array([-2, -2, -10])[:, None] - 0.01, np.array([2, 2, -4])[:, None] + 0.01
+    assert ((points > low) & (points < high)).all()
+
+
+def test_the_same_key_makes_the_same_scenes_and_another_one_others():
+    first, again, other = (make_scenes(KIND, jax.random.key(k), 40) for k in (7, 7, 8))
+    assert same_bits(first, again)
+    assert not np.allclose(first.cameras, other.cameras)
+    assert len({c.tobytes() for c in np.asarray(first.cameras)}) == 40
+
+
+def test_what_a_policy_is_told_of_a_scene_is_true():
+    scenes = make_scenes(KIND, jax.random.key(1), 40)
+    cost = initial_costs(KIND, scenes)
+    info = info_of(KIND, scenes, cost, 33)
+    for k, seen in enumerate(grid(KIND, scenes)):
+        if not seen.any():
+            continue
+        assert int(info.observations[k]) == seen.sum()
+        assert int(info.cameras[k]) == seen.any(axis=1).sum()
+        assert int(info.points[k]) == seen.any(axis=0).sum()
+        np.testing.assert_allclose(info.focal[k], np.median(np.asarray(scenes.cameras)[k, 6, seen.any(axis=1)]))
+        assert int(info.max_iterations[k]) == 33
+        assert info.cost[k] == cost[k]
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-14, 1e-8, 1e-3, 1.0, 3.0, np.pi - 1e-3, np.pi - 1e-8, np.pi - 1e-12, np.pi])
+def test_angle_axis_vectors_are_those_of_scipy(angle):
+    axes = np.random.default_rng(0).normal(size=(30, 3))
+    axes = np.vstack([axes, np.eye(3), -np.eye(3)])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    rotation = Rotation.from_rotvec(angle * axes)
+    found = np.array(_angle_axis(jnp.asarray(rotation.as_matrix())))
+    assert (np.linalg.norm(found, axis=1) <= np.pi + 1e-12).all()
+    assert (Rotation.from_rotvec(found) * rotation.inv()).magnitude().max() < 1e-7 * angle + 1e-13
+    if angle < np.pi - 1e-6:  # beyond, either sign of the axis is right within rounding
+        np.testing.assert_allclose(found, angle * axes, rtol=1e-7, atol=1e-12)
+
+
+# Playing
+
+CERES = make_policy("ceres")
+
+
+@functools.cache
+def played() -> Trajectories:
+    """Ceres' rule on every scene of the bank."""
+    return play(KIND, tiny_bank(), CERES, StepOptions(), LIMIT)
+
+
+def test_the_bank_is_large_enough_to_test_with():
+    assert 12 <= len(tiny_bank().initial_cost) <= 110
+
+
+def test_a_scene_is_played_as_it_is_solved():
+    bank, found = tiny_bank(), played()
+    for k in (0, 5):
+        alone = solve(problem_of(KIND, bank.scenes, k), "ceres", max_iterations=LIMIT)
+        count = min(5, alone.iterations)
+        expected = np.concatenate([[alone.initial_cost], alone.history.cost])[: count + 1]
+        np.testing.assert_allclose(found.costs[k, : count + 1], expected, rtol=1e-6)
+        np.testing.assert_allclose(found.dampings[k, :count], alone.history.damping[:count], rtol=1e-4)
+        if alone.converged:
+            np.testing.assert_allclose(found.costs[k, -1], alone.final_cost, rtol=1e-3)
+
+
+def test_costs_start_at_the_start_never_rise_and_stay_after_the_end():
+    bank, found = tiny_bank(), played()
+    assert found.costs.shape == (len(bank.initial_cost), LIMIT + 1)
+    np.testing.assert_array_equal(found.costs[:, 0], bank.initial_cost)
+    assert (np.diff(found.costs, axis=1) <= 0).all()
+    ends = 0
+    for costs, dampings, count, converged in zip(*found, strict=True):
+        assert 1 <= count <= LIMIT
+        assert converged or count == LIMIT
+        assert (costs[count:] == costs[count]).all()
+        assert (dampings[:count] > 0).all()
+        assert (dampings[count:] == 0).all()
+        ends += count < LIMIT
+    assert ends > 0
+    assert len(set(found.iterations)) > 3
+
+
+def test_lanes_do_not_mix_scenes(monkeypatch):
+    """The scenes in another order, and in fewer lanes than scenes, so that lanes are used again."""
+    from jaxba.game import play as module
+
+    bank = tiny_bank()
+    order = np.random.default_rng(0).permutation(len(bank.initial_cost))
+    monkeypatch.setattr(module, "LANES", 8)
+    assert len(order) > 8
+    mixed = play(KIND, sieve(bank, order), CERES, StepOptions(), LIMIT - 1)  # another limit: a program of its own
+    straight = played()
+    np.testing.assert_allclose(mixed.costs, straight.costs[order][:, :-1], rtol=1e-5)
+    np.testing.assert_array_equal(np.minimum(straight.iterations[order], LIMIT - 1), mixed.iterations)
+
+
+def test_a_network_meets_in_a_solve_what_it_meets_in_the_game():
+    """Each of its lambdas in a solve is the one it chose in the game, so its observations were the same."""
+    rng = np.random.default_rng(2)
+    size = AGENT.observation_size
+    draw = lambda *shape: rng.normal(size=shape).astype(np.float32)
+    policy = Learned((Layer(draw(size, 8), draw(8)), Layer(draw(8, 2), draw(2))), AGENT)
+    bank = tiny_bank()
+    found = play(KIND, bank, policy, StepOptions(), LIMIT)
+    limit = int(bank.info.max_iterations[0])
+    for k in (0, 1, 5):
+        alone = solve(problem_of(KIND, bank.scenes, k), policy, StepOptions(), max_iterations=limit)
+        count = min(4, alone.iterations)
+        np.testing.assert_allclose(found.dampings[k, :count], alone.history.damping[:count], rtol=1e-3)
+
+
+# The environment
+
+_jitted_reset = jax.jit(lambda game, key: game.reset(key))
+_jitted_step = jax.jit(lambda game, state, action: game.step(state, action))
+
+ENVS = 6
+
+
+def actions(steps: int, seed: int = 0, envs: int = ENVS) -> jnp.ndarray:
+    """Random ones."""
+    return jnp.asarray(np.random.default_rng(seed).uniform(-1, 1, (steps, envs, 1)), jnp.float32)
+
+
+def _host(tree):
+    return jax.tree.map(np.asarray, tree)
+
+
+@functools.cache
+def random_game(limit_is_failure: bool):
+    """What happens in 50 steps of random actions: pairs of the state before and the step, all on the host."""
+    game = tiny_game(replace(RULES, limit_is_failure=limit_is_failure), ENVS)
+    state, seen = _jitted_reset(game, jax.random.key(3))
+    found = []
+    for action in actions(50):
+        before = state
+        state, step = _jitted_step(game, state, action)
+        found.append((before._replace(episodes=_host(before.episodes)), *_host((seen, action, step))))
+        seen = step.observation
+    return game, found
+
+
+def test_the_game_keeps_the_contract_of_an_environment():
+    game, found = random_game(False)
+    assert isinstance(game, Environment)
+    assert (game.num_envs, game.observation_size, game.action_size) == (ENVS, AGENT.observation_size, 1)
+    for _, seen, _, step in found:
+        assert seen.shape == step.observation.shape == step.final_observation.shape == (ENVS, game.observation_size)
+        assert seen.dtype == step.observation.dtype == step.reward.dtype == np.float32
+        assert set(step.metrics) == {"length", "success", "rejections", "ceres"}
+
+
+def test_fifty_random_actions_leave_everything_finite():
+    for _, found in (random_game(False), random_game(True)):
+        for before, seen, _, step in found:
+            leaves = jax.tree.leaves((before.episodes, seen, step))
+            assert all(np.isfinite(x).all() for x in leaves if np.issubdtype(x.dtype, np.inexact))
+
+
+@pytest.mark.parametrize("limit_is_failure", [False, True])
+def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else(limit_is_failure):
+    """The cost after the action is that of `lm_step` on the scene alone, taken once more."""
+    game, found = random_game(limit_is_failure)
+    bank = tiny_bank()
+    goals = limits = 0
+    for k, (before, _, action, step) in enumerate(found):
+        (episodes,) = before.episodes
+        best = np.asarray(bank.best_cost)[episodes.scene]
+        cost = np.array([_alone(game, episodes, action, e) for e in range(ENVS)]) if k < 12 else None
+        at_limit = episodes.memory.iteration + 1 >= RULES.max_iterations
+        success = step.metrics["success"] > 0
+        if cost is not None:
+            np.testing.assert_array_equal(success, cost <= best * (1 + RULES.tolerance))
+        np.testing.assert_array_equal(step.terminated, success | (at_limit if limit_is_failure else False))
+        np.testing.assert_array_equal(step.truncated, False if limit_is_failure else at_limit & ~success)
+        np.testing.assert_array_equal(step.metrics["length"], episodes.memory.iteration + 1)
+        goals, limits = goals + success.sum(), limits + (at_limit & ~success).sum()
+    assert goals >= 5
+    assert limits >= 5
+
+
+@functools.partial(jax.jit, static_argnames=("game_rules", "kind"))
+def _iterate(game, kind, bank, episode, action, game_rules):
+    after, step = game.iterate(kind, bank, episode, action)
+    return after, step
+
+
+def _alone(game: Game, episodes, action, e: int) -> float:
+    episode = jax.tree.map(lambda x: jnp.asarray(x[e]), episodes)
+    return float(_iterate(game, KIND, game.banks[0], episode, jnp.asarray(action[e, 0]), game.config)[1].cost)
+
+
+def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_is_the_true_one():
+    game, found = random_game(False)
+    starts = {}
+    for scene in range(len(tiny_bank().initial_cost)):
+        episode = game.start(game.banks[0], jnp.asarray(scene, jnp.int32))
+        starts[np.asarray(observe(AGENT, episode.memory)).tobytes()] = scene
+    assert len(starts) > 10
+    ended = 0
+    for k, (before, _, action, step) in enumerate(found):
+        done = step.terminated | step.truncated
+        for e in range(ENVS):
+            if done[e]:
+                assert step.observation[e].tobytes() in starts
+                assert step.final_observation[e].tobytes() not in starts
+                ended += 1
+            else:
+                np.testing.assert_array_equal(step.observation[e], step.final_observation[e])
+            if k < 6:
+                episode = jax.tree.map(lambda x, e=e: jnp.asarray(x[e]), before.episodes[0])
+                after, _ = _iterate(game, KIND, game.banks[0], episode, jnp.asarray(action[e, 0]), game.config)
+                np.testing.assert_allclose(step.final_observation[e], observe(AGENT, after.memory), atol=1e-5)
+        if k + 1 < len(found):
+            (following,) = found[k + 1][0].episodes
+            assert (following.memory.iteration[done] == 0).all()
+            np.testing.assert_array_equal(
+                following.state.cost[done], np.asarray(tiny_bank().initial_cost)[following.scene[done]]
+            )
+    assert ended >= 30
+    scenes = {int(s) for before, *_ in found for s in before.episodes[0].scene}
+    assert len(scenes) > 10  # of the whole bank, not the same ones again
+
+
+def _reward(config: GameConfig, cost: float, before: float, best: float, iteration: int, success: bool, over: bool):
+    """By hand; `iteration` counts from one."""
+    bonus = config.bonus if success else 0.0
+    value = {
+        "duration": bonus - 1,  # no point iterations in this game
+        "constant": bonus - 1,
+        "reduction": bonus * (1 - 0.01 * (iteration - 1)),
+        "reversed": bonus - np.log10(cost / best),
+    }[config.reward]
+    if config.shaping:
+        far = lambda c: np.log10(max(c / best - 1, SHAPING_FLOOR))
+        value += config.shaping * (far(before) - (0.0 if over else config.discount * far(cost)))
+    return config.scale * value
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        replace(RULES, reward="duration"),
+        replace(RULES, reward="constant", bonus=3.0, scale=1.0),
+        replace(RULES, reward="reduction"),
+        replace(RULES, reward="reversed"),
+        replace(RULES, reward="constant", shaping=0.5, limit_is_failure=True),
+    ],
+    ids=lambda config: config.reward + ("+shaping" if config.shaping else ""),
+)
+def test_rewards_are_those_of_the_contract(config):
+    """By `Game._reward` alone, on made-up steps: no program of its own for each."""
+    from support import step_info
+
+    game = tiny_game(config)
+    memory = begin(config.agent, tiny_info())
+    for cost, before, best, iteration in (
+        (5.0, 9.0, 1.0, 1),
+        (1.0005, 3.0, 1.0, 2),
+        (2.0, 2.0, 0.5, 4),
+        (1.0, 1.2, 1.0, 3),
+    ):
+        success = cost <= best * (1 + config.tolerance)
+        over = success or (config.limit_is_failure and iteration >= config.max_iterations)
+        step = step_info(True, cost=cost, previous_cost=before)
+        found = game._reward(
+            step,
+            memory._replace(iteration=jnp.asarray(iteration, jnp.int32)),
+            jnp.asarray(best),
+            jnp.asarray(success),
+            jnp.asarray(over),
+        )
+        np.testing.assert_allclose(found, _reward(config, cost, before, best, iteration, success, over), rtol=1e-9)
+
+
+def tiny_info():
+    return jax.tree.map(lambda x: x[0], tiny_bank().info)
+
+
+def test_a_point_iteration_costs_a_tenth_of_a_linear_solve():
+    from support import step_info
+
+    game = dataclasses.replace(tiny_game(), options=StepOptions(refine_points=3))
+    memory = begin(AGENT, tiny_info())
+    no = jnp.asarray(False)
+    found = game._reward(step_info(True, cost=5.0, previous_cost=9.0), memory, jnp.asarray(1.0), no, no)
+    np.testing.assert_allclose(found, -RULES.scale * (1 + 3 * POINT_ITERATION_COST))
+    assert POINT_ITERATION_COST == 0.1
+
+
+def test_the_game_pays_what_it_says():
+    """The rewards of the compiled game, from the costs in its own states."""
+    game, found = random_game(False)
+    checked = 0
+    for k in range(len(found) - 1):
+        before, _, _, step = found[k]
+        (episodes,), (following,) = before.episodes, found[k + 1][0].episodes
+        for e in range(ENVS):
+            success = bool(step.metrics["success"][e])
+            best = float(np.asarray(tiny_bank().best_cost)[episodes.scene[e]])
+            cost = best if step.terminated[e] or step.truncated[e] else float(following.state.cost[e])
+            want = _reward(
+                game.config, cost, float(episodes.state.cost[e]), best, int(step.metrics["length"][e]), success, False
+            )
+            np.testing.assert_allclose(step.reward[e], want, rtol=1e-5)
+            checked += 1
+    assert checked == 49 * ENVS
+
+
+def test_the_same_key_and_actions_give_the_same_numbers_and_the_game_is_traced_once():
+    game, found = random_game(False)
+    traced = _jitted_step._cache_size()
+    state, _ = _jitted_reset(game, jax.random.key(3))
+    for action, (before, _, _, step) in zip(actions(50), found, strict=True):
+        assert same_bits(before.episodes, state.episodes)
+        state, again = _jitted_step(game, state, action)
+        assert same_bits(again, step)
+    other, _ = _jitted_reset(game, jax.random.key(4))
+    assert not same_bits(other.episodes, found[0][0].episodes)
+    _jitted_step(dataclasses.replace(game, banks=(_shifted(game.banks[0]),)), other, actions(1)[0])
+    assert _jitted_step._cache_size() == traced  # other scenes, same program
+
+
+def _shifted(bank: Bank) -> Bank:
+    return jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), bank)
+
+
+def test_demonstrations_are_actions_of_which_some_follow_ceres_rule():
+    game = tiny_game(RULES, 8)
+    state, _ = _jitted_reset(game, jax.random.key(0))
+    found = np.asarray(game.demonstrate(state, jax.random.key(1)))
+    assert found.shape == (8, 1)
+    assert (np.abs(found) < 1).all()
+    lambdas = [
+        float(damping_of(AGENT, jax.tree.map(lambda x, e=e: x[e], state.episodes[0].memory), jnp.asarray(found[e, 0])))
+        for e in range(8)
+    ]
+    np.testing.assert_allclose([lambdas[1], lambdas[5]], 1e-4, rtol=1e-4)  # Ceres' first lambda
+    np.testing.assert_allclose([lambdas[3], lambdas[7]], 1e-6, rtol=1e-4)  # and two decades bolder
+    assert len(set(found[::2, 0])) == 4
+
+
+@pytest.mark.parametrize(
+    "change", [{"reward": "fame"}, {"max_iterations": 0}, {"tolerance": 0.0}, {"scale": -1.0}, {"tolerance": -1e-3}]
+)
+@pytest.mark.usefixtures("unchecked")
+def test_impossible_rules_are_refused(change):
+    with pytest.raises(ValueError, match=next(iter(change))):
+        replace(RULES, **change)
+
+
+# Scores
+
+
+def test_reaching_a_cost_is_counted_from_the_start():
+    costs = np.array([[9.0, 5.0, 1.0005, 1.0], [1.0, 1.0, 1.0, 1.0], [9.0, 8.0, 7.0, 6.0], [9.0, 1.002, 1.002, 1.0009]])
+    np.testing.assert_array_equal(reach(costs, np.ones(4), 1e-3), [2, 0, np.inf, 3])
+    np.testing.assert_array_equal(reach(costs, np.full(4, 6.5), 0.0), [1, 0, 3, 1])
+
+
+def test_a_score_is_what_numpy_makes_of_the_iterations():
+    costs = np.array([[8.0, 4.0, 2.0, 1.0, 1.0], [8.0, 1.0, 1.0, 1.0, 1.0], [8.0, 7.0, 6.0, 5.0, 5.0]])
+    run = Trajectories(costs, costs[:, 1:], np.array([4, 2, 4]), np.array([True, True, False]))
+    found = score([run, run], [np.ones(3), np.array([4.0, 1.0, 5.0])], 1e-3, 4)
+    there = np.array([3, 1, 4, 1, 1, 3])  # the third never gets there: the limit
+    np.testing.assert_allclose(found.mean, there.mean())
+    np.testing.assert_allclose(found.geometric_mean, np.prod(there) ** (1 / 6))
+    np.testing.assert_allclose(found.median, np.median(there))
+    np.testing.assert_allclose(found.p90, np.percentile(there, 90))
+    np.testing.assert_allclose(found.failures, 1 / 6)
+    np.testing.assert_allclose(found.to_convergence, 2 * (4 + 2 + 4) / 6)
+    np.testing.assert_allclose(found.end, np.median([0, 0, 4, -0.75, 0, 0]))
+
+
+def test_an_evaluation_is_the_score_of_playing():
+    bank = tiny_bank()
+    expected = score([played()], [np.asarray(bank.best_cost)], 1e-3, LIMIT)
+    assert evaluate([KIND], [bank], CERES, StepOptions(), 1e-3, LIMIT) == expected
+
+
+def test_the_virtual_best_is_no_worse_than_any_of_its_members_on_any_scene():
+    bank = tiny_bank()
+    policies = {name: (make_policy(name), StepOptions()) for name in ("ceres", "ceres:10", "ceres:1e-9")}
+    found = compare([KIND], [bank], policies, 1e-3, LIMIT)
+    assert list(found) == [*policies, "virtual best"]
+    best = found["virtual best"]
+    for name in policies:
+        for field in ("mean", "geometric_mean", "median", "p90", "failures", "to_convergence", "end"):
+            assert getattr(best, field) <= getattr(found[name], field) + 1e-12, (name, field)
+    assert best.mean < min(found[name].mean for name in policies)
+    # and no better than the best of each scene
+    runs = [play(KIND, bank, policy, StepOptions(), LIMIT) for policy, _ in policies.values()]
+    known = np.min([np.asarray(bank.best_cost), *(run.costs[:, -1] for run in runs)], axis=0)
+    soonest = np.min([np.minimum(np.maximum(reach(run.costs, known, 1e-3), 1), LIMIT) for run in runs], axis=0)
+    np.testing.assert_allclose(best.mean, soonest.mean())

@@ -1,0 +1,96 @@
+"""When a small decrease means that a minimum is near, and when only that lambda was large."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import support
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support import step_info
+
+from jaxba import Termination, Tolerances, solve
+from jaxba.termination import HIDDEN_DECREASE, converged_in_cost, termination_of
+
+LIMIT = 30
+
+
+def quadratic_step(curvature: float, damping: float, gradient: float):
+    """Decrease, undamped decrease, and damping's share of one step on `h x^2 / 2 + g x`."""
+    move = -gradient / (curvature + damping)
+    decrease = -(gradient * move + 0.5 * curvature * move**2)
+    share = damping * move**2 / ((curvature + damping) * move**2)
+    return decrease, gradient**2 / (2 * curvature), share
+
+
+positive = st.floats(1e-3, 1e3)
+
+
+@settings(deadline=None)
+@given(positive, st.floats(1e-6, 1e3), positive)
+def test_the_undamped_decrease_is_told_exactly_on_a_parabola(curvature, damping, gradient):
+    decrease, undamped, share = quadratic_step(curvature, damping, gradient)
+    np.testing.assert_allclose(decrease / (1 - share**2), undamped, rtol=1e-9)
+
+
+@settings(deadline=None)
+@given(positive, st.floats(1e-6, 1e5), positive, st.floats(-9, -3), st.floats(-4, 4))
+def test_on_a_parabola_it_ends_where_the_undamped_decrease_is_small(curvature, damping, gradient, digits, over):
+    """`over`: decades by which the cost times ftol exceeds the decrease."""
+    decrease, undamped, share = quadratic_step(curvature, damping, gradient)
+    ftol = 10.0**digits
+    cost = decrease / ftol * 10.0**over
+    for edge in (decrease / (ftol * cost), undamped / (HIDDEN_DECREASE * ftol * cost)):
+        if abs(edge - 1) < 1e-4:
+            return  # rounding decides
+    if cost - decrease <= 0 or decrease < 1e-11 * cost:  # no cost is negative, nor is a decrease below its last digits
+        return
+    info = step_info(True, cost=cost - decrease, previous_cost=cost, damping_share=share)
+    expected = decrease <= ftol * cost and undamped <= HIDDEN_DECREASE * ftol * cost
+    assert bool(converged_in_cost(info, ftol)) == expected
+
+
+def test_a_rejected_step_never_ends_a_solve_as_converged():
+    info = step_info(False, cost=1.0, previous_cost=1.0, step_norm=0.0, damping_share=0.0)
+    assert not converged_in_cost(info, 1e-6)
+    code = termination_of(info, jnp.asarray(False), jnp.asarray(3, jnp.int32), Tolerances(), 100)
+    assert int(code) == Termination.RUNNING
+
+
+@pytest.mark.parametrize(("share", "ends"), [(0.0, True), (0.9, True), (0.999999, False), (1.0, False)])
+def test_the_same_small_decrease_ends_a_solve_or_not_by_what_made_it_small(share, ends):
+    info = step_info(True, cost=1 - 5e-7, previous_cost=1.0, damping_share=share)
+    assert bool(converged_in_cost(info, 1e-6)) == ends
+
+
+def test_no_decrease_at_all_is_convergence_whatever_lambda_was():
+    """Then the undamped step promises nothing either; without this a solve at the exact minimum would never end."""
+    assert converged_in_cost(step_info(True, cost=1.0, previous_cost=1.0, damping_share=0.999), 1e-6)
+
+
+def test_a_huge_lambda_does_not_feign_convergence_and_ceres_rule_converges():
+    problem = support.tiny()
+    ftol_alone = Tolerances(ftol=1e-5, xtol=0.0)
+    stuck = solve(problem, "constant:1e6", max_iterations=LIMIT, tolerances=ftol_alone)
+    costs = np.concatenate([[stuck.initial_cost], stuck.history.cost])
+    assert stuck.accepted > 0
+    assert (-np.diff(costs) <= 1e-5 * costs[:-1]).all()  # each alone would have ended it by the plain rule
+    assert stuck.termination == Termination.MAX_ITERATIONS
+    fine = solve(problem, "ceres", max_iterations=LIMIT, tolerances=ftol_alone)
+    assert fine.termination == Termination.COST
+    assert fine.final_cost < 0.9 * stuck.final_cost
+
+
+def test_nor_does_it_by_the_length_of_its_steps():
+    stuck = solve(support.tiny(), "constant:1e6", max_iterations=LIMIT)
+    assert stuck.termination == Termination.MAX_ITERATIONS
+
+
+def test_near_the_minimum_a_small_undamped_step_ends_a_solve():
+    problem = solve(support.tiny(), "ceres", max_iterations=LIMIT, tolerances=Tolerances(ftol=1e-9)).problem
+    again = solve(problem, "constant:1e-6", max_iterations=LIMIT)
+    assert again.termination == Termination.COST
+    assert again.iterations <= 2
+    damped = solve(problem, "constant:1e6", max_iterations=LIMIT)
+    np.testing.assert_allclose(damped.final_cost, again.final_cost, rtol=1e-6)

@@ -1,0 +1,272 @@
+"""Embedded iterations: cameras alone, shorter trials, repairs; against SciPy, dense algebra and plain evaluation."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import support
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+from support import same_bits, start, step
+
+from jaxba import BundleProblem, Layout, LMState, StepOptions, geometry
+from jaxba.game.bank import class_layout, initial_costs, with_scene
+from jaxba.game.scenes import SceneClass, make_scenes
+from jaxba.linearize import cost, linearize
+from jaxba.resect import DAMPINGS, refine_cameras, solve_positive
+from jaxba.schur import solve_step
+from jaxba.trial import GOOD_GAIN, HOPELESS, NEGLIGIBLE, SHORTER
+
+PLAIN = StepOptions()
+SHORTER_ONLY = StepOptions(trials=4)
+EVERYTHING = StepOptions(refine_points=3, trials=4, camera_rounds=3)
+
+BOLD = 1e-8
+"""A lambda that leaves far starts to Gauss-Newton."""
+
+_refine = jax.jit(refine_cameras, static_argnames=("options",))
+
+
+def turned(seed: int, size: float) -> BundleProblem:
+    """`tiny` with cameras off in proportion to `size`; the shape stays, so the program does too."""
+    problem = support.tiny()
+    rng = np.random.default_rng(seed)
+    cameras = np.array(problem.cameras)
+    cameras[:, :3] += 0.05 * size * rng.normal(size=(len(cameras), 3))
+    cameras[:, 3:6] += 0.2 * size * rng.normal(size=(len(cameras), 3))
+    cameras[:, 6] *= 1 + 0.1 * size * rng.normal(size=len(cameras))
+    return problem.replace(cameras=cameras)
+
+
+def far(seed: int) -> BundleProblem:
+    """`turned`, with points far from where they belong as well."""
+    problem = turned(seed, 1.0)
+    return problem.replace(points=problem.points + np.random.default_rng(100 + seed).normal(size=problem.points.shape))
+
+
+def camera_costs(problem: BundleProblem) -> np.ndarray:
+    """Cost of each camera's observations, by NumPy."""
+    squared = np.sum(geometry.residuals(problem) ** 2, axis=1)
+    return np.bincount(problem.camera_index, 0.5 * squared, minlength=problem.num_cameras)
+
+
+def resected(problem: BundleProblem, times: int = 1) -> BundleProblem:
+    """The problem after rounds of every camera alone."""
+    layout, before = start(problem)
+    cameras = before.cameras
+    for _ in range(times):
+        cameras = _refine(layout, cameras, before.points, PLAIN)
+    return support.back(problem, before, before._replace(cameras=cameras))
+
+
+# Cameras alone
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-6, 6))
+def test_small_systems_are_solved_as_lapack_solves_them(seed, decades):
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(7, 9, 12))
+    scale = 10.0 ** rng.uniform(-abs(decades), abs(decades), size=(7, 9, 1))
+    matrix, right = (scale * root) @ (scale * root).transpose(0, 2, 1), scale[:, :, 0] * rng.normal(size=(7, 9))
+    found = np.asarray(solve_positive(jnp.asarray(matrix), jnp.asarray(right)))
+    expected = np.linalg.solve(matrix, right[:, :, None])[:, :, 0]
+    # in the units of the scale, where the systems are well conditioned
+    np.testing.assert_allclose(found * scale[:, :, 0], expected * scale[:, :, 0], rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize(("seed", "size"), [(0, 0.0), (1, 0.1), (2, 1.0), (3, 3.0), (4, 20.0)])
+def test_no_camera_gets_worse_and_points_are_not_touched(seed, size):
+    problem = turned(seed, size)
+    after = resected(problem)
+    assert (camera_costs(after) <= camera_costs(problem)).all()
+    assert np.array_equal(after.points, problem.points)
+
+
+def test_a_round_is_a_damped_gauss_newton_step_of_each_camera():
+    """On the manifold, by the Jacobian of support.py; where the first damping does not help, the second."""
+    manifold = StepOptions(rotation="manifold")
+    helped = 0
+    for seed, size in ((1, 0.1), (2, 0.5), (5, 2.0)):
+        problem = turned(seed, size)
+        after = resected(problem)
+        residual, jacobian = support.linear(problem, manifold)
+        before = camera_costs(problem)
+        for camera in range(problem.num_cameras):
+            own = slice(9 * camera, 9 * camera + 9)
+            block, gradient = jacobian[:, own].T @ jacobian[:, own], jacobian[:, own].T @ residual
+            expected = problem.cameras[camera]
+            for damping in DAMPINGS:
+                change = np.zeros(jacobian.shape[1])
+                change[own] = -np.linalg.solve(block + damping * np.diag(np.diag(block)), gradient)
+                moved = support.moved(problem, manifold, change)
+                if camera_costs(moved)[camera] < before[camera]:
+                    expected, helped = moved.cameras[camera], helped + 1
+                    break
+            np.testing.assert_allclose(after.cameras[camera], expected, rtol=1e-5, atol=1e-6)
+    assert helped >= 12
+
+
+def test_every_camera_ends_where_scipy_ends_on_that_camera_alone():
+    problem = turned(6, 0.1)
+    once, found = camera_costs(resected(problem)), camera_costs(resected(problem, 40))
+    for camera in range(problem.num_cameras):
+        own = problem.camera_index == camera
+        points, seen = problem.points[problem.point_index[own]], problem.observations[own]
+
+        def residuals(x: np.ndarray, points=points, seen=seen) -> np.ndarray:
+            local = points @ geometry.rotation_matrices(x[None, :3])[0].T + x[3:6]
+            intrinsics = np.broadcast_to(x[6:], (len(points), 3))
+            return (geometry.distort(local[:, :2] / -local[:, 2:], intrinsics) - seen).ravel()
+
+        best = least_squares(
+            residuals, problem.cameras[camera], x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=2000
+        )
+        assert best.cost <= once[camera] * (1 + 1e-9)
+        np.testing.assert_allclose(found[camera], best.cost, rtol=1e-5)
+
+
+def test_cameras_that_see_nothing_do_not_move():
+    problem = support.odd()
+    unseen = np.bincount(problem.camera_index, minlength=problem.num_cameras) == 0
+    assert unseen.any()
+    after = resected(problem)
+    assert np.array_equal(after.cameras[unseen], problem.cameras[unseen])
+    assert not np.array_equal(after.cameras[~unseen], problem.cameras[~unseen])
+
+
+# Trials
+
+
+_whole_step = jax.jit(solve_step, static_argnames=("options",))
+
+
+@pytest.mark.parametrize("damping", [1e-3, 1.0])
+def test_without_embedded_iterations_the_candidate_is_the_step_and_nothing_else(damping):
+    for problem in (support.tiny(), turned(1, 0.3)):
+        dense = support.dense(problem, PLAIN, damping)
+        layout, before = start(problem)
+        after, info = step(layout, before, damping, PLAIN)
+        plain = geometry.cost(support.moved(problem, PLAIN, dense.step))
+        np.testing.assert_allclose(info.candidate_cost, plain, rtol=1e-6)
+        np.testing.assert_allclose(info.predicted, dense.predicted, rtol=1e-6)
+        assert bool(info.accepted) == (plain < geometry.cost(problem))
+        np.testing.assert_allclose(after.cost, min(plain, geometry.cost(problem)), rtol=1e-6)
+
+
+def test_the_promise_at_a_share_of_the_step_is_the_quadratic_model_there():
+    problem, damping = turned(1, 0.3), 1e-3
+    layout, before = start(problem)
+    linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
+    found = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(damping), PLAIN)
+    dense = support.dense(problem, PLAIN, damping)
+    for share in (1.0, 0.25, 0.0625, 0.5, 1.7):
+        change = share * dense.jacobian @ dense.step
+        model = -change @ (dense.residual + 0.5 * change)
+        np.testing.assert_allclose(found.predicted(jnp.asarray(share)), model, rtol=1e-7)
+
+
+KIND, SCENES = SceneClass(5, 12), 80
+
+
+@functools.cache
+def wide() -> list[tuple[Layout, LMState]]:
+    """Scenes of the game, some of them such that Gauss-Newton fails; one program for all."""
+    scenes = make_scenes(KIND, jax.random.key(0), SCENES)
+    costs = initial_costs(KIND, scenes)
+    large = np.flatnonzero(np.asarray(scenes.mask).sum(axis=1) >= 25)
+    return [
+        (
+            with_scene(class_layout(KIND), scenes.pixels[k], scenes.mask[k]),
+            LMState(scenes.cameras[k], scenes.points[k], costs[k]),
+        )
+        for k in large
+    ]
+
+
+_cost = jax.jit(cost, static_argnames=("loss",))
+
+
+def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
+    saved = 0
+    for layout, before in wide():
+        same, once = step(layout, before, BOLD, PLAIN)
+        after, info = step(layout, before, BOLD, SHORTER_ONLY)
+        if once.accepted:  # then nothing is tried again
+            assert same_bits(same, after)
+            continue
+        assert same_bits(same, before)
+        if not info.accepted:
+            assert same_bits(after, before)
+            continue
+        saved += 1
+        linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
+        whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(BOLD), PLAIN)
+        power = round(float(np.log(info.step_norm / once.step_norm) / np.log(SHORTER)))
+        assert power in (1, 2, 3)
+        costs = []
+        for share in SHORTER ** np.arange(power + 1.0):
+            cameras, points = before.cameras + share * whole.cameras, before.points + share * whole.points
+            costs.append(float(_cost(layout, cameras, points, PLAIN.loss)))
+        assert not min(costs[:-1]) < before.cost  # no longer share would have done
+        np.testing.assert_allclose(after.cameras, cameras, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(after.points, points, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(info.predicted, whole.predicted(jnp.asarray(share)), rtol=1e-6)
+        np.testing.assert_allclose(info.cost, costs[-1], rtol=1e-6)
+        assert after.cost < before.cost
+    assert saved >= 3
+
+
+@pytest.mark.parametrize("options", [PLAIN, SHORTER_ONLY, EVERYTHING], ids=["plain", "trials", "everything"])
+def test_the_cost_never_rises_and_is_that_of_the_parameters(options):
+    accepted = 0
+    for problem in (support.tiny(), turned(2, 0.3), far(0), far(1), far(2)):
+        for damping in (BOLD, 1e-3, 1.0):
+            layout, before = start(problem)
+            after, info = step(layout, before, damping, options)
+            assert info.cost <= info.previous_cost
+            assert after.cost == info.cost
+            np.testing.assert_allclose(info.cost, geometry.cost(support.back(problem, before, after)), rtol=1e-9)
+            accepted += int(info.accepted)
+    assert accepted >= 5
+
+
+@pytest.mark.parametrize("options", [PLAIN, SHORTER_ONLY, EVERYTHING], ids=["plain", "trials", "everything"])
+def test_a_refused_step_leaves_every_bit_alone(options):
+    for problem in (turned(2, 0.3), far(0)):
+        layout, before = start(problem)
+        after, info = step(layout, before, 1e-3, options, min_gain=1e9)
+        assert not info.accepted
+        assert same_bits(after, before)
+        assert info.cost == info.previous_cost
+
+
+def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
+    rounds = StepOptions(camera_rounds=3)
+    better = trusted = 0
+    for layout, before in wide():
+        plain = step(layout, before, BOLD, PLAIN)[1]
+        mended = step(layout, before, BOLD, rounds)[1]
+        np.testing.assert_allclose(mended.predicted, plain.predicted, rtol=1e-9)
+        assert not mended.candidate_cost > plain.candidate_cost * (1 + 1e-12)
+        better += bool(mended.candidate_cost < 0.9 * plain.candidate_cost)
+        if plain.gain_ratio > GOOD_GAIN or plain.candidate_cost > HOPELESS * before.cost:
+            trusted += 1  # the model was right, or it is past mending
+            assert mended.candidate_cost == plain.candidate_cost
+    assert better >= 1
+    assert trusted >= 5
+
+
+def test_a_promise_too_small_to_matter_is_tried_once():
+    """At such a lambda the step promises next to nothing; refused, it is refused at full length."""
+    layout, before = start(turned(2, 0.3))
+    for damping, tries in ((1e12, 1), (1e-3, 4)):
+        whole = step(layout, before, damping, PLAIN, min_gain=1e9)[1]
+        assert (whole.predicted < NEGLIGIBLE * before.cost) == (tries == 1)
+        last = step(layout, before, damping, SHORTER_ONLY, min_gain=1e9)[1]
+        assert (last.predicted < 0.5 * whole.predicted) == (tries > 1)

@@ -1,0 +1,29 @@
+"""A game small enough to compile in seconds, shared by the tests of the environment and of its Gymnasium adapter."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+
+from jaxba import StepOptions
+from jaxba.damping.agent import AgentConfig
+from jaxba.game.bank import Bank, draft, sieve
+from jaxba.game.env import Game, GameConfig, make_game
+from jaxba.game.scenes import SceneClass
+
+KIND = SceneClass(4, 12)
+AGENT = AgentConfig(history=2, low=-10.0, high=2.0, refine_points=0, trials=1, camera_rounds=0)
+RULES = GameConfig(agent=AGENT, max_iterations=4, limit_is_failure=False)
+
+
+@functools.cache
+def tiny_bank() -> Bank:
+    """A dozen scenes or more, with the best costs that Ceres' and GTSAM's rules find."""
+    made = draft(KIND, jax.random.key(5), 120, StepOptions(), 40, rules=("ceres",))
+    return sieve(made.bank, made.useful)
+
+
+def tiny_game(config: GameConfig = RULES, envs: int = 6) -> Game:
+    """A game on them."""
+    return make_game(config, [KIND], [tiny_bank()], [envs])
