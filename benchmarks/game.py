@@ -2,8 +2,9 @@
 
     python -m benchmarks.game runs/default --policy runs/default/policy.safetensors --scenes 200
 
-Every rule with plain steps, with three point iterations, and with all embedded iterations; the best constant of a grid; a
-random policy; the virtual best of all rules per scene; beam search over lambda (the floor) and its greedy cousin.
+Every rule with plain steps, with three point iterations, and with all embedded iterations; the best constant of a
+grid; a random policy; the virtual best of all rules per scene; beam search over lambda (the floor) and its greedy
+cousin.
 """
 
 from __future__ import annotations

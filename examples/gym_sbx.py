@@ -35,8 +35,8 @@ class ForStableBaselines(VecEnv):
     """A Gymnasium vector environment that resets in the same step, in the form that Stable-Baselines3 has for it."""
 
     def __init__(self, envs: GymVectorGame) -> None:
-        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
         self.envs = envs
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> np.ndarray:
         seed = next((s for s in self._seeds if s is not None), None)

@@ -43,6 +43,7 @@ class StepInfo(NamedTuple):
     step_norm: Float[Array, ""]  # of the proposed step as long as it was tried, refined points included
     parameter_norm: Float[Array, ""]  # before the step
     cg_iterations: Int[Array, ""]
+    share: Float[Array, ""]  # length of the candidate relative to the whole step, below 1 after further trials
     damping_share: Float[Array, ""]  # share of the step's curvature that is damping's, 0 (Gauss-Newton) to 1
 
 
@@ -101,5 +102,6 @@ def lm_step(
         step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in moved)),
         parameter_norm=jnp.sqrt(jnp.sum(state.cameras**2) + jnp.sum(state.points**2)),
         cg_iterations=step.cg_iterations,
+        share=trial.share,
         damping_share=step.damped / step.slope,
     )

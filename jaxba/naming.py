@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from jaxba.damping import LEARNED, LEARNED_PLAIN, DampingPolicy, Learned, is_learned, make_policy
 from jaxba.damping.agent import AgentConfig
+from jaxba.damping.registry import SUFFIX
 from jaxba.options import StepOptions
 
 METHODS = ("lm",)
@@ -67,12 +68,19 @@ def parse_solver(name: str) -> SolverName:
         SolverNameError: an unknown method or type, or a malformed name.
         UnknownPolicyError: an unknown policy.
     """
-    rest, at, dtype = name.strip().partition("@")
-    parts = rest.split("+")
+    # a path may hold any sign: it ends where its suffix does
+    path, suffix, rest = name.strip().rpartition(SUFFIX)
+    prefix, at, dtype = rest.partition("@")
+    parts = prefix.split("+")
+    if suffix:
+        method, plus, file = path.partition("+")
+        known = bool(plus) and method in METHODS
+        parts[0] = (file if known else path) + suffix + parts[0]
+        parts = [method, *parts] if known else parts
     # the plus sign of an exponent belongs to its number: constant:1e+2
     merged: list[str] = []
     for part in parts:
-        if merged and re.search(r":\d*\.?\d*[eE]$", merged[-1]):
+        if merged and not merged[-1].endswith(SUFFIX) and re.search(r":\d*\.?\d*[eE]$", merged[-1]):
             merged[-1] += "+" + part
         else:
             merged.append(part)

@@ -29,6 +29,7 @@ from jaxba.naming import DTYPES
 from jaxba.options import StepOptions
 from jaxba.problem import AnyArray, BundleProblem, ProblemError
 from jaxba.schur import largest_diagonal
+from jaxba.sums import point_sum
 from jaxba.termination import Termination, Tolerances, termination_of
 
 MAX_ITERATIONS = 100
@@ -211,10 +212,10 @@ def _start(layout: Layout, state: LMState, policy: DampingPolicy, options: StepO
     info = ProblemInfo(
         cost=state.cost,
         observations=count(jnp.sum(layout.slot_mask)),
-        cameras=count(layout.num_cameras),
-        points=count(layout.num_points),
+        cameras=count(jnp.sum(layout.camera_seen)),
+        points=count(jnp.sum(point_sum(layout, layout.slot_mask[None].astype(state.cost.dtype)) > 0)),
         unit=unit,
-        focal=jnp.median(jnp.abs(state.cameras[6])),
+        focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
         max_iterations=count(max_iterations),
     )
     policy_state, damping = policy.init(info)

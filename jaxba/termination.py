@@ -76,7 +76,8 @@ def converged_in_cost(step: StepInfo, ftol: Any) -> Bool[Array, ""]:
     """
     decrease, share = step.previous_cost - step.cost, step.damping_share
     hidden = decrease > HIDDEN_DECREASE * (1 - share) * (1 + share) * ftol * step.previous_cost
-    return step.accepted & (decrease <= ftol * step.previous_cost) & ~hidden
+    whole = ~(step.share < 1)  # a step that had to be shortened says nothing either
+    return step.accepted & (decrease <= ftol * step.previous_cost) & ~hidden & whole
 
 
 def termination_of(
@@ -84,7 +85,9 @@ def termination_of(
 ) -> Int[Array, ""]:
     """First stop rule that applies. Only an accepted step, or a zero gradient, ends a solve as converged."""
     by_cost = converged_in_cost(step, tolerances.ftol)
-    by_step = step.accepted & (step.step_norm <= tolerances.xtol * (step.parameter_norm + tolerances.xtol))
+    bound = tolerances.xtol * (step.parameter_norm + tolerances.xtol)
+    hidden = step.step_norm > HIDDEN_DECREASE * (1 - step.damping_share) * bound
+    by_step = step.accepted & (step.step_norm <= bound) & ~hidden
     by_gradient = step.gradient_max <= tolerances.gtol
     limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
     stalled = ~step.accepted & stuck

@@ -136,6 +136,7 @@ def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp
         "gradient_max": 1.0,
         "step_norm": 1.0,
         "parameter_norm": 1.0,
+        "share": 1.0,
         "damping_share": 0.0,
         **changes,
     }

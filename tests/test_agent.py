@@ -33,7 +33,7 @@ _observe = jax.jit(observe, static_argnums=0)
 _damping = jax.jit(damping_of, static_argnums=0)
 _record = jax.jit(record, static_argnums=0)
 
-RANGE = {"low": -10.0, "high": 2.0}
+RANGE = {"low": -10.0, "high": 2.0, "first_low": -10.0, "descent": 50.0}
 FREE = AgentConfig(guard="off", **RANGE)
 REJECTED, ACCEPTED = False, True
 
@@ -77,7 +77,7 @@ def after(config: AgentConfig, memory: Memory, accepted: bool, log_damping: floa
 @pytest.mark.parametrize(("low", "high"), [(-10.0, 2.0), (-6.0, 0.0)])
 def test_actions_are_decades_from_the_lowest_to_the_highest(low, high):
     for guard in ("off", "pause", "hand-over"):
-        config = AgentConfig(low=low, high=high, guard=guard)
+        config = AgentConfig(low=low, high=high, guard=guard, first_low=low, descent=50.0)
         memory = _begin(config, info())
         found = [decades(config, memory, action) for action in (-1, -0.5, 0, 0.5, 1)]
         np.testing.assert_allclose(found, np.linspace(low, high, 5), atol=1e-6)
@@ -205,6 +205,18 @@ def test_a_solve_cannot_stand_still_under_a_large_lambda():
     for change in ({"cost": 99.0}, {"damping_share": 0.9 * HEAVY_SHARE}):
         free = after(config, memory, ACCEPTED, 1.0, **{**tiny, **change})
         np.testing.assert_allclose(decades(config, free, 1), config.high, atol=1e-6)
+
+
+def test_lambda_falls_from_one_iteration_to_the_next_by_so_many_decades_at_most():
+    config = AgentConfig(**{**RANGE, "first_low": -5.0, "descent": 2.0})
+    memory = _begin(config, info())
+    np.testing.assert_allclose([decades(config, memory, a) for a in (-1, 0, 1)], [-5, -4, 2], atol=1e-6)
+    memory = after(config, memory, ACCEPTED, -4.0)
+    np.testing.assert_allclose([decades(config, memory, a) for a in (-1, -0.25, 1)], [-6, -5.5, 2], atol=1e-6)
+    memory = after(config, memory, ACCEPTED, -9.5)
+    np.testing.assert_allclose(decades(config, memory, -1), config.low, atol=1e-6)
+    free = AgentConfig(**{**RANGE, "first_low": -5.0, "descent": 2.0, "guard": "off"})
+    np.testing.assert_allclose(decades(free, memory, -1), free.low, atol=1e-6)
 
 
 # Observations
@@ -360,6 +372,9 @@ def test_a_configuration_comes_back_from_its_numbers(config):
         ({"high": float("inf")}, "lambda"),
         ({"patience": 0}, "patience"),
         ({"max_rejections": 0}, "max_rejections"),
+        ({"descent": 0.0}, "descent"),
+        ({"min_gain": 1.0}, "min_gain"),
+        ({"min_gain": float("nan")}, "min_gain"),
         ({"escalate": -0.1}, "escalate"),
         ({"escalate": float("nan")}, "escalate"),
         ({"escalate": float("inf")}, "escalate"),

@@ -34,7 +34,7 @@ from jaxba.damping.learned import (
 from jaxba.game import sac
 from jaxba.naming import SolverName, parse_solver
 
-AGENT = AgentConfig(history=2, low=-10.0, high=2.0)
+AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0)
 
 
 def random_policy(seed: int, agent: AgentConfig = AGENT, width: int = 16, spread: float = 1.0) -> Learned:

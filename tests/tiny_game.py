@@ -13,7 +13,9 @@ from jaxba.game.env import Game, GameConfig, make_game
 from jaxba.game.scenes import SceneClass
 
 KIND = SceneClass(4, 12)
-AGENT = AgentConfig(history=2, low=-10.0, high=2.0, refine_points=0, trials=1, camera_rounds=0)
+AGENT = AgentConfig(
+    history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0, refine_points=0, trials=1, camera_rounds=0
+)
 RULES = GameConfig(agent=AGENT, max_iterations=4, limit_is_failure=False)
 
 

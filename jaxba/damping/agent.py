@@ -6,6 +6,7 @@ observation, the same map from an action in (-1, 1) to lambda, the same guard ar
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -17,6 +18,7 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.damping.rules import LARGEST, Ceres
 from jaxba.lm import StepInfo
 from jaxba.options import StepOptions
+from jaxba.trial import SHORTER
 
 Observation = Literal["scale-free", "paper", "released-code"]
 ActionMode = Literal["absolute", "relative"]
@@ -30,6 +32,9 @@ PAPER_LIMIT = 1000.0
 
 RELATIVE_REACH = 3.0
 """Decades by which a relative action changes lambda at most."""
+
+LARGEST_ESCALATION = 12.0
+"""Decades; more than the whole range of lambda means nothing."""
 
 FIRST_DAMPING = -4.0
 """log10 of the lambda that a first relative action starts from, with twice the reach. Source: Ceres' first lambda."""
@@ -52,8 +57,8 @@ class AgentConfig:
     high: float = 2.0
     """log10 of the largest lambda."""
 
-    first_low: float = -6.0
-    """log10 of the smallest first lambda. A constant 1e-6 needs as few iterations as Gauss-Newton on real problems."""
+    first_low: float = -5.0
+    """log10 of the smallest first lambda, where nothing is known of the problem yet."""
 
     descent: float = 1.5
     """Decades by which lambda may fall from one iteration to the next. Without this and the last limit a policy jumped
@@ -68,8 +73,8 @@ class AgentConfig:
     """`absolute`: an action is a lambda, linear in its logarithm. `relative`: it is a factor on the last one."""
 
     guard: GuardMode = "hand-over"
-    """`off`: nothing is done to the agent's choices. Otherwise, after `patience` rejections in a row, Ceres' rule decides: until a step is accepted (`pause`), or to the end
-    (`hand-over`)."""
+    """`off`: nothing is done to the agent's choices. Otherwise, after `patience` rejections in a row, Ceres' rule
+    decides: until a step is accepted (`pause`), or to the end (`hand-over`)."""
 
     patience: int = 2
     """Rejections in a row that call the guard."""
@@ -78,7 +83,8 @@ class AgentConfig:
     """Rejections in a solve after which the guard decides to the end, in either mode."""
 
     escalate: float = 0.5
-    """Decades by which lambda must rise after a rejection at least; 0 switches it off, as does guard `off`."""
+    """Decades by which lambda must rise at least after a rejection, and after an accepted step for each time that it
+    had to be shortened; 0 switches it off, as does guard `off`."""
 
     refine_points: int = 3
     """Embedded point iterations of the step that it drives."""
@@ -103,8 +109,8 @@ class AgentConfig:
             raise ValueError(f"min_gain must be at least 0 and below 1, is {self.min_gain}")
         if self.descent <= 0:
             raise ValueError(f"descent must be positive, is {self.descent}")
-        if self.escalate < 0:
-            raise ValueError(f"escalate must not be negative, is {self.escalate}")
+        if not 0 <= self.escalate <= LARGEST_ESCALATION:
+            raise ValueError(f"escalate must be 0 to {LARGEST_ESCALATION:g}, is {self.escalate}")
         self.step_options(StepOptions())
 
     def step_options(self, options: StepOptions) -> StepOptions:
@@ -151,7 +157,8 @@ class StepFacts(NamedTuple):
     candidate: Array  # log10 of the candidate's cost over the cost, for rejected steps
     damping: Array  # log10 of lambda
     accepted: Array
-    share: Array  # share of the step's curvature that was damping's
+    damping_share: Array  # share of the step's curvature that was damping's
+    shortened: Array  # how often the step was shortened
 
 
 _GLOBALS = (
@@ -185,6 +192,7 @@ class Memory(NamedTuple):
     failed: Float[Array, ""]
     growth: Float[Array, ""]  # of the guard's rule after the next rejection
     gain: Float[Array, ""]  # of the last step
+    shortened: Float[Array, ""]  # how often the last step was shortened
     hand_over: Bool[Array, ""]  # the guard decides to the end
     capped: Bool[Array, ""]  # the last step was short because of its lambda
 
@@ -195,7 +203,7 @@ def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
     number = lambda x: jnp.asarray(x, dtype)
     zero = jnp.zeros((), jnp.int32)
     no = jnp.zeros((), bool)
-    error = _error(info, info.cost) if config.observation == "paper" else number(0.0)
+    error = jnp.minimum(_error(info, info.cost), PAPER_LIMIT) if config.observation == "paper" else number(0.0)
     return Memory(
         info=info,
         facts=jnp.zeros((config.history, len(StepFacts._fields)), dtype),
@@ -210,6 +218,7 @@ def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
         failed=number(config.low),
         growth=number(Ceres().reject_growth),
         gain=number(0.0),
+        shortened=number(0.0),
         hand_over=no,
         capped=no,
     )
@@ -251,7 +260,9 @@ def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) ->
     lowest = jnp.where(memory.iteration == 0, config.first_low, memory.damping - config.descent)
     wanted = jnp.maximum(wanted, lowest)
     rejected = memory.row > 0
-    wanted = jnp.where(rejected, jnp.maximum(wanted, memory.damping + config.escalate), wanted)
+    too_bold = rejected | (memory.shortened > 0)
+    rise = config.escalate * jnp.where(rejected, 1.0, memory.shortened)
+    wanted = jnp.where(too_bold, jnp.maximum(wanted, memory.damping + rise), wanted)
     wanted = jnp.where(memory.capped, jnp.minimum(wanted, memory.damping - 1), wanted)
     rule = Ceres()
     shrink = jnp.clip(1 - (2 * memory.gain - 1) ** 3, rule.shrink_floor, rule.shrink_ceiling)
@@ -269,6 +280,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     decrease = (step.previous_cost - step.cost) / step.previous_cost
     tiny = lambda x: (_log(x + FLOOR) + 4.5) / 4.5
     gain = jnp.where(jnp.isfinite(step.gain_ratio), step.gain_ratio, -1.0)
+    shortened = jnp.round(-jnp.log(step.share) / -math.log(SHORTER))
     facts = StepFacts(
         present=jnp.ones((), dtype),
         decrease=_log(step.previous_cost / step.cost),
@@ -278,7 +290,8 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         candidate=jnp.where(step.accepted, 0.0, _log(step.candidate_cost / step.previous_cost)),
         damping=_decades(damping),
         accepted=jnp.where(step.accepted, 1.0, -1.0),
-        share=step.damping_share,
+        damping_share=step.damping_share,
+        shortened=shortened / 2,
     )
     row = jnp.clip(jnp.nan_to_num(jnp.stack(facts), nan=2.0), -2, 2).astype(dtype)
     error = {
@@ -293,7 +306,8 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     if config.guard == "hand-over":
         over = over | (in_row >= config.patience)
     guarding = memory.hand_over | (memory.row >= config.patience)
-    growth = jnp.where(step.accepted | ~guarding, Ceres().reject_growth, 2 * memory.growth).astype(dtype)
+    growth = jnp.where(guarding, 2 * memory.growth, Ceres().reject_growth)
+    growth = jnp.where(step.accepted, 0.5 * Ceres().reject_growth, growth).astype(dtype)
     pick = lambda yes, no: jnp.where(step.accepted, yes, no).astype(dtype)
     return Memory(
         info=memory.info,
@@ -309,12 +323,13 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         failed=pick(config.low, jnp.maximum(damping, memory.failed)),
         growth=growth,
         gain=gain.astype(dtype),
+        shortened=shortened.astype(dtype),
         hand_over=memory.hand_over | over,
         capped=step.accepted & (decrease < HEAVY_DECREASE) & (step.damping_share > HEAVY_SHARE),
     )
 
 
-HEAVY_DECREASE, HEAVY_SHARE = 1e-4, 0.5
+HEAVY_DECREASE, HEAVY_SHARE = 1e-2, 0.5
 """A step that lowers the cost by less, and is short for damping more than this share, must be followed by a lambda ten
 times smaller: else a solve could stand still without having converged."""
 

@@ -122,7 +122,7 @@ def load_policy(path: str | Path) -> Learned:
         raise PolicyFileError(f"{path}: no policy of jaxba (its metadata says {facts.get('format', 'nothing')!r})")
     try:
         config = config_from(json.loads(facts["agent"]))
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise PolicyFileError(f"{path}: cannot be used by this version: {error}") from None
     count = len(tensors) // 2
     try:
@@ -136,6 +136,8 @@ def load_policy(path: str | Path) -> Learned:
                 f"{path}: layer {k} has the shape {layer.kernel.shape}, which does not take {size} numbers "
                 f"(observation {config.observation!r}, history {config.history})"
             )
+        if layer.kernel.dtype != np.float32 or layer.bias.dtype != np.float32:
+            raise PolicyFileError(f"{path}: layer {k} is not of type float32")
         if not (np.isfinite(layer.kernel).all() and np.isfinite(layer.bias).all()):
             raise PolicyFileError(f"{path}: layer {k} holds numbers that are not finite")
         size = layer.kernel.shape[1]

@@ -1,7 +1,7 @@
 """The game as Gymnasium environments, for trainers that speak NumPy. Needs the extra `gym`.
 
-`GymVectorGame` steps all scenes of a `Game` in one compiled call and resets those that ended in the same step. `GymGame` is
-a game of one scene at a time, which its trainer resets.
+`GymVectorGame` steps all scenes of a `Game` in one compiled call and resets those that ended in the same step.
+`GymGame` is a game of one scene at a time, which its trainer resets.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.game.env import Game
-from jaxba.game.protocol import Step
 
 try:
     import gymnasium
@@ -40,7 +39,7 @@ def action_space(game: Game) -> spaces.Box:
 
 
 class _Compiled:
-    """The two functions of a game, from and to NumPy. The game is an argument: its banks are no constants of a program."""
+    """The two functions of a game, from and to NumPy. The game is their argument, its banks no constants of them."""
 
     def __init__(self, game: Game) -> None:
         self.game = game
@@ -53,8 +52,8 @@ class _Compiled:
             self.state, observation = _reset(self.game, key)
             return np.array(observation)
 
-    def step(self, action: np.ndarray) -> Step:
-        """One iteration of every scene."""
+    def step(self, action: np.ndarray) -> Any:
+        """One iteration of every scene: a `Step` of NumPy arrays."""
         with jax.enable_x64(self.x64):
             self.state, step = _step(self.game, self.state, jnp.asarray(action, jnp.float32))
             return jax.tree.map(np.array, step)  # copies: a user may keep them, and write to them
@@ -116,7 +115,10 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
 
 
 class GymGame(gymnasium.Env):
-    """A game of one scene at a time, a random one of the bank in every episode. `info` as `GymVectorGame`'s `final_info`."""
+    """A game of one scene at a time, a random one of the bank in every episode.
+
+    Where an episode ends, `info` has what `GymVectorGame` has in `final_info`.
+    """
 
     metadata = {"render_modes": []}  # noqa: RUF012 - gymnasium's own way
 
@@ -182,8 +184,8 @@ def _actions(action: Any, shape: tuple[int, ...] | None) -> np.ndarray:
     return np.clip(array, -1, 1)
 
 
-def _infos(step: Step, done: np.ndarray) -> dict[str, Any]:
-    """In the form of gymnasium's own vector environments: an array for each name, and under `_name` where it is valid."""
+def _infos(step: Any, done: np.ndarray) -> dict[str, Any]:
+    """As gymnasium's own vector environments have it: an array for each name, and under `_name` where it is valid."""
     if not done.any():
         return {}
     last = np.full(len(done), None, dtype=object)
