@@ -213,7 +213,7 @@ def _start(layout: Layout, state: LMState, policy: DampingPolicy, options: StepO
         cost=state.cost,
         observations=count(jnp.sum(layout.slot_mask)),
         cameras=count(jnp.sum(layout.camera_seen)),
-        points=count(jnp.sum(point_sum(layout, layout.slot_mask[None].astype(state.cost.dtype)) > 0)),
+        points=count(jnp.sum(point_sum(layout, jnp.asarray(layout.slot_mask, state.cost.dtype)[None]) > 0)),
         unit=unit,
         focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
         max_iterations=count(max_iterations),

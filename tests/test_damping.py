@@ -270,7 +270,7 @@ def test_every_name_makes_its_policy_with_the_lambda_that_was_asked_for():
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("cerse", "unknown damping policy 'cerse'; known: ceres, classic"),
+        ("cerse", "unknown damping policy 'cerse'; known: learned, ceres, classic"),
         ("", "unknown damping policy ''"),
         ("ceres:x", "must be a positive number, not 'x'"),
         ("ceres:-1", "must be a positive number, not '-1'"),

@@ -115,7 +115,7 @@ BAD = {
     "unknown observation": (GOOD, _agent(observation="everything"), "observation"),
     "wrong type": (GOOD, _agent(history="5"), "history"),
     "not a number": (GOOD, _agent(escalate=float("nan")), "escalate"),
-    "another observation": (GOOD, _agent(observation="paper"), r"layer 0.*\(29, 16\).*paper"),
+    "another observation": (GOOD, _agent(observation="paper"), r"layer 0.*\(31, 16\).*paper"),
     "another history": (GOOD, _agent(history=7), "layer 0"),
     "layers that do not fit": (_changed("layer1.kernel", lambda x: x[:-1]), _facts(), "layer 1"),
     "a bias that does not fit": (_changed("layer0.bias", lambda x: x[:-1]), _facts(), "layer 0"),
@@ -314,12 +314,3 @@ def test_no_policy_makes_a_solve_worse_than_its_start(seed):
         found = solve(scene(seed), policy, max_iterations=40)
         assert found.final_cost <= found.initial_cost
         assert (np.diff(np.concatenate([[found.initial_cost], found.history.cost])) <= 0).all()
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_a_random_policy_under_guard_gets_where_ceres_rule_gets(seed):
-    options = AGENT.step_options(StepOptions())
-    rule = solve(scene(seed), "ceres", options, max_iterations=40)
-    found = solve(scene(seed), random_policy(10 + seed), max_iterations=100)
-    assert rule.converged
-    assert found.final_cost <= rule.final_cost * (1 + 1e-3)

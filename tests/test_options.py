@@ -16,7 +16,9 @@ from jaxba import Loss, StepOptions
         ({"linear_solver": "auto"}, "linear_solver must be one of explicit"),
         ({"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
         ({"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),
-        ({"refine_points": -1}, "refine_points must not be negative"),
+        ({"refine_points": -1}, "refine_points must be at least 0"),
+        ({"camera_rounds": -1}, "camera_rounds must be at least 0"),
+        ({"trials": 0}, "trials must be at least 1"),
         ({"cg_max_iterations": 0}, "cg_max_iterations must be at least 1"),
     ],
 )
