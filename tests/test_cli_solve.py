@@ -49,7 +49,7 @@ def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
     np.testing.assert_allclose(record["final_cost"], geometry.cost(solved), rtol=1e-10)
     for name in ("observations", "camera_index", "point_index"):
         assert np.array_equal(getattr(solved, name), getattr(support.tiny(), name))
-    assert (record["solver"], record["dtype"], record["termination"]) == ("ceres", "float64", "cost")
+    assert (record["solver"], record["dtype"], record["termination"]) == ("learned", "float64", "cost")
     assert (record["cameras"], record["points"], record["observations"]) == (6, 40, 200)
     costs = [point["cost"] for point in record["trace"]]
     assert costs[0] == record["initial_cost"]
@@ -112,7 +112,7 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     assert "damping classic:0.03 + 3 point iterations, float64" in capsys.readouterr().out
     assert run([str(tiny), "--dtype", "float32", "--max-iterations", "2", "--log", str(log)]) == 0
     record = json.loads(log.read_text())
-    assert (record["solver"], record["dtype"]) == ("ceres@float32", "float32")
+    assert (record["solver"], record["dtype"]) == ("learned@float32", "float32")
     assert run([str(tiny), "--linear-solver", "implicit", "--max-iterations", "2", "--log", str(log)]) == 0
     record = json.loads(log.read_text())
     assert record["cg_iterations"] > 0
