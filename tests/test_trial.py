@@ -15,8 +15,9 @@ from scipy.optimize import least_squares
 from support import same_bits, start, step
 
 from jaxba import BundleProblem, Layout, LMState, StepOptions, geometry
-from jaxba.game.bank import class_layout, initial_costs, with_scene
+from jaxba.game.bank import initial_costs
 from jaxba.game.scenes import SceneClass, make_scenes
+from jaxba.game.slots import class_layout, with_scene
 from jaxba.linearize import cost, linearize
 from jaxba.resect import DAMPINGS, refine_cameras, solve_positive
 from jaxba.schur import solve_step

@@ -264,8 +264,7 @@ def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) ->
     rise = config.escalate * jnp.where(rejected, 1.0, memory.shortened)
     wanted = jnp.where(too_bold, jnp.maximum(wanted, memory.damping + rise), wanted)
     wanted = jnp.where(memory.capped, jnp.minimum(wanted, memory.damping - 1), wanted)
-    rule = Ceres()
-    shrink = jnp.clip(1 - (2 * memory.gain - 1) ** 3, rule.shrink_floor, rule.shrink_ceiling)
+    shrink = Ceres().after_success(memory.gain)
     guard = memory.damping + jnp.log10(jnp.where(rejected, memory.growth, shrink))
     # what is smaller than the rule's own first lambda is not where a rescue starts
     guard = jnp.where(memory.row == config.patience, jnp.maximum(guard, FIRST_DAMPING), guard)

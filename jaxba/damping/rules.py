@@ -93,6 +93,10 @@ class Ceres:
     relative: float = 0.0
     """1 where `initial` counts in units of the largest Hessian entry under identity scaling (g2o)."""
 
+    def after_success(self, gain: Float[Array, ""]) -> Float[Array, ""]:
+        """Factor on lambda after an accepted step with this gain ratio."""
+        return jnp.clip(1 - (2 * gain - 1) ** 3, self.shrink_floor, self.shrink_ceiling)
+
     def init(self, info: ProblemInfo) -> tuple[_Growing, Array]:
         """See `DampingPolicy`."""
         damping = _scalar(self.initial * (1 + self.relative * (info.unit - 1)), info)
@@ -100,8 +104,7 @@ class Ceres:
 
     def propose(self, state: _Growing, step: StepInfo) -> tuple[_Growing, Array]:
         """See `DampingPolicy`."""
-        shrink = jnp.clip(1 - (2 * step.gain_ratio - 1) ** 3, self.shrink_floor, self.shrink_ceiling)
-        factor = jnp.where(step.accepted, shrink, state.growth)
+        factor = jnp.where(step.accepted, self.after_success(step.gain_ratio), state.growth)
         growth = jnp.where(step.accepted, self.reject_growth, 2 * state.growth).astype(state.growth.dtype)
         damping = jnp.clip(state.damping * factor, self.minimum, LARGEST).astype(state.damping.dtype)
         return _Growing(damping, growth), damping

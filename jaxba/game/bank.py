@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import jax
@@ -21,11 +21,10 @@ from jaxtyping import Bool, Float, Int
 from jaxba.damping import ProblemInfo, make_policy
 from jaxba.game.play import Trajectories, play
 from jaxba.game.scenes import SceneClass, Scenes, make_scenes
-from jaxba.layout import Layout, build_layout
+from jaxba.game.slots import class_layout, with_scene
 from jaxba.linearize import cost
 from jaxba.losses import Loss
 from jaxba.options import StepOptions
-from jaxba.problem import BundleProblem
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose best cost counts, each with point iterations."""
@@ -61,26 +60,6 @@ class Bank(NamedTuple):
     best_cost: Float[Array, " scenes"]
     info: ProblemInfo  # a field per scene
     effort: Float[Array, " scenes"]  # iterations of Ceres' rule to 1e-3 of the best cost
-
-
-@functools.cache
-def class_layout(kind: SceneClass) -> Layout:
-    """Slots for every pair of a camera and a point; scenes put their own pixels and mask in (`with_scene`)."""
-    count = kind.cameras * kind.points
-    camera, point = np.tile(np.arange(kind.cameras), kind.points), np.repeat(np.arange(kind.points), kind.cameras)
-    cameras = np.zeros((kind.cameras, 9))
-    problem = BundleProblem.create(cameras, np.zeros((kind.points, 3)), np.zeros((count, 2)), camera, point)
-    layout = build_layout(problem)
-    if layout.grid is None:
-        raise AssertionError("scenes of the game are dense")
-    return layout
-
-
-def with_scene(layout: Layout, pixels: Float[Array, "2 slots"], mask: Bool[Array, " slots"]) -> Layout:
-    """The class's layout with one scene's observations."""
-    cameras = layout.num_cameras
-    seen = jnp.any(mask.reshape(cameras, -1), axis=1)
-    return replace(layout, pixels=pixels, slot_mask=mask, camera_seen=seen)
 
 
 def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:

@@ -25,10 +25,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.agent import AgentConfig, Memory, begin, damping_of, observe, record
 from jaxba.damping.rules import Ceres
-from jaxba.game.bank import Bank, class_layout, with_scene
+from jaxba.game.bank import Bank
 from jaxba.game.play import step_groups
 from jaxba.game.protocol import Step
 from jaxba.game.scenes import SceneClass
+from jaxba.game.slots import class_layout, with_scene
 from jaxba.lm import LMState, StepInfo, lm_step
 from jaxba.options import StepOptions
 
@@ -238,8 +239,7 @@ class Game:
 
 def _rule_damping(agent: AgentConfig, memory: Memory) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
-    rule = Ceres()
-    shrink = jnp.clip(1 - (2 * memory.gain - 1) ** 3, rule.shrink_floor, rule.shrink_ceiling)
+    shrink = Ceres().after_success(memory.gain)
     factor = jnp.where(memory.iteration == 0, 1.0, jnp.where(memory.row > 0, 2.0**memory.row, shrink))
     return memory.damping + jnp.log10(factor)
 

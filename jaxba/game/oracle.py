@@ -17,9 +17,10 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.game.bank import Bank, class_layout, with_scene
+from jaxba.game.bank import Bank
 from jaxba.game.play import Trajectories, step_groups
 from jaxba.game.scenes import SceneClass
+from jaxba.game.slots import class_layout, with_scene
 from jaxba.lm import LMState, StepInfo, lm_step
 from jaxba.options import StepOptions
 

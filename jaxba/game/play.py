@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.game.scenes import SceneClass
+from jaxba.game.slots import class_layout, with_scene
 from jaxba.lm import LMState, StepInfo, lm_step
 from jaxba.options import StepOptions
 from jaxba.termination import converged_in_cost
@@ -103,8 +104,6 @@ def play(
 
 @functools.partial(jax.jit, static_argnames=("kind", "options", "limit"))
 def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: Array) -> _Loop:
-    from jaxba.game.bank import class_layout, with_scene
-
     layout = class_layout(kind)
     count = bank.initial_cost.shape[0]
     lanes = min(LANES, count)

@@ -67,7 +67,7 @@ class SceneClass:
 
 
 class Scenes(NamedTuple):
-    """A batch of scenes of one class, in the order of its layout (`bank.class_layout`)."""
+    """A batch of scenes of one class, in the order of its layout (`slots.class_layout`)."""
 
     cameras: Float[Array, "scenes 9 cameras"]  # the start
     points: Float[Array, "scenes 3 points"]  # the last point is the layout's empty one

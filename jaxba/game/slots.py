@@ -1,0 +1,34 @@
+"""The layout that all scenes of a class share, and one scene's observations in it."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxba.game.scenes import SceneClass
+from jaxba.layout import Layout, build_layout
+from jaxba.problem import AnyArray, BundleProblem
+
+
+@functools.cache
+def class_layout(kind: SceneClass) -> Layout:
+    """Slots for every pair of a camera and a point; scenes put their own pixels and mask in (`with_scene`)."""
+    count = kind.cameras * kind.points
+    camera, point = np.tile(np.arange(kind.cameras), kind.points), np.repeat(np.arange(kind.points), kind.cameras)
+    cameras = np.zeros((kind.cameras, 9))
+    problem = BundleProblem.create(cameras, np.zeros((kind.points, 3)), np.zeros((count, 2)), camera, point)
+    layout = build_layout(problem)
+    if layout.grid is None:
+        raise AssertionError("scenes of the game are dense")
+    return layout
+
+
+def with_scene(layout: Layout, pixels: Float[AnyArray, "2 slots"], mask: Bool[AnyArray, " slots"]) -> Layout:
+    """The class's layout with one scene's observations."""
+    cameras = layout.num_cameras
+    seen = jnp.any(mask.reshape(cameras, -1), axis=1)
+    return replace(layout, pixels=pixels, slot_mask=mask, camera_seen=seen)
