@@ -15,6 +15,7 @@ from jaxba.io import read_bal, read_bundler, read_problem, write_bal, write_ply,
 from jaxba.layout import Layout, build_layout
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.losses import Loss
+from jaxba.methods import METHODS, Method, make_method
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
@@ -25,6 +26,7 @@ from jaxba.transform import drop_invalid, normalize, perturb, poba_start
 __version__ = "0.1.0"
 
 __all__ = [
+    "METHODS",
     "POLICIES",
     "BundleProblem",
     "Ceres",
@@ -36,6 +38,7 @@ __all__ = [
     "LMState",
     "Layout",
     "Loss",
+    "Method",
     "ProblemError",
     "ProblemInfo",
     "Safeguard",
@@ -51,6 +54,7 @@ __all__ = [
     "initial_state",
     "like",
     "lm_step",
+    "make_method",
     "make_policy",
     "normalize",
     "perturb",

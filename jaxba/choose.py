@@ -6,11 +6,12 @@ matter for the choice, and those move little between machines.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxba.options import LinearSolver
+from jaxba.options import REDUCED_SOLVERS, LinearSolver, StepOptions
 from jaxba.ordering import camera_order, is_banded
 from jaxba.problem import BundleProblem
 
@@ -113,6 +114,27 @@ def choose(problem: BundleProblem) -> LinearSolver:
     """The solver with the lowest predicted cost; a tie goes to the more exact one."""
     costs = predict(problem)._asdict()
     return min(costs, key=lambda name: costs[name])  # type: ignore[return-value]
+
+
+def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_solver: str | None) -> StepOptions:
+    """Options with the linear solver that was asked for.
+
+    Args:
+        problem: decides `auto`.
+        options: of the step.
+        linear_solver: a name, `auto`, or None to keep what the options say. A method that is a linear solver itself
+            (methods.py) has no choice to make: `auto` keeps it.
+
+    Raises:
+        ValueError: such a method, and another solver asked for by name.
+    """
+    if linear_solver is None or linear_solver == options.linear_solver:
+        return options
+    if options.linear_solver not in REDUCED_SOLVERS:
+        if linear_solver == "auto":
+            return options
+        raise ValueError(f"linear solver {linear_solver!r} is for plain LM steps; this method has its own")
+    return replace(options, linear_solver=choose(problem) if linear_solver == "auto" else linear_solver)
 
 
 def _within(size: float, seconds: float) -> float:

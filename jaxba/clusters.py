@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 
 from jaxba.pairs import PairLayout, pair_layout
@@ -67,7 +67,7 @@ def cluster_layout(
         empty: a slot that holds no observation.
     """
     wanted = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
-    label = agglomerate(shared_points(camera, point, cameras, points), cameras, wanted)
+    label = agglomerate(shared_points(camera, point, cameras, points)[0], cameras, wanted)
     clusters = int(label.max()) + 1
     sizes = np.bincount(label, minlength=clusters)
     members = np.full((clusters, int(sizes.max())), cameras, np.int32)
@@ -90,17 +90,18 @@ def cluster_layout(
 
 def shared_points(
     camera: Int[np.ndarray, " observations"], point: Int[np.ndarray, " observations"], cameras: int, points: int
-) -> csr_matrix:
-    """How many points each pair of cameras shares, [cameras, cameras] without its diagonal."""
+) -> tuple[csr_matrix, Float[np.ndarray, " cameras"]]:
+    """How many points each pair of cameras shares, [cameras, cameras] without its diagonal, and how many each sees."""
     kept = np.ones(len(point), bool)
     work = float(np.sum(np.bincount(point).astype(float) ** 2))
     if work > MAX_PRODUCTS:  # a sample of the points says as much
         kept = point % int(-(-work // MAX_PRODUCTS)) == 0
     seen = csr_matrix((np.ones(kept.sum(), np.float32), (camera[kept], point[kept])), shape=(cameras, points))
     shared = (seen @ seen.T).tocsr()
+    own = shared.diagonal().astype(float)
     shared.setdiag(0)
     shared.eliminate_zeros()
-    return shared
+    return shared, own
 
 
 def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray, " nodes"]:

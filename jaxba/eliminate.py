@@ -63,12 +63,12 @@ class CameraSystem(NamedTuple):
 
 
 def eliminate_points(
-    layout: Layout, linear: Linearization, damping: Float[Array, ""], options: StepOptions
+    layout: Layout, linear: Linearization, damping: Float[Array, "*points"], options: StepOptions
 ) -> PointSystem:
-    """Forms, damps and factors the 3 x 3 block of every point."""
+    """Forms, damps and factors the 3 x 3 block of every point; one lambda for all, or one each."""
     sums = point_sum(layout, jnp.stack(normal_entries(linear.point_jacobian, linear.residual)))
     matrix, gradient = [sums[k] for k in range(6)], [sums[k] for k in range(6, 9)]
-    diagonal = [_damping_diagonal(matrix[k], damping, options) for k in (0, 2, 5)]
+    diagonal = [damping_diagonal(matrix[k], damping, options) for k in (0, 2, 5)]
     for place, extra in zip((0, 2, 5), diagonal, strict=True):
         matrix[place] = matrix[place] + extra
     factor = cholesky3(matrix)
@@ -83,7 +83,7 @@ def camera_system(
     linear: Linearization,
     points: PointSystem,
     coordinates: Coordinates,
-    damping: Float[Array, ""],
+    damping: Float[Array, "*cameras_1"],
     options: StepOptions,
 ) -> CameraSystem:
     """Sums `[J_c, r, r - Q h]^T [J_c, r, r - Q h]` per camera: block, gradient and right-hand side at once."""
@@ -100,7 +100,7 @@ def camera_system(
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
     )
-    extra = _damping_diagonal(diagonal, damping, options)
+    extra = damping_diagonal(diagonal, damping, options)
     # a camera that nobody uses gets a unit block and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     turned = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
@@ -147,7 +147,15 @@ def project_to_points(
     return list(point_sum(layout, inner))
 
 
-def _damping_diagonal(diagonal: Array, damping: Float[Array, ""], options: StepOptions) -> Array:
+def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: Coordinates) -> Float[Array, ""]:
+    """Largest entry of the gradient, in the options' coordinates."""
+    turned = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
+    gradient = jnp.concatenate([turned, system.gradient[:, 3:]], axis=1)
+    return jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.max(jnp.abs(jnp.stack(points.gradient))))
+
+
+def damping_diagonal(diagonal: Array, damping: Float[Array, "..."], options: StepOptions) -> Array:
+    """The diagonal matrix that damping adds to one with the given diagonal."""
     if options.scaling == "identity":
         return jnp.full_like(diagonal, 1) * damping
     high = min(DIAGONAL_MAXIMUM, float(jnp.finfo(diagonal.dtype).max) / 4)

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.clusters import ClusterLayout, cluster_layout
 from jaxba.options import StepOptions
 from jaxba.pairs import PairLayout, pair_layout
+from jaxba.partition import Partition, partition_layout
 from jaxba.problem import AnyArray, BundleProblem
 from jaxba.trees import sum_tree
 
@@ -76,6 +77,9 @@ class Layout:
     clusters: ClusterLayout | None
     """None where nothing asks for a coarse system."""
 
+    partitions: Partition | None
+    """Random clusterings, one behind the other; None where no method asks for them."""
+
     buckets: tuple[tuple[int, int], ...] = field(metadata={"static": True})
     """(slots per point, points) of each bucket."""
 
@@ -96,7 +100,13 @@ class Layout:
 
 
 def build_layout(
-    problem: BundleProblem, *, pairs: bool = True, factor: bool = True, clusters: bool = False, grid: bool = True
+    problem: BundleProblem,
+    *,
+    pairs: bool = True,
+    factor: bool = True,
+    clusters: bool = False,
+    grid: bool = True,
+    partitions: int | None = None,
 ) -> Layout:
     """Sorts a problem's observations into slots.
 
@@ -108,6 +118,7 @@ def build_layout(
         clusters: whether to group cameras for the two-level preconditioner.
         grid: whether a factored system may be formed as one dense product, where nearly all cameras see nearly all
             points; pairs are not listed then.
+        partitions: cameras of a cluster at most, to draw random partitions of the cameras; needs pairs.
 
     Returns:
         A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths.
@@ -162,6 +173,16 @@ def build_layout(
     if pairs and factor and grid and is_dense(camera, point, tracks, len(seen)):
         table = np.full((columns, len(seen)), empty, np.int32)
         table[slot_point[slot], camera] = slot
+    listed = None
+    if pairs and table is None:
+        listed = pair_layout(camera, slot, tracks, start, problem.num_cameras, empty, factor=factor)
+    drawn = None
+    if partitions is not None:
+        if listed is None:
+            raise ValueError("partitions need pairs that are listed: pairs=True, factor=False")
+        drawn = partition_layout(
+            camera, point, slot, len(seen), len(tracks), slot_point, empty, listed, largest=partitions
+        )
     return Layout(
         slot_camera=slot_camera,
         slot_point=slot_point,
@@ -171,11 +192,10 @@ def build_layout(
         bucket_points=tuple(bucket_points),
         camera_levels=sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK),
         camera_seen=seen > 0,
-        pairs=pair_layout(camera, slot, tracks, start, problem.num_cameras, empty, factor=factor)
-        if pairs and table is None
-        else None,
+        pairs=listed,
         grid=table,
         clusters=cluster_layout(camera, point, slot, len(seen), len(tracks), slot_point, empty) if clusters else None,
+        partitions=drawn,
         buckets=tuple((int(length), len(members)) for length, members in zip(lengths, bucket_points, strict=True)),
     )
 
@@ -187,7 +207,15 @@ def layout_for(problem: BundleProblem, options: StepOptions) -> Layout:
         pairs=options.forms_reduced_system,
         factor=options.linear_solver == "explicit",
         clusters=options.uses_clusters,
+        partitions=options.cluster_cameras if options.uses_partitions else None,
     )
+
+
+def partition_of(layout: Layout) -> Partition:
+    """The partitions of a layout that has them."""
+    if layout.partitions is None:
+        raise ValueError("this layout has no partitions: build it with partitions=, the cameras of a cluster at most")
+    return layout.partitions
 
 
 def is_dense(camera: np.ndarray, point: np.ndarray, tracks: np.ndarray, cameras: int) -> bool:

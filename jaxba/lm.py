@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.layout import Layout
+from jaxba.decompose import decomposed_round
+from jaxba.layout import Layout, partition_of
 from jaxba.linearize import cost, linearize
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
@@ -69,6 +70,7 @@ def lm_step(
     damping: Float[Array, ""],
     options: StepOptions,
     min_gain: float | Float[Array, ""] = 0.0,
+    turn: int | Int[Array, ""] = 0,
 ) -> tuple[LMState, StepInfo]:
     """One iteration: one linear solve with one lambda, accepted or rejected (design, section 2).
 
@@ -78,13 +80,16 @@ def lm_step(
         damping: lambda; see `StepOptions.scaling`.
         options: static.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
+        turn: iterations done before, for methods that draw new clusters in each.
 
     Returns:
         The next state (the same one after a rejection) and a record of what happened.
     """
     damping = jnp.asarray(damping, state.cost.dtype)
+    if options.linear_solver == "decomposed":
+        return _round(layout, state, damping, options, min_gain, turn)
     linear = linearize(layout, state.cameras, state.points, options.loss)
-    step = solve_step(layout, linear, state.cameras, state.points, damping, options)
+    step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn)
     trial = best_trial(layout, state.cameras, state.points, state.cost, linear, step, options, min_gain)
     accepted = trial.accepted
     choose = lambda new, old: jnp.where(accepted, new, old)
@@ -103,5 +108,37 @@ def lm_step(
         parameter_norm=jnp.sqrt(jnp.sum(state.cameras**2) + jnp.sum(state.points**2)),
         cg_iterations=step.cg_iterations,
         share=trial.share,
-        damping_share=step.damped / step.slope,
+        damping_share=jnp.clip(step.damped / step.slope, 0, 1),
+    )
+
+
+def _round(
+    layout: Layout,
+    state: LMState,
+    damping: Float[Array, ""],
+    options: StepOptions,
+    min_gain: float | Float[Array, ""],
+    turn: int | Int[Array, ""],
+) -> tuple[LMState, StepInfo]:
+    """A round of domain decomposition in the place of a step: parts of it are accepted, each by itself."""
+    partition = partition_of(layout).at(turn)
+    found = decomposed_round(layout, *state, damping, partition, options, min_gain)
+    choose = lambda new, old: jnp.where(found.accepted, new, old)
+    after = LMState(*(choose(*pair) for pair in zip(found[:3], state, strict=True)))
+    moved = [found.cameras - state.cameras, found.points - state.points]
+    one = jnp.ones_like(state.cost)
+    return after, StepInfo(
+        cost=after.cost,
+        previous_cost=state.cost,
+        candidate_cost=found.cost,
+        predicted=found.predicted,
+        gain_ratio=found.gain,
+        accepted=found.accepted,
+        damping=damping,
+        gradient_max=found.gradient_max,
+        step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in moved)),
+        parameter_norm=jnp.sqrt(jnp.sum(state.cameras**2) + jnp.sum(state.points**2)),
+        cg_iterations=jnp.zeros((), jnp.int32),
+        share=one,
+        damping_share=jnp.clip(1 - found.curvature / found.slope, 0, 1),
     )

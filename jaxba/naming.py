@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from jaxba.damping import LEARNED, LEARNED_PLAIN, DampingPolicy, Learned, is_learned, make_policy
 from jaxba.damping.agent import AgentConfig
 from jaxba.damping.registry import SUFFIX
+from jaxba.methods import DEFAULT_METHOD, METHODS, make_method
 from jaxba.options import StepOptions
-
-METHODS = ("lm",)
-"""Known methods; `lm` is understood where none is named."""
 
 DTYPES = ("float64", "float32", "mixed")
 """Known floating point types; the first is understood where none is named."""
@@ -35,11 +33,11 @@ class SolverName:
     dtype: str = DTYPES[0]
     """Floating point type."""
 
-    method: str = METHODS[0]
-    """How a step is computed."""
+    method: str = DEFAULT_METHOD
+    """How a step is computed, see `jaxba.methods`."""
 
     def __str__(self) -> str:
-        method = "" if self.method == METHODS[0] else f"{self.method}+"
+        method = "" if self.method == DEFAULT_METHOD else f"{self.method}+"
         if self.refine_points is None:
             refine = "" if is_learned(self.policy) else "+embedded"
         else:
@@ -51,14 +49,15 @@ class SolverName:
         """The policy, and the options of the step that it drives.
 
         Raises:
-            UnknownPolicyError, PolicyFileError: as `make_policy`.
+            UnknownPolicyError, PolicyFileError, UnknownMethodError: as `make_policy`, `make_method`.
         """
         plain = self.policy == LEARNED and self.refine_points == 0
         policy = make_policy(LEARNED_PLAIN if plain else self.policy)
+        base = make_method(self.method).options(StepOptions())
         if self.refine_points is not None:
-            return policy, StepOptions(refine_points=self.refine_points)
+            return policy, replace(base, refine_points=self.refine_points)
         agent = policy.config if isinstance(policy, Learned) else AgentConfig()
-        return policy, agent.step_options(StepOptions())
+        return policy, agent.step_options(base)
 
 
 def parse_solver(name: str) -> SolverName:
@@ -94,7 +93,7 @@ def parse_solver(name: str) -> SolverName:
         merged.pop()
     else:
         stated = False
-    method = merged.pop(0) if len(merged) > 1 else METHODS[0]
+    method = merged.pop(0) if len(merged) > 1 else DEFAULT_METHOD
     if len(merged) != 1 or not merged[0]:
         raise SolverNameError(f"{name!r} is no solver; the form is [method+]policy[+refineK|+embedded][@dtype]")
     if method not in METHODS:

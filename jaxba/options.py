@@ -7,8 +7,11 @@ from typing import Literal, get_args
 
 from jaxba.losses import Loss
 
-LinearSolver = Literal["explicit", "sparse", "implicit", "power"]
+LinearSolver = Literal["explicit", "sparse", "implicit", "power", "normal", "clustered", "decomposed"]
 LinearSolverChoice = Literal["auto", "explicit", "sparse", "implicit", "power"]
+REDUCED_SOLVERS: tuple[LinearSolver, ...] = ("explicit", "sparse", "implicit")
+"""Solvers that give the same step to their tolerance, so that `auto` may choose among them."""
+
 Preconditioner = Literal["two-level", "schur-jacobi", "jacobi", "power-series"]
 Scaling = Literal["diagonal", "identity"]
 Rotation = Literal["angle-axis", "manifold"]
@@ -27,7 +30,9 @@ class StepOptions:
 
     linear_solver: LinearSolver = "explicit"
     """`explicit`: form the reduced camera system and factor it. `sparse`: form its blocks, conjugate gradients.
-    `implicit`: conjugate gradients without forming it. `power`: a power series, without forming it."""
+    `implicit`: conjugate gradients without forming it. `power`: a power series, without forming it. `normal`: conjugate
+    gradients on all variables (normal.py). `clustered`: clusters of cameras, then repairs (split.py). `decomposed`:
+    clusters that are optimised beside each other (decompose.py). The last four are methods (methods.py)."""
 
     preconditioner: Preconditioner = "two-level"
     """Of conjugate gradients. `schur-jacobi`: the block diagonal of the reduced system. `two-level`: the same and a
@@ -38,6 +43,15 @@ class StepOptions:
 
     power_order: int = 20
     """Terms of a power series as solver. Source: Weber et al. 2023, section 5 (order 20)."""
+
+    cluster_cameras: int = 100
+    """Cameras of a cluster at most. Source: STBA, authors' code."""
+
+    repairs: int = 4
+    """Richardson steps that repair a clustered step. Source: STBA, authors' code."""
+
+    block_steps: int = 1
+    """Steps of each cluster in a round of domain decomposition; one, so that a round is one linear solve."""
 
     scaling: Scaling = "diagonal"
     """What lambda multiplies: `diagonal` the clamped diagonal of the Hessian (Ceres), `identity` the unit
@@ -87,7 +101,10 @@ class StepOptions:
         for name, least in (("refine_points", 0), ("camera_rounds", 0), ("trials", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, is {getattr(self, name)}")
-        for name in ("preconditioner_order", "power_order"):
+        for name in ("cluster_cameras", "block_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, is {getattr(self, name)}")
+        for name in ("preconditioner_order", "power_order", "repairs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
         if self.cg_max_iterations < 1:
@@ -96,7 +113,17 @@ class StepOptions:
     @property
     def forms_reduced_system(self) -> bool:
         """Whether the layout must list pairs."""
-        return self.linear_solver in ("explicit", "sparse")
+        return self.linear_solver in ("explicit", "sparse") or self.uses_partitions
+
+    @property
+    def uses_partitions(self) -> bool:
+        """Whether the layout must draw random clusters of cameras."""
+        return self.linear_solver in ("clustered", "decomposed")
+
+    @property
+    def leaves_rest(self) -> bool:
+        """Whether a step leaves a residual of the linear system that is not orthogonal to it."""
+        return self.linear_solver in ("clustered", "power")
 
     @property
     def uses_clusters(self) -> bool:

@@ -13,11 +13,21 @@ from jaxtyping import Float, Int
 
 from jaxba import camera
 from jaxba.coarse import Anchor
-from jaxba.eliminate import CameraSystem, Coordinates, PointSystem, back_substitute, camera_system, eliminate_points
-from jaxba.layout import Layout
+from jaxba.eliminate import (
+    CameraSystem,
+    Coordinates,
+    PointSystem,
+    back_substitute,
+    camera_system,
+    eliminate_points,
+    largest_gradient,
+)
+from jaxba.layout import Layout, partition_of
 from jaxba.linearize import Linearization
+from jaxba.normal import image, solve_normal
 from jaxba.options import StepOptions
 from jaxba.reduced import solve_reduced
+from jaxba.split import clustered_step
 from jaxba.sums import point_sum, tree_sum
 
 
@@ -27,7 +37,7 @@ class Step(NamedTuple):
     cameras: Float[Array, "9 cameras"]  # in the coordinates of the options
     points: Float[Array, "3 points"]
     slope: Float[Array, ""]  # -g.d = d.(H + D) d, pixels^2
-    damped: Float[Array, ""]  # d.D d, pixels^2
+    damped: Float[Array, ""]  # d.D d, pixels^2; of a step that does not solve the system, what -g.d exceeds d.H d by
     gradient_max: Float[Array, ""]  # largest entry of the gradient before the step
     cg_iterations: Int[Array, ""]  # 0 when the system was factored
 
@@ -43,6 +53,7 @@ def solve_step(
     points: Float[Array, "3 points"],
     damping: Float[Array, ""],
     options: StepOptions,
+    turn: int | Int[Array, ""] = 0,
 ) -> Step:
     """One damped step.
 
@@ -53,6 +64,7 @@ def solve_step(
         points: current points, for the directions of the coarse system.
         damping: lambda, dimensionless for diagonal scaling.
         options: solver, scaling, coordinates.
+        turn: number of the iteration, where the step depends on it (random clusters).
 
     Returns:
         The step; not finite where the factorisation failed, which the caller treats as a rejection.
@@ -62,21 +74,29 @@ def solve_step(
     anchor = Anchor(frames.rotation, frames.translation, points)
     eliminated = eliminate_points(layout, linear, damping, options)
     system = camera_system(layout, linear, eliminated, coordinates, damping, options)
-    step, iterations = solve_reduced(layout, linear, eliminated, system, anchor, options)
+    if options.linear_solver == "normal":
+        step, moves, iterations = solve_normal(layout, linear, eliminated, system, options)
+        point_step = list(moves)
+    elif options.linear_solver == "clustered":
+        partition = partition_of(layout).at(turn)
+        step = clustered_step(layout, linear, eliminated, system, damping, partition, options)
+        iterations = jnp.zeros((), jnp.int32)
+    else:
+        step, iterations = solve_reduced(layout, linear, eliminated, system, anchor, options)
     step = jnp.where(layout.camera_seen[:, None], step, jnp.zeros_like(step))
-    point_step = back_substitute(layout, linear, eliminated, step)
+    if options.linear_solver != "normal":
+        point_step = back_substitute(layout, linear, eliminated, step)
     turned = jnp.einsum("cij,cj->ci", coordinates.inverse, step[:, :3])
     camera_step = jnp.concatenate([turned, step[:, 3:]], axis=1)
-    turned = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
-    gradient = jnp.concatenate([turned, system.gradient[:, 3:]], axis=1)
-    gradient_max = jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.max(jnp.abs(jnp.stack(eliminated.gradient))))
     slope, damped = _slope_and_damping(eliminated, system, step, camera_step, point_step)
+    if options.leaves_rest:
+        damped = slope - sum(jnp.sum(m * m) for m in image(layout, linear, step, jnp.stack(point_step)))
     return Step(
         camera_step.T,
         jnp.stack(point_step),
         slope,
         damped,
-        gradient_max,
+        largest_gradient(eliminated, system, coordinates),
         iterations,
     )
 
@@ -86,9 +106,9 @@ def _slope_and_damping(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`-g.d` and `d.D d`, from which the linear model's decrease follows as a sum that does not cancel.
 
-    The decrease is `-(g.d + d.H d / 2)`. `(H + D) d = -g - rest` turns it into `(d.D d - g.d - d.rest) / 2`. The rest
-    is zero for a factored system, and orthogonal to the step for conjugate gradients started at zero. Both kept terms
-    are positive.
+    For steps that solve the system. The decrease is `-(g.d + d.H d / 2)`. `(H + D) d = -g - rest` turns it into
+    `(d.D d - g.d - d.rest) / 2`. The rest is zero for a factored system, and orthogonal to the step for conjugate
+    gradients started at zero. Both kept terms are positive.
     """
     moves = jnp.stack(point_step)
     slope = jnp.sum(system.gradient * step) + jnp.sum(jnp.stack(points.gradient) * moves)

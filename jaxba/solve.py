@@ -19,12 +19,13 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba import geometry, host
-from jaxba.choose import choose
+from jaxba.choose import choose_linear_solver
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, Learned, ProblemInfo, make_policy
 from jaxba.layout import Layout, layout_for
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
+from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES
 from jaxba.options import StepOptions
 from jaxba.problem import AnyArray, BundleProblem, ProblemError
@@ -113,6 +114,7 @@ def solve(
     damping: str | DampingPolicy = "ceres",
     options: StepOptions | None = None,
     *,
+    method: str = DEFAULT_METHOD,
     linear_solver: str | None = None,
     max_iterations: int = MAX_ITERATIONS,
     tolerances: Tolerances | None = None,
@@ -125,6 +127,7 @@ def solve(
         problem: start of the optimisation.
         damping: a policy, or the name of one (`jaxba.make_policy`).
         options: how a step is made; if left out, with the embedded iterations that a learned policy was trained with.
+        method: how a step is made (`jaxba.METHODS`); fixes the options that make it.
         linear_solver: overrides that of the options; `auto` asks the cost model in choose.py.
         max_iterations: limit of linear solves.
         tolerances: convergence tests.
@@ -147,6 +150,7 @@ def solve(
     policy = make_policy(damping) if isinstance(damping, str) else damping
     if options is None:
         options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
+    options = make_method(method).options(options)
     options = choose_linear_solver(problem, options, linear_solver)
     tolerances = tolerances or Tolerances()
     if dtype == "mixed":
@@ -188,13 +192,6 @@ def _explain_start(problem: BundleProblem) -> str:
         f"the cost at the start is not finite: observation {bad[0]}{others}, point {point} lies on the plane of camera "
         f"{camera} or its projection overflows"
     )
-
-
-def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_solver: str | None) -> StepOptions:
-    """Resolves `auto`; None keeps what the options say."""
-    if linear_solver == "auto":
-        linear_solver = choose(problem)
-    return options if linear_solver is None else replace(options, linear_solver=linear_solver)  # type: ignore[arg-type]
 
 
 @functools.partial(jax.jit, static_argnames=("options", "dtype"))
@@ -269,7 +266,7 @@ def solve_loop(
         Final carry, and histories of length `max_iterations`, zero past the last iteration.
     """
     carry = _start(layout, state, policy, options, max_iterations)
-    step_of = lambda c: lm_step(layout, c.state, c.damping, options, policy.min_gain)
+    step_of = lambda c: lm_step(layout, c.state, c.damping, options, policy.min_gain, c.iteration)
     shapes = jax.eval_shape(lambda c: _history(step_of(c)[1]), carry)
     empty = jax.tree.map(lambda s: jnp.zeros((max_iterations, *s.shape), s.dtype), shapes)
 
@@ -296,7 +293,7 @@ def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *,
         limit = jnp.asarray(max_iterations, jnp.int32)
 
         def iterate(carry: _Carry) -> tuple[_Carry, StepInfo]:
-            state, step = _step(layout, carry.state, carry.damping, options, min_gain)
+            state, step = _step(layout, carry.state, carry.damping, options, min_gain, carry.iteration)
             carry = _advance_jit(carry, state, step, policy, tolerances, limit)
             return carry, jax.tree.map(lambda x: x.item(), jax.device_get(step))
 

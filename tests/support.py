@@ -29,10 +29,10 @@ MINIATURES = ("dubrovnik-3-7-pre", "dubrovnik-3-7-18-pre", "dubrovnik-1-1-pre")
 _step = jax.jit(lm_step, static_argnames=("options",))
 
 
-def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0):
+def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0, turn=0):
     """`lm_step`, compiled. Called as `solve` does, so that the compilation cache serves both."""
     number = lambda x: jnp.asarray(x, state.cost.dtype)
-    return _step(layout, state, number(damping), options, number(min_gain))
+    return _step(layout, state, number(damping), options, number(min_gain), jnp.asarray(turn, jnp.int32))
 
 
 def bal_file(name: str) -> Path:

@@ -13,10 +13,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxba import BundleProblem, build_layout
-from jaxba.choose import count_pairs, predict
+from jaxba.choose import choose_linear_solver, count_pairs, predict
 from jaxba.options import StepOptions
 from jaxba.scenes import SceneConfig, random_scene
-from jaxba.solve import choose_linear_solver
 
 SEQUENCE = SceneConfig(
     cameras=300, points=6000, observations=24000, max_depth=10.0, gap_share=0.0, trajectory="lateral"

@@ -56,10 +56,11 @@ def groups(label) -> set[frozenset[int]]:
 def test_shared_points_are_those_that_two_cameras_both_see(size):
     problem = problem_of(*size)
     cameras, points = problem.num_cameras, problem.num_points
-    found = shared_points(np.asarray(problem.camera_index), np.asarray(problem.point_index), cameras, points)
+    found, seen = shared_points(np.asarray(problem.camera_index), np.asarray(problem.point_index), cameras, points)
     sees = [set(problem.point_index[problem.camera_index == c].tolist()) for c in range(cameras)]
     expected = [[0 if a == b else len(sees[a] & sees[b]) for b in range(cameras)] for a in range(cameras)]
     assert np.array_equal(found.toarray(), expected)
+    assert np.array_equal(seen, [len(points) for points in sees])
     assert np.count_nonzero(found.data) == found.nnz
 
 
@@ -67,7 +68,7 @@ def test_with_too_many_pairs_a_sample_of_the_points_is_counted(monkeypatch):
     """Every fourth point instead of all: a quarter of what each two share, since here all see all."""
     camera, point = np.tile(np.arange(5), 400), np.repeat(np.arange(400), 5)
     monkeypatch.setattr(clusters, "MAX_PRODUCTS", 400 * 25 / 4)
-    found = shared_points(camera, point, 5, 400)
+    found, _ = shared_points(camera, point, 5, 400)
     assert np.array_equal(found.toarray(), 100 * (1 - np.eye(5)))
 
 

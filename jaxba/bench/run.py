@@ -16,6 +16,7 @@ import jaxba
 from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import Source
 from jaxba.bench.summary import write_text
+from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.solve import MAX_ITERATIONS, IterationRecord, Solution, Tolerances, solve
@@ -38,7 +39,7 @@ class RunSettings:
     """Relative decrease of an accepted step that ends a solve."""
 
     linear_solver: str = "auto"
-    """`auto`, `explicit` or `implicit`."""
+    """`auto`, `explicit`, `sparse`, `implicit` or `power`, of plain LM steps; other methods have their own."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def run_solver(
         problem,
         policy,
         options,
-        linear_solver=settings.linear_solver,
+        linear_solver=settings.linear_solver if solver.method == DEFAULT_METHOD else None,
         max_iterations=settings.max_iterations,
         tolerances=Tolerances(ftol=settings.ftol),
         dtype=solver.dtype,

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxba.cli import common
+from jaxba.methods import DEFAULT_METHOD, MethodName
 from jaxba.options import LinearSolverChoice, Preconditioner
 
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
@@ -29,6 +30,10 @@ class Arguments:
     damping: str = "learned"
     """Who chooses lambda: learned (the shipped policy), a .safetensors file of jaxba-train, ceres, classic, gtsam,
     nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4; most take a first lambda, as in classic:0.03."""
+
+    method: MethodName = "lm"
+    """How a step is made. lm: Levenberg-Marquardt. stba: random clusters of cameras. deeplm: conjugate gradients on all
+    variables. ddlm: clusters optimised beside each other. poba: a power series. See docs/methods.md."""
 
     refine_points: int | None = None
     """Embedded point iterations after each camera step, and no other embedded iterations. If left out: those that a
@@ -91,6 +96,8 @@ def _solve(args: Arguments) -> int:
     )
     if args.refine_points is not None and args.refine_points < 0:
         raise common.UsageError(f"--refine-points must not be negative, is {args.refine_points}")
+    if args.method != DEFAULT_METHOD and args.linear_solver != "auto":
+        raise common.UsageError(f"--linear-solver is for --method lm; {args.method} has its own")
     common.check_writable("--output", args.output)
     common.check_writable("--log", args.log)
     if args.output and args.log and Path(args.output).resolve() == Path(args.log).resolve():
@@ -107,7 +114,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.solve import IterationRecord, Tolerances, solve
 
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
-    name = SolverName(args.damping, refine, args.dtype)
+    name = SolverName(args.damping, refine, args.dtype, args.method)
     policy, options = name.build()
     problem = read_problem(args.problem) if args.problem else embedded_sources()[0].read()
     common.prepare_process()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxba import geometry
+from jaxba.methods import DEFAULT_METHOD
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.solve import IterationRecord, Solution
@@ -21,8 +22,9 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         refine += f", up to {options.camera_rounds} camera rounds"
     if options.trials > 1:
         refine += f", up to {options.trials} trials"
+    solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     sizes = f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations"
-    return f"{name}: {sizes}\ndamping {args.damping}{refine}, {args.dtype}, linear solver {args.linear_solver}"
+    return f"{name}: {sizes}\ndamping {args.damping}{refine}, {args.dtype}, {solver}"
 
 
 def header(initial_cost: float) -> str:

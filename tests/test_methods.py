@@ -1,0 +1,308 @@
+"""Methods against dense algebra, and what each of them promises."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import support
+from support import bal_file, needs_data, start, step
+from test_step import DAMPINGS, check_step
+
+from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
+from jaxba.clock import CompileClock
+from jaxba.decompose import decomposed_round
+from jaxba.eliminate import Coordinates, apply_reduced, camera_system, eliminate_points
+from jaxba.layout import partition_of
+from jaxba.linearize import linearize
+from jaxba.methods import UnknownMethodError
+from jaxba.split import agreed_gradient, clustered_step, eliminate_copies, repair, solve_clusters, split_right
+
+CLUSTERED = StepOptions(linear_solver="clustered", cluster_cameras=2)
+DECOMPOSED = StepOptions(linear_solver="decomposed", cluster_cameras=2)
+NORMAL = StepOptions(linear_solver="normal", cg_forcing=0.0, cg_tolerance=1e-15, cg_max_iterations=20000)
+
+
+def pieces(problem: BundleProblem, label: np.ndarray) -> BundleProblem:
+    """The problem in which every point has been split into one per cluster that sees it."""
+    key = np.asarray(problem.point_index) * (label.max() + 1) + label[problem.camera_index]
+    names, index = np.unique(key, return_inverse=True)
+    points = np.asarray(problem.points)[names // (label.max() + 1)]
+    return BundleProblem.create(problem.cameras, points, problem.observations, problem.camera_index, index)
+
+
+def systems(problem: BundleProblem, options: StepOptions, damping: float, turn: int = 0):
+    """Everything that a clustered step is made of."""
+    layout, state = start(problem, options)
+    layout = jax.tree.map(jnp.asarray, layout)
+    return layout, *_systems(layout, state, jnp.asarray(damping), options), partition_of(layout).at(turn)
+
+
+@functools.partial(jax.jit, static_argnames=("options",))
+def _systems(layout, state, damping, options):
+    linear = linearize(layout, state.cameras, state.points, options.loss)
+    points = eliminate_points(layout, linear, damping, options)
+    system = camera_system(layout, linear, points, Coordinates.of(state.cameras, options), damping, options)
+    return linear, points, system
+
+
+# STBA
+
+
+@pytest.mark.parametrize("damping", DAMPINGS)
+@pytest.mark.parametrize("make", [support.tiny, support.odd, support.whitened], ids=["tiny", "odd", "whitened"])
+def test_stba_with_one_cluster_is_the_exact_step(make, damping):
+    check_step(make(), replace(CLUSTERED, cluster_cameras=100), damping)
+
+
+@pytest.mark.parametrize("damping", [1e-6, 1e-3, 0.5])
+def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
+    """Below lambda 1 the step is that of a dense solution in which nothing holds the pieces of a point together."""
+    problem, options = support.tiny(), replace(CLUSTERED, rotation="manifold")
+    layout, linear, points, system, part = systems(problem, options, damping)
+    split = eliminate_copies(layout, linear, jnp.asarray(damping), part, options)
+    right = split_right(layout, linear, system, split)
+    found = solve_clusters(layout, linear, points._replace(projected=split.projected), system, right, part)
+    truth = support.dense(pieces(problem, np.asarray(part.label)), options, damping)
+    np.testing.assert_allclose(found.ravel(), truth.step[: found.size], rtol=1e-6, atol=1e-9)
+
+
+def test_the_split_reduced_system_is_block_diagonal():
+    """The dense Schur complement of the split problem has nothing outside the clusters; that of the true one has."""
+    problem, options = support.tiny(), replace(CLUSTERED, rotation="manifold")
+    label = np.asarray(systems(problem, options, 1e-3)[-1].label)
+    apart = np.repeat(label, 9)[:, None] != np.repeat(label, 9)
+
+    def reduced(problem: BundleProblem) -> np.ndarray:
+        dense = support.dense(problem, options, 1e-3)
+        hessian = dense.jacobian.T @ dense.jacobian + 1e-3 * np.diag(dense.diagonal)
+        cut = problem.cameras.size
+        return hessian[:cut, :cut] - hessian[:cut, cut:] @ np.linalg.solve(hessian[cut:, cut:], hessian[cut:, :cut])
+
+    assert np.all(reduced(pieces(problem, label))[apart] == 0)
+    assert np.abs(reduced(problem)[apart]).max() > 1
+
+
+@pytest.mark.parametrize("damping", [1e-3, 1.0, 30.0])
+def test_repairs_shrink_the_error_by_the_spectral_radius_of_the_jacobi_iteration(damping):
+    """In the norm of B the error falls by at least the spectral radius of `B^-1 (B - S)`, which is below one."""
+    problem, options = support.tiny(), replace(CLUSTERED, rotation="manifold")
+    layout, linear, points, system, part = systems(problem, options, damping)
+    size = system.right.size
+    basis = jnp.eye(size).reshape(size, -1, 9)
+    matrix = np.asarray(jax.vmap(lambda x: apply_reduced(layout, linear, points, system, x))(basis)).reshape(size, size)
+    own = np.zeros((size, size))
+    for camera, block in enumerate(np.asarray(system.blocks)):
+        own[9 * camera : 9 * camera + 9, 9 * camera : 9 * camera + 9] = block
+    root = np.linalg.cholesky(own)
+    inner = np.linalg.solve(root, np.linalg.solve(root, (own - matrix).T).T)
+    radius = np.max(np.abs(np.linalg.eigvalsh((inner + inner.T) / 2)))
+    assert radius < 1
+    exact = np.linalg.solve(matrix, np.asarray(system.right).ravel())
+    first = clustered_step(layout, linear, points, system, jnp.asarray(damping), part, replace(options, repairs=0))
+    error = lambda x: np.linalg.norm(root.T @ (np.asarray(x).ravel() - exact))
+    before = error(first)
+    assert before > 1e-6 * np.linalg.norm(root.T @ exact)
+    for rounds in (1, 2, 4, 8):
+        after = error(repair(layout, linear, points, system, first, rounds))
+        assert after <= radius**rounds * before * (1 + 1e-6) + 1e-9 * before
+
+
+def test_agreed_gradients_equal_the_published_projection():
+    """`g - H^T (H D^-1 H^T)^-1 H D^-1 g` with H taking differences to the first copy."""
+    layout, *_, part = systems(support.tiny(), CLUSTERED, 2.0)
+    rng = np.random.default_rng(0)
+    copies = part.levels[-1].shape[0]
+    gradient, diagonal = rng.normal(size=(3, copies)), rng.uniform(0.1, 9, size=(3, copies))
+    found = np.asarray(agreed_gradient(layout, part, jnp.asarray(diagonal), jnp.asarray(gradient)))
+    compared = 0
+    for point in range(layout.num_points):
+        slots = np.flatnonzero(np.asarray(layout.slot_mask) & (np.asarray(layout.slot_point) == point))
+        own = np.unique(np.asarray(part.copy)[slots])
+        for k in range(3):
+            g, d = gradient[k, own], diagonal[k, own]
+            expected = g
+            if len(own) > 1:
+                h = np.hstack([np.ones((len(own) - 1, 1)), -np.eye(len(own) - 1)])
+                expected = g - h.T @ np.linalg.solve(h @ np.diag(1 / d) @ h.T, h @ (g / d))
+                compared += 1
+            np.testing.assert_allclose(found[k, own], expected, rtol=1e-9, atol=1e-12)
+    assert compared > 20
+
+
+def test_copies_agree_from_lambda_one_on_and_not_before():
+    layout, linear, _, _, part = systems(support.tiny(), CLUSTERED, 1.0)
+    plain = lambda damping: eliminate_copies(layout, linear, jnp.asarray(damping), part, CLUSTERED)
+    below, above = plain(1 - 1e-9), plain(1.0)
+    assert np.abs(np.stack(below.solved) - np.stack(above.solved)).max() > 0.1
+    np.testing.assert_allclose(np.stack(below.projected[0]), np.stack(above.projected[0]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("options", [CLUSTERED, StepOptions(linear_solver="power", power_order=3)])
+def test_an_inexact_step_predicts_what_its_own_linear_model_says(options):
+    """`-(g.d + d.H d / 2)` of the step that was made, not of the one that would solve the system."""
+    problem, damping = support.tiny(), 1e-2
+    layout, before = start(problem, options)
+    after, info = step(layout, before, damping, options, -1e9)
+    assert info.accepted
+    made = support.difference(problem, support.back(problem, before, after), options)
+    dense = replace(support.dense(problem, options, damping), step=made)
+    np.testing.assert_allclose(info.predicted, dense.predicted, rtol=1e-9)
+    exact = support.dense(problem, options, damping)
+    assert np.linalg.norm(made - exact.step) > 1e-3 * np.linalg.norm(exact.step)
+
+
+# DeepLM, global
+
+
+@pytest.mark.parametrize("damping", [1e-2, 1.0, 100.0])
+@pytest.mark.parametrize("make", [support.tiny, support.odd, support.whitened], ids=["tiny", "odd", "whitened"])
+def test_global_deeplm_run_to_convergence_is_the_exact_step(make, damping):
+    check_step(make(), NORMAL, damping)
+
+
+# Domain decomposition
+
+
+def test_ddlm_with_one_block_is_plain_lm():
+    problem = support.tiny()
+    one = replace(DECOMPOSED, cluster_cameras=100)
+    layout, state = start(problem, one)
+    plain, same = start(problem, StepOptions())
+    for turn, damping in enumerate([1e-4, 1e-2, 1e-6, 1.0]):
+        state, ours = step(layout, state, damping, one, turn=turn)
+        same, theirs = step(plain, same, damping, StepOptions())
+        assert ours.accepted
+        assert theirs.accepted
+        for name in ("cost", "predicted", "gain_ratio", "gradient_max", "step_norm", "damping_share"):
+            np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-6, err_msg=name)
+        np.testing.assert_allclose(state.cameras, same.cameras, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("changes", [{}, {"block_steps": 3}, {"refine_points": 2}])
+@pytest.mark.parametrize("damping", [1e-10, 1e-4, 1.0])
+def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, changes):
+    problem, options = support.odd(), replace(DECOMPOSED, **changes)
+    layout, first = start(problem, options)
+    state = first
+    for turn in range(6):
+        before = state
+        state, info = step(layout, state, damping, options, turn=turn)
+        assert state.cost <= before.cost
+        assert bool(info.accepted) == (state.cost < before.cost)
+        np.testing.assert_allclose(state.cost, support.cost(support.back(problem, first, state), options), rtol=1e-9)
+
+
+@functools.partial(jax.jit, static_argnames=("options",))
+def _round(layout, state, damping, part, options):
+    return decomposed_round(layout, *state, damping, part, options, 0.0)
+
+
+def test_clusters_of_ddlm_share_no_variable():
+    """What a cluster does is what it would do with all others left out: cameras of the others and points that any of
+    them sees stand still."""
+    problem, damping = support.tiny(), 1e-3
+    layout, state = start(problem, DECOMPOSED)
+    part = partition_of(layout).at(0)
+    found = _round(layout, state, jnp.asarray(damping), part, DECOMPOSED)
+    label = np.asarray(part.label)
+    tested = 0
+    for name in range(label.max() + 1):
+        mine = np.flatnonzero(label[problem.camera_index] == name)
+        shared = np.isin(problem.point_index[mine], problem.point_index[label[problem.camera_index] != name])
+        # separators become constants: dense step with their columns left out
+        seen = problem.observations[mine], problem.camera_index[mine], problem.point_index[mine]
+        only = BundleProblem.create(problem.cameras, problem.points, *seen)
+        residual, jacobian = support.linear(only, DECOMPOSED)
+        fixed = np.unique(problem.point_index[mine][shared])
+        size = problem.cameras.size
+        free = np.concatenate([9 * np.flatnonzero(label == name)[:, None] + np.arange(9)]).ravel()
+        own = np.setdiff1d(np.unique(problem.point_index[mine]), fixed)
+        free = np.concatenate([free, (size + 3 * own[:, None] + np.arange(3)).ravel()]).astype(int)
+        part_jacobian = jacobian[:, free]
+        hessian = part_jacobian.T @ part_jacobian
+        hessian += damping * np.diag(np.clip(np.diag(hessian), 1e-6, 1e32))
+        expected = -np.linalg.solve(hessian, part_jacobian.T @ residual)[: 9 * np.sum(label == name)].reshape(-1, 9)
+        moved = np.asarray(found.cameras - state.cameras).T[label == name]
+        if np.abs(moved).max() > 0:  # the cluster was accepted
+            np.testing.assert_allclose(moved, expected, rtol=1e-5, atol=1e-8)
+            tested += 1
+    assert tested >= 1
+
+
+# Power series
+
+
+def test_the_power_series_comes_closer_with_every_order():
+    problem, damping = support.tiny(), 1e-1
+    truth = support.dense(problem, StepOptions(), damping)
+    errors = []
+    for order in (0, 1, 2, 5, 10, 20, 40, 80):
+        options = StepOptions(linear_solver="power", power_order=order)
+        layout, before = start(problem, options)
+        after, info = step(layout, before, damping, options, -1e9)
+        assert info.accepted
+        made = support.difference(problem, support.back(problem, before, after), options)
+        errors.append(truth.norm(made - truth.step) / truth.norm(truth.step))
+    assert all(late < early for early, late in itertools.pairwise(errors))
+    assert errors[-1] < 1e-2 * errors[0]
+
+
+# All of them
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_lowers_the_cost_under_its_own_rule_and_stops(method):
+    problem = support.tiny()
+    options = make_method(method).options(StepOptions(cluster_cameras=3))
+    solution = solve(problem, make_method(method).rule, options)
+    reference = solve(problem, "ceres")
+    assert solution.converged or method == "ddlm"  # whose rounds come closer for ever
+    assert np.all(np.diff(solution.history.cost) <= 0)
+    assert solution.final_cost <= reference.final_cost * (1 + 1e-2)
+
+
+def test_a_method_chosen_by_name_is_the_one_made_of_its_options():
+    problem = support.tiny()
+    by_name = solve(problem, "classic", method="poba")
+    by_hand = solve(problem, "classic", StepOptions(linear_solver="power"))
+    np.testing.assert_array_equal(by_name.history.cost, by_hand.history.cost)
+    assert by_name.linear_solver == "power"
+
+
+def test_a_method_with_its_own_solver_takes_no_other():
+    with pytest.raises(ValueError, match="its own"):
+        solve(support.tiny(), "ceres", method="stba", linear_solver="explicit")
+    assert solve(support.tiny(), "ceres", method="deeplm", linear_solver="auto").linear_solver == "normal"
+
+
+def test_an_unknown_method_is_named_with_the_known_ones():
+    with pytest.raises(UnknownMethodError, match="lm, stba, deeplm, ddlm, poba"):
+        solve(support.tiny(), method="magic")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_names_a_rule_that_exists(method):
+    make_policy(make_method(method).rule)
+
+
+@needs_data
+@pytest.mark.parametrize("method", ["stba", "ddlm"])
+def test_random_clusters_are_one_program_for_all_turns(method):
+    """Ladybug-49 in clusters of 16: iterations draw different clusters and compile nothing new."""
+    problem = read_bal(bal_file("problem-49-7776-pre"))
+    options = make_method(method).options(StepOptions(cluster_cameras=16))
+    layout, state = start(problem, options)
+    label = partition_of(layout).label
+    assert len(np.unique(label, axis=0)) > 10
+    state, _ = step(layout, state, 1e-3, options, turn=0)
+    with CompileClock() as clock:
+        for turn in range(1, 4):
+            state, info = step(layout, state, 1e-3, options, turn=turn)
+            assert info.cost <= info.previous_cost
+    assert clock.seconds == 0
