@@ -1,4 +1,4 @@
-"""Where a benchmark's problems come from: files, and random scenes by name."""
+"""Where a benchmark's problems come from: files, downloaded problems by name, and random scenes by name."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from jaxba.data.places import resolve
 from jaxba.io import read_problem
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, like, random_scene
@@ -55,6 +56,8 @@ def embedded_sources() -> list[Source]:
 def sources(locations: list[str]) -> list[Source]:
     """Names for locations, all different; missing files and unknown scenes are refused at once.
 
+    A location such as ladybug-49, where no file is called so, is a downloaded problem of BAL.
+
     Raises:
         ProblemError: in one line.
     """
@@ -66,10 +69,11 @@ def sources(locations: list[str]) -> list[Source]:
                 like(name)
             label, family = (f"{name}-{seed}" if seed else name), "scene"
         else:
+            name, location = location, resolve(location)
             path = Path(location)
             if not path.is_file():
                 raise ProblemError(f"{location}: {'a directory, not a file' if path.is_dir() else 'no such file'}")
-            label = re.sub(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$", "", path.name) or path.name
+            label = re.sub(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$", "", Path(name).name) or path.name
             family = path.resolve().parent.name
         taken = {source.name for source in found}
         if label in taken and f"{family}-{label}" not in taken:

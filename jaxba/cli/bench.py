@@ -29,11 +29,12 @@ class Arguments:
     """Options of `jaxba-bench`."""
 
     problems: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Files, or random scenes such as scene:ladybug-49 or scene:tiny:7. Without them (and without a suite) an
-    embedded suite of four random scenes runs."""
+    """Files, downloaded problems of BAL such as ladybug-49 (see jaxba-data), or random scenes such as
+    scene:ladybug-49 or scene:tiny:7. Without them (and without a suite) an embedded suite of four random scenes
+    runs."""
 
     suite: str | None = None
-    """YAML file with any of: problems (globs and $VARIABLES allowed), solvers, tolerance, repeats,
+    """YAML file with any of: problems (names, globs and $VARIABLES allowed), solvers, tolerance, repeats,
     max_iterations."""
 
     solvers: str | None = None

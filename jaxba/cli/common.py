@@ -68,11 +68,12 @@ def use_compilation_cache() -> None:
     """Keeps compiled programs in the user's cache folder, so that the next run starts at once."""
     import jax
 
+    from jaxba.data.places import user_cache
+
     choice = os.environ.get(CACHE_VARIABLE, "")
     if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):
         return
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    folder = Path(choice) if choice else Path(base) / "jaxba" / "xla"
+    folder = Path(choice) if choice else user_cache("xla")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

@@ -25,7 +25,8 @@ class Arguments:
     """Options of `jaxba-solve`."""
 
     problem: Annotated[str | None, tyro.conf.Positional] = None
-    """BAL file or Bundler .out file, plain or .bz2, .gz, .xz. Without it a built-in random scene is solved."""
+    """BAL file or Bundler .out file, plain or .bz2, .gz, .xz, or the name of a downloaded problem of BAL, such as
+    ladybug-49 (see jaxba-data). Without it a built-in random scene is solved."""
 
     damping: str = "learned"
     """Who chooses lambda: learned (the shipped policy), a .safetensors file of jaxba-train, ceres, classic, gtsam,
@@ -108,6 +109,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.bench.summary import write_text
     from jaxba.cli import table
     from jaxba.damping import is_learned
+    from jaxba.data.places import resolve
     from jaxba.io import read_problem, write_problem
     from jaxba.losses import Loss
     from jaxba.naming import SolverName
@@ -116,7 +118,7 @@ def _solve(args: Arguments) -> int:
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
     name = SolverName(args.damping, refine, args.dtype, args.method)
     policy, options = name.build()
-    problem = read_problem(args.problem) if args.problem else embedded_sources()[0].read()
+    problem = read_problem(resolve(args.problem)) if args.problem else embedded_sources()[0].read()
     common.prepare_process()
     options = replace(
         options,

@@ -1,0 +1,149 @@
+"""`jaxba-data`: problems of the BAL data set, downloaded once and then known by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+
+from jaxba.cli import common
+
+FILE_WIDTH = 120
+"""Columns of the list where the output is no terminal."""
+
+
+@dataclass(frozen=True)
+class Download:
+    """Downloads problems into the cache folder. What broke off is continued; what is there is not asked for again."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Such as ladybug-1197; a family (trafalgar) stands for all of its problems."""
+
+    base_url: str | None = None
+    """Folder of the families on another server. Default: the data set's own."""
+
+    checksum: bool = True
+    """Refuse files with another checksum than the known one. --no-checksum: unpack a file and compare its header
+    with its name instead, as for files without a known checksum."""
+
+
+@dataclass(frozen=True)
+class List:
+    """Lists the problems: name, size, file, and whether it is in the cache folder."""
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names or families; all if left out."""
+
+
+@dataclass(frozen=True)
+class PathOf:
+    """Prints the path of a downloaded problem."""
+
+    name: Annotated[str, tyro.conf.Positional]
+    """Such as ladybug-1197."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of `jaxba-data`."""
+
+    command: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[Download, tyro.conf.subcommand("download")]
+        | Annotated[List, tyro.conf.subcommand("list")]
+        | Annotated[PathOf, tyro.conf.subcommand("path")]
+    ]
+
+
+def main() -> None:
+    """Entry point of `jaxba-data`."""
+    common.exit_with(run())
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; status 0 when all is there, 2 for bad input or a failed download, 130 after Ctrl-C."""
+    text = "Problems of BAL (Bundle Adjustment in the Large). JAXBA_BAL names another folder than the user's cache."
+    return common.run_command(Arguments, _data, text, argv)
+
+
+def _data(args: Arguments) -> int:
+    if isinstance(args.command, Download):
+        return _download(args.command)
+    if isinstance(args.command, List):
+        return _list(args.command)
+    from jaxba.data.places import local_path
+
+    print(local_path(args.command.name))
+    return 0
+
+
+def _list(args: List) -> int:
+    from rich.console import Console
+    from rich.table import Table
+
+    from jaxba.data.catalog import ENTRIES, select
+    from jaxba.data.places import data_folder, stored
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=FILE_WIDTH)
+    table = Table(box=None, header_style="bold", pad_edge=False)  # 80 columns wide
+    for title in ("name", "cameras", "points", "file", "sha256", "here"):
+        table.add_column(title, no_wrap=True, justify="right" if title in ("cameras", "points") else "left")
+    for entry in select(args.names) if args.names else ENTRIES:
+        file = entry.file.partition("/")[2]
+        known, here = ("known" if entry.sha256 else "no"), ("yes" if stored(entry) else "no")
+        table.add_row(entry.name, str(entry.cameras), str(entry.points), file, known, here)
+    console.print(table)
+    console.print(f"folder: {data_folder()}", highlight=False, markup=False, soft_wrap=True)
+    return 0
+
+
+def _download(args: Download) -> int:
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+    from jaxba.data.catalog import select
+    from jaxba.data.places import data_folder
+
+    if not args.names:
+        raise common.UsageError("name a problem or a family; jaxba-data list shows them")
+    entries, folder = select(args.names), data_folder()
+    try:
+        from jaxba.data import download
+    except ImportError as error:
+        raise common.UsageError(str(error)) from None
+    console = Console(soft_wrap=True, highlight=False)
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
+    status = 0
+    with Progress(
+        *columns, TimeRemainingColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+        for entry in entries:
+            task = progress.add_task(entry.name, total=None)
+
+            def show(done: int, total: int | None, task: Any = task) -> None:
+                progress.update(task, completed=done, total=total)
+
+            try:
+                path, new = download.fetch(entry, folder, show, args.base_url or download.BASE_URL, args.checksum)
+            except KeyboardInterrupt:
+                console.print("interrupted; what has come is kept, run the same command again to continue")
+                return common.INTERRUPTED
+            except download.DownloadError as error:
+                progress.remove_task(task)
+                status = common.complain(str(error))
+                if isinstance(error, download.UnreachableError):
+                    break  # the others would not come either
+                continue
+            progress.remove_task(task)
+            state = _state(new, args.checksum and bool(entry.sha256))
+            console.print(f"{entry.name}: {state}: {path}", markup=False)
+    return status
+
+
+def _state(new: bool, checksum: bool) -> str:
+    if not checksum:
+        return "downloaded, unpacks, header fits its name" if new else "was here (no checksum compared)"
+    return "downloaded, checksum agrees" if new else "was here, checksum agrees"

@@ -1,0 +1,126 @@
+"""Downloads of BAL problems into the cache folder. Needs the extra `data`.
+
+pooch decides what is missing, checks the checksum and moves the file to its place; `transfer` continues what broke off,
+which pooch does not.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+from jaxba.data.catalog import Entry
+from jaxba.io.files import open_input, reason
+from jaxba.problem import ProblemError
+
+try:
+    import pooch
+
+    from jaxba.data.transfer import DownloadError, Report, UnreachableError, download_rest
+except ModuleNotFoundError:
+    raise ImportError("this needs pooch: pip install jaxba[data]") from None
+try:
+    import fcntl
+except ModuleNotFoundError:  # not a POSIX system: two downloads of one file at once are then not kept apart
+    fcntl = None
+
+__all__ = ["BASE_URL", "DownloadError", "UnreachableError", "fetch", "partial_path"]
+
+BASE_URL = "https://grail.cs.washington.edu/projects/bal/data"
+"""The data set's own server."""
+
+
+def fetch(
+    entry: Entry, folder: Path, report: Report, base_url: str = BASE_URL, use_checksum: bool = True
+) -> tuple[Path, bool]:
+    """The path of a problem, downloaded where it is missing or differs from its checksum.
+
+    The file appears in its place whole and checked, or not at all. What a broken connection leaves waits beside it
+    under a hidden name for the next call. Without a checksum the file must unpack and its header fit its name.
+
+    Args:
+        entry: the problem.
+        folder: of the whole data set; made where it is missing.
+        report: progress, as `download_rest` tells it.
+        base_url: folder of the families on a server.
+        use_checksum: false to treat a known checksum as unknown, for a mirror that compressed the files anew.
+
+    Returns:
+        The path, and whether anything had to be downloaded.
+
+    Raises:
+        DownloadError: in one line.
+    """
+    known = f"sha256:{entry.sha256}" if use_checksum and entry.sha256 else None
+    registry: dict[str, Any] = {entry.file: known}  # pooch compares nothing where it finds None
+    cache = pooch.Pooch(path=folder, base_url=base_url.rstrip("/") + "/", registry=registry)
+    pooch.get_logger().setLevel("ERROR")
+    target, partial, came = folder / entry.file, partial_path(entry, folder), []
+
+    def downloader(url: str, output_file: Any, _: Any) -> None:
+        came.append(url)
+        download_rest(url, partial, report)
+        if known is None:
+            _check(partial, entry)
+        os.replace(partial, output_file)
+
+    try:
+        if not (target.is_file() and (known is None or pooch.file_hash(str(target)) == entry.sha256)):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with _alone(partial):
+                cache.fetch(entry.file, downloader=cast(Any, downloader))
+    except DownloadError:
+        raise
+    except ValueError as error:  # pooch's word for a wrong checksum
+        message = f"{cache.get_url(entry.file)}: the file has a wrong checksum and was removed"
+        raise DownloadError(message) from error
+    except OSError as error:
+        raise DownloadError(f"cannot write to {folder}: {reason(error)}") from error
+    return target, bool(came)
+
+
+def partial_path(entry: Entry, folder: Path) -> Path:
+    """Where an unfinished download waits. A pattern such as problem-* does not find it."""
+    target = folder / entry.file
+    return target.with_name(f".{target.name.removesuffix('.txt.bz2')}.part.bz2")
+
+
+def _check(partial: Path, entry: Entry) -> None:
+    """Removes and refuses a file that does not unpack or whose header has other counts than its name."""
+    head, why = b"", "its header does not fit its name"
+    try:
+        with open_input(partial) as blocks:
+            for block in blocks:
+                head = head or block[:100]
+    except ProblemError as error:
+        why = reason(error.__cause__) if error.__cause__ else "it is no bz2 file"
+        head = b""
+    if [*head.split(b"\n", 1)[0].split()[:2]] != [b"%d" % entry.cameras, b"%d" % entry.points]:
+        partial.unlink()
+        raise DownloadError(f"{entry.name}: what came is not the problem and was removed: {why}")
+
+
+@contextmanager
+def _alone(partial: Path) -> Iterator[None]:
+    """Waits until no other process works on a partial file, and keeps others waiting."""
+    if fcntl is None:
+        yield
+        return
+    path = partial.with_suffix(".lock")
+    while True:
+        with open(path, "ab") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            try:
+                ours = os.path.samestat(os.fstat(file.fileno()), path.stat())
+            except FileNotFoundError:
+                ours = False
+            if not ours:
+                continue  # whoever had it has removed it
+            try:
+                yield
+            finally:
+                path.unlink()
+            return

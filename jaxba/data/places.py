@@ -1,0 +1,57 @@
+"""Where downloaded problems lie, and how their names become paths."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from jaxba.data.catalog import Entry, find
+from jaxba.data.problems import PROBLEMS
+from jaxba.problem import ProblemError
+
+FOLDER_VARIABLE = "JAXBA_BAL"
+"""Environment variable: folder of downloaded problems, instead of `bal` in the user's cache folder."""
+
+_NAME = re.compile(rf"(?:{'|'.join(PROBLEMS)})-\d+", re.IGNORECASE)
+
+
+def user_cache(part: str) -> Path:
+    """A folder of jaxba's in the user's cache folder (that of the XDG base directory specification)."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(base) / "jaxba" / part
+
+
+def data_folder() -> Path:
+    """The folder of downloaded problems. It need not exist."""
+    return Path(os.environ.get(FOLDER_VARIABLE) or user_cache("bal"))
+
+
+def stored(entry: Entry) -> Path | None:
+    """Path of a problem that has been downloaded."""
+    path = data_folder() / entry.file
+    return path if path.is_file() else None
+
+
+def local_path(name: str) -> Path:
+    """Path of the downloaded problem of a name.
+
+    Raises:
+        ProblemError: there is no problem of that name, or it has not been downloaded; one line that says what to do.
+    """
+    entry = find(name)
+    path = stored(entry)
+    if path is None:
+        raise ProblemError(f"{entry.name} is not here; get it with: jaxba-data download {entry.name}")
+    return path
+
+
+def resolve(location: str) -> str:
+    """The path that a user means: a name such as ladybug-49, where no file is called so, is a downloaded problem.
+
+    Raises:
+        ProblemError: as `local_path` does, for what has the form of a name.
+    """
+    if _NAME.fullmatch(location) and not os.path.lexists(location):
+        return str(local_path(location))
+    return location
