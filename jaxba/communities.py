@@ -89,7 +89,7 @@ def _matching(graph: csr_matrix, label: np.ndarray) -> np.ndarray:
     """Pairs of cameras whose edge was cut, the heaviest edges first, each camera once."""
     edges = graph.tocoo()
     cut = np.flatnonzero((edges.row < edges.col) & (label[edges.row] != label[edges.col]))
-    cut = cut[np.argsort(-edges.data[cut], kind="stable")]
+    cut = cut[np.argsort(-np.asarray(edges.data, float)[cut], kind="stable")]
     into = list(range(len(label)))
     free = [True] * len(label)
     for one, other in zip(edges.row[cut].tolist(), edges.col[cut].tolist(), strict=True):

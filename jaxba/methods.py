@@ -88,9 +88,20 @@ if set(METHODS) != set(get_args(MethodName)):
 def make_method(name: str) -> Method:
     """The method called `name`.
 
+    Args:
+        name: a key of `METHODS`; those that cluster cameras take the size of a cluster, as in `stba:16`.
+
     Raises:
-        UnknownMethodError: no such method.
+        UnknownMethodError: no such method, or a size that makes no sense.
     """
-    if name not in METHODS:
+    base, colon, size = name.partition(":")
+    if base not in METHODS:
         raise UnknownMethodError(f"unknown method {name!r}; known: {', '.join(METHODS)}")
-    return METHODS[name]
+    method = METHODS[base]
+    if not colon:
+        return method
+    if not method.options(StepOptions()).uses_partitions:
+        raise UnknownMethodError(f"{name!r}: {base} has no clusters whose size could be set")
+    if not (size.isdecimal() and int(size) > 0):
+        raise UnknownMethodError(f"{name!r}: the cameras of a cluster must be a positive number, not {size!r}")
+    return replace(method, fixes=_fixed(**method.fixes, cluster_cameras=int(size)))

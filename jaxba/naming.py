@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from jaxba.damping import LEARNED, LEARNED_PLAIN, DampingPolicy, Learned, is_learned, make_policy
 from jaxba.damping.agent import AgentConfig
 from jaxba.damping.registry import SUFFIX
-from jaxba.methods import DEFAULT_METHOD, METHODS, make_method
+from jaxba.methods import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
 from jaxba.options import StepOptions
 
 DTYPES = ("float64", "float32", "mixed")
@@ -73,7 +73,7 @@ def parse_solver(name: str) -> SolverName:
     parts = prefix.split("+")
     if suffix:
         method, plus, file = path.partition("+")
-        known = bool(plus) and method in METHODS
+        known = bool(plus) and method.partition(":")[0] in METHODS
         parts[0] = (file if known else path) + suffix + parts[0]
         parts = [method, *parts] if known else parts
     # the plus sign of an exponent belongs to its number: constant:1e+2
@@ -96,8 +96,10 @@ def parse_solver(name: str) -> SolverName:
     method = merged.pop(0) if len(merged) > 1 else DEFAULT_METHOD
     if len(merged) != 1 or not merged[0]:
         raise SolverNameError(f"{name!r} is no solver; the form is [method+]policy[+refineK|+embedded][@dtype]")
-    if method not in METHODS:
-        raise SolverNameError(f"unknown method {method!r} in {name!r}; known: {', '.join(METHODS)}")
+    try:
+        make_method(method)
+    except UnknownMethodError as error:
+        raise SolverNameError(f"{error} (in {name!r})") from None
     if at and dtype not in DTYPES:
         raise SolverNameError(f"unknown type {dtype!r} in {name!r}; known: {', '.join(DTYPES)}")
     make_policy(merged[0])

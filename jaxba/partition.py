@@ -13,6 +13,7 @@ import itertools
 from dataclasses import dataclass
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Int
@@ -56,7 +57,8 @@ class Partition:
     def at(self, turn: int | Int[Array, ""]) -> Partition:
         """The partition of an iteration, counted from 0."""
         count = self.label.shape[0]
-        return jax.tree.map(lambda x: x[turn % count], self)
+        arrays = self if isinstance(turn, int) else jax.tree.map(jnp.asarray, self)
+        return jax.tree.map(lambda x: x[turn % count], arrays)
 
 
 def partition_layout(

@@ -21,7 +21,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxba.blocks3 import Cholesky3, cholesky3
-from jaxba.dense import factor_and_solve
+from jaxba.dense import MIN_UNKNOWNS, factor_and_solve
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, damping_diagonal
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
@@ -133,8 +133,8 @@ def solve_clusters(
     matrices = cluster_matrices(layout, linear, points, system, partition)
     padded = jnp.concatenate([right, jnp.zeros((1, 9), right.dtype)])
     rights = take_rows(padded, partition.members).reshape(partition.members.shape[0], -1)
-    # one after the other on a CPU, where each factorisation uses all cores by itself
-    if jax.default_backend() == "cpu":
+    # large ones one after the other on a CPU, where each factorisation uses all cores by itself
+    if jax.default_backend() == "cpu" and rights.shape[1] >= MIN_UNKNOWNS:
         found = lax.map(lambda pair: factor_and_solve(*pair), (matrices, rights))
     else:
         found = jax.vmap(factor_and_solve)(matrices, rights)

@@ -117,6 +117,9 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     record = json.loads(log.read_text())
     assert record["cg_iterations"] > 0
     assert record["backend"].endswith("(implicit)")
+    assert run([str(tiny), "--method", "stba:3", "--damping", "stba", "--max-iterations", "2", "--log", str(log)]) == 0
+    assert json.loads(log.read_text())["solver"] == "stba:3+stba"
+    assert "method stba:3" in capsys.readouterr().out
 
 
 def test_what_is_odd_about_the_data_is_counted(tmp_path, capsys):
@@ -211,6 +214,9 @@ BAD = {
     "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),
     "unknown damping": (lambda tiny: [str(tiny), "--damping", "cerse"], "unknown damping policy 'cerse'"),
     "lambda that is no number": (lambda tiny: [str(tiny), "--damping", "constant:x"], "positive number"),
+    "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm, ddlm, poba"),
+    "size of no clusters": (lambda tiny: [str(tiny), "--method", "poba:3"], "no clusters"),
+    "solver of a method": (lambda tiny: [str(tiny), "--method", "poba", "--linear-solver", "sparse"], "has its own"),
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must not be negative"),
     "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be positive"),
     "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be positive"),

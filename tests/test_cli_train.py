@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -149,6 +150,14 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(folder, finished, caps
 
 
 # Errors
+
+
+@pytest.mark.slow
+def test_an_agent_is_trained_for_the_method_that_is_named(tmp_path):
+    out = tmp_path / "run"
+    assert run([*COMMAND, "method=stba", "cluster_cameras=2", "chunks=1", "--out", str(out)]) == 0
+    assert json.loads((out / "rules.json").read_text()).keys() == {"stba", "ceres", "virtual best"}
+    assert (out / "policy.safetensors").is_file()
 
 
 def test_a_folder_with_a_run_is_refused(folder, capsys):

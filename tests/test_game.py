@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from support import same_bits
 from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 
-from jaxba import BundleProblem, StepOptions, geometry, make_policy, solve
+from jaxba import BundleProblem, StepOptions, geometry, make_method, make_policy, solve
 from jaxba.damping.agent import begin, damping_of, observe
 from jaxba.damping.learned import Layer, Learned
 from jaxba.game.bank import Bank, info_of, initial_costs, reach, sieve
@@ -26,6 +26,8 @@ from jaxba.game.evaluate import compare, evaluate, score
 from jaxba.game.play import Trajectories, play
 from jaxba.game.protocol import Environment
 from jaxba.game.scenes import MIN_VIEWS, SceneClass, Scenes, _angle_axis, make_scenes
+from jaxba.game.slots import class_layout
+from jaxba.layout import partition_of
 
 LIMIT = 25
 
@@ -159,6 +161,28 @@ def test_a_scene_is_played_as_it_is_solved():
         np.testing.assert_allclose(found.dampings[k, :count], alone.history.damping[:count], rtol=1e-4)
         if alone.converged:
             np.testing.assert_allclose(found.costs[k, -1], alone.final_cost, rtol=1e-3)
+
+
+@pytest.mark.parametrize("method", ["stba", "deeplm", "ddlm", "poba"])
+def test_a_scene_is_played_as_it_is_solved_by_every_method(method):
+    bank, options = tiny_bank(), make_method(method).options(StepOptions())
+    found = play(KIND, bank, CERES, options, 6)
+    for k in (0, 5):
+        alone = solve(problem_of(KIND, bank.scenes, k), "ceres", options, max_iterations=6)
+        count = min(4, alone.iterations)
+        np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["stba", "ddlm"])
+def test_scenes_of_a_class_share_random_clusters(method):
+    bank, options = tiny_bank(), make_method(method).options(StepOptions(cluster_cameras=2))
+    labels = partition_of(class_layout(KIND, options)).label
+    assert labels.max() >= 1
+    assert len(np.unique(labels, axis=0)) > 1
+    found = play(KIND, bank, CERES, options, 12)
+    assert (np.diff(found.costs, axis=1) <= 0).all()
+    assert np.median(found.costs[:, -1] / found.costs[:, 0]) < 0.5
+    assert (found.costs[:, 6] != played().costs[:, 6]).all()
 
 
 def test_costs_start_at_the_start_never_rise_and_stay_after_the_end():

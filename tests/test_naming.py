@@ -12,6 +12,7 @@ from jaxba.naming import DTYPES, SolverName, SolverNameError, parse_solver
 
 names = st.builds(
     SolverName,
+    method=st.sampled_from(["lm", "stba", "stba:12", "deeplm", "ddlm", "ddlm:3", "poba"]),
     policy=st.one_of(
         st.sampled_from(sorted(POLICIES)),
         st.floats(1e-300, 1e300).map(lambda x: f"constant:{x!r}"),
@@ -26,7 +27,7 @@ names = st.builds(
 @given(names)
 def test_a_name_reads_back_as_itself(name):
     assert parse_solver(str(name)) == name
-    assert parse_solver(f"  lm+{name} ") == name
+    assert name.method != "lm" or parse_solver(f"  lm+{name} ") == name
     assert str(parse_solver(str(name))) == str(name)
 
 
@@ -43,6 +44,11 @@ def test_a_name_reads_back_as_itself(name):
         ("constant:1e+2", SolverName("constant:1e+2"), None),
         ("lm+constant:1.5E+2+refine1", SolverName("constant:1.5E+2", 1), "constant:1.5E+2+refine1"),
         ("gauss-newton", SolverName("gauss-newton"), "gauss-newton"),
+        ("stba+classic", SolverName("classic", method="stba"), None),
+        ("stba:16+ceres+refine2@float32", SolverName("ceres", 2, "float32", "stba:16"), None),
+        ("deeplm+learned", SolverName("learned", None, method="deeplm"), None),
+        ("ddlm+learned+refine0", SolverName("learned", 0, method="ddlm"), None),
+        ("poba+constant:1e-4", SolverName("constant:1e-4", method="poba"), None),
     ],
 )
 def test_names_of_the_contract(text, name, shortest):
@@ -63,6 +69,9 @@ def test_names_of_the_contract(text, name, shortest):
         ("refine3", UnknownPolicyError),
         ("+refine3", SolverNameError),
         ("gn+ceres", SolverNameError),
+        ("lm:3+ceres", SolverNameError),
+        ("stba:0+ceres", SolverNameError),
+        ("ddlm:few+ceres", SolverNameError),
         ("lm+lm+ceres", SolverNameError),
         ("ceres@", SolverNameError),
         ("ceres@float16", SolverNameError),

@@ -183,7 +183,7 @@ def wide() -> list[tuple[Layout, LMState]]:
     large = np.flatnonzero(np.asarray(scenes.mask).sum(axis=1) >= 25)
     return [
         (
-            with_scene(class_layout(KIND), scenes.pixels[k], scenes.mask[k]),
+            with_scene(class_layout(KIND, StepOptions()), scenes.pixels[k], scenes.mask[k]),
             LMState(scenes.cameras[k], scenes.points[k], costs[k]),
         )
         for k in large

@@ -32,12 +32,13 @@ def run_command(
 
     parsed = tyro.cli(arguments, args=argv, description=description)
     from jaxba.damping.registry import UnknownPolicyError
+    from jaxba.methods import UnknownMethodError
     from jaxba.naming import SolverNameError
     from jaxba.problem import ProblemError
 
     try:
         return main(parsed)
-    except (ProblemError, UsageError, UnknownPolicyError, SolverNameError) as error:
+    except (ProblemError, UsageError, UnknownPolicyError, UnknownMethodError, SolverNameError) as error:
         return complain(str(error))
 
 

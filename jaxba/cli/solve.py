@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxba.cli import common
-from jaxba.methods import DEFAULT_METHOD, MethodName
+from jaxba.methods import DEFAULT_METHOD
 from jaxba.options import LinearSolverChoice, Preconditioner
 
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
@@ -32,9 +32,10 @@ class Arguments:
     """Who chooses lambda: learned (the shipped policy), a .safetensors file of jaxba-train, ceres, classic, gtsam,
     nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4; most take a first lambda, as in classic:0.03."""
 
-    method: MethodName = "lm"
-    """How a step is made. lm: Levenberg-Marquardt. stba: random clusters of cameras. deeplm: conjugate gradients on all
-    variables. ddlm: clusters optimised beside each other. poba: a power series. See docs/methods.md."""
+    method: str = DEFAULT_METHOD
+    """How a step is made. lm: Levenberg-Marquardt. stba: random clusters of cameras, of at most 100 or, as stba:16, of
+    another size. deeplm: conjugate gradients on all variables. ddlm: clusters optimised beside each other, ddlm:16.
+    poba: a power series. See docs/methods.md."""
 
     refine_points: int | None = None
     """Embedded point iterations after each camera step, and no other embedded iterations. If left out: those that a

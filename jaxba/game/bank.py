@@ -83,7 +83,7 @@ def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], 
 @functools.partial(jax.jit, static_argnames=("kind",))
 def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
     """The cost of every start, pixels squared."""
-    layout = class_layout(kind)
+    layout = class_layout(kind, StepOptions())
 
     def one(scene: Scenes) -> Array:
         return cost(with_scene(layout, scene.pixels, scene.mask), scene.cameras, scene.points, Loss())

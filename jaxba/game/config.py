@@ -19,6 +19,8 @@ from jaxba.game.env import GameConfig
 from jaxba.game.loop import LoopConfig
 from jaxba.game.sac import SacConfig
 from jaxba.game.settings import SettingsError
+from jaxba.methods import DEFAULT_METHOD, MethodName, make_method
+from jaxba.options import StepOptions
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,12 @@ class TrainConfig:
     envs: tuple[int, ...] = (64,)
     """Environments of each class of scenes."""
 
+    method: MethodName = "lm"
+    """How a step is made (jaxba/methods.py). Best costs and the selection of scenes are those of plain LM."""
+
+    cluster_cameras: int = 4
+    """Cameras of a cluster at most, for methods with clusters: scenes are too small for those of real problems."""
+
     bank: BankConfig = field(default_factory=BankConfig)
     """Scenes."""
 
@@ -60,8 +68,14 @@ class TrainConfig:
     loop: LoopConfig = field(default_factory=LoopConfig)
     """Sizes of the training loop."""
 
+    @property
+    def step_options(self) -> StepOptions:
+        """Of the method's steps, without embedded iterations."""
+        base = StepOptions(cluster_cameras=self.cluster_cameras)
+        return make_method(self.method).options(base) if self.method != DEFAULT_METHOD else StepOptions()
+
     def __post_init__(self) -> None:
-        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep"):
+        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep", "cluster_cameras"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.seed < 2**31:

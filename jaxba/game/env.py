@@ -162,9 +162,12 @@ class Game:
 
     def iterate(self, kind: SceneClass, bank: Bank, episode: Episode, action: Array) -> tuple[Episode, StepInfo]:
         """One LM iteration of one scene."""
-        own = with_scene(class_layout(kind), bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
+        layout = class_layout(kind, self.options)
+        own = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
         damping = damping_of(self.config.agent, episode.memory, action)
-        state, step = lm_step(own, episode.state, damping, self.options, self.config.agent.min_gain)
+        state, step = lm_step(
+            own, episode.state, damping, self.options, self.config.agent.min_gain, episode.memory.iteration
+        )
         return Episode(episode.scene, state, record(self.config.agent, episode.memory, step)), step
 
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
@@ -260,7 +263,7 @@ def make_game(
         envs: environments of each class.
         options: of the LM step; its embedded iterations are those of the agent.
     """
-    for kind in kinds:
-        class_layout(kind)  # on the host, before anything is traced
     options = config.agent.step_options(options or StepOptions())
+    for kind in kinds:
+        class_layout(kind, options)  # on the host, before anything is traced
     return Game(tuple(banks), tuple(kinds), tuple(envs), config, options)

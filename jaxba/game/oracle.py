@@ -73,7 +73,7 @@ def beam_search(
 def _search(
     kind: SceneClass, bank: Bank, options: StepOptions, iterations: int, width: int, grid: tuple[float, ...]
 ) -> Array:
-    layout = class_layout(kind)
+    layout = class_layout(kind, options)
 
     def one(scene: Bank) -> Array:
         own = with_scene(layout, scene.scenes.pixels, scene.scenes.mask)

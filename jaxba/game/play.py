@@ -104,7 +104,7 @@ def play(
 
 @functools.partial(jax.jit, static_argnames=("kind", "options", "limit"))
 def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: Array) -> _Loop:
-    layout = class_layout(kind)
+    layout = class_layout(kind, options)
     count = bank.initial_cost.shape[0]
     lanes = min(LANES, count)
 
@@ -118,7 +118,7 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
     def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:
         row = jnp.minimum(lane.scene, count - 1)
         own = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
-        state, step = lm_step(own, lane.state, lane.damping, options, policy.min_gain)
+        state, step = lm_step(own, lane.state, lane.damping, options, policy.min_gain, lane.iteration)
         policy_state, damping = policy.propose(lane.policy, step)
         return _Lane(lane.scene, state, policy_state, damping, lane.iteration + 1), step
 

@@ -11,16 +11,27 @@ from jaxtyping import Bool, Float
 
 from jaxba.game.scenes import SceneClass
 from jaxba.layout import Layout, build_layout
+from jaxba.options import StepOptions
 from jaxba.problem import AnyArray, BundleProblem
 
 
+def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
+    """Slots for every pair of a camera and a point; scenes put their own pixels and mask in (`with_scene`).
+
+    Random clusters, where the options ask for them, are those of a scene in which everybody sees everything, so that
+    all scenes of a class share them.
+    """
+    return _layout(kind, options.cluster_cameras if options.uses_partitions else None)
+
+
 @functools.cache
-def class_layout(kind: SceneClass) -> Layout:
-    """Slots for every pair of a camera and a point; scenes put their own pixels and mask in (`with_scene`)."""
+def _layout(kind: SceneClass, partitions: int | None) -> Layout:
     count = kind.cameras * kind.points
     camera, point = np.tile(np.arange(kind.cameras), kind.points), np.repeat(np.arange(kind.points), kind.cameras)
     cameras = np.zeros((kind.cameras, 9))
     problem = BundleProblem.create(cameras, np.zeros((kind.points, 3)), np.zeros((count, 2)), camera, point)
+    if partitions is not None:
+        return build_layout(problem, factor=False, partitions=partitions)
     layout = build_layout(problem)
     if layout.grid is None:
         raise AssertionError("scenes of the game are dense")

@@ -21,6 +21,7 @@ from jaxba.game.config import TrainConfig
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Score, compare, evaluate
 from jaxba.game.sac import Learner
+from jaxba.methods import make_method
 from jaxba.options import StepOptions
 
 BANK = "bank.npz"
@@ -95,7 +96,9 @@ def build(config: TrainConfig, folder: Path, say: Callable[[str], None] = lambda
         options = StepOptions(refine_points=config.bank.refine_points)
         splits = make_banks(config.bank, jax.random.key(config.seed), options, config.game.max_iterations, say)
         _write_banks(path, splits)
-    game = make_game(config.game, config.bank.classes, [split.train for split in splits], config.envs)
+    game = make_game(
+        config.game, config.bank.classes, [split.train for split in splits], config.envs, config.step_options
+    )
     held_out = tuple(split.held_out for split in splits)
     return Task(config, game, held_out, _rules(config, game, held_out, folder / RULES, say))
 
@@ -106,10 +109,10 @@ def _rules(
     if path.is_file():
         return {name: Score(**numbers) for name, numbers in json.loads(path.read_text(encoding="utf-8")).items()}
     say("hand-written rules on the held-out scenes")
-    policies: dict[str, tuple[DampingPolicy, StepOptions]] = {
-        name: (make_policy(name), StepOptions()) for name in YARDSTICKS
-    }
-    if game.options != StepOptions():
+    plain = config.step_options
+    names = dict.fromkeys((make_method(config.method).rule, *YARDSTICKS))
+    policies: dict[str, tuple[DampingPolicy, StepOptions]] = {name: (make_policy(name), plain) for name in names}
+    if game.options != plain:
         policies[YARDSTICKS[0] + EMBEDDED] = make_policy(YARDSTICKS[0]), game.options
     scores = _compare(config, held_out, policies)
     part = path.with_suffix(".part")
