@@ -1,0 +1,239 @@
+"""Ceres as a peer: under its own rule, or driven by a damping policy one iteration at a time. Needs the extra `ceres`.
+
+Recorded costs are BAL's, evaluated at the parameters after each accepted step while the clock stands. They are what
+Ceres minimises as long as no point passes behind its camera; where one did, the log says so.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from jaxba import geometry
+from jaxba.lm import StepInfo
+from jaxba.peers.colmap import pyceres
+from jaxba.peers.colmap_problem import ColmapProblem
+from jaxba.problem import BundleProblem, ProblemError
+from jaxba.solve import MAX_ITERATIONS, History, IterationRecord, Solution, explain_start
+from jaxba.termination import Termination, Tolerances
+
+_log = logging.getLogger(__name__)
+
+LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
+"""Ceres' linear solvers by mode; the iterative one preconditions with SCHUR_JACOBI."""
+
+COST_AGREES = 1e-9
+"""Relative difference of Ceres' cost and BAL's that rounding explains."""
+
+ENDS = {
+    "Function tolerance": Termination.COST,
+    "Parameter tolerance": Termination.STEP,
+    "Gradient tolerance": Termination.GRADIENT,
+    "Maximum number of iterations": Termination.MAX_ITERATIONS,
+    "Minimum trust region radius": Termination.DAMPING_LIMIT,
+}
+"""How the message of Ceres' summary begins; anything else is a failure of five invalid steps in a row."""
+
+DISCARDED = (Termination.COST, Termination.STEP)
+"""Ceres tests a candidate before it accepts, so that these end a solve with a step that is computed and not taken."""
+
+Callback = Callable[[IterationRecord], Any]
+
+
+def solver_options(mode: str, threads: int) -> Any:
+    """Ceres' defaults with the linear solver of a mode, and silence."""
+    options = pyceres.SolverOptions()
+    options.linear_solver_type = getattr(pyceres.LinearSolverType, LINEAR_SOLVERS[mode])
+    options.preconditioner_type = pyceres.PreconditionerType.SCHUR_JACOBI
+    options.num_threads = threads
+    options.logging_type = pyceres.LoggingType.SILENT
+    return options
+
+
+class Run:
+    """A solve in progress: its problem, its clock, and what was recorded."""
+
+    def __init__(self, problem: BundleProblem, callback: Callback | None) -> None:
+        """Makes the Ceres problem.
+
+        Raises:
+            ProblemError: the cost at the start is not finite, or the problem has covariances.
+        """
+        self.initial_cost = geometry.cost(problem)
+        if not np.isfinite(self.initial_cost):
+            raise ProblemError(explain_start(problem))
+        started = time.perf_counter()
+        self.colmap = ColmapProblem(problem)
+        self.setup_s = time.perf_counter() - started
+        self.callback = callback
+        self.steps: list[StepInfo] = []
+        self.cost = self.initial_cost
+        self.strayed = 0
+        self.paused = 0.0
+        self.total_s = 0.0
+        if behind := int(self.colmap.in_python.sum()):
+            _log.warning("%d observations of points behind their camera: Python evaluates them for Ceres", behind)
+
+    def start(self) -> None:
+        """Starts the clock."""
+        self.started = time.perf_counter()
+        self.paused = 0.0
+
+    def record(self, step: StepInfo) -> bool:
+        """Notes an iteration, the parameters being those after it; returns whether the caller wants to stop."""
+        now = time.perf_counter()
+        self.total_s = now - self.started - self.paused
+        if step.accepted:
+            self.cost = geometry.cost(self.colmap.bundle())
+            self.strayed += abs(self.cost - step.cost) > COST_AGREES * self.cost
+        self.steps.append(step._replace(cost=self.cost))
+        stop = self.callback(IterationRecord(len(self.steps), self.total_s, self.steps[-1])) if self.callback else False
+        self.paused += time.perf_counter() - now
+        return bool(stop)
+
+    def solution(self, termination: Termination, linear_solver: str, compile_s: float = 0.0) -> Solution:
+        """The end of the run."""
+        if self.strayed:
+            _log.warning(
+                "points went behind their camera: in %d of %d iterations Ceres' cost leaves observations out that the "
+                "recorded one counts",
+                self.strayed,
+                len(self.steps),
+            )
+        return Solution(
+            problem=self.colmap.bundle(),
+            initial_cost=self.initial_cost,
+            final_cost=self.cost,
+            iterations=len(self.steps),
+            accepted=sum(bool(step.accepted) for step in self.steps),
+            termination=termination,
+            history=History(*(np.array([getattr(step, name) for step in self.steps]) for name in History._fields)),
+            linear_solver=linear_solver,
+            setup_s=self.setup_s,
+            compile_s=compile_s,
+            total_s=self.total_s,
+        )
+
+
+def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
+    """The record of a rejected step of which nothing else is known, but for what is `known`."""
+    facts: dict[str, Any] = {
+        "cost": cost,
+        "previous_cost": cost,
+        "candidate_cost": np.nan,
+        "predicted": np.nan,
+        "gain_ratio": np.nan,
+        "accepted": False,
+        "damping": damping,
+        "gradient_max": np.nan,
+        "step_norm": np.nan,
+        "parameter_norm": np.nan,
+        "cg_iterations": 0,
+        "share": 1.0,
+        "damping_share": np.nan,
+    }
+    return StepInfo(**{**facts, **known})
+
+
+def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: str, **known: Any) -> StepInfo:
+    """The record of one of Ceres' iteration summaries.
+
+    Args:
+        now: of the iteration.
+        before: of the one before it, at whose end the gradient was taken.
+        previous_cost: last accepted cost; the summary of a rejected step has the candidate's.
+        damping: lambda that the step used.
+        mode: a direct solver has no conjugate gradients to count.
+        known: fields that Ceres does not report.
+    """
+    facts = {
+        "previous_cost": previous_cost,
+        "gradient_max": before.gradient_max_norm,
+        "step_norm": now.step_norm,
+        "cg_iterations": now.linear_solver_iterations if mode == "iterative" else 0,
+    }
+    if now.step_is_valid:
+        facts["accepted"] = bool(now.step_is_successful)
+        facts["candidate_cost"], facts["gain_ratio"] = now.cost, now.relative_decrease
+        if now.relative_decrease != 0:
+            facts["predicted"] = now.cost_change / now.relative_decrease
+    else:
+        facts["candidate_cost"] = np.inf
+    return step_info(now.cost if now.step_is_successful else previous_cost, damping, **{**facts, **known})
+
+
+class _Watch(pyceres.IterationCallback):
+    """Turns Ceres' iteration callbacks into records."""
+
+    def __init__(self, run: Run, mode: str) -> None:
+        super().__init__()
+        self.run, self.mode = run, mode
+        self.last: Any = None
+        self.cost: Any = np.nan
+
+    def __call__(self, summary: Any) -> Any:
+        stop = False
+        if self.last is None:
+            self.cost = summary.cost
+        else:
+            step = step_of(summary, self.last, self.cost, 1 / self.last.trust_region_radius, self.mode)
+            self.cost = step.cost
+            stop = self.run.record(step)
+        self.last = pyceres.IterationSummary(summary)
+        kind = pyceres.CallbackReturnType
+        return kind.SOLVER_TERMINATE_SUCCESSFULLY if stop else kind.SOLVER_CONTINUE
+
+
+def solve_by_ceres(
+    problem: BundleProblem,
+    mode: str,
+    *,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerances: Tolerances | None = None,
+    threads: int = 1,
+    callback: Callback | None = None,
+) -> Solution:
+    """Ceres under its own trust-region rule and its own stop tests, at jaxba's tolerances.
+
+    The test of a small decrease looks at the candidate: that last linear solve is counted, as a step not taken.
+    `step_norm` is Ceres' (0 for the first step, quaternions instead of angles); `parameter_norm` and `damping_share`
+    are not known.
+
+    Args:
+        problem: start of the optimisation.
+        mode: a key of `LINEAR_SOLVERS`.
+        max_iterations: limit of linear solves.
+        tolerances: convergence tests.
+        threads: of Ceres.
+        callback: called after every iteration; a true return value stops the solve.
+
+    Raises:
+        ProblemError: as `Run`.
+    """
+    tolerances = tolerances or Tolerances()
+    run = Run(problem, callback)
+    options = solver_options(mode, threads)
+    options.max_num_iterations = max_iterations
+    options.function_tolerance, options.parameter_tolerance = tolerances.ftol, tolerances.xtol
+    options.gradient_tolerance = tolerances.gtol
+    options.update_state_every_iteration = True
+    watch = _Watch(run, mode)
+    options.callbacks = [watch]
+    summary = pyceres.SolverSummary()
+    run.start()
+    pyceres.solve(options, run.colmap.ceres, summary)
+    if summary.message.startswith("User callback"):
+        end = Termination.STOPPED
+    else:
+        end = next((end for words, end in ENDS.items() if summary.message.startswith(words)), Termination.STALLED)
+    if end == Termination.STALLED:
+        _log.warning("Ceres gave up: %s", summary.message)
+    if end in DISCARDED:
+        damping = 1 / watch.last.trust_region_radius
+        run.record(step_info(watch.cost, damping, gradient_max=watch.last.gradient_max_norm))
+    run.total_s = time.perf_counter() - run.started - run.paused
+    return run.solution(end, mode)
