@@ -129,6 +129,7 @@ def _parse_peer(name: str) -> SolverName:
         return SolverName("", peer=peer)
     driver = parse_solver(policy)
     # lambda alone: the peer computes the step, in its own arithmetic
-    if driver != SolverName(driver.policy, driver.refine_points) or re.search(r"\+(refine[1-9]|embedded)", policy):
+    embedded = driver.refine_points is None and (not is_learned(driver.policy) or policy.endswith("+embedded"))
+    if embedded or driver.refine_points or driver != SolverName(driver.policy, driver.refine_points):
         raise SolverNameError(f"{name!r} is no solver; a policy drives {library} by lambda alone: {peer}+policy")
     return SolverName(driver.policy, peer=peer)

@@ -104,12 +104,13 @@ class Run:
                 self.strayed,
                 len(self.steps),
             )
+        accepted = sum(bool(step.accepted) for step in self.steps)
         return Solution(
-            problem=self.colmap.bundle(),
+            problem=self.colmap.bundle() if accepted else self.colmap.start,
             initial_cost=self.initial_cost,
             final_cost=self.cost,
             iterations=len(self.steps),
-            accepted=sum(bool(step.accepted) for step in self.steps),
+            accepted=accepted,
             termination=termination,
             history=History(*(np.array([getattr(step, name) for step in self.steps]) for name in History._fields)),
             linear_solver=linear_solver,
