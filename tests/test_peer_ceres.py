@@ -28,6 +28,9 @@ from jaxba import (
     read_problem,
     solve,
 )
+from jaxba.bench import report
+from jaxba.bench.records import read_records
+from jaxba.cli.bench import run as run_bench
 
 pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")
 pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
@@ -199,6 +202,17 @@ def test_the_cost_counts_on_where_points_pass_behind_their_camera(caplog):
     np.testing.assert_allclose(found.final_cost, geometry.cost(found.problem), rtol=1e-12)
 
 
+@pytest.mark.parametrize("seed", [7, 8])
+def test_ceres_alone_counts_them_too_and_does_not_record_a_step_twice(seed, caplog):
+    with caplog.at_level(logging.INFO, logger="jaxba.peers"):
+        found = solve_by_ceres(scattered(seed), "dense", max_iterations=15)
+    assert "went behind their camera" in caplog.text
+    ours = solve(scattered(seed), "ceres", MANIFOLD, max_iterations=15)
+    assert found.iterations == ours.iterations == 15
+    np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
+
+
 @pytest.mark.parametrize("damping", [1e-4, 1.0])
 def test_facts_that_ceres_does_not_report_are_those_of_our_step(damping):
     problem = support.tiny()
@@ -266,6 +280,7 @@ def test_driven_by_its_own_rule_ceres_does_what_it_does_alone():
     alone = solve_by_ceres(support.tiny(), "dense")
     found = drive_ceres(support.tiny(), "dense", make_policy("ceres"))
     assert (alone.termination, alone.history.accepted[-1]) == (Termination.COST, False)
+    assert alone.history.gain_ratio[-1] == 0
     assert alone.iterations == found.iterations
     taken = alone.accepted
     np.testing.assert_allclose(alone.history.damping, found.history.damping, rtol=1e-6)
@@ -345,6 +360,23 @@ def test_a_backend_names_its_versions():
     assert backend("dense").endswith(", dense)")
 
 
+def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(report, "write_all", lambda *_, **__: [])
+    names = ["ceres", "pyceres:sparse", "pyceres:dense+ceres", "pyceres:dense+learned"]
+    argv = ["scene:tiny", "--solvers", ",".join(names), "--repeats", "1", "--out", str(tmp_path)]
+    assert run_bench(argv) == 0
+    ours, *peers = read_records(tmp_path / "results.jsonl")
+    assert [record.solver for record in peers] == names[1:]
+    for record, mode in zip(peers, ("sparse", "dense", "dense"), strict=True):
+        assert record.backend == backend(mode)
+        assert (record.device, record.dtype, record.termination) == ("cpu: host", "float64", "cost")
+        assert record.threads == ours.threads
+        assert [point.iteration for point in record.trace] == list(range(record.iterations + 1))
+        np.testing.assert_allclose(record.initial_cost, ours.initial_cost, rtol=1e-12)
+        np.testing.assert_allclose(record.final_cost, ours.final_cost, rtol=1e-4)
+    assert [record.trace[1].damping for record in peers] == [1e-4, 1e-4, pytest.approx(1e-5)]
+
+
 # Real problems
 
 
@@ -371,6 +403,23 @@ def test_with_points_behind_cameras_ceres_ends_on_ladybug_where_bal_s_cost_says(
     np.testing.assert_allclose(found.initial_cost, 850912.460681, rtol=1e-11)
     np.testing.assert_allclose(found.final_cost, 13344.3183, rtol=1e-6)
     assert (found.iterations, found.accepted, found.termination) == (32, 31, Termination.COST)
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.parametrize("name", IN_FRONT)
+def test_real_costs_of_ceres_alone_are_ours_under_its_lambdas(name):
+    """Twelve iterations. In the next one four observations of kittistereo00s are behind a camera (left out, Ceres ended
+    at 60470): their points passed through infinity and hang on the clamp of the diagonal, which acts after the column
+    scaling of the first Jacobian in Ceres, and before any in jaxba. That costs 1.2e-6 there.
+    """
+    problem = real(name)
+    found = solve_by_ceres(problem, "dense", max_iterations=12)
+    taken = found.iterations - (found.termination == Termination.COST)
+    its_own = Schedule(values=tuple(found.history.damping[:taken].tolist()), min_gain=1e-3)
+    ours = solve(problem, its_own, MANIFOLD, max_iterations=taken, tolerances=NEVER)
+    np.testing.assert_array_equal(found.history.accepted[:taken], ours.history.accepted)
+    np.testing.assert_allclose(found.history.cost[:taken], ours.history.cost, rtol=1e-6)
 
 
 @needs_data

@@ -1,7 +1,6 @@
 """Ceres as a peer: under its own rule, or driven by a damping policy one iteration at a time. Needs the extra `ceres`.
 
-Recorded costs are BAL's, evaluated at the parameters after each accepted step while the clock stands. They are what
-Ceres minimises as long as no point passes behind its camera; where one did, the log says so.
+Costs are BAL's: observations of points behind their camera, which COLMAP leaves out, are counted (`colmap_problem.py`).
 """
 
 from __future__ import annotations
@@ -12,10 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxba import geometry
 from jaxba.lm import StepInfo
-from jaxba.peers.colmap import pyceres
+from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
 from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.solve import MAX_ITERATIONS, History, IterationRecord, Solution, explain_start
@@ -25,9 +25,6 @@ _log = logging.getLogger(__name__)
 
 LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
 """Ceres' linear solvers by mode; the iterative one preconditions with SCHUR_JACOBI."""
-
-COST_AGREES = 1e-9
-"""Relative difference of Ceres' cost and BAL's that rounding explains."""
 
 ENDS = {
     "Function tolerance": Termination.COST,
@@ -72,7 +69,6 @@ class Run:
         self.callback = callback
         self.steps: list[StepInfo] = []
         self.cost = self.initial_cost
-        self.strayed = 0
         self.paused = 0.0
         self.total_s = 0.0
         if behind := int(self.colmap.in_python.sum()):
@@ -83,13 +79,27 @@ class Run:
         self.started = time.perf_counter()
         self.paused = 0.0
 
+    def hidden(self) -> Bool[np.ndarray, " observations"]:
+        """Observations that COLMAP leaves out at the present parameters, found while the clock stands."""
+        now = time.perf_counter()
+        behind = geometry.depths(self.colmap.bundle()) < SMALLEST_DEPTH
+        self.paused += time.perf_counter() - now
+        return behind & ~self.colmap.in_python
+
+    def count(self, hidden: Bool[np.ndarray, " observations"]) -> None:
+        """Has observations counted from here on."""
+        number = self.colmap.keep(hidden)
+        _log.info("%d observations of points that went behind their camera: Python evaluates them from here on", number)
+
     def record(self, step: StepInfo) -> bool:
-        """Notes an iteration, the parameters being those after it; returns whether the caller wants to stop."""
+        """Notes an iteration, the parameters being those after it; returns whether the caller wants to stop.
+
+        The recorded cost is evaluated anew, by jaxba, while the clock stands.
+        """
         now = time.perf_counter()
         self.total_s = now - self.started - self.paused
         if step.accepted:
             self.cost = geometry.cost(self.colmap.bundle())
-            self.strayed += abs(self.cost - step.cost) > COST_AGREES * self.cost
         self.steps.append(step._replace(cost=self.cost))
         stop = self.callback(IterationRecord(len(self.steps), self.total_s, self.steps[-1])) if self.callback else False
         self.paused += time.perf_counter() - now
@@ -97,13 +107,6 @@ class Run:
 
     def solution(self, termination: Termination, linear_solver: str, compile_s: float = 0.0) -> Solution:
         """The end of the run."""
-        if self.strayed:
-            _log.warning(
-                "points went behind their camera: in %d of %d iterations Ceres' cost leaves observations out that the "
-                "recorded one counts",
-                self.strayed,
-                len(self.steps),
-            )
         accepted = sum(bool(step.accepted) for step in self.steps)
         return Solution(
             problem=self.colmap.bundle() if accepted else self.colmap.start,
@@ -168,25 +171,38 @@ def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: s
 
 
 class _Watch(pyceres.IterationCallback):
-    """Turns Ceres' iteration callbacks into records."""
+    """Turns Ceres' iteration callbacks into records, until a step that it accepted has hidden an observation."""
 
     def __init__(self, run: Run, mode: str) -> None:
         super().__init__()
         self.run, self.mode = run, mode
+        self.begin()
+
+    def begin(self) -> None:
+        """Before a call of Ceres."""
         self.last: Any = None
+        self.before: Any = None
+        self.hidden: Any = None
         self.cost: Any = np.nan
 
     def __call__(self, summary: Any) -> Any:
-        stop = False
+        kind, stop = pyceres.CallbackReturnType, False
         if self.last is None:
             self.cost = summary.cost
         else:
-            step = step_of(summary, self.last, self.cost, 1 / self.last.trust_region_radius, self.mode)
+            if summary.step_is_successful and (hidden := self.run.hidden()).any():
+                self.hidden = hidden
+                return kind.SOLVER_ABORT
+            step = step_of(summary, self.last, self.cost, self.damping, self.mode)
             self.cost = step.cost
             stop = self.run.record(step)
-        self.last = pyceres.IterationSummary(summary)
-        kind = pyceres.CallbackReturnType
+        self.last, self.before = pyceres.IterationSummary(summary), self.run.colmap.parameters()
         return kind.SOLVER_TERMINATE_SUCCESSFULLY if stop else kind.SOLVER_CONTINUE
+
+    @property
+    def damping(self) -> float:
+        """Lambda of the next step."""
+        return 1 / self.last.trust_region_radius
 
 
 def solve_by_ceres(
@@ -200,7 +216,10 @@ def solve_by_ceres(
 ) -> Solution:
     """Ceres under its own trust-region rule and its own stop tests, at jaxba's tolerances.
 
-    The test of a small decrease looks at the candidate: that last linear solve is counted, as a step not taken.
+    The test of a small decrease looks at the candidate: that last linear solve is counted, as a step that is not taken
+    and gains nothing. An accepted step that takes a point behind its camera, which COLMAP rewards with a residual of
+    zero, is undone and repeated from the same radius with that observation counted: one iteration in the time of two.
+
     `step_norm` is Ceres' (0 for the first step, quaternions instead of angles); `parameter_norm` and `damping_share`
     are not known.
 
@@ -218,15 +237,21 @@ def solve_by_ceres(
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
     options = solver_options(mode, threads)
-    options.max_num_iterations = max_iterations
     options.function_tolerance, options.parameter_tolerance = tolerances.ftol, tolerances.xtol
     options.gradient_tolerance = tolerances.gtol
     options.update_state_every_iteration = True
-    watch = _Watch(run, mode)
+    watch, summary = _Watch(run, mode), pyceres.SolverSummary()
     options.callbacks = [watch]
-    summary = pyceres.SolverSummary()
     run.start()
-    pyceres.solve(options, run.colmap.ceres, summary)
+    while True:
+        watch.begin()
+        options.max_num_iterations = max_iterations - len(run.steps)
+        pyceres.solve(options, run.colmap.ceres, summary)
+        if watch.hidden is None:
+            break
+        run.colmap.restore(watch.before)
+        run.count(watch.hidden)
+        options.initial_trust_region_radius = watch.last.trust_region_radius
     if summary.message.startswith("User callback"):
         end = Termination.STOPPED
     else:
@@ -234,7 +259,7 @@ def solve_by_ceres(
     if end == Termination.STALLED:
         _log.warning("Ceres gave up: %s", summary.message)
     if end in DISCARDED:
-        damping = 1 / watch.last.trust_region_radius
-        run.record(step_info(watch.cost, damping, gradient_max=watch.last.gradient_max_norm))
+        gradient = watch.last.gradient_max_norm
+        run.record(step_info(watch.cost, watch.damping, gradient_max=gradient, gain_ratio=0.0))
     run.total_s = time.perf_counter() - run.started - run.paused
     return run.solution(end, mode)

@@ -61,9 +61,9 @@ class ColmapProblem:
         blocks = [self._points[point], self._poses[camera], self._lenses[camera]]
         self._residuals[observation] = self.ceres.add_residual_block(self._costs[observation], None, blocks)
 
-    def keep(self, behind: Bool[np.ndarray, " observations"]) -> int:
+    def keep(self, hidden: Bool[np.ndarray, " observations"]) -> int:
         """Gives observations whose points went behind their camera a cost function that counts; returns how many."""
-        new = np.flatnonzero(behind & ~self.in_python).tolist()
+        new = np.flatnonzero(hidden & ~self.in_python).tolist()
         for observation in new:
             self.ceres.remove_residual_block(self._residuals[observation])
             self._add(observation, AnySide)

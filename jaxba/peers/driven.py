@@ -8,7 +8,6 @@ driven times only.
 
 from __future__ import annotations
 
-import logging
 import time
 from typing import Any
 
@@ -20,14 +19,12 @@ from jaxba import host
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm import StepInfo
-from jaxba.peers.ceres import COST_AGREES, Callback, Run, solver_options, step_info, step_of
+from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import Observed, observed, step_facts
 from jaxba.problem import BundleProblem
 from jaxba.solve import MAX_ITERATIONS, Solution, after_step
 from jaxba.termination import Termination, Tolerances
-
-_log = logging.getLogger(__name__)
 
 LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
 """Limits of the radius that leave every lambda of a policy as it is."""
@@ -41,7 +38,10 @@ _init = jax.jit(lambda policy, info: policy.init(info))
 
 
 class _Last(pyceres.IterationCallback):
-    """Keeps the summaries of a call: the start, and the iteration if it came to its end."""
+    """Keeps the summaries of a call: the start, and the iteration if it came to its end.
+
+    One for all calls: to assign to `SolverOptions.callbacks` again adds to what is there (pyceres 2.6).
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -91,6 +91,8 @@ def drive_ceres(
     options.max_num_iterations = 1
     options.function_tolerance = options.parameter_tolerance = options.gradient_tolerance = 0.0
     options.min_relative_decrease = float(policy.min_gain)
+    last = _Last()
+    options.callbacks = [last]
     options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
     with jax.enable_x64(True), host.calm_blas(), CompileClock() as clock:
         started = time.perf_counter()
@@ -106,7 +108,7 @@ def drive_ceres(
         end, iteration = Termination.RUNNING, 0
         while end == Termination.RUNNING:
             iteration += 1
-            step = _iterate(run, options, constant, mode, float(damping))
+            step = _iterate(run, options, last.summaries, constant, mode, float(damping))
             state, damping, answer = _answer(policy, state, step, iteration, tolerances, max_iterations)
             end = Termination(int(answer))
             if run.record(step) and end == Termination.RUNNING:
@@ -114,16 +116,15 @@ def drive_ceres(
     return run.solution(end, mode, clock.seconds)
 
 
-def _iterate(run: Run, options: Any, constant: Observed, mode: str, damping: float) -> StepInfo:
+def _iterate(run: Run, options: Any, summaries: list[Any], constant: Observed, mode: str, damping: float) -> StepInfo:
     """One linear solve by one call of Ceres; the parameters change if its step is accepted."""
     before = run.colmap.parameters()
     options.initial_trust_region_radius = float(np.clip(1 / damping, SMALLEST_RADIUS, LARGEST_RADIUS))
-    last = _Last()
-    options.callbacks = [last]
+    summaries.clear()
     pyceres.solve(options, run.colmap.ceres, pyceres.SolverSummary())
-    if len(last.summaries) < 2:  # the gradient is zero, or the candidate's cost or parameters are those before it
-        return _idle(run.cost, damping, *(summary.gradient_max_norm for summary in last.summaries))
-    first, second = last.summaries
+    if len(summaries) < 2:  # the gradient is zero, or the candidate's cost or parameters are those before it
+        return _idle(run.cost, damping, *(summary.gradient_max_norm for summary in summaries))
+    first, second = summaries
     if not second.step_is_successful:
         unknown = {"step_norm": np.nan, "damping_share": REJECTED_SHARE}
         return step_of(second, first, first.cost, damping, mode, **unknown)
@@ -131,17 +132,17 @@ def _iterate(run: Run, options: Any, constant: Observed, mode: str, damping: flo
     names = ("step_norm", "parameter_norm", "damping_share")
     known = {name: float(getattr(facts, name)) for name in names}
     step = step_of(second, first, first.cost, damping, mode, **known)
-    whole = float(facts.cost)
-    if abs(whole - second.cost) <= COST_AGREES * whole:
+    hidden = np.asarray(facts.behind) & ~run.colmap.in_python
+    if not hidden.any():
         return step
+    whole = float(facts.cost)
     gain = (first.cost - whole) / step.predicted
     step = step._replace(candidate_cost=whole, gain_ratio=gain)
     if gain > options.min_relative_decrease:
-        count = run.colmap.keep(np.asarray(facts.behind))
-        _log.info("%d observations of points that went behind their camera: Python evaluates them from here on", count)
+        run.count(hidden)
         return step._replace(cost=whole)
     run.colmap.restore(before)
-    return step._replace(accepted=False, cost=first.cost, step_norm=np.nan)
+    return step._replace(accepted=False, cost=first.cost, step_norm=np.nan, damping_share=REJECTED_SHARE)
 
 
 def _idle(cost: float, damping: float, gradient_max: float = np.nan) -> StepInfo:
