@@ -10,6 +10,7 @@ import logging
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 import support
@@ -31,11 +32,12 @@ from jaxba import (
 from jaxba.bench import report
 from jaxba.bench.records import read_records
 from jaxba.cli.bench import run as run_bench
+from jaxba.clock import CompileClock
 
 pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")
 pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
-from jaxba.peers.ceres import solve_by_ceres, solver_options
+from jaxba.peers.ceres import Run, solve_by_ceres, solver_options
 from jaxba.peers.colmap import AnySide, backend, pyceres, reprojection
 from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.peers.driven import drive_ceres
@@ -266,6 +268,17 @@ def test_a_policy_that_is_rejected_goes_on_from_the_same_state():
     np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
     np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-12)
     np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["learned-plain", "ceres", "schedule"])
+def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
+    jax.clear_caches()
+    before = []
+    start = Run.start
+    with CompileClock() as clock:
+        monkeypatch.setattr(Run, "start", lambda run: (before.append(clock.seconds), start(run)))
+        drive_ceres(support.tiny(), "dense", make_policy(name))
+        assert clock.seconds == before[0] > 0
 
 
 @pytest.mark.parametrize("damping", [1e-30, 1e30])

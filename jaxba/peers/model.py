@@ -25,23 +25,12 @@ class Observed(NamedTuple):
 class StepFacts(NamedTuple):
     """Facts about a step `d` from the parameters where `r` and `J` are taken."""
 
-    slope: Float[Array, ""]  # -g.d = -r.Jd, pixels^2
-    curvature: Float[Array, ""]  # |Jd|^2, pixels^2
+    predicted: Float[Array, ""]  # decrease promised by the linear model, pixels^2
+    damping_share: Float[Array, ""]  # share of `d.(H + D) d` that is D's, for a step with (H + D) d = -g
     step_norm: Float[Array, ""]  # rotations in radians
     parameter_norm: Float[Array, ""]  # before the step, in BAL's parameters
     cost: Float[Array, ""]  # after the step, as BAL counts it
     behind: Bool[Array, " observations"]  # after the step, what COLMAP leaves out
-
-    @property
-    def predicted(self) -> Array:
-        """Decrease promised by the linear model."""
-        return self.slope - 0.5 * self.curvature
-
-    @property
-    def damping_share(self) -> Array:
-        """Share of `d.(H + D) d` that is D's. An exact step has `(H + D) d = -g`, so that the whole is `slope`."""
-        share = (self.slope - self.curvature) / self.slope
-        return jnp.where(self.slope > 0, jnp.clip(share, 0, 1), 0)
 
 
 def observed(problem: BundleProblem, pixels: np.ndarray) -> Observed:
@@ -63,9 +52,10 @@ def step_facts(constant: Observed, before: Any, after: Any) -> StepFacts:
     there = at(*(block.T for block in after))
     squares = lambda *arrays: jnp.sqrt(sum(jnp.sum(x * x) for x in arrays))
     bal_angle = 2 * jnp.arctan2(jnp.linalg.norm(poses[:, 1:4], axis=1), jnp.abs(poses[:, 0]))
+    slope, curvature = -jnp.sum(residual * rate), jnp.sum(rate * rate)  # -g.d and d.H d
     return StepFacts(
-        slope=-jnp.sum(residual * rate),
-        curvature=jnp.sum(rate * rate),
+        predicted=slope - 0.5 * curvature,
+        damping_share=jnp.where(slope > 0, jnp.clip((slope - curvature) / slope, 0, 1), 0),
         step_norm=squares(2 * turn, *moved),
         parameter_norm=squares(bal_angle, poses[:, 4:], lenses, points),
         cost=0.5 * jnp.sum((_pixel(*there) - constant.pixels) ** 2),
