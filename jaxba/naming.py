@@ -1,4 +1,7 @@
-"""Solver names, the same in every command, table and file: `[method+]policy[+refineK|+embedded][@dtype]`."""
+"""Solver names, the same in every command, table and file: `[method+]policy[+refineK|+embedded][@dtype]`.
+
+A peer has its library's name: `pyceres:MODE`, and `pyceres:MODE+policy` where a policy drives it.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ from jaxba.options import StepOptions
 
 DTYPES = ("float64", "float32", "mixed")
 """Known floating point types; the first is understood where none is named."""
+
+PEERS = {"pyceres": ("dense", "sparse", "iterative")}
+"""Libraries that can run as peers, and their modes."""
 
 
 class SolverNameError(ValueError):
@@ -36,7 +42,12 @@ class SolverName:
     method: str = DEFAULT_METHOD
     """How a step is computed, see `jaxba.methods`."""
 
+    peer: str = ""
+    """`LIBRARY:MODE` where another library computes the steps; its own rule chooses lambda if `policy` is empty."""
+
     def __str__(self) -> str:
+        if self.peer:
+            return f"{self.peer}+{self.policy}" if self.policy else self.peer
         method = "" if self.method == DEFAULT_METHOD else f"{self.method}+"
         if self.refine_points is None:
             refine = "" if is_learned(self.policy) else "+embedded"
@@ -64,9 +75,11 @@ def parse_solver(name: str) -> SolverName:
     """Reads a solver's name.
 
     Raises:
-        SolverNameError: an unknown method or type, or a malformed name.
+        SolverNameError: an unknown method, mode or type, or a malformed name.
         UnknownPolicyError: an unknown policy.
     """
+    if name.strip().partition(":")[0] in PEERS:
+        return _parse_peer(name.strip())
     # a path may hold any sign: it ends where its suffix does
     path, suffix, rest = name.strip().rpartition(SUFFIX)
     prefix, at, dtype = rest.partition("@")
@@ -106,3 +119,18 @@ def parse_solver(name: str) -> SolverName:
     if is_learned(merged[0]) and not stated:
         refine = None
     return SolverName(merged[0], refine, dtype or DTYPES[0], method)
+
+
+def _parse_peer(name: str) -> SolverName:
+    peer, plus, policy = name.partition("+")
+    library, _, mode = peer.partition(":")
+    if mode not in PEERS[library]:
+        raise SolverNameError(f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}")
+    if not plus:
+        return SolverName("", peer=peer)
+    driver = parse_solver(policy)
+    # lambda alone: the peer computes the step, in its own arithmetic
+    embedded = driver.refine_points is None and (not is_learned(driver.policy) or policy.endswith("+embedded"))
+    if embedded or driver.refine_points or driver != SolverName(driver.policy, driver.refine_points):
+        raise SolverNameError(f"{name!r} is no solver; a policy drives {library} by lambda alone: {peer}+policy")
+    return SolverName(driver.policy, peer=peer)

@@ -161,7 +161,7 @@ def solve(
         state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
         setup_s = time.perf_counter() - started
         if not np.isfinite(float(state.cost)):
-            raise ProblemError(_explain_start(problem))
+            raise ProblemError(explain_start(problem))
         run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)
         final, history, compile_s, total_s = run(layout, state, policy, tolerances, options, max_iterations)
         count = int(final.iteration)
@@ -180,8 +180,8 @@ def solve(
         )
 
 
-def _explain_start(problem: BundleProblem) -> str:
-    """Which observation makes the initial cost infinite."""
+def explain_start(problem: BundleProblem) -> str:
+    """Which observation makes the initial cost infinite, in one line."""
     with np.errstate(all="ignore"):
         bad = np.flatnonzero(~np.isfinite(geometry.residuals(problem)).all(axis=1))
     if not bad.size:
@@ -222,16 +222,28 @@ def _start(layout: Layout, state: LMState, policy: DampingPolicy, options: StepO
 _step = jax.jit(lm_step, static_argnames=("options",))
 
 
+def after_step(
+    policy: DampingPolicy,
+    policy_state: Any,
+    step: StepInfo,
+    iteration: Int[Array, ""],
+    tolerances: Tolerances,
+    max_iterations: Any,
+) -> tuple[Any, Float[Array, ""], Int[Array, ""]]:
+    """The policy's answer to a step, and the stop rules: its next state, the next lambda, a `Termination`."""
+    after, damping = policy.propose(policy_state, step)
+    # the same state and lambda after a rejection: the policy would ask for the same step for ever
+    same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (policy_state, after)), strict=True)]
+    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping)
+    return after, damping, termination_of(step, stuck, iteration, tolerances, max_iterations)
+
+
 def _advance(
     carry: _Carry, state: LMState, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
 ) -> _Carry:
-    """Everything of an iteration that follows the step: the policy's answer and the stop rules."""
-    policy_state, damping = policy.propose(carry.policy, step)
+    """Everything of an iteration that follows the step."""
     iteration = carry.iteration + 1
-    # the same state and lambda after a rejection: the policy would ask for the same step for ever
-    same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (carry.policy, policy_state)), strict=True)]
-    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping)
-    end = termination_of(step, stuck, iteration, tolerances, max_iterations)
+    policy_state, damping, end = after_step(policy, carry.policy, step, iteration, tolerances, max_iterations)
     return _Carry(state, policy_state, damping, iteration, end)
 
 

@@ -6,7 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from jaxba.bench.sources import Source
 from jaxba.bench.summary import write_text
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
+from jaxba.peers import require
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.solve import MAX_ITERATIONS, IterationRecord, Solution, Tolerances, solve
 
@@ -67,6 +68,8 @@ def run_solver(
         if on_iteration:
             on_iteration(step)
 
+    if solver.peer:
+        return _run_peer(problem, source, solver, repeat, settings, steps, watch)
     policy, options = solver.build()
     solution = solve(
         problem,
@@ -79,6 +82,35 @@ def run_solver(
         callback=watch,
     )
     return record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
+
+
+def _run_peer(
+    problem: BundleProblem,
+    source: Source,
+    solver: SolverName,
+    repeat: int,
+    settings: RunSettings,
+    steps: list[IterationRecord],
+    watch: Callable[[IterationRecord], Any],
+) -> Record:
+    """The same by another library, which computes on the host."""
+    from jaxba.peers.ceres import solve_by_ceres
+    from jaxba.peers.colmap import backend
+    from jaxba.peers.driven import drive_ceres
+
+    mode = solver.peer.partition(":")[2]
+    shared: dict[str, Any] = {
+        "max_iterations": settings.max_iterations,
+        "tolerances": Tolerances(ftol=settings.ftol),
+        "threads": threads(),
+        "callback": watch,
+    }
+    if solver.policy:
+        solution = drive_ceres(problem, mode, solver.build()[0], **shared)
+    else:
+        solution = solve_by_ceres(problem, mode, **shared)
+    record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
+    return replace(record, backend=backend(mode), device="cpu: host")
 
 
 def record_of(
@@ -146,10 +178,12 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     """All runs, problem by problem.
 
     Raises:
-        SolverNameError, UnknownPolicyError: a name that is no solver.
+        SolverNameError, UnknownPolicyError: a name that is no solver, or a peer that is not installed.
     """
     names = list(dict.fromkeys(str(parse_solver(name)) for name in solvers))
     parsed = [parse_solver(name) for name in names]
+    for solver in parsed:
+        require(solver)
     return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
 
 

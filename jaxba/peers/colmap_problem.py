@@ -1,0 +1,108 @@
+"""A bundle adjustment problem as a Ceres problem, and back. Needs the extra `ceres`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxba import geometry
+from jaxba.peers.colmap import LENS_SIZE, PRINCIPAL_POINT, SMALLEST_DEPTH, AnySide, pose_manifold, pyceres, reprojection
+from jaxba.problem import BundleProblem, ProblemError
+
+FLIP = np.array([1.0, -1.0, -1.0])
+"""BAL's axes of a camera to COLMAP's; for pixels its first two."""
+
+
+class ColmapProblem:
+    """The parameters as arrays of our own, and a `pyceres.Problem` that works on them in place.
+
+    Each camera has its own pose, f, k1 and k2; the principal point is constant, the gauge is free. An observation whose
+    point is not in front of its camera at the start has a cost function in Python (`AnySide`), since COLMAP's would be
+    zero; `keep` does the same for those that get there later.
+
+    Ceres holds bare pointers into `poses`, `lenses` and `points`, and to the cost functions. This object owns them all,
+    so keep it for as long as `ceres` is used.
+    """
+
+    def __init__(self, problem: BundleProblem) -> None:
+        """Copies the parameters; the problem itself never changes.
+
+        Raises:
+            ProblemError: the problem has covariances.
+        """
+        if problem.whitening is not None:
+            raise ProblemError("Ceres as a peer takes no covariances or weights")
+        cameras = np.asarray(problem.cameras, np.float64)
+        self.start = problem
+        self.poses = np.hstack([colmap_quaternions(cameras[:, :3]), cameras[:, 3:6] * FLIP])
+        self.lenses = np.zeros((len(cameras), LENS_SIZE))
+        self.lenses[:, [0, 3, 4]] = cameras[:, 6:]
+        self.points = np.array(problem.points, np.float64, order="C")
+        self.pixels = np.asarray(problem.observations, np.float64) * FLIP[:2]
+        self.ceres = pyceres.Problem()
+        self._points, self._poses, self._lenses = list(self.points), list(self.poses), list(self.lenses)
+        self._manifolds = (pose_manifold(), pyceres.SubsetManifold(LENS_SIZE, list(PRINCIPAL_POINT)))
+        self._costs: list[Any] = [None] * problem.num_observations
+        self._residuals: list[Any] = [None] * problem.num_observations
+        self.in_python = geometry.depths(problem) < SMALLEST_DEPTH
+        """Per observation: whether its cost function is in Python."""
+        for observation, hidden in enumerate(self.in_python):
+            self._add(observation, AnySide if hidden else reprojection)
+        self.seen = np.unique(problem.camera_index)
+        for camera in self.seen:
+            self.ceres.set_manifold(self._poses[camera], self._manifolds[0])
+            self.ceres.set_manifold(self._lenses[camera], self._manifolds[1])
+
+    def _add(self, observation: int, cost: Any) -> None:
+        camera, point = self.start.camera_index[observation], self.start.point_index[observation]
+        self._costs[observation] = cost(self.pixels[observation])
+        blocks = [self._points[point], self._poses[camera], self._lenses[camera]]
+        self._residuals[observation] = self.ceres.add_residual_block(self._costs[observation], None, blocks)
+
+    def keep(self, hidden: Bool[np.ndarray, " observations"]) -> int:
+        """Gives observations whose points went behind their camera a cost function that counts; returns how many."""
+        new = np.flatnonzero(hidden & ~self.in_python).tolist()
+        for observation in new:
+            self.ceres.remove_residual_block(self._residuals[observation])
+            self._add(observation, AnySide)
+        self.in_python[new] = True
+        return len(new)
+
+    def parameters(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Copies of `poses`, `lenses` and `points`."""
+        return self.poses.copy(), self.lenses.copy(), self.points.copy()
+
+    def restore(self, parameters: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+        """Puts back what `parameters` returned, in place."""
+        for block, old in zip((self.poses, self.lenses, self.points), parameters, strict=True):
+            block[:] = old
+
+    def residuals(self) -> Float[np.ndarray, " residuals"]:
+        """What Ceres sees at the present parameters, pixels."""
+        return np.array(self.ceres.evaluate_residuals())
+
+    def bundle(self) -> BundleProblem:
+        """The problem at the present parameters; what nobody observes is unchanged."""
+        cameras: Any = np.array(self.start.cameras, np.float64)
+        poses, lenses = self.poses[self.seen], self.lenses[self.seen]
+        cameras[self.seen] = np.hstack([bal_rotations(poses[:, :4]), poses[:, 4:] * FLIP, lenses[:, [0, 3, 4]]])
+        return self.start.replace(cameras=cameras, points=self.points.copy())
+
+
+def colmap_quaternions(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
+    """Unit quaternions xyzw of `diag(1, -1, -1) R(w)` for angle-axis vectors w: `i q`, where i turns by pi about x."""
+    half = 0.5 * vectors
+    angle = np.linalg.norm(half, axis=1)
+    x, y, z = (np.sinc(angle / np.pi)[:, None] * half).T
+    return np.column_stack([np.cos(angle), -z, y, -x])
+
+
+def bal_rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
+    """Angle-axis vectors, of length pi at most: the inverse of `colmap_quaternions`."""
+    x, y, z, w = np.where(quaternions[:, :1] < 0, -1.0, 1.0).T * quaternions.T
+    vector = np.column_stack([-w, z, -y])
+    sine = np.linalg.norm(vector, axis=1)
+    scale = np.divide(2 * np.arctan2(sine, x), sine, out=np.full(len(sine), 2.0), where=sine > 0)  # 2: limit at zero
+    return scale[:, None] * vector

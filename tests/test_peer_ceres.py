@@ -1,0 +1,446 @@
+"""Ceres as a peer: COLMAP's cost is BAL's, its steps are ours, and what drives it is a policy like any other.
+
+Ours means `rotation="manifold"`: Ceres turns a quaternion by twice its tangent vector, from the left. The factor of two
+is a scaling of variables, which diagonal damping does not see.
+"""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+import support
+from support import DATA, needs_data, same_bits
+
+from jaxba import (
+    BundleProblem,
+    Classic,
+    ProblemError,
+    Schedule,
+    StepOptions,
+    Termination,
+    Tolerances,
+    geometry,
+    make_policy,
+    read_problem,
+    solve,
+)
+from jaxba.bench import report
+from jaxba.bench.records import read_records
+from jaxba.cli.bench import run as run_bench
+from jaxba.clock import CompileClock
+
+pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")
+pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
+
+from jaxba.peers.ceres import Run, solve_by_ceres, solver_options
+from jaxba.peers.colmap import AnySide, backend, pyceres, reprojection
+from jaxba.peers.colmap_problem import ColmapProblem
+from jaxba.peers.driven import drive_ceres
+from jaxba.peers.model import observed, step_facts
+
+MANIFOLD = StepOptions(rotation="manifold")
+NEVER = Tolerances(ftol=0.0, xtol=0.0, gtol=0.0)
+SOME = Schedule(values=(1e-3, 1e-2, 1e-1, 1.0))
+
+LADYBUG = "bal/problem-49-7776-pre"
+IN_FRONT = ("bal/problem-21-11315-pre", "bal-converted/sba-54-5207-pre", "bal-converted/kittistereo00s-77-15638-pre")
+"""Real problems without a point behind a camera."""
+
+
+def real(name: str) -> BundleProblem:
+    return read_problem(f"{DATA}/{name}.txt.bz2")
+
+
+def scattered(seed: int) -> BundleProblem:
+    """`tiny` with its points thrown 3 units, a third of the way to the cameras."""
+    problem = support.tiny()
+    return problem.replace(points=problem.points + 3 * np.random.default_rng(seed).normal(size=problem.points.shape))
+
+
+# The problem
+
+
+@pytest.mark.parametrize("make", [support.tiny, support.odd, support.single])
+def test_to_colmap_and_back_is_the_same_problem(make):
+    problem = make()
+    back = ColmapProblem(problem).bundle()
+    np.testing.assert_allclose(back.cameras, problem.cameras, rtol=1e-13, atol=1e-15)
+    np.testing.assert_array_equal(back.points, problem.points)
+    unseen = np.setdiff1d(np.arange(problem.num_cameras), problem.camera_index)
+    assert same_bits(back.cameras[unseen], problem.cameras[unseen])
+
+
+@pytest.mark.parametrize("make", [support.tiny, support.odd, lambda: scattered(2)])
+def test_residuals_are_those_of_bal_also_behind_the_camera(make):
+    problem = make()
+    colmap = ColmapProblem(problem)
+    assert colmap.in_python.sum() == np.sum(geometry.depths(problem) <= 0)
+    ours = -geometry.residuals(problem) * (1, -1)
+    found = np.array([cost.evaluate(*blocks(colmap, k))[0].ravel() for k, cost in enumerate(colmap._costs)])
+    np.testing.assert_allclose(found, ours, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(0.5 * np.sum(colmap.residuals() ** 2), geometry.cost(problem), rtol=1e-12)
+
+
+def blocks(colmap: ColmapProblem, observation: int) -> tuple:
+    camera, point = colmap.start.camera_index[observation], colmap.start.point_index[observation]
+    return colmap.points[point], colmap.poses[camera], colmap.lenses[camera]
+
+
+def test_the_python_cost_function_is_colmap_s_in_front_of_the_camera():
+    colmap = ColmapProblem(support.tiny())
+    for k in range(0, 200, 7):
+        theirs, mine = reprojection(colmap.pixels[k]), AnySide(colmap.pixels[k])
+        residual, jacobians = theirs.evaluate(*blocks(colmap, k))
+        found = np.full(2, np.nan), [np.full(2 * size, np.nan) for size in (3, 7, 5)]
+        assert mine.Evaluate(blocks(colmap, k), *found)
+        np.testing.assert_allclose(found[0], residual.ravel(), rtol=1e-10, atol=1e-10)
+        # a quaternion's derivative along itself is free: only its tangent counts
+        tangent = quaternion_tangent(blocks(colmap, k)[1][:4])
+        for value, truth, size in zip(found[1], jacobians, (3, 7, 5), strict=True):
+            value, truth = value.reshape(2, size), np.asarray(truth).reshape(2, size)
+            if size == 7:
+                value, truth = ([m[:, :4] @ tangent, m[:, 4:]] for m in (value, truth))
+                value, truth = np.hstack(value), np.hstack(truth)
+            np.testing.assert_allclose(value, truth, rtol=1e-9, atol=1e-9 * np.abs(truth).max())
+
+
+def quaternion_tangent(q: np.ndarray) -> np.ndarray:
+    """Columns `(e_k, 0) q`, xyzw."""
+    x, y, z, w = q
+    return np.array([[w, z, -y], [-z, w, x], [y, -x, w], [-x, -y, -z]])
+
+
+def test_colmap_itself_takes_a_point_behind_its_camera_as_no_error():
+    """Why `AnySide` exists; if this changes, it can go."""
+    colmap = ColmapProblem(support.odd())
+    behind = np.flatnonzero(colmap.in_python)
+    assert behind.size
+    for k in behind:
+        residual, _ = reprojection(colmap.pixels[k]).evaluate(*blocks(colmap, k))
+        np.testing.assert_array_equal(residual, 0)
+        assert np.abs(geometry.residuals(support.odd())[k]).max() > 1
+
+
+def test_covariances_are_refused_in_one_line():
+    with pytest.raises(ProblemError, match="no covariances") as caught:
+        solve_by_ceres(support.whitened(), "dense")
+    assert "\n" not in str(caught.value)
+
+
+def test_a_start_without_a_finite_cost_is_refused_in_one_line():
+    problem = support.single()
+    turned = problem.replace(cameras=np.array([[0, 0, 0, 0.3, 0.2, -0.7, 500, 0, 0]]))
+    with pytest.raises(ProblemError, match="on the plane of camera 0") as caught:
+        drive_ceres(turned, "dense", SOME)
+    assert "\n" not in str(caught.value)
+
+
+ALONE = """
+import gc, sys
+import numpy as np
+from jaxba import like, random_scene
+from jaxba.peers.colmap import pyceres
+from jaxba.peers.colmap_problem import ColmapProblem
+colmaps = [ColmapProblem(random_scene(like("tiny"), seed)) for seed in range(3)]
+del colmaps[1]
+gc.collect()
+junk = [np.full(7, np.nan) for _ in range(10000)]
+for colmap in colmaps:
+    options, summary = pyceres.SolverOptions(), pyceres.SolverSummary()
+    options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
+    pyceres.solve(options, colmap.ceres, summary)
+    assert summary.final_cost < summary.initial_cost
+del colmap, colmaps
+gc.collect()
+print("done")
+"""
+
+
+def test_what_ceres_points_to_lives_as_long_as_the_adapter_and_nothing_is_freed_twice():
+    """In a process of its own, since its end is part of the test."""
+    done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr
+
+
+# The step
+
+
+@pytest.mark.parametrize("mode", ["dense", "sparse"])
+@pytest.mark.parametrize("make", [support.tiny, support.odd])
+def test_costs_are_ours_under_the_same_lambdas(mode, make):
+    found = drive_ceres(make(), mode, SOME, max_iterations=12, tolerances=NEVER)
+    ours = solve(make(), SOME, MANIFOLD, max_iterations=12, tolerances=NEVER)
+    assert found.iterations == ours.iterations == 12
+    np.testing.assert_array_equal(found.history.damping, ours.history.damping)
+    np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-9)
+    np.testing.assert_allclose(found.history.candidate_cost, ours.history.candidate_cost, rtol=1e-9)
+    good = ours.history.accepted & (found.history.cost < 0.999 * np.r_[ours.initial_cost, ours.history.cost[:-1]])
+    np.testing.assert_allclose(found.history.gain_ratio[good], ours.history.gain_ratio[good], rtol=1e-7)
+    np.testing.assert_allclose(found.history.step_norm[good], ours.history.step_norm[good], rtol=1e-6)
+
+
+def test_in_the_coordinates_of_the_file_the_costs_differ():
+    """Diagonal damping depends on the coordinates: this is why `MANIFOLD` is the truth above."""
+    found = drive_ceres(support.tiny(), "dense", SOME, max_iterations=3, tolerances=NEVER)
+    ours = solve(support.tiny(), SOME, StepOptions(), max_iterations=3, tolerances=NEVER)
+    assert np.abs(found.history.cost / ours.history.cost - 1).max() > 1e-6
+
+
+def test_the_cost_counts_on_where_points_pass_behind_their_camera(caplog):
+    problem = scattered(8)
+    assert (geometry.depths(problem) > 0).all()
+    with caplog.at_level(logging.INFO, logger="jaxba.peers"):
+        found = drive_ceres(problem, "dense", SOME, max_iterations=12)
+    assert "went behind their camera" in caplog.text
+    assert (geometry.depths(found.problem) < 0).any()
+    ours = solve(problem, SOME, MANIFOLD, max_iterations=12)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
+    np.testing.assert_allclose(found.final_cost, geometry.cost(found.problem), rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_ceres_alone_counts_them_too_and_does_not_record_a_step_twice(seed, caplog):
+    with caplog.at_level(logging.INFO, logger="jaxba.peers"):
+        found = solve_by_ceres(scattered(seed), "dense", max_iterations=15)
+    assert "went behind their camera" in caplog.text
+    ours = solve(scattered(seed), "ceres", MANIFOLD, max_iterations=15)
+    assert found.iterations == ours.iterations == 15
+    np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("damping", [1e-4, 1.0])
+def test_facts_that_ceres_does_not_report_are_those_of_our_step(damping):
+    problem = support.tiny()
+    layout, state = support.start(problem, MANIFOLD)
+    _, step = support.step(layout, state, damping, MANIFOLD)
+    colmap = ColmapProblem(problem)
+    before = colmap.parameters()
+    after = drive_ceres(problem, "dense", Schedule(values=(damping,)), max_iterations=1)
+    there = ColmapProblem(after.problem).parameters()
+    facts = step_facts(observed(problem, colmap.pixels), before, there)
+    np.testing.assert_allclose(facts.predicted, step.predicted, rtol=1e-8)
+    np.testing.assert_allclose(facts.damping_share, step.damping_share, rtol=1e-6)
+    np.testing.assert_allclose(facts.step_norm, step.step_norm, rtol=1e-7)
+    np.testing.assert_allclose(facts.parameter_norm, step.parameter_norm, rtol=1e-12)
+    np.testing.assert_allclose(facts.cost, geometry.cost(after.problem), rtol=1e-12)
+    assert not facts.behind.any()
+
+
+# Driven
+
+
+def test_a_rejected_step_leaves_every_bit():
+    stubborn = Schedule(values=(1e-4,), min_gain=2.0)
+    found = drive_ceres(support.tiny(), "dense", stubborn)
+    assert (found.iterations, found.accepted, found.termination) == (1, 0, Termination.STALLED)
+    assert same_bits(found.problem, support.tiny())
+    assert found.final_cost == found.initial_cost == geometry.cost(found.problem)
+    assert found.history.candidate_cost[0] < found.initial_cost
+    colmap = ColmapProblem(support.tiny())
+    before = colmap.parameters()
+    options = solver_options("dense", 1)
+    options.max_num_iterations, options.min_relative_decrease = 1, 2.0
+    pyceres.solve(options, colmap.ceres, pyceres.SolverSummary())
+    assert same_bits(before, colmap.parameters())
+
+
+@pytest.mark.parametrize("name", ["learned-plain", "ceres", "classic"])
+def test_a_policy_does_with_ceres_what_it_does_with_our_step(name):
+    policy = make_policy(name)
+    found = drive_ceres(support.tiny(), "dense", policy)
+    ours = solve(support.tiny(), policy, MANIFOLD)
+    assert (found.iterations, found.accepted, found.termination) == (ours.iterations, ours.accepted, ours.termination)
+    np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-4)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-9)
+
+
+def test_a_policy_that_is_rejected_goes_on_from_the_same_state():
+    found = drive_ceres(scattered(7), "dense", Classic(), max_iterations=30)
+    ours = solve(scattered(7), Classic(), MANIFOLD, max_iterations=30)
+    assert not found.history.accepted.all()
+    np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
+    np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-12)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["learned-plain", "ceres", "schedule"])
+def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
+    jax.clear_caches()
+    before = []
+    start = Run.start
+    with CompileClock() as clock:
+        monkeypatch.setattr(Run, "start", lambda run: (before.append(clock.seconds), start(run)))
+        drive_ceres(support.tiny(), "dense", make_policy(name))
+        assert clock.seconds == before[0] > 0
+
+
+@pytest.mark.parametrize("damping", [1e-30, 1e30])
+def test_every_lambda_is_possible(damping):
+    found = drive_ceres(support.tiny(), "dense", Schedule(values=(damping,)), max_iterations=2)
+    assert found.history.damping[0] == damping
+    assert found.final_cost <= found.initial_cost
+
+
+def test_driven_by_its_own_rule_ceres_does_what_it_does_alone():
+    """The same algorithm in pieces; alone it stops before the last step, which it counts here as not taken."""
+    alone = solve_by_ceres(support.tiny(), "dense")
+    found = drive_ceres(support.tiny(), "dense", make_policy("ceres"))
+    assert (alone.termination, alone.history.accepted[-1]) == (Termination.COST, False)
+    assert alone.history.gain_ratio[-1] == 0
+    assert alone.iterations == found.iterations
+    taken = alone.accepted
+    np.testing.assert_allclose(alone.history.damping, found.history.damping, rtol=1e-6)
+    np.testing.assert_allclose(alone.history.cost[:taken], found.history.cost[:taken], rtol=1e-9)
+
+
+def test_the_iterative_mode_counts_conjugate_gradients_and_the_direct_ones_have_none():
+    for mode in ("dense", "sparse", "iterative"):
+        for found in (
+            solve_by_ceres(support.tiny(), mode, max_iterations=3),
+            drive_ceres(support.tiny(), mode, SOME, max_iterations=3),
+        ):
+            assert found.linear_solver == mode
+            assert (found.history.cg_iterations > 0).all() == (mode == "iterative")
+            assert found.final_cost < found.initial_cost
+
+
+# Both
+
+
+def alone(problem, **options):
+    return solve_by_ceres(problem, "dense", **options)
+
+
+def driven(problem, **options):
+    return drive_ceres(problem, "dense", Classic(), **options)
+
+
+@pytest.mark.parametrize("run", [alone, driven])
+def test_what_is_returned_is_consistent(run):
+    seen = []
+    found = run(support.odd(), callback=lambda record: seen.append(record) and None)
+    assert found.converged
+    np.testing.assert_allclose(found.initial_cost, geometry.cost(support.odd()), rtol=1e-12)
+    assert found.final_cost == geometry.cost(found.problem) == found.history.cost[-1]
+    assert [record.iteration for record in seen] == list(range(1, found.iterations + 1))
+    np.testing.assert_array_equal([record.step.cost for record in seen], found.history.cost)
+    times = [record.time_s for record in seen]
+    assert times == sorted(times)
+    assert 0 < times[0] <= times[-1] <= found.total_s
+    assert found.setup_s > 0
+    assert found.accepted == found.history.accepted.sum()
+    unseen = np.setdiff1d(np.arange(support.odd().num_points), support.odd().point_index)
+    assert same_bits(found.problem.points[unseen], support.odd().points[unseen])
+
+
+@pytest.mark.parametrize("run", [alone, driven])
+def test_points_behind_their_camera_are_said_in_one_line(run, caplog):
+    run(support.odd(), max_iterations=1)
+    assert [r.getMessage() for r in caplog.records] == [
+        "1 observations of points behind their camera: Python evaluates them for Ceres"
+    ]
+
+
+@pytest.mark.parametrize("run", [alone, driven])
+def test_limits_and_callbacks_end_a_solve(run):
+    limited = run(support.tiny(), max_iterations=2)
+    assert (limited.iterations, limited.termination) == (2, Termination.MAX_ITERATIONS)
+    stopped = run(support.tiny(), callback=lambda record: record.iteration == 3)
+    assert (stopped.iterations, stopped.termination) == (3, Termination.STOPPED)
+    np.testing.assert_allclose(stopped.history.cost[:2], limited.history.cost, rtol=1e-12)
+    assert geometry.cost(stopped.problem) == stopped.final_cost < limited.final_cost
+
+
+@pytest.mark.parametrize("run", [alone, driven])
+def test_ctrl_c_comes_through(run):
+    def press(record):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(support.tiny(), callback=press)
+
+
+def test_a_backend_names_its_versions():
+    assert backend("dense").startswith("pyceres ")
+    assert "(Ceres 2." in backend("dense")
+    assert backend("dense").endswith(", dense)")
+
+
+def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(report, "write_all", lambda *_, **__: [])
+    names = ["ceres", "pyceres:sparse", "pyceres:dense+ceres", "pyceres:dense+learned"]
+    argv = ["scene:tiny", "--solvers", ",".join(names), "--repeats", "1", "--out", str(tmp_path)]
+    assert run_bench(argv) == 0
+    ours, *peers = read_records(tmp_path / "results.jsonl")
+    assert [record.solver for record in peers] == names[1:]
+    for record, mode in zip(peers, ("sparse", "dense", "dense"), strict=True):
+        assert record.backend == backend(mode)
+        assert (record.device, record.dtype, record.termination) == ("cpu: host", "float64", "cost")
+        assert record.threads == ours.threads
+        assert [point.iteration for point in record.trace] == list(range(record.iterations + 1))
+        np.testing.assert_allclose(record.initial_cost, ours.initial_cost, rtol=1e-12)
+        np.testing.assert_allclose(record.final_cost, ours.final_cost, rtol=1e-4)
+    assert [record.trace[1].damping for record in peers] == [1e-4, 1e-4, pytest.approx(1e-5)]
+
+
+# Real problems
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.parametrize("name", IN_FRONT)
+def test_real_costs_are_ours_at_the_start_and_under_the_same_lambdas(name):
+    problem = real(name)
+    colmap = ColmapProblem(problem)
+    assert not colmap.in_python.any()
+    np.testing.assert_allclose(0.5 * np.sum(colmap.residuals() ** 2), geometry.cost(problem), rtol=1e-12)
+    policy = Schedule(values=(1e-4, 1e-5, 1e-3, 1e-6))
+    found = drive_ceres(problem, "dense", policy, max_iterations=8, tolerances=NEVER)
+    ours = solve(problem, policy, MANIFOLD, max_iterations=8, tolerances=NEVER)
+    np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
+
+
+@needs_data
+@pytest.mark.slow
+def test_with_points_behind_cameras_ceres_ends_on_ladybug_where_bal_s_cost_says():
+    """13344.318: C++ Ceres 2.1 on BAL's own cost (test_golden.py), in other coordinates."""
+    found = solve_by_ceres(real(LADYBUG), "dense")
+    np.testing.assert_allclose(found.initial_cost, 850912.460681, rtol=1e-11)
+    np.testing.assert_allclose(found.final_cost, 13344.3183, rtol=1e-6)
+    assert (found.iterations, found.accepted, found.termination) == (32, 31, Termination.COST)
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.parametrize("name", IN_FRONT)
+def test_real_costs_of_ceres_alone_are_ours_under_its_lambdas(name):
+    """Twelve iterations. In the next one four observations of kittistereo00s are behind a camera (left out, Ceres ended
+    at 60470): their points passed through infinity and hang on the clamp of the diagonal, which acts after the column
+    scaling of the first Jacobian in Ceres, and before any in jaxba. That costs 1.2e-6 there.
+    """
+    problem = real(name)
+    found = solve_by_ceres(problem, "dense", max_iterations=12)
+    taken = found.iterations - (found.termination == Termination.COST)
+    its_own = Schedule(values=tuple(found.history.damping[:taken].tolist()), min_gain=1e-3)
+    ours = solve(problem, its_own, MANIFOLD, max_iterations=taken, tolerances=NEVER)
+    np.testing.assert_array_equal(found.history.accepted[:taken], ours.history.accepted)
+    np.testing.assert_allclose(found.history.cost[:taken], ours.history.cost, rtol=1e-6)
+
+
+@needs_data
+@pytest.mark.slow
+def test_the_learned_policy_drives_ladybug_as_with_our_step_also_where_points_pass_behind():
+    policy = make_policy("learned-plain")
+    found = drive_ceres(real(LADYBUG), "dense", policy, max_iterations=12)
+    ours = solve(real(LADYBUG), policy, MANIFOLD, max_iterations=12)
+    np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
+    np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-2)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)

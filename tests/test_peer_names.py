@@ -1,0 +1,92 @@
+"""Names of peers, and what is said where their library is missing; needs no library."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import pytest
+
+from jaxba import peers
+from jaxba.bench import run as bench_run
+from jaxba.bench.sources import sources
+from jaxba.cli.bench import run
+from jaxba.damping import Learned, UnknownPolicyError
+from jaxba.naming import PEERS, SolverName, SolverNameError, parse_solver
+from jaxba.options import StepOptions
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "shortest"),
+    [
+        ("pyceres:dense", SolverName("", peer="pyceres:dense"), None),
+        ("pyceres:sparse", SolverName("", peer="pyceres:sparse"), None),
+        (" pyceres:iterative ", SolverName("", peer="pyceres:iterative"), "pyceres:iterative"),
+        ("pyceres:dense+learned", SolverName("learned", peer="pyceres:dense"), None),
+        ("pyceres:dense+learned+refine0", SolverName("learned", peer="pyceres:dense"), "pyceres:dense+learned"),
+        ("pyceres:sparse+constant:1e+2", SolverName("constant:1e+2", peer="pyceres:sparse"), None),
+        ("pyceres:iterative+classic:0.03", SolverName("classic:0.03", peer="pyceres:iterative"), None),
+    ],
+)
+def test_peers_have_the_names_of_the_contract(text, name, shortest):
+    assert parse_solver(text) == name
+    assert str(name) == (shortest or text)
+    assert parse_solver(str(name)) == name
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "message"),
+    [
+        ("pyceres", SolverNameError, "known: dense, sparse, iterative"),
+        ("pyceres:", SolverNameError, "known: dense, sparse, iterative"),
+        ("pyceres:qr", SolverNameError, "unknown mode 'qr'"),
+        ("pyceres:qr+ceres", SolverNameError, "unknown mode 'qr'"),
+        ("pyceres:dense@float32", SolverNameError, "unknown mode 'dense@float32'"),
+        ("pyceres:dense+", SolverNameError, "is no solver"),
+        ("pyceres:dense+cerse", UnknownPolicyError, "unknown damping policy 'cerse'"),
+        ("pyceres:dense+ceres+refine3", SolverNameError, "by lambda alone: pyceres:dense+policy"),
+        ("pyceres:dense+ceres+embedded", SolverNameError, "by lambda alone"),
+        ("pyceres:dense+learned+embedded", SolverNameError, "by lambda alone"),
+        ("pyceres:dense+ceres@float32", SolverNameError, "by lambda alone"),
+        ("pyceres:dense+pyceres:dense", SolverNameError, "by lambda alone"),
+        ("pyceres:dense+pyceres:dense+ceres", SolverNameError, "by lambda alone"),
+        ("lm+pyceres:dense", UnknownPolicyError, "unknown damping policy 'pyceres:dense'"),
+    ],
+)
+def test_what_is_no_peer_is_one_clear_line(text, error, message):
+    with pytest.raises(error) as caught:
+        parse_solver(text)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_learned_policy_drives_a_peer_by_lambda_alone():
+    policy, options = parse_solver("pyceres:dense+learned").build()
+    assert isinstance(policy, Learned)
+    assert (policy.config.refine_points, policy.config.trials, policy.config.camera_rounds) == (0, 1, 0)
+    assert options == StepOptions()
+
+
+def test_every_peer_says_what_brings_it():
+    assert set(peers.NEEDS) == set(PEERS)
+
+
+def test_without_its_library_a_peer_is_refused_before_anything_runs(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(peers, "find_spec", lambda name: None)
+    with pytest.raises(SolverNameError, match=r"needs pyceres and pycolmap: pip install jaxba\[ceres\]"):
+        bench_run.plan(sources(["scene:tiny"]), ["classic", "pyceres:dense+classic"], 1)
+    assert run(["scene:tiny", "--solvers", "classic,pyceres:dense", "--out", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: 'pyceres:dense' needs pyceres")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+    bench_run.plan(sources(["scene:tiny"]), ["classic", "ceres"], 1)
+
+
+def test_without_its_library_the_module_says_what_to_install(monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("jaxba.peers.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "pyceres", None)
+    with pytest.raises(ImportError, match=r"pip install jaxba\[ceres\]") as caught:
+        importlib.import_module("jaxba.peers.driven")
+    assert "\n" not in str(caught.value)
