@@ -30,11 +30,19 @@ from jaxba.eliminate import (
     largest_gradient,
 )
 from jaxba.layout import Layout
-from jaxba.linearize import Linearization, linearize, point_normal_equations, residuals, slot_costs, slot_frames
+from jaxba.linearize import (
+    Linearization,
+    in_front,
+    linearize,
+    point_normal_equations,
+    residuals,
+    slot_costs,
+    slot_frames,
+)
 from jaxba.normal import image
 from jaxba.options import StepOptions
 from jaxba.partition import Partition
-from jaxba.refine import refine_points
+from jaxba.refine import Home, refine_points
 from jaxba.resect import move_cameras
 from jaxba.split import solve_clusters
 from jaxba.sums import point_sum, take, total, tree_sum
@@ -109,7 +117,8 @@ def decomposed_round(
         turned = jnp.einsum("cij,cj->ci", coordinates.inverse, moves[:, :3])
         step = jnp.concatenate([turned, moves[:, 3:]], axis=1).T
         trial = move_cameras(carry.cameras, step, options)
-        trial_points, costs = _own_points(layout, trial, carry.points + point_moves, carry.points, partition, options)
+        home = Home(carry.points, linear.front)
+        trial_points, costs = _own_points(layout, trial, carry.points + point_moves, home, partition, options)
         decrease, predicted = by_cluster(linear.costs - costs), slopes - curvatures / 2
         good = (decrease > 0) & (predicted > 0) & (decrease > min_gain * predicted)  # false where they are no numbers
         sum_of = lambda values: jnp.sum(jnp.where(jnp.isfinite(predicted), values, 0))
@@ -176,13 +185,13 @@ def _point_value(layout: Layout, of_camera: Float[Array, " cameras"]) -> Float[A
 
 
 def _own_points(
-    layout: Layout, cameras: Array, points: Array, before: Array, partition: Partition, options: StepOptions
+    layout: Layout, cameras: Array, points: Array, home: Home, partition: Partition, options: StepOptions
 ) -> tuple[Float[Array, "3 points"], Float[Array, " slots"]]:
     """The clusters' points after embedded iterations, if there are any, and the cost of every slot."""
     frames = slot_frames(layout, cameras)
     if options.refine_points:
-        points = refine_points(layout, frames, points, options.loss, options.refine_points)[0]
-        points = jnp.where(partition.separator, before, points)
+        points = refine_points(layout, frames, points, options.loss, options.refine_points, home)[0]
+        points = jnp.where(partition.separator, home.points, points)
     return points, slot_costs(options.loss, residuals(layout, frames, points)[1])
 
 
@@ -201,7 +210,8 @@ def _separators(
     """A damped step of every separator, then embedded iterations of all points; the cost after them."""
     frames = slot_frames(layout, cameras)
     if options.refine_points:
-        points, costs = refine_points(layout, frames, points, options.loss, options.refine_points)
+        home = Home(points, in_front(residuals(layout, frames, points)[0]))
+        points, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home)
         return points, total(costs)
     projection, residual = residuals(layout, frames, points)
     entries = point_normal_equations(layout, frames, projection, residual, options.loss)

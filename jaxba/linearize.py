@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba import camera
 from jaxba.barrier import materialized
@@ -25,6 +25,7 @@ class Linearization(NamedTuple):
     camera_jacobian: list[list[Array]]  # [2][9] of (slots,)
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
     costs: Array  # (slots,), pixels squared
+    front: Bool[Array, " slots"]  # whether the point lies in front of its camera
 
 
 def slot_frames(layout: Layout, cameras: Float[Array, "9 cameras"]) -> camera.Frames:
@@ -44,6 +45,16 @@ def residuals(
     projection = camera.project(frames, take(points, layout.slot_point), layout.slot_mask)
     difference = projection.pixel - layout.pixels.astype(projection.pixel.dtype)
     return projection, _whiten(layout, [difference[0], difference[1]])
+
+
+def in_front(projection: camera.Projection) -> Bool[Array, " slots"]:
+    """Whether the point of a slot lies in front of its camera, which looks down -z; false in empty slots."""
+    return projection.inverse_depth < 0
+
+
+def behind(projection: camera.Projection) -> Bool[Array, " slots"]:
+    """Whether it lies behind; false in empty slots."""
+    return projection.inverse_depth > 0
 
 
 def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, " slots"]:
@@ -98,7 +109,7 @@ def linearize(
         residual = [root * r for r in residual]
         by_camera = [[root * column for column in row] for row in by_camera]
         by_point = [[root * column for column in row] for row in by_point]
-    return Linearization(residual, by_camera, by_point, costs)
+    return Linearization(residual, by_camera, by_point, costs, in_front(projection))
 
 
 def _whiten(layout: Layout, pair: list[Array]) -> list[Array]:

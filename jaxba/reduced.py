@@ -78,8 +78,8 @@ def solve_reduced(
 
 
 def to_single(tree: T) -> T:
-    """The same numbers in float32."""
-    return jax.tree.map(lambda x: x.astype(jnp.float32), tree)
+    """The same numbers in float32; truth values stay what they are."""
+    return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float32), tree)
 
 
 def _iterate_reduced(

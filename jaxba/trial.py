@@ -3,7 +3,7 @@
 The linear model is wrong far from where it was made, and mostly wrong locally: points fly off, cameras turn away from
 what they see. Repairing that locally is cheap beside a linear solve, and lets bolder steps pass:
 
-1. `refine_points`: every point re-optimised alone at the new cameras.
+1. `refine_points`: every point re-optimised alone at the new cameras, none of them sent behind one.
 2. `camera_rounds`: where the step did less than half of what the model promised and is not hopeless, cameras alone,
    then points alone again, a few times over. A step along a curved valley comes back to its floor.
 3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 but without 2.
@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, residuals, slot_costs, slot_frames
 from jaxba.options import StepOptions
-from jaxba.refine import refine_points
+from jaxba.refine import Home, refine_points
 from jaxba.resect import move_cameras, refine_cameras
 from jaxba.schur import Step
 from jaxba.sums import point_sum, total
@@ -73,7 +73,7 @@ def best_trial(
         cameras: present cameras.
         points: present points.
         cost: their cost, pixels squared.
-        linear: what was known there; only its costs are used.
+        linear: what was known there; only its costs and what lay in front of its camera are used.
         step: the solution of the damped system.
         options: static.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
@@ -89,10 +89,12 @@ def best_trial(
         accepted = (decrease > 0) & (candidate <= cost) & (predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
         return Trial(cameras, points, candidate, predicted, gain, accepted, share)
 
+    home = Home(points, linear.front)
+
     def settle(cameras: Array, points: Array, share: Array) -> Trial:
         frames = slot_frames(layout, cameras)
         if options.refine_points:
-            points, costs = refine_points(layout, frames, points, options.loss, options.refine_points)
+            points, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home)
         else:
             costs = slot_costs(options.loss, residuals(layout, frames, points)[1])
         return judge(cameras, points, costs, share)
