@@ -103,7 +103,7 @@ class EvaluateArguments:
     poses: str | None = None
     """True poses of the whole sequence, 12 numbers a line. Without them there is only the picture."""
 
-    lengths: tuple[float, ...] = (100, 200, 300, 400, 500, 600, 700, 800)
+    lengths: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
     """Metres of the segments over which relative errors are taken."""
 
     out: str = "runs/kitti"

@@ -243,9 +243,7 @@ def image_reader(sequence: Sequence) -> Reader:
     """
     from jaxba.kitti.opencv import cv2
 
-    shape: list[tuple[int, ...]] = []
-
-    def read(index: int) -> np.ndarray:
+    def decode(index: int) -> np.ndarray:
         path = sequence.images[index]
         try:
             data = np.frombuffer(path.read_bytes(), np.uint8)
@@ -254,12 +252,18 @@ def image_reader(sequence: Sequence) -> Reader:
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
         if image is None:
             raise ProblemError(f"{display_name(path)}: is no image that can be decoded")
-        shape.append(image.shape)
+        return np.asarray(image)
+
+    shape: list[tuple[int, ...]] = []
+
+    def read(index: int) -> np.ndarray:
+        image = decode(index)
+        if not shape:
+            shape.append(image.shape if index == 0 else decode(0).shape)
         if image.shape != shape[0]:
             sizes = [f"{s[1]} x {s[0]}" for s in (image.shape, shape[0])]
-            raise ProblemError(f"{display_name(path)}: is {sizes[0]} pixels, images before it are {sizes[1]}")
-        del shape[1:]
-        return np.asarray(image)
+            raise ProblemError(f"{display_name(sequence.images[index])}: is {sizes[0]} pixels, the first is {sizes[1]}")
+        return image
 
     return read
 

@@ -52,7 +52,7 @@ class Work:
         """
         path = self.folder / f"{name}.npz"
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
                 return kind(*(file[field] for field in kind._fields))  # type: ignore[attr-defined]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             pass
