@@ -335,13 +335,16 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
     path = image(sequence, 3)
     good = path.read_bytes()
     for data, words in (
+        (good[: len(good) // 2], "is no image"),
         (b"", "is no image"),
         (b"not a png", "is no image"),
         (b"\x89PNG\r\n\x1a\n" + b"x" * 50, "is no image"),
     ):
         path.write_bytes(data)
         assert build(sequence, tmp_path / "p.txt") == 2
-        assert f"000003.png: {words}" in capfd.readouterr().err
+        message = capfd.readouterr().err
+        assert f"000003.png: {words}" in message
+        assert message.count("\n") == 1
     cv2.imwrite(str(path), np.zeros((40, 60), np.uint8))
     assert build(sequence, tmp_path / "p.txt") == 2
     assert "000003.png: is 60 x 40 pixels, the first is 320 x 160" in capfd.readouterr().err

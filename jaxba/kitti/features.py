@@ -71,7 +71,8 @@ def detect(image: np.ndarray, features: Features, count: int) -> KeyPoints:
 def match(first: KeyPoints, second: KeyPoints) -> Int[np.ndarray, "m 2"]:
     """Pairs of key-points that are each other's nearest, by a clear margin (ratio test) on both sides.
 
-    Distances are Euclidean (SIFT, 128 numbers) or Hamming (ORB, 256 bits).
+    Distances are Euclidean (SIFT, 128 numbers) or Hamming (ORB, 256 bits). All numbers are integers below 2^24, so
+    float32 is exact and the order of summation does not matter.
     """
     if len(first.pixels) < 2 or len(second.pixels) < 2:
         return np.empty((0, 2), np.int64)

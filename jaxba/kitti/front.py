@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
@@ -74,22 +75,21 @@ def link(sequence: Sequence, options: FrontOptions, work: Work, report: Report) 
 def _match(sequence: Sequence, options: FrontOptions, work: Work, report: Report, stamps: list[str]) -> Linked:
     read = image_reader(sequence)
     kind = (options.features, options.keypoints, cv2.__version__)
-    points: list[KeyPoints] = []
-    for i, number in enumerate(sequence.numbers):
-        report("key-points", i, len(sequence))
-        key = digest("points", kind, stamps[i])
-        make = lambda i=i: detect(read(i), options.features, options.keypoints)
-        points.append(work.get(f"points-{number:06d}-{key}", KeyPoints, make))
-    pairs = [(j - gap, j) for j in range(len(points)) for gap in range(1, options.reach + 1) if j >= gap]
-    matches = {}
-    for done, (i, j) in enumerate(pairs):
-        report("matches", done, len(pairs))
-        key = digest("match", kind, stamps[i], stamps[j], asdict(sequence.calibration), options.seed)
-        name = f"match-{sequence.numbers[i]:06d}-{sequence.numbers[j]:06d}-{key}"
-        make = lambda i=i, j=j: _verify(points[i], points[j], sequence, options.seed)
-        matches[i, j] = np.stack(work.get(name, Verified, make), axis=1)
+    recent: deque[KeyPoints] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
+    pixels: list[np.ndarray] = []
+    matches: dict[tuple[int, int], np.ndarray] = {}
+    for j, number in enumerate(sequence.numbers):
+        report("key-points and matches", j, len(sequence))
+        key = digest("points", kind, stamps[j])
+        recent.append(work.get(f"points-{number:06d}-{key}", KeyPoints, lambda j=j: detect(read(j), *kind[:2])))
+        pixels.append(recent[-1].pixels)
+        for i in range(max(j - options.reach, 0), j):
+            key = digest("match", kind, stamps[i], stamps[j], asdict(sequence.calibration), options.seed)
+            name = f"match-{sequence.numbers[i]:06d}-{number:06d}-{key}"
+            make = lambda a=recent[i - j - 1], b=recent[-1]: _verify(a, b, sequence, options.seed)
+            matches[i, j] = np.stack(work.get(name, Verified, make), axis=1)
     linked = [0]
-    for j in range(1, len(points)):
+    for j in range(1, len(sequence)):
         before = [i for i in linked if j - i <= options.reach]
         if not before:
             _give_up(sequence, options, linked[-1], {k: len(matches[i, k]) for i, k in matches if i == linked[-1]})
@@ -103,7 +103,7 @@ def _match(sequence: Sequence, options: FrontOptions, work: Work, report: Report
         for (i, j), found in matches.items()
         if i in position and j in position and len(found) >= options.min_matches
     }
-    return Linked(join_matches([points[i].pixels for i in linked], strong), tuple(linked))
+    return Linked(join_matches([pixels[i] for i in linked], strong), tuple(linked))
 
 
 def _verify(a: KeyPoints, b: KeyPoints, sequence: Sequence, seed: int) -> Verified:

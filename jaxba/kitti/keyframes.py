@@ -67,7 +67,7 @@ def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, n
         rays = calibration.rays(tracks.pixels)
         for i in range(1, images):
             a, b = tracks.shared(chosen[-1], i)
-            own = int(np.count_nonzero(tracks.image == chosen[-1]))
+            own = len(tracks.rows_of_image(chosen[-1]))
             if len(a) < max(SHARE * own, MIN_SHARED) or parallax(rays[a], rays[b], calibration.fx) >= PARALLAX:
                 chosen.append(i)
     if len(chosen) < 2:

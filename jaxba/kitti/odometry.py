@@ -60,17 +60,15 @@ class _Map:
         self.translation = np.zeros((views, 3))
         self.placed = np.zeros(views, bool)
         self.points = np.full((tracks.count, 3), np.nan)
-        self.rows = [np.flatnonzero(tracks.image == view) for view in range(views)]
 
     def place(self, view: int, rotation: np.ndarray, translation: np.ndarray) -> None:
         self.rotation[view], self.translation[view], self.placed[view] = rotation, translation, True
 
     def triangulate(self, views: list[int]) -> None:
         """Anew all tracks that these views see, from all views placed so far."""
-        wanted = np.zeros(self.tracks.count, bool)
-        for view in views:
-            wanted[self.tracks.track[self.rows[view]]] = True
-        rows = np.flatnonzero(wanted[self.tracks.track] & self.placed[self.tracks.image])
+        seen = np.unique(np.concatenate([self.tracks.track[self.tracks.rows_of_image(view)] for view in views]))
+        rows = self.tracks.rows_of_tracks(seen)
+        rows = rows[self.placed[self.tracks.image[rows]]]
         names, track = np.unique(self.tracks.track[rows], return_inverse=True)
         rows = rows[np.bincount(track)[track] >= 2]
         names, track = np.unique(self.tracks.track[rows], return_inverse=True)
@@ -184,7 +182,7 @@ def _neighbour(scene: _Map, view: int) -> int:
 
 def _resect(scene: _Map, view: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Pose of a view by the points that it sees: P3P within RANSAC, then Levenberg-Marquardt on the inliers."""
-    rows = scene.rows[view]
+    rows = scene.tracks.rows_of_image(view)
     rows = rows[np.isfinite(scene.points[scene.tracks.track[rows], 0])]
     if len(rows) < MIN_POINTS:
         return None

@@ -23,6 +23,9 @@ CALIBRATION_FILES = ("calib.txt", "K.txt")
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
+PNG_END = b"IEND"
+"""Name of the last part of a PNG file."""
+
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of `R R^T - I` in a file of poses; KITTI writes 7 digits."""
 
@@ -249,7 +252,8 @@ def image_reader(sequence: Sequence) -> Reader:
             data = np.frombuffer(path.read_bytes(), np.uint8)
         except OSError as error:
             raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
+        whole = PNG_END in data[-16:].tobytes() or path.suffix.lower() != ".png"  # libpng complains on its own
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size and whole else None
         if image is None:
             raise ProblemError(f"{display_name(path)}: is no image that can be decoded")
         return np.asarray(image)

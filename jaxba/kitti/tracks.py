@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -33,9 +34,26 @@ class Tracks:
         """Sightings of each track."""
         return np.bincount(self.track, minlength=self.count)
 
+    @cached_property
+    def _by_image(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows in the order of their images, and where each image's begin (one more entry than images)."""
+        order = np.argsort(self.image, kind="stable")
+        return order, np.searchsorted(self.image[order], np.arange(int(self.image.max(initial=-1)) + 2))
+
+    def rows_of_image(self, image: int) -> Int[np.ndarray, " m"]:
+        """Rows of the sightings in an image, in the order of their tracks."""
+        order, start = self._by_image
+        return order[start[image] : start[image + 1]] if 0 <= image < len(start) - 1 else order[:0]
+
+    def rows_of_tracks(self, tracks: Int[np.ndarray, " k"]) -> Int[np.ndarray, " m"]:
+        """Rows of all sightings of some tracks (in ascending order), in the order of the table."""
+        first, end = (np.searchsorted(self.track, tracks, side=side) for side in ("left", "right"))
+        sizes = end - first
+        return np.repeat(first - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
+
     def shared(self, a: int, b: int) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
         """Rows of the tracks that both images see: those in image a, those in image b, in the same order."""
-        rows_a, rows_b = np.flatnonzero(self.image == a), np.flatnonzero(self.image == b)
+        rows_a, rows_b = self.rows_of_image(a), self.rows_of_image(b)
         _, at_a, at_b = np.intersect1d(self.track[rows_a], self.track[rows_b], return_indices=True)
         return rows_a[at_a], rows_b[at_b]
 
