@@ -183,7 +183,7 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     """jaxba-kitti, jaxba-solve and jaxba-kitti evaluate, one after the other."""
     out, solved, folder = tmp_path / "p.txt", tmp_path / "solved.txt.gz", tmp_path / "eval"
     poses = rendered[OTHER] / "poses.txt"
-    start = ["--start", "noisy-poses", "--rotation-sigma", "0.3", "--translation-sigma", "0.1", "--max-error", "40"]
+    start = ["--start", "noisy-poses", "--rotation-sigma", "0.3", "--translation-sigma", "0.1"]
     assert build(rendered[OTHER], out, *start, "--keyframes", "all") == 0
     ate = start_error(capsys.readouterr().out)
     assert solve([str(out), "--damping", "ceres", "--output", str(solved)]) == 0

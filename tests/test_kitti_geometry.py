@@ -271,6 +271,22 @@ def test_cameras_and_poses_are_the_same_thing():
     np.testing.assert_allclose(poses_of_cameras(np.asarray(made.problem.cameras)), poses, atol=1e-9)
 
 
+def test_points_drift_with_the_first_camera_that_sees_them():
+    poses, views, points = street()
+    sightings = sight(views, points)
+    late = sightings.camera >= np.where(sightings.track % 2, 2, 0)  # odd points are first seen by camera 2
+    tracks = as_tracks(Sightings(*(part[late] for part in sightings)))
+    noisy = drift(poses, 0.3, 0.1, 5)
+    inverse = noisy[:, :, :3].transpose(0, 2, 1)
+    start = Views(inverse, -np.einsum("nij,nj->ni", inverse, noisy[:, :, 3]))
+    made = assemble(tracks, views, CALIBRATION, tuple(range(6)), NEARLY_ALL, 2, start).problem
+    np.testing.assert_allclose(poses_of_cameras(np.asarray(made.cameras)), noisy, atol=1e-9)
+    error = np.linalg.norm(geometry.residuals(made), axis=1)
+    first = np.where(np.asarray(made.point_index) % 2, 2, 0) == made.camera_index
+    assert error[first].max() < 1e-6
+    assert np.median(error[~first]) > 0.5
+
+
 def test_a_frame_without_points_is_named():
     _, views, points = street()
     tracks = as_tracks(sight(views, points))

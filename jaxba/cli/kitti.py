@@ -56,17 +56,17 @@ class Arguments:
     """True poses, 12 numbers a line, a line for every frame of the sequence from frame 0 on. With --start vo they only
     serve to print the error of the start."""
 
-    rotation_sigma: float = 0.05
+    rotation_sigma: float = 0.1
     """Error of noisy-poses: degrees on each axis a key-frame."""
 
-    translation_sigma: float = 0.02
+    translation_sigma: float = 0.05
     """Error of noisy-poses: on each axis, as a share of the way from the key-frame before."""
 
     min_angle: float = 1.0
     """A point needs two rays that meet at this angle, degrees."""
 
     max_error: float = 3.0
-    """Largest reprojection error at the start, pixels."""
+    """Largest reprojection error of a point's sighting, pixels; before the noise of noisy-poses."""
 
     min_views: int = 2
     """Key-frames that must see a point."""

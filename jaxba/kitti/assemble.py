@@ -30,7 +30,13 @@ class Assembled:
 
 
 def assemble(
-    tracks: Tracks, views: Views, calibration: Calibration, frames: tuple[int, ...], filters: Filters, min_views: int
+    tracks: Tracks,
+    views: Views,
+    calibration: Calibration,
+    frames: tuple[int, ...],
+    filters: Filters,
+    min_views: int,
+    start: Views | None = None,
 ) -> Assembled:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
 
@@ -44,6 +50,8 @@ def assemble(
         frames: frame number of each view.
         filters: for points.
         min_views: sightings that a point needs.
+        start: where the cameras of the problem stand, if not at `views`, which then only choose and triangulate the
+            points. Every point moves with the first camera that sees it, as a map drifts with the one who draws it.
 
     Raises:
         ProblemError: a camera would see fewer than 10 points.
@@ -59,12 +67,17 @@ def assemble(
             "choose other --frames, --features or --start, or a smaller --min-angle"
         )
     names, point_index = np.unique(tracks.track[keep], return_inverse=True)
+    points = points[names]
+    if start is not None:
+        first = tracks.image[keep][np.searchsorted(point_index, np.arange(len(names)))]
+        local = views.local(first, points) - start.translation[first]
+        points, views = np.einsum("nji,nj->ni", start.rotation[first], local), start
     cameras = np.zeros((len(frames), 9))
     cameras[:, :3] = angle_axis(FLIP @ views.rotation)
     cameras[:, 3:6] = views.translation @ FLIP
     cameras[:, 6] = calibration.fx
     pixels = calibration.fx * rays[keep] * [1, -1]
-    problem = BundleProblem.create(cameras, points[names], pixels, tracks.image[keep], point_index)
+    problem = BundleProblem.create(cameras, points, pixels, tracks.image[keep], point_index)
     return Assembled(problem, frames)
 
 

@@ -34,10 +34,10 @@ class BuildOptions:
     start: Start = "vo"
     """Where the poses come from."""
 
-    rotation_sigma: float = 0.05
+    rotation_sigma: float = 0.1
     """Of `noisy-poses`: degrees a key-frame."""
 
-    translation_sigma: float = 0.02
+    translation_sigma: float = 0.05
     """Of `noisy-poses`: share of the motion's length."""
 
     filters: Filters = field(default_factory=Filters)
@@ -90,6 +90,7 @@ def build(
     frames = tuple(numbers[i] for i in chosen)
     tracks = linked.tracks.restrict(chosen)
     restarts: tuple[int, ...] = ()
+    moved = None
     if options.start == "vo":
         placed = visual_odometry(
             tracks,
@@ -104,10 +105,11 @@ def build(
     else:
         assert poses_of_frames is not None
         poses = poses_of_frames(frames)
-        if options.start == "noisy-poses":
-            poses = drift(poses, options.rotation_sigma, options.translation_sigma, options.front.seed)
         views = views_of_poses(poses)
+        if options.start == "noisy-poses":
+            noisy = drift(poses, options.rotation_sigma, options.translation_sigma, options.front.seed)
+            moved = views_of_poses(noisy)
     report("triangulation", 0, 1)
-    whole = assemble(tracks, views, sequence.calibration, frames, options.filters, options.min_views)
+    whole = assemble(tracks, views, sequence.calibration, frames, options.filters, options.min_views, moved)
     dropped = tuple(sorted(set(sequence.numbers[: linked.frames[-1] + 1]) - set(numbers)))
     return Built(whole, len(sequence), dropped, tracks.count, restarts)
