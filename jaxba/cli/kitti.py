@@ -1,0 +1,356 @@
+"""`jaxba-kitti`: from the images of a KITTI odometry sequence to a problem, and from solutions to trajectory errors."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from jaxba.cli import common
+
+FILE_WIDTH = 120
+"""Columns of tables where the output is no terminal."""
+
+EVALUATE = "evaluate"
+"""First argument of the second form of the command; a folder of that name can be given as ./evaluate."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of `jaxba-kitti`."""
+
+    sequence: Annotated[str, tyro.conf.Positional]
+    """Folder of a KITTI odometry sequence: image_0/000000.png ..., calib.txt."""
+
+    out: str = "kitti.txt.bz2"
+    """The problem, a BAL file, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json, written beside it, says
+    which frame every camera is."""
+
+    frames: str = ":"
+    """first:end or first:end:step by frame number, the end not included, such as 0:200."""
+
+    features: Literal["sift", "orb", "klt"] = "sift"
+    """Key-points that are matched (sift, orb), or corners that are followed from frame to frame (klt)."""
+
+    keypoints: int = 2000
+    """Most key-points of a frame."""
+
+    reach: int = 3
+    """Match every frame with this many frames before it."""
+
+    min_matches: int = 40
+    """Verified matches that two frames need."""
+
+    keyframes: str = "auto"
+    """auto: by parallax and by the share of tracks left. all, or N for every N-th frame."""
+
+    start: Literal["vo", "poses", "noisy-poses"] = "vo"
+    """Poses from monocular visual odometry, from --poses, or from --poses with errors that accumulate."""
+
+    poses: str | None = None
+    """True poses, 12 numbers a line, a line for every frame of the sequence from frame 0 on. With --start vo they only
+    serve to print the error of the start."""
+
+    rotation_sigma: float = 0.1
+    """Error of noisy-poses: degrees on each axis a key-frame."""
+
+    translation_sigma: float = 0.05
+    """Error of noisy-poses: on each axis, as a share of the way from the key-frame before."""
+
+    min_angle: float = 1.0
+    """A point needs two rays that meet at this angle, degrees."""
+
+    max_error: float = 3.0
+    """Largest reprojection error of a point's sighting, pixels; before the noise of noisy-poses."""
+
+    min_views: int = 2
+    """Key-frames that must see a point."""
+
+    window: int | None = None
+    """Write several problems of this many key-frames each, named NAME-FIRST-LAST by their frames."""
+
+    stride: int | None = None
+    """Key-frames from the start of one window to that of the next; half a window if left out."""
+
+    camera: int = 0
+    """Which camera: image_0 and P0, or 1 to 3."""
+
+    calibration: str | None = None
+    """File of the camera's matrix, lines as in calib.txt or 3 x 3 numbers; that of the sequence if left out."""
+
+    work: str | None = None
+    """Folder in which results of single frames are kept, so that a run goes on where it was; NAME.work if left out."""
+
+    seed: int = 0
+    """Of every random sample and error."""
+
+
+@dataclass(frozen=True)
+class EvaluateArguments:
+    """Options of `jaxba-kitti evaluate`."""
+
+    problem: Annotated[str, tyro.conf.Positional]
+    """A problem of jaxba-kitti, with its NAME.frames.json beside it."""
+
+    solutions: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """What jaxba-solve made of it, BAL files."""
+
+    poses: str | None = None
+    """True poses of the whole sequence, 12 numbers a line. Without them there is only the picture."""
+
+    lengths: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+    """Metres of the segments over which relative errors are taken."""
+
+    out: str = "runs/kitti"
+    """Folder of top-view.png and .svg, evaluation.json and the aligned trajectories."""
+
+
+def main() -> None:
+    """Entry point of `jaxba-kitti`."""
+    common.exit_with(run())
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Runs the command; status 0 when all is written, 2 for bad input, 130 after Ctrl-C (a new run goes on)."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    if argv[:1] == [EVALUATE]:
+        text = "Trajectory errors, and the scene from above."
+        return common.run_command(EvaluateArguments, _evaluate, text, argv[1:])
+    text = "From KITTI images to a problem. 'jaxba-kitti evaluate --help': solutions compared with true poses."
+    return common.run_command(Arguments, _build, text, argv)
+
+
+def _build(args: Arguments) -> int:
+    common.check_positive(
+        keypoints=args.keypoints, reach=args.reach, max_error=args.max_error, min_matches=args.min_matches
+    )
+    if args.min_views < 2:
+        raise common.UsageError(f"--min-views must be at least 2, is {args.min_views}")
+    if not 0 <= args.min_angle < 180:
+        raise common.UsageError(f"--min-angle must lie between 0 and 180, is {args.min_angle:g}")
+    if not 0 <= args.seed < 2**31:
+        raise common.UsageError(f"--seed must lie between 0 and 2147483647, is {args.seed}")
+    if args.start != "vo" and args.poses is None:
+        raise common.UsageError(f"--start {args.start} needs --poses")
+    if args.stride is not None and args.window is None:
+        raise common.UsageError("--stride needs --window")
+    common.check_writable("--out", args.out)
+    from jaxba.io.files import strip_compression
+
+    stem = Path(strip_compression(args.out))
+    if stem.suffix.lower() in (".ply", ".out"):
+        raise common.UsageError(f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
+    try:
+        from jaxba.kitti import opencv  # noqa: F401 - says what to install
+    except ImportError as error:
+        raise common.UsageError(str(error)) from None
+    from jaxba.kitti.build import BuildOptions, build
+    from jaxba.kitti.front import FrontOptions
+    from jaxba.kitti.sequence import poses_of, read_poses, read_sequence
+    from jaxba.kitti.triangulate import Filters
+    from jaxba.kitti.work import Work
+
+    sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
+    poses = None
+    if args.poses is not None:
+        table, name = read_poses(args.poses), args.poses
+        poses_of(table, sequence.numbers, sequence.calibration, name)  # complains before any work
+        poses = lambda frames: poses_of(table, frames, sequence.calibration, name)
+    front = FrontOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
+    options = BuildOptions(
+        front,
+        args.keyframes,
+        args.start,
+        args.rotation_sigma,
+        args.translation_sigma,
+        Filters(args.min_angle, args.max_error),
+        args.min_views,
+    )
+    console = _console()
+    work = Work(Path(args.work) if args.work else stem.with_suffix(".work"))
+    try:
+        with _Progress(console) as progress:
+            built = build(sequence, options, work, poses, progress.report)
+        parts = _parts(built, args)
+        files = [_write(part, path, sequence, args) for part, path in parts]
+    except KeyboardInterrupt:
+        console.print("interrupted; what is done is kept, run the same command again to continue")
+        return common.INTERRUPTED
+    console.print(_build_table([part for part, _ in parts], built, poses))
+    for words, numbers in (
+        ("left out, too few matches", built.dropped),
+        ("placed without enough known points, with the scale of the step before", built.restarts),
+    ):
+        if numbers:
+            console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")
+    console.print(f"wrote {', '.join(files)}")
+    return 0
+
+
+def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
+    """Problems to be written, and where."""
+    from jaxba.io.files import strip_compression
+    from jaxba.kitti.assemble import windows
+
+    if args.window is None:
+        return [(built.whole, args.out)]
+    stride = max(args.window // 2, 1) if args.stride is None else args.stride
+    plain = strip_compression(args.out)
+    stem, ending = Path(plain).with_suffix(""), Path(plain).suffix + args.out[len(plain) :]
+    parts = windows(built.whole, args.window, stride, args.min_views)
+    return [(part, f"{stem}-{part.frames[0]:06d}-{part.frames[-1]:06d}{ending}") for part in parts]
+
+
+def _write(part: Any, path: str, sequence: Any, args: Arguments) -> str:
+    """The side file, then the problem: who finds a problem finds its frames."""
+    from jaxba import __version__
+    from jaxba.io import write_problem
+    from jaxba.kitti.assemble import side_facts
+    from jaxba.kitti.evaluate import write_side
+    from jaxba.kitti.opencv import cv2
+
+    times = None if sequence.times is None else dict(zip(sequence.numbers, sequence.times.tolist(), strict=True))
+    facts = side_facts(
+        part,
+        sequence.calibration,
+        times=None if times is None else [times[number] for number in part.frames],
+        options=asdict(args),
+        versions={"jaxba": __version__, "opencv": cv2.__version__},
+    )
+    write_side(path, facts)
+    write_problem(part.problem, path)
+    return path
+
+
+def _build_table(parts: list[Any], built: Any, poses: Any) -> Any:
+    import numpy as np
+
+    from jaxba import geometry
+    from jaxba.kitti.assemble import poses_of_cameras
+    from jaxba.kitti.evaluate import score
+    from jaxba.problem import ProblemError
+
+    kept = len(built.whole.frames)
+    title = f"{built.frames} frames, {kept} key-frames, {built.tracks} tracks"
+    table = _table(title, "frames", "key-frames", "points", "observations", "mean error (px)", "ATE of the start (m)")
+    for part in parts:
+        problem = part.problem
+        error = np.linalg.norm(geometry.residuals(problem), axis=1).mean()
+        ate = "-"
+        if poses is not None:
+            try:
+                ate = f"{score(poses_of_cameras(problem.cameras), poses(part.frames)).absolute.rmse:.3f}"
+            except ProblemError:  # a straight line, or two cameras
+                ate = "undefined"
+        numbers = (problem.num_cameras, problem.num_points, problem.num_observations, f"{error:.3f}", ate)
+        table.add_row(f"{part.frames[0]} to {part.frames[-1]}", *map(str, numbers))
+    return table
+
+
+def _evaluate(args: EvaluateArguments) -> int:
+    if not args.lengths or not all(length > 0 for length in args.lengths):
+        raise common.UsageError("--lengths must be positive")
+    from jaxba.bench.plots import save_figure
+    from jaxba.bench.summary import write_text
+    from jaxba.kitti import evaluate, plots
+
+    side = evaluate.read_side(args.problem)
+    truth = None if args.poses is None else evaluate.truth_of(side, args.poses)
+    results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
+    path = None if truth is None else truth[:, :, 3]
+    views = [plots.View(_caption(r), r.points, r.poses[:, :, 3]) for r in results]
+    figure = plots.plot_top_view(views, path)
+    folder = Path(args.out)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text(folder / "evaluation.json", json.dumps(evaluate.as_json(results, side), allow_nan=False) + "\n")
+        for number, result in enumerate(results):
+            evaluate.write_poses(folder / f"poses-{number}-{result.name}.txt", result.poses)
+        if truth is not None:
+            evaluate.write_poses(folder / "poses-truth.txt", truth)
+        files = save_figure(figure, folder / "top-view")
+    except OSError as error:
+        raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
+    console = _console()
+    console.print(_evaluate_table(results, truth))
+    console.print(f"wrote {files[0]} and {len(results) + (truth is not None) + 2} files beside it")
+    return 0
+
+
+def _caption(result: Any) -> str:
+    ate = "" if result.scores is None else f", ATE {result.scores.absolute.rmse:.2f} m"
+    return f"{result.name}{ate}"
+
+
+def _evaluate_table(results: list[Any], truth: Any) -> Any:
+    from jaxba.kitti.trajectory import path_length
+
+    title = f"{len(results[0].poses)} key-frames"
+    if truth is None:
+        table = _table(title, "file", "rms (px)")
+    else:
+        title += f", {path_length(truth):.1f} m of path; after similarity alignment"
+        names = ("ATE (m)", "largest (m)", "RPE (m)", "RPE (deg)", "segments (%)", "(deg/m)", "number")
+        table = _table(title, "file", "rms (px)", *names)
+    for r in results:
+        row = [r.name, f"{r.rms:.4f}"]
+        if r.scores is not None:
+            s = r.scores
+            row += [f"{s.absolute.rmse:.3f}", f"{s.absolute.largest:.3f}"]
+            row += [f"{s.relative.translation.rmse:.4f}", f"{s.relative.rotation.rmse:.4f}"]
+            segments = s.segments
+            row += ["-"] * 3 if segments is None else [f"{segments.translation:.3f}", f"{segments.rotation:.5f}"]
+            row += [] if segments is None else [str(segments.segments)]
+        table.add_row(*row)
+    return table
+
+
+def _table(title: str, first: str, *columns: str) -> Any:
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", title_style="bold")
+    table.add_column(first, no_wrap=True)
+    for name in columns:
+        table.add_column(name, justify="right")
+    return table
+
+
+def _console() -> Any:
+    from rich.console import Console
+
+    console = Console(soft_wrap=True, highlight=False)
+    return console if console.is_terminal else Console(soft_wrap=True, highlight=False, width=FILE_WIDTH)
+
+
+class _Progress:
+    """A live line on a terminal, a line for every stage elsewhere."""
+
+    def __init__(self, console: Any) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self.console = console
+        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._stage = ""
+
+    def __enter__(self) -> _Progress:
+        self._bar.start()
+        self._task = self._bar.add_task("starting", total=None)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        """So much of a stage is done."""
+        if stage != self._stage:
+            self._stage = stage
+            self._bar.reset(self._task, description=stage)
+            if not self.console.is_terminal:
+                self.console.print(stage if total <= 1 else f"{stage} ({total})")
+        self._bar.update(self._task, completed=done, total=total)

@@ -1,0 +1,127 @@
+"""Views and tracks as a bundle adjustment problem in BAL's convention, and back."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.geometry import angle_axis, camera_centers, rotation_matrices
+from jaxba.kitti.sequence import Calibration
+from jaxba.kitti.tracks import Tracks
+from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate_robustly
+from jaxba.problem import BundleProblem, ProblemError
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""From axes x right, y down, z forward (KITTI) to x right, y up, z backward (BAL)."""
+
+MIN_SIGHTINGS = 10
+"""Sightings that a camera needs: twice as many numbers as its 9 parameters, and a little more."""
+
+
+@dataclass(frozen=True)
+class Assembled:
+    """A problem and where its cameras come from."""
+
+    problem: BundleProblem
+    frames: tuple[int, ...]
+    """Frame number of every camera."""
+
+
+def assemble(
+    tracks: Tracks,
+    views: Views,
+    calibration: Calibration,
+    frames: tuple[int, ...],
+    filters: Filters,
+    min_views: int,
+    start: Views | None = None,
+) -> Assembled:
+    """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
+
+    Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical
+    pixels are scaled by fx / fy.
+
+    Args:
+        tracks: their images are the views.
+        views: world to camera, looking down +z.
+        calibration: of all views.
+        frames: frame number of each view.
+        filters: for points.
+        min_views: sightings that a point needs.
+        start: where the cameras of the problem stand, if not at `views`, which then only choose and triangulate the
+            points. Every point moves with the first camera that sees it, as a map drifts with the one who draws it.
+
+    Raises:
+        ProblemError: a camera would see fewer than 10 points.
+    """
+    rays = calibration.rays(tracks.pixels)
+    sightings = Sightings(tracks.image, tracks.track, rays)
+    points, keep = triangulate_robustly(views, sightings, filters, calibration.fx, min_views)
+    seen = np.bincount(tracks.image[keep], minlength=len(frames))
+    if seen.min() < MIN_SIGHTINGS:
+        bad = int(seen.argmin())
+        raise ProblemError(
+            f"too few points: frame {frames[bad]} sees {seen[bad]} good ones, at least {MIN_SIGHTINGS} are needed; "
+            "choose other --frames, --features or --start, or a smaller --min-angle"
+        )
+    names, point_index = np.unique(tracks.track[keep], return_inverse=True)
+    points = points[names]
+    if start is not None:
+        first = tracks.image[keep][np.searchsorted(point_index, np.arange(len(names)))]
+        local = views.local(first, points) - start.translation[first]
+        points, views = np.einsum("nji,nj->ni", start.rotation[first], local), start
+    cameras = np.zeros((len(frames), 9))
+    cameras[:, :3] = angle_axis(FLIP @ views.rotation)
+    cameras[:, 3:6] = views.translation @ FLIP
+    cameras[:, 6] = calibration.fx
+    pixels = calibration.fx * rays[keep] * [1, -1]
+    problem = BundleProblem.create(cameras, points, pixels, tracks.image[keep], point_index)
+    return Assembled(problem, frames)
+
+
+def poses_of_cameras(cameras: Float[np.ndarray, "cameras 9"]) -> Float[np.ndarray, "cameras 3 4"]:
+    """Camera-to-world poses in KITTI's axes (x right, y down, z forward) of BAL cameras."""
+    rotation = (FLIP @ rotation_matrices(cameras[:, :3])).transpose(0, 2, 1)
+    return np.concatenate([rotation, camera_centers(cameras)[:, :, None]], axis=2)
+
+
+def windows(whole: Assembled, size: int, stride: int, min_views: int) -> list[Assembled]:
+    """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before.
+
+    The last one ends with the last camera, so it may start less than `stride` after its predecessor. A window keeps
+    the points that it sees `min_views` times.
+
+    Raises:
+        ProblemError: the sizes make no sense.
+    """
+    cameras = whole.problem.num_cameras
+    if not 2 <= size <= cameras:
+        raise ProblemError(f"--window must lie between 2 and the {cameras} key-frames, is {size}")
+    if stride < 1:
+        raise ProblemError(f"--stride must be positive, is {stride}")
+    starts = list(range(0, cameras - size, stride))
+    starts.append(cameras - size)
+    return [_window(whole, first, first + size, min_views) for first in starts]
+
+
+def _window(whole: Assembled, first: int, end: int, min_views: int) -> Assembled:
+    problem = whole.problem
+    camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    keep = (camera_index >= first) & (camera_index < end)
+    keep &= np.bincount(point_index[keep], minlength=problem.num_points)[point_index] >= min_views
+    names, renumbered = np.unique(point_index[keep], return_inverse=True)
+    part = BundleProblem.create(
+        np.asarray(problem.cameras)[first:end],
+        np.asarray(problem.points)[names],
+        np.asarray(problem.observations)[keep],
+        camera_index[keep] - first,
+        renumbered,
+    )
+    return replace(whole, problem=part, frames=whole.frames[first:end])
+
+
+def side_facts(part: Assembled, calibration: Calibration, **facts: object) -> dict[str, object]:
+    """What the side file of a problem holds."""
+    return {"format": 1, "frames": list(part.frames), "calibration": asdict(calibration), **facts}

@@ -1,0 +1,168 @@
+"""A problem and its solutions against ground truth: numbers, pictures, and trajectories for other tools."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba import geometry
+from jaxba.io import read_problem
+from jaxba.io.files import StrPath, display_name, open_output, reason, strip_compression
+from jaxba.kitti import trajectory
+from jaxba.kitti.assemble import poses_of_cameras
+from jaxba.kitti.sequence import Calibration, poses_of, read_poses
+from jaxba.problem import BundleProblem, ProblemError
+
+
+@dataclass(frozen=True)
+class SideFile:
+    """What a problem's arrays do not tell."""
+
+    frames: tuple[int, ...]
+    """Frame number of every camera."""
+
+    calibration: Calibration
+    """With which the images were taken."""
+
+    facts: Mapping[str, Any]
+    """Everything else in the file."""
+
+
+class Scores(NamedTuple):
+    """Errors of one trajectory, in metres and degrees; see `trajectory`."""
+
+    scale: float  # metres a unit of the trajectory
+    absolute: trajectory.Errors
+    relative: trajectory.RelativeErrors
+    segments: trajectory.SegmentErrors | None
+
+
+class Evaluated(NamedTuple):
+    """One file."""
+
+    name: str
+    problem: BundleProblem
+    poses: Float[np.ndarray, "cameras 3 4"]  # after alignment, where there is a truth
+    points: Float[np.ndarray, "points 3"]  # the same
+    rms: float  # reprojection error, pixels
+    scores: Scores | None
+
+
+def side_path(path: StrPath) -> Path:
+    """Name of the side file of a problem: `kitti00.txt.bz2` has `kitti00.frames.json`."""
+    return Path(strip_compression(path)).with_suffix(".frames.json")
+
+
+def write_side(path: StrPath, facts: Mapping[str, Any]) -> None:
+    """Writes the side file of a problem. Raises ProblemError."""
+    with open_output(side_path(path)) as file:
+        file.write((json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
+
+
+def read_side(path: StrPath) -> SideFile:
+    """Reads the side file of a problem.
+
+    Raises:
+        ProblemError: there is none, or it is none of `jaxba-kitti`.
+    """
+    side = side_path(path)
+    try:
+        facts = json.loads(side.read_text(encoding="utf-8"))
+        calibration = Calibration(**{**facts["calibration"], "offset": tuple(facts["calibration"]["offset"])})
+        frames = tuple(int(number) for number in facts["frames"])
+    except OSError as error:
+        raise ProblemError(f"{display_name(side)}: cannot be read: {reason(error)}; jaxba-kitti writes it") from None
+    except (ValueError, KeyError, TypeError):
+        raise ProblemError(f"{display_name(side)}: is no side file of jaxba-kitti") from None
+    return SideFile(frames, calibration, facts)
+
+
+def truth_of(side: SideFile, path: StrPath) -> Float[np.ndarray, "cameras 3 4"]:
+    """True poses of a problem's cameras, from the file of the whole sequence. Raises ProblemError."""
+    return poses_of(read_poses(path), side.frames, side.calibration, display_name(path))
+
+
+def score(
+    poses: Float[np.ndarray, "cameras 3 4"],
+    truth: Float[np.ndarray, "cameras 3 4"],
+    lengths: tuple[float, ...] = trajectory.DEVKIT_LENGTHS,
+) -> Scores:
+    """All errors of a trajectory after its alignment. Raises ProblemError where it cannot be aligned."""
+    similarity = trajectory.umeyama(poses[:, :, 3], truth[:, :, 3])
+    aligned = similarity.poses(poses)
+    return Scores(
+        similarity.scale,
+        trajectory.absolute_errors(aligned, truth),
+        trajectory.relative_errors(aligned, truth),
+        trajectory.segment_errors(aligned, truth, lengths),
+    )
+
+
+def evaluate(
+    paths: Sequence[StrPath],
+    side: SideFile,
+    truth: Float[np.ndarray, "cameras 3 4"] | None,
+    lengths: tuple[float, ...] = trajectory.DEVKIT_LENGTHS,
+) -> list[Evaluated]:
+    """A problem and its solutions, each aligned with the truth on its own; without a truth, with the first camera.
+
+    Raises:
+        ProblemError: a file cannot be read, has other cameras than the side file, or cannot be aligned.
+    """
+    results = []
+    for path in paths:
+        problem = read_problem(path)
+        if problem.num_cameras != len(side.frames):
+            counts = f"{problem.num_cameras} cameras, the side file names {len(side.frames)} frames"
+            raise ProblemError(f"{display_name(path)}: has {counts}")
+        poses, points = poses_of_cameras(np.asarray(problem.cameras)), np.asarray(problem.points)
+        scores = None
+        if truth is not None:
+            similarity = trajectory.umeyama(poses[:, :, 3], truth[:, :, 3])
+            scores = score(poses, truth, lengths)
+        else:
+            similarity = trajectory.Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
+        rms = float(np.sqrt(2 * geometry.cost(problem) / problem.num_observations))
+        name = Path(strip_compression(path)).stem
+        results.append(Evaluated(name, problem, similarity.poses(poses), similarity.points(points), rms, scores))
+    return results
+
+
+def as_json(results: Sequence[Evaluated], side: SideFile) -> dict[str, Any]:
+    """The numbers of `evaluate`, for files."""
+    return {
+        "frames": list(side.frames),
+        "results": [
+            {
+                "name": r.name,
+                "cameras": r.problem.num_cameras,
+                "points": r.problem.num_points,
+                "observations": r.problem.num_observations,
+                "rms_px": r.rms,
+                **({} if r.scores is None else _scores_json(r.scores)),
+            }
+            for r in results
+        ],
+    }
+
+
+def _scores_json(scores: Scores) -> dict[str, Any]:
+    return {
+        "scale": scores.scale,
+        "ate_m": scores.absolute._asdict(),
+        "rpe_translation_m": scores.relative.translation._asdict(),
+        "rpe_rotation_deg": scores.relative.rotation._asdict(),
+        "segments": None if scores.segments is None else scores.segments._asdict(),
+    }
+
+
+def write_poses(path: StrPath, poses: Float[np.ndarray, "cameras 3 4"]) -> None:
+    """A line of 12 numbers a pose, as KITTI and evo read them. Raises ProblemError."""
+    with open_output(path) as file:
+        file.write("".join(" ".join(map(repr, row)) + "\n" for row in poses.reshape(-1, 12).tolist()).encode())

@@ -1,0 +1,82 @@
+"""Key-frames: the frames that enter the problem."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.kitti.sequence import Calibration
+from jaxba.kitti.tracks import Tracks
+from jaxba.problem import ProblemError
+
+PARALLAX = 10.0
+"""Median parallax in pixels at which `auto` takes a frame. VINS-Mono (Qin et al. 2018) takes 10 at 460 pixels focal
+length."""
+
+SHARE = 0.5
+"""... or when fewer than this share of the last key-frame's tracks are left."""
+
+MIN_SHARED = 20
+"""Tracks that neighbouring key-frames must share for the pose of one to say anything about that of the other."""
+
+
+def parallax(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], focal: float) -> float:
+    """Median motion in pixels that no rotation of the camera explains; zero for a camera that only turns.
+
+    The rotation is the best one in the least-squares sense between the rays, so far scenery may hide a little of a
+    translation.
+
+    Args:
+        first: rays `(X / Z, Y / Z)` in one view.
+        second: the same in the other view.
+        focal: pixels.
+
+    Source of the rotation: Kabsch 1976.
+    """
+    a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (first, second))
+    a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
+    u, _, vt = np.linalg.svd(b.T @ a)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    turned = a @ rotation.T
+    return float(focal * np.median(np.linalg.norm(turned[:, :2] / turned[:, 2:] - second, axis=1)))
+
+
+def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, numbers: tuple[int, ...]) -> list[int]:
+    """Which images are key-frames.
+
+    Args:
+        tracks: over all images.
+        images: how many there are.
+        choice: `auto` (by parallax and by the share of tracks left), `all`, or a number N for every N-th.
+        calibration: of the images.
+        numbers: the frame numbers of the images, for messages.
+
+    Raises:
+        ProblemError: the choice is none of these, the camera does not move, or neighbours share too few tracks.
+    """
+    if choice != "auto":
+        step = 1 if choice == "all" else int(choice) if re.fullmatch(r"[1-9]\d{0,8}", choice) else 0
+        if not step:
+            raise ProblemError(f"--keyframes must be auto, all or a number such as 2, is {choice!r}")
+        chosen = list(range(0, images, step))
+    else:
+        chosen = [0]
+        rays = calibration.rays(tracks.pixels)
+        for i in range(1, images):
+            a, b = tracks.shared(chosen[-1], i)
+            own = len(tracks.rows_of_image(chosen[-1]))
+            if len(a) < max(SHARE * own, MIN_SHARED) or parallax(rays[a], rays[b], calibration.fx) >= PARALLAX:
+                chosen.append(i)
+    if len(chosen) < 2:
+        raise ProblemError(f"the camera hardly moves in frames {numbers[0]} to {numbers[images - 1]}: one key-frame")
+    for i, j in pairwise(chosen):
+        shared = len(tracks.shared(i, j)[0])
+        if shared < MIN_SHARED:
+            raise ProblemError(
+                f"too few matches: key-frames {numbers[i]} and {numbers[j]} share {shared} tracks, "
+                f"at least {MIN_SHARED} are needed; choose --keyframes all, or other --frames or --features"
+            )
+    return chosen

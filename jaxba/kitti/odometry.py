@@ -1,0 +1,242 @@
+"""Monocular visual odometry over key-frames: the poses from which bundle adjustment starts.
+
+Two views with enough parallax are related by an essential matrix and their tracks triangulated; every other view is
+placed by the points that it sees (PnP), and new points are triangulated as soon as their rays open an angle. The scale
+is that of the first baseline, and nothing is adjusted: errors accumulate as they do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.kitti.features import essential
+from jaxba.kitti.opencv import cv2
+from jaxba.kitti.sequence import Calibration
+from jaxba.kitti.tracks import Tracks
+from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate
+from jaxba.problem import ProblemError
+
+BOOTSTRAP_ANGLE = 2.0
+"""Median angle in degrees between the rays of the first two views' points that is enough at once."""
+
+BOOTSTRAP_LEAST = 0.5
+"""... and the least that is taken where no pair has more. Noise of a pixel is 0.1 degrees at KITTI's focal length."""
+
+BOOTSTRAP_REACH = 12
+"""Views after the first that are tried as second ones."""
+
+MIN_POINTS = 15
+"""Points that a view must agree with to be placed by them, and that the first two views must give."""
+
+PNP_PIXELS = 3.0
+"""Reprojection error of an outlier."""
+
+PNP_ITERATIONS = 300
+
+EPIPOLAR_PIXELS = 1.0
+
+
+class Odometry(NamedTuple):
+    """Poses of all views, and what happened."""
+
+    views: Views  # world to camera, the first view at the origin
+    bootstrap: tuple[int, int]
+    restarts: tuple[
+        int, ...
+    ]  # views placed without enough known points: the scale was carried over from the step before
+
+
+class _Map:
+    """What is known so far."""
+
+    def __init__(self, tracks: Tracks, views: int, calibration: Calibration, filters: Filters, seed: int) -> None:
+        self.tracks, self.calibration, self.filters, self.seed = tracks, calibration, filters, seed
+        self.rays = calibration.rays(tracks.pixels)
+        self.rotation = np.tile(np.eye(3), (views, 1, 1))
+        self.translation = np.zeros((views, 3))
+        self.placed = np.zeros(views, bool)
+        self.points = np.full((tracks.count, 3), np.nan)
+
+    def place(self, view: int, rotation: np.ndarray, translation: np.ndarray) -> None:
+        self.rotation[view], self.translation[view], self.placed[view] = rotation, translation, True
+
+    def triangulate(self, views: list[int]) -> None:
+        """Anew all tracks that these views see, from all views placed so far."""
+        seen = np.unique(np.concatenate([self.tracks.track[self.tracks.rows_of_image(view)] for view in views]))
+        rows = self.tracks.rows_of_tracks(seen)
+        rows = rows[self.placed[self.tracks.image[rows]]]
+        names, track = np.unique(self.tracks.track[rows], return_inverse=True)
+        rows = rows[np.bincount(track)[track] >= 2]
+        names, track = np.unique(self.tracks.track[rows], return_inverse=True)
+        if not len(names):
+            return
+        sightings = Sightings(self.tracks.image[rows], track, self.rays[rows])
+        found = triangulate(Views(self.rotation, self.translation), sightings)
+        good = found.good(track, self.filters, self.calibration.fx)
+        self.points[names[good]] = found.points[good]
+        known = ~good & (np.bincount(track) > 2)  # two views alone may just be too close together
+        self.points[names[known]] = np.nan
+
+
+def visual_odometry(
+    tracks: Tracks,
+    views: int,
+    calibration: Calibration,
+    filters: Filters,
+    seed: int,
+    names: tuple[int, ...],
+    report: Callable[[int], None] = lambda done: None,
+) -> Odometry:
+    """Poses of all views from tracks alone.
+
+    Views before the first pair with parallax (a car that stands still, or only turns) are placed afterwards.
+
+    Args:
+        tracks: their images are the views, 0 to `views` - 1.
+        views: how many.
+        calibration: of all views.
+        filters: for points.
+        seed: of random samples.
+        names: frame numbers of the views, for messages.
+        report: told how many views are placed.
+
+    Raises:
+        ProblemError: no pair of views has parallax, or a view shares too few tracks with its neighbour.
+    """
+    scene = _Map(tracks, views, calibration, filters, seed)
+    first, second = _bootstrap(scene, views, names)
+    scene.triangulate([first, second])
+    restarts = []
+    forward = [*range(first + 1, second), *range(second + 1, views)]
+    for done, view in enumerate([*forward, *range(first - 1, -1, -1)]):
+        report(done + 2)
+        pose = _resect(scene, view)
+        if pose is None:
+            pose = _carry_on(scene, view, names)
+            restarts.append(view)
+        scene.place(view, *pose)
+        scene.triangulate([view])
+    # the first view becomes the origin
+    turn, shift = scene.rotation[0], scene.translation[0]
+    rotation = scene.rotation @ turn.T
+    translation = scene.translation - rotation @ shift
+    return Odometry(Views(rotation, translation), (first, second), tuple(restarts))
+
+
+def _bootstrap(scene: _Map, views: int, names: tuple[int, ...]) -> tuple[int, int]:
+    """Places the two views from which everything else is placed: the earliest pair with parallax."""
+    best: tuple[float, int, int, np.ndarray, np.ndarray] | None = None
+    for i in range(views - 1):
+        for j in range(i + 1, min(i + 1 + BOOTSTRAP_REACH, views)):
+            found = _relative(scene, i, j)
+            if found is None:
+                break
+            rotation, translation, angle = found
+            if best is None or angle > best[0]:
+                best = (angle, i, j, rotation, translation)
+            if angle >= BOOTSTRAP_ANGLE:
+                break
+        if best is not None and best[0] >= BOOTSTRAP_ANGLE:
+            break
+    if best is None or best[0] < BOOTSTRAP_LEAST:
+        angle = 0.0 if best is None else best[0]
+        raise ProblemError(
+            f"no two of the key-frames {names[0]} to {names[views - 1]} have enough parallax to start from "
+            f"(at most {angle:.2f} degrees, {BOOTSTRAP_LEAST} are needed): the camera stands still or only turns"
+        )
+    _, i, j, rotation, translation = best
+    scene.place(i, np.eye(3), np.zeros(3))
+    scene.place(j, rotation, translation)
+    return i, j
+
+
+def _relative(scene: _Map, i: int, j: int) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """Motion from view i to view j with a baseline of 1, and its points' median angle; None if they share little."""
+    a, b = scene.tracks.shared(i, j)
+    if len(a) < MIN_POINTS:
+        return None
+    threshold = EPIPOLAR_PIXELS / scene.calibration.fx
+    matrix, inliers = essential(scene.rays[a], scene.rays[b], threshold, scene.seed)
+    if matrix is None or inliers.sum() < MIN_POINTS:
+        return None
+    a, b = scene.rays[a[inliers]], scene.rays[b[inliers]]
+    _, rotation, translation, _ = cv2.recoverPose(matrix, np.ascontiguousarray(a), np.ascontiguousarray(b), np.eye(3))
+    rotation, translation = np.asarray(rotation), np.asarray(translation).ravel()
+    views = Views(np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation]))
+    track = np.repeat(np.arange(len(a)), 2)
+    found = triangulate(views, Sightings(np.tile([0, 1], len(a)), track, np.stack([a, b], axis=1).reshape(-1, 2)))
+    good = found.good(track, Filters(angle=0.0, pixels=scene.filters.pixels), scene.calibration.fx)
+    if good.sum() < MIN_POINTS:
+        return None
+    return rotation, translation, float(np.median(found.angle[good]))
+
+
+def _neighbour(scene: _Map, view: int) -> int:
+    placed = np.flatnonzero(scene.placed)
+    return int(placed[np.argmin(np.abs(placed - view))])
+
+
+def _resect(scene: _Map, view: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Pose of a view by the points that it sees: P3P within RANSAC, then Levenberg-Marquardt on the inliers."""
+    rows = scene.tracks.rows_of_image(view)
+    rows = rows[np.isfinite(scene.points[scene.tracks.track[rows], 0])]
+    if len(rows) < MIN_POINTS:
+        return None
+    near = _neighbour(scene, view)
+    # in the frame of the neighbour, where coordinates are small
+    points = scene.points[scene.tracks.track[rows]] @ scene.rotation[near].T + scene.translation[near]
+    rays = np.ascontiguousarray(scene.rays[rows])
+    cv2.setRNGSeed(scene.seed)
+    ok, turn, shift, inliers = cv2.solvePnPRansac(
+        points,
+        rays,
+        np.eye(3),
+        np.zeros(4),
+        iterationsCount=PNP_ITERATIONS,
+        reprojectionError=PNP_PIXELS / scene.calibration.fx,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not ok or inliers is None or len(inliers) < MIN_POINTS:
+        return None
+    chosen: np.ndarray = np.asarray(inliers).ravel()
+    for _ in range(2):  # refine, gather the inliers anew, refine
+        turn, shift = cv2.solvePnPRefineLM(points[chosen], rays[chosen], np.eye(3), np.zeros(4), turn, shift)
+        rotation = np.asarray(cv2.Rodrigues(turn)[0])
+        local = points @ rotation.T + np.asarray(shift).ravel()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error = np.linalg.norm(local[:, :2] / local[:, 2:] - rays, axis=1)
+        chosen = np.flatnonzero((error * scene.calibration.fx <= PNP_PIXELS) & (local[:, 2] > 0))
+        if len(chosen) < MIN_POINTS:
+            return None
+    translation = rotation @ scene.translation[near] + np.asarray(shift).ravel()
+    return rotation @ scene.rotation[near], translation
+
+
+def _carry_on(scene: _Map, view: int, names: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a view relative to its neighbour alone, with the length of the step before it."""
+    near = _neighbour(scene, view)
+    found = _relative(scene, near, view)
+    if found is None:
+        shared = len(scene.tracks.shared(near, view)[0])
+        raise ProblemError(
+            f"too few matches: key-frames {names[near]} and {names[view]} share {shared} tracks that fit one motion "
+            f"badly, {MIN_POINTS} good ones are needed; choose other --frames or --features"
+        )
+    rotation, translation, _ = found
+    centers = Views(scene.rotation, scene.translation).centers()
+    before = near + (1 if near > view else -1)
+    step = 1.0
+    if 0 <= before < len(centers) and scene.placed[before]:
+        step = float(np.linalg.norm(centers[near] - centers[before]))
+    return rotation @ scene.rotation[near], rotation @ scene.translation[near] + step * translation
+
+
+def views_of_poses(poses: Float[np.ndarray, "views 3 4"]) -> Views:
+    """World-to-camera views of camera-to-world poses."""
+    rotation = poses[:, :, :3].transpose(0, 2, 1)
+    return Views(rotation, -np.einsum("nij,nj->ni", rotation, poses[:, :, 3]))

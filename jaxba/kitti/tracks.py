@@ -1,0 +1,120 @@
+"""Tracks: which key-points of which images are the same point of the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """A table of sightings, sorted by track and then by image; no track is twice in an image."""
+
+    image: Int[np.ndarray, " n"]
+    """Image of each sighting: a position in some list of images."""
+
+    track: Int[np.ndarray, " n"]
+    """Its track, numbered from 0 without gaps."""
+
+    pixels: Float[np.ndarray, "n 2"]
+    """Where, from the centre of the first pixel, x to the right, y down."""
+
+    @property
+    def count(self) -> int:
+        """Number of tracks."""
+        return int(self.track[-1]) + 1 if len(self.track) else 0
+
+    def lengths(self) -> Int[np.ndarray, " tracks"]:
+        """Sightings of each track."""
+        return np.bincount(self.track, minlength=self.count)
+
+    @cached_property
+    def _by_image(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows in the order of their images, and where each image's begin (one more entry than images)."""
+        order = np.argsort(self.image, kind="stable")
+        return order, np.searchsorted(self.image[order], np.arange(int(self.image.max(initial=-1)) + 2))
+
+    def rows_of_image(self, image: int) -> Int[np.ndarray, " m"]:
+        """Rows of the sightings in an image, in the order of their tracks."""
+        order, start = self._by_image
+        return order[start[image] : start[image + 1]] if 0 <= image < len(start) - 1 else order[:0]
+
+    def rows_of_tracks(self, tracks: Int[np.ndarray, " k"]) -> Int[np.ndarray, " m"]:
+        """Rows of all sightings of some tracks (in ascending order), in the order of the table."""
+        first, end = (np.searchsorted(self.track, tracks, side=side) for side in ("left", "right"))
+        sizes = end - first
+        return np.repeat(first - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
+
+    def shared(self, a: int, b: int) -> tuple[Int[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+        """Rows of the tracks that both images see: those in image a, those in image b, in the same order."""
+        rows_a, rows_b = self.rows_of_image(a), self.rows_of_image(b)
+        _, at_a, at_b = np.intersect1d(self.track[rows_a], self.track[rows_b], return_indices=True)
+        return rows_a[at_a], rows_b[at_b]
+
+    def keep(self, rows: np.ndarray, min_views: int) -> Tracks:
+        """The sightings that a mask selects, of tracks that then still have `min_views`; tracks are numbered anew."""
+        image, track, pixels = self.image[rows], self.track[rows], self.pixels[rows]
+        long = np.bincount(track, minlength=self.count)[track] >= min_views
+        return Tracks(image[long], np.unique(track[long], return_inverse=True)[1], pixels[long])
+
+    def restrict(self, images: Sequence[int], min_views: int = 2) -> Tracks:
+        """The sightings of some images, which become numbers 0, 1, ...; tracks with fewer than `min_views` go."""
+        new = np.full(int(self.image.max(initial=-1)) + 1, -1)
+        wanted = np.asarray(images, int)
+        new[wanted[wanted < len(new)]] = np.flatnonzero(wanted < len(new))
+        kept = self.keep(new[self.image] >= 0, min_views)
+        return Tracks(new[kept.image], kept.track, kept.pixels)
+
+
+def make_tracks(image: np.ndarray, track: np.ndarray, pixels: np.ndarray, min_views: int = 2) -> Tracks:
+    """A table of sightings in any order, their tracks with any numbers."""
+    order = np.lexsort((image, track))
+    track = np.unique(track[order], return_inverse=True)[1]
+    table = Tracks(np.asarray(image)[order], track, np.asarray(pixels, np.float64)[order])
+    return table.keep(np.ones(len(track), bool), min_views)
+
+
+def join_matches(
+    pixels: Sequence[Float[np.ndarray, "_ 2"]], matches: Mapping[tuple[int, int], Int[np.ndarray, "_ 2"]]
+) -> Tracks:
+    """Tracks from matches of pairs of images: what is connected belongs together.
+
+    A connected set with two key-points of one image cannot be one point. It is split into the chains that matches of
+    neighbouring images (the nearest that each was matched with) make of it: these are one to one, so a chain is never
+    twice in an image.
+
+    Args:
+        pixels: key-points of every image.
+        matches: by pair of images (i < j), pairs of key-points, one to one.
+    """
+    sizes = [len(points) for points in pixels]
+    first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    image = np.repeat(np.arange(len(pixels)), sizes)
+    edges = {pair: first[list(pair)] + np.asarray(found, np.int64).reshape(-1, 2) for pair, found in matches.items()}
+    label = _components(int(first[-1]), list(edges.values()))
+    order = np.lexsort((image, label))
+    twice = (np.diff(label[order]) == 0) & (np.diff(image[order]) == 0)
+    bad = np.isin(label, label[order][1:][twice])
+    if bad.any():
+        nearest: dict[int, int] = {}
+        for i, j in sorted(edges):
+            nearest.setdefault(i, j)
+        back: dict[int, int] = {}
+        for i, j in sorted(edges, reverse=True):
+            back.setdefault(j, i)
+        chain = [edges[i, j] for i, j in nearest.items() if back[j] == i]
+        part = _components(int(first[-1]), chain)
+        label = np.where(bad, label.max() + 1 + part, label)
+    return make_tracks(image, label, np.concatenate([np.empty((0, 2)), *pixels]))
+
+
+def _components(count: int, edges: Sequence[np.ndarray]) -> np.ndarray:
+    pairs = np.concatenate([np.empty((0, 2), np.int64), *edges])
+    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]

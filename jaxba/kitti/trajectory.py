@@ -1,0 +1,170 @@
+"""Trajectories compared: absolute and relative errors after a similarity alignment.
+
+A trajectory is a stack of camera-to-world poses `[R | c]`, shape (poses, 3, 4), in the order of time. Definitions are
+those of evo (`evo_ape -a -s`, `evo_rpe -a -s`) and of the KITTI odometry development kit; each function names its own.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.problem import ProblemError
+
+Poses = Float[np.ndarray, "poses 3 4"]
+
+DEVKIT_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+"""Metres. Source: `lengths` in the development kit's evaluate_odometry.cpp."""
+
+DEVKIT_STEP = 10
+"""Segments start at every tenth pose. Source: `step_size` there."""
+
+LEAST_SPREAD = 1e-12
+"""Second singular value of the covariance, as a share of the first, below which positions lie on a line and leave the
+rotation about it open."""
+
+
+class Similarity(NamedTuple):
+    """`x -> scale R x + t`."""
+
+    scale: float
+    rotation: Float[np.ndarray, "3 3"]
+    translation: Float[np.ndarray, "3"]
+
+    def points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Moves points."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def poses(self, poses: Poses) -> Poses:
+        """Moves camera-to-world poses: centres as points, orientations by the rotation."""
+        centers = self.points(poses[:, :, 3])
+        return np.concatenate([self.rotation @ poses[:, :, :3], centers[:, :, None]], axis=2)
+
+
+class Errors(NamedTuple):
+    """Statistics of non-negative errors."""
+
+    rmse: float
+    mean: float
+    median: float
+    largest: float
+
+
+class RelativeErrors(NamedTuple):
+    """From one pose to the next."""
+
+    translation: Errors  # units of the truth
+    rotation: Errors  # degrees
+
+
+class SegmentErrors(NamedTuple):
+    """The development kit's averages over all segments."""
+
+    translation: float  # percent of the segment's length
+    rotation: float  # degrees per metre
+    segments: int
+
+
+def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Similarity:
+    """The similarity that brings `source` nearest to `target` in the least-squares sense.
+
+    Raises:
+        ProblemError: fewer than three points, or all of them in one place or on one line.
+
+    Source: Umeyama 1991, eqs. 38-42; evo's `geometry.umeyama_alignment` is the same.
+    """
+    if len(source) < 3:
+        raise ProblemError(f"an alignment needs 3 poses, not {len(source)}")
+    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    a, b = source - mean_source, target - mean_target
+    u, d, vt = np.linalg.svd(b.T @ a / len(a))
+    if not d[1] > LEAST_SPREAD * d[0]:
+        raise ProblemError("the trajectories cannot be aligned: the positions of one lie on a straight line")
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = (u * sign) @ vt
+    scale = float((d * sign).sum() / (a * a).sum() * len(a))
+    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def align(estimate: Poses, truth: Poses) -> Poses:
+    """The estimate after the similarity that brings its centres nearest to the truth's. Raises as `umeyama`."""
+    return umeyama(estimate[:, :, 3], truth[:, :, 3]).poses(estimate)
+
+
+def absolute_errors(aligned: Poses, truth: Poses) -> Errors:
+    """Distances between camera centres, in units of the truth; `rmse` is the ATE, as `evo_ape -a -s` prints it.
+
+    Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", section IV.B.
+    """
+    return _statistics(np.linalg.norm(aligned[:, :, 3] - truth[:, :, 3], axis=1))
+
+
+def relative_errors(aligned: Poses, truth: Poses) -> RelativeErrors:
+    """Errors of the motion from each pose to the next, `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; evo's RPE with a delta of one.
+
+    The estimate must have the truth's scale (`align`); its rotation and position do not matter.
+    """
+    error = _product(_inverse(_motion(truth[:-1], truth[1:])), _motion(aligned[:-1], aligned[1:]))
+    return RelativeErrors(_statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error)))
+
+
+def segment_errors(
+    aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS, step: int = DEVKIT_STEP
+) -> SegmentErrors | None:
+    """Errors over stretches of the true path, per metre; None where the path is too short for all of them.
+
+    A segment of length L starts at every `step`-th pose and ends at the first one whose distance along the true path
+    is larger by more than L.
+
+    Source: evaluate_odometry.cpp of the development kit (`calcSequenceErrors`).
+    """
+    steps = np.linalg.norm(np.diff(truth[:, :, 3], axis=0), axis=1)
+    distance = np.concatenate([[0.0], np.cumsum(steps)])
+    pairs = []
+    for first in range(0, len(truth), step):
+        for length in lengths:
+            last = int(np.searchsorted(distance, distance[first] + length, side="right"))
+            if last < len(truth):
+                pairs.append((first, last, length))
+    if not pairs:
+        return None
+    first, last = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
+    length = np.array([pair[2] for pair in pairs])
+    error = _product(_inverse(_motion(aligned[first], aligned[last])), _motion(truth[first], truth[last]))
+    translation = np.linalg.norm(error[:, :, 3], axis=1) / length
+    rotation = _angles(error) / length
+    return SegmentErrors(100 * float(translation.mean()), float(rotation.mean()), len(pairs))
+
+
+def path_length(poses: Poses) -> float:
+    """Length of the path through all centres."""
+    return float(np.linalg.norm(np.diff(poses[:, :, 3], axis=0), axis=1).sum())
+
+
+def _statistics(errors: np.ndarray) -> Errors:
+    return Errors(
+        float(np.sqrt((errors**2).mean())), float(errors.mean()), float(np.median(errors)), float(errors.max())
+    )
+
+
+def _motion(first: Poses, second: Poses) -> Poses:
+    return _product(_inverse(first), second)
+
+
+def _inverse(poses: Poses) -> Poses:
+    rotation = poses[:, :, :3].transpose(0, 2, 1)
+    return np.concatenate([rotation, -rotation @ poses[:, :, 3:]], axis=2)
+
+
+def _product(a: Poses, b: Poses) -> Poses:
+    rotation = a[:, :, :3] @ b[:, :, :3]
+    return np.concatenate([rotation, a[:, :, :3] @ b[:, :, 3:] + a[:, :, 3:]], axis=2)
+
+
+def _angles(poses: Poses) -> Float[np.ndarray, " poses"]:
+    """Rotation angles in degrees. From sine and cosine: the arc cosine alone loses half of the digits near zero."""
+    r = poses[:, :, :3]
+    skew = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1)
+    return np.rad2deg(np.arctan2(np.linalg.norm(skew, axis=1), np.trace(r, axis1=1, axis2=2) - 1))

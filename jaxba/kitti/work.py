@@ -1,0 +1,62 @@
+"""The work folder: results of single frames and pairs, so that a killed run goes on where it was.
+
+A file's name holds a hash of everything its content depends on, so nothing stale is ever read; the folder may be
+deleted at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from jaxba.io.files import display_name, open_output, reason
+from jaxba.problem import ProblemError
+
+Result = TypeVar("Result", bound=tuple)
+
+VERSION = "1"
+"""To be raised with every change of what a stored result means."""
+
+
+def digest(*parts: object) -> str:
+    """16 hexadecimal digits that stand for the parts, by their `repr`."""
+    return hashlib.sha256("\0".join(map(repr, (VERSION, *parts))).encode()).hexdigest()[:16]
+
+
+class Work:
+    """Named tuples of arrays, one `.npz` file each."""
+
+    def __init__(self, folder: Path) -> None:
+        """Makes the folder. Raises ProblemError where that fails."""
+        self.folder = folder
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ProblemError(f"cannot make {display_name(folder)}: {reason(error)}") from None
+
+    def get(self, name: str, kind: type[Result], make: Callable[[], Result]) -> Result:
+        """The stored tuple of this name; made and stored if there is none, or it cannot be read.
+
+        Args:
+            name: of the file, without its ending; holds a `digest` of all that the result depends on.
+            kind: a named tuple of arrays.
+            make: called where needed.
+
+        Raises:
+            ProblemError: the file cannot be written, or what `make` raises.
+        """
+        path = self.folder / f"{name}.npz"
+        try:
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+                return kind(*(file[field] for field in kind._fields))  # type: ignore[attr-defined]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            pass
+        result = make()
+        with open_output(path) as stream:
+            np.savez(stream, **result._asdict())  # type: ignore[attr-defined]
+        return result

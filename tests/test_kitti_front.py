@@ -1,0 +1,436 @@
+"""From rendered images to a problem: two cameras, three kinds of key-points, and what goes wrong on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import kitti_scene
+import numpy as np
+import pytest
+from kitti_scene import OTHER, SMALL, Camera, cv2, render, textures, write_sequence
+
+from jaxba import geometry, read_bal
+from jaxba.cli.kitti import run
+from jaxba.cli.solve import run as solve
+from jaxba.kitti import front, klt
+from jaxba.kitti.features import KeyPoints, detect, essential, match
+from jaxba.kitti.sequence import Calibration
+
+DATA = os.environ.get("JAXBA_DATA")
+needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
+
+FRAMES = 14
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory) -> dict[Camera, Path]:
+    """The same drive seen by two cameras of different size and calibration."""
+    root = tmp_path_factory.mktemp("kitti")
+    poses = kitti_scene.path(FRAMES)
+    return {camera: write_sequence(root / str(camera.width), camera, poses) for camera in (SMALL, OTHER)}
+
+
+@pytest.fixture
+def sequence(rendered, tmp_path) -> Path:
+    """A copy of the smaller sequence, to be spoiled."""
+    return Path(shutil.copytree(rendered[SMALL], tmp_path / "sequence"))
+
+
+def build(sequence: Path, out: Path, *options: str) -> int:
+    poses = ["--poses", str(sequence / "poses.txt")]
+    return run([str(sequence), "--out", str(out), *poses, *options])
+
+
+def image(sequence: Path, number: int) -> Path:
+    return sequence / "image_0" / f"{number:06d}.png"
+
+
+def start_error(printed: str) -> float:
+    """ATE of the start in the table, metres; the path is 5 m long."""
+    row = next(line for line in printed.splitlines() if " to " in line and line.startswith("│"))
+    return float(row.split("│")[-2])
+
+
+# Pieces
+
+
+def known_motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(0)
+    local = random.uniform([-5, -3, 8], [5, 3, 30], (300, 3))
+    turn = cv2.Rodrigues(np.array([0.01, 0.06, -0.02]))[0]
+    after = local @ turn.T + [0.3, 0.05, -1.0]
+    return local[:, :2] / local[:, 2:], after[:, :2] / after[:, 2:], turn
+
+
+def test_wrong_matches_are_told_from_right_ones_by_the_epipolar_geometry():
+    first, second, turn = known_motion()
+    second = second + 1e-4 * np.random.default_rng(1).standard_normal(second.shape)
+    second[:60] = np.random.default_rng(2).uniform(-0.5, 0.5, (60, 2))
+    matrix, inliers = essential(first, second, 1 / 700, seed=0)
+    assert matrix is not None
+    assert inliers[60:].mean() > 0.98
+    assert inliers[:60].mean() < 0.1
+    shift = np.array([0.3, 0.05, -1.0])
+    cross = np.array([[0, -shift[2], shift[1]], [shift[2], 0, -shift[0]], [-shift[1], shift[0], 0]])
+    truth = cross @ turn
+    cosine = abs((matrix * truth).sum()) / np.linalg.norm(matrix) / np.linalg.norm(truth)
+    assert cosine > 0.9999
+    again = essential(first, second, 1 / 700, seed=0)
+    assert np.array_equal(again[0], matrix)
+
+
+def brute_force(a: np.ndarray, b: np.ndarray, ratio: float) -> set[tuple[int, int]]:
+    """Mutual nearest neighbours with the ratio test on both sides, by loops."""
+    distance = np.array([[float(np.linalg.norm(x.astype(float) - y)) for y in b.astype(float)] for x in a])
+    found = set()
+    for i in range(len(a)):
+        j = int(distance[i].argmin())
+        if distance[:, j].argmin() != i:
+            continue
+        row, column = np.sort(distance[i]), np.sort(distance[:, j])
+        if distance[i, j] < ratio * row[1] and distance[i, j] < ratio * column[1]:
+            found.add((i, j))
+    return found
+
+
+def test_matches_are_those_of_a_search_by_loops():
+    random = np.random.default_rng(3)
+    a = random.integers(0, 60, (30, 128)).astype(np.uint8)
+    b = np.concatenate([a[random.permutation(30)[:20]], random.integers(0, 60, (15, 128)).astype(np.uint8)])
+    b = np.clip(b.astype(int) + random.integers(-14, 15, b.shape), 0, 255).astype(np.uint8)
+    found = match(KeyPoints(np.zeros((30, 2)), a), KeyPoints(np.zeros((35, 2)), b))
+    assert {tuple(pair) for pair in found.tolist()} == brute_force(a, b, 0.8)
+    assert 10 < len(found) <= 20
+
+
+def test_bits_are_compared_by_hamming_distance():
+    random = np.random.default_rng(4)
+    a = random.integers(0, 256, (25, 32)).astype(np.uint8)
+    b = a[::-1] ^ (random.integers(0, 256, a.shape) & random.integers(0, 256, a.shape) & 17).astype(np.uint8)
+    found = match(KeyPoints(np.zeros((25, 2)), a), KeyPoints(np.zeros((25, 2)), b))
+    counts = np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2)
+    for i, j in found.tolist():
+        assert counts[i].argmin() == j
+        assert counts[i, j] < 0.8 * np.sort(counts[i])[1]
+    assert len(found) == 25
+
+
+@pytest.mark.parametrize("features", ["sift", "orb"])
+def test_a_blank_image_has_no_key_points(features):
+    found = detect(np.full((100, 200), 90, np.uint8), features, 500)
+    assert len(found.pixels) == 0
+    assert len(match(found, found)) == 0
+
+
+def test_followed_points_are_where_the_geometry_says(rendered):
+    """Corners of the first frame move as their plane demands."""
+    poses = kitti_scene.path(2)
+    first, second = (cv2.imread(str(image(rendered[SMALL], i)), 0) for i in (0, 1))
+    calibration = Calibration(SMALL.fx, SMALL.fy, SMALL.cx, SMALL.cy)
+    points = klt.start(first, 600)
+    after, old = klt.follow(first, second, points, 600, calibration, 0)
+    assert old > 100
+    assert (np.diff(after.tracks) > 0).all()
+    _, a, b = np.intersect1d(points.tracks, after.tracks, return_indices=True)
+    assert len(a) == old
+    rays = np.column_stack([calibration.rays(points.pixels[a]), np.ones(old)]) @ poses[0, :, :3].T
+    distance = np.full(old, np.inf)
+    for axis, position, _ in kitti_scene.PLANES:
+        with np.errstate(divide="ignore"):
+            along = (position - poses[0, axis, 3]) / rays[:, axis]
+        distance = np.where((along > 0) & (along < distance), along, distance)
+    local = (poses[0, :, 3] + rays * distance[:, None] - poses[1, :, 3]) @ poses[1, :, :3]
+    expected = (local[:, :2] / local[:, 2:]) * [SMALL.fx, SMALL.fy] + [SMALL.cx, SMALL.cy]
+    error = np.linalg.norm(after.pixels[b] - expected, axis=1)
+    assert np.median(error) < 0.15
+    assert np.mean(error < 1) > 0.95
+
+
+def test_new_corners_keep_their_distance(rendered):
+    first = cv2.imread(str(image(rendered[SMALL], 0)), 0)
+    pixels = klt.start(first, 600).pixels
+    gaps = np.linalg.norm(pixels[:, None] - pixels, axis=2) + 1e9 * np.eye(len(pixels))
+    assert gaps.min() >= klt.DISTANCE
+
+
+# The whole command
+
+
+@pytest.mark.parametrize(
+    ("camera", "features", "limit"),
+    [(SMALL, "sift", 0.05), (OTHER, "sift", 0.05), (SMALL, "orb", 0.2), (OTHER, "klt", 0.05)],
+)
+def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera, features, limit):
+    out = tmp_path / "problem.txt.bz2"
+    assert build(rendered[camera], out, "--features", features) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert start_error(printed.out) < limit
+    problem, side = read_bal(out), json.loads((tmp_path / "problem.frames.json").read_text())
+    assert problem.num_cameras == len(side["frames"])
+    assert side["calibration"]["fx"] == camera.fx
+    assert side["options"]["features"] == features
+    assert (geometry.depths(problem) > 0).all()
+    assert np.abs(geometry.residuals(problem)).max() <= 3.0 + 1e-6
+    assert np.bincount(problem.point_index).min() >= 2
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["problem.frames.json", "problem.txt.bz2", "problem.work"]
+
+
+def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
+    """jaxba-kitti, jaxba-solve and jaxba-kitti evaluate, one after the other."""
+    out, solved, folder = tmp_path / "p.txt", tmp_path / "solved.txt.gz", tmp_path / "eval"
+    poses = rendered[OTHER] / "poses.txt"
+    start = ["--start", "noisy-poses", "--rotation-sigma", "0.3", "--translation-sigma", "0.1"]
+    assert build(rendered[OTHER], out, *start, "--keyframes", "all") == 0
+    ate = start_error(capsys.readouterr().out)
+    assert solve([str(out), "--damping", "ceres", "--output", str(solved)]) == 0
+    capsys.readouterr()
+    assert run(["evaluate", str(out), str(solved), "--poses", str(poses), "--out", str(folder), "--lengths", "2"]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    found = json.loads((folder / "evaluation.json").read_text())
+    before, after = found["results"]
+    assert before["ate_m"]["rmse"] == pytest.approx(ate, abs=6e-4)
+    assert after["ate_m"]["rmse"] < 0.5 * before["ate_m"]["rmse"]
+    assert after["rms_px"] < before["rms_px"]
+    assert after["segments"]["segments"] == before["segments"]["segments"] > 0
+    names = {
+        "evaluation.json",
+        "poses-0-p.txt",
+        "poses-1-solved.txt",
+        "poses-truth.txt",
+        "top-view.png",
+        "top-view.svg",
+    }
+    assert {p.name for p in folder.iterdir()} == names
+    np.testing.assert_allclose(np.loadtxt(folder / "poses-truth.txt"), np.loadtxt(poses), atol=1e-8)
+    picture = cv2.imread(str(folder / "top-view.png"))
+    red = (picture[..., 2] > 150) & (picture[..., 0] < 80) & (picture[..., 1] < 80)
+    assert red.sum() > 100  # the path
+    assert (picture.max(axis=2) < 100).sum() > 500  # the points
+
+
+def test_given_poses_are_the_start(rendered, tmp_path, capsys):
+    out = tmp_path / "p.txt"
+    assert build(rendered[SMALL], out, "--start", "poses", "--keyframes", "3", "--frames", "1:14") == 0
+    assert start_error(capsys.readouterr().out) < 1e-6
+    assert json.loads((tmp_path / "p.frames.json").read_text())["frames"] == [1, 4, 7, 10, 13]
+    assert run(["evaluate", str(out), "--out", str(tmp_path / "e")]) == 0  # no truth: the picture alone
+    assert "ate_m" not in json.loads((tmp_path / "e" / "evaluation.json").read_text())["results"][0]
+
+
+def test_windows_are_problems_of_their_own(rendered, tmp_path):
+    out = tmp_path / "p.txt.gz"
+    assert build(rendered[SMALL], out, "--window", "6", "--stride", "4", "--keyframes", "all") == 0
+    names = sorted(p.name for p in tmp_path.iterdir() if p.name.endswith(".gz"))
+    assert names == [f"p-{a:06d}-{a + 5:06d}.txt.gz" for a in (0, 4, 8)]
+    for name in names:
+        assert read_bal(tmp_path / name).num_cameras == 6
+        assert len(json.loads((tmp_path / name.replace("txt.gz", "frames.json")).read_text())["frames"]) == 6
+
+
+# Same command, same numbers
+
+
+@pytest.mark.parametrize("features", ["sift", "klt"])
+def test_a_killed_run_goes_on_and_gives_the_same_bytes(sequence, tmp_path, monkeypatch, capsys, features):
+    whole, broken = tmp_path / "a.txt", tmp_path / "b.txt"
+    options = ("--features", features, "--keypoints", "700")
+    assert build(sequence, whole, *options) == 0
+    calls, name = [], "_verify" if features == "sift" else "follow"
+    original = getattr(front, name)
+
+    def killed(*arguments):
+        calls.append(1)
+        if len(calls) == 6:
+            raise KeyboardInterrupt
+        return original(*arguments)
+
+    monkeypatch.setattr(front, name, killed)
+    assert build(sequence, broken, *options) == 130
+    assert "run the same command again" in capsys.readouterr().out
+    assert not broken.exists()
+    stored = sorted((tmp_path / "b.work").iterdir())
+    stored[1].write_bytes(stored[1].read_bytes()[:100])  # cut short: made anew
+    assert not [path for path in stored if path.suffix != ".npz"]
+    monkeypatch.setattr(front, name, original)
+    before = len(calls)
+    assert build(sequence, broken, *options) == 0
+    assert len(calls) == before
+    assert broken.read_bytes() == whole.read_bytes()
+    assert sorted(p.name for p in (tmp_path / "a.work").iterdir()) == sorted(
+        p.name for p in (tmp_path / "b.work").iterdir()
+    )
+
+
+def test_a_changed_image_is_not_taken_from_the_work_folder(sequence, tmp_path):
+    out = tmp_path / "p.txt"
+    assert build(sequence, out) == 0
+    first = out.read_bytes()
+    shutil.copy(image(sequence, 6), image(sequence, 5))
+    assert build(sequence, out) == 0
+    assert out.read_bytes() != first
+
+
+# Sequences with trouble
+
+
+def test_a_black_frame_is_left_out(sequence, tmp_path, capsys):
+    for features in ("sift", "klt"):
+        cv2.imwrite(str(image(sequence, 5)), np.zeros((SMALL.height, SMALL.width), np.uint8))
+        out = tmp_path / f"{features}.txt"
+        assert build(sequence, out, "--features", features, "--keyframes", "all") == 0
+        printed = capsys.readouterr()
+        assert "note: left out, too few matches: frame 5\n" in printed.out
+        assert json.loads(out.with_suffix(".frames.json").read_text())["frames"] == [*range(5), *range(6, FRAMES)]
+        assert start_error(printed.out) < 0.1
+
+
+@pytest.mark.parametrize("features", ["sift", "orb", "klt"])
+def test_a_long_gap_is_an_error_that_names_the_frames(sequence, tmp_path, capsys, features):
+    for number in (6, 7, 8):
+        cv2.imwrite(str(image(sequence, number)), np.zeros((SMALL.height, SMALL.width), np.uint8))
+    assert build(sequence, tmp_path / "p.txt", "--features", features) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(
+        "error: too few matches: frame 5 shares 0 with frame 6, 0 with frame 7, 0 with frame 8"
+    )
+    assert printed.err.count("\n") == 1
+    assert not (tmp_path / "p.txt").exists()
+    assert build(sequence, tmp_path / "p.txt", "--features", features, "--frames", "0:6") == 0
+
+
+@pytest.mark.parametrize("choice", ["auto", "all"])
+def test_a_car_that_stands_first_is_no_trouble(sequence, tmp_path, capsys, choice):
+    """Frames 0 to 4 from one place (with the noise of a sensor), then the drive."""
+    random = np.random.default_rng(0)
+    still = cv2.imread(str(image(sequence, 4)), 0)
+    poses = kitti_scene.path(FRAMES)
+    for number in range(5):
+        noise = np.rint(2 * random.standard_normal(still.shape))
+        cv2.imwrite(str(image(sequence, number)), np.clip(still + noise, 0, 255).astype(np.uint8))
+        poses[number] = poses[4]
+    (sequence / "poses.txt").write_text("".join(" ".join(map(str, pose.ravel())) + "\n" for pose in poses))
+    assert build(sequence, tmp_path / "p.txt", "--keyframes", choice) == 0
+    assert start_error(capsys.readouterr().out) < 0.1
+
+
+@pytest.mark.parametrize("choice", ["auto", "all"])
+def test_a_camera_that_only_turns_is_refused(sequence, tmp_path, capsys, choice):
+    layers, poses = textures(), kitti_scene.path(FRAMES)
+    for number in range(6):
+        pose = poses[number].copy()
+        pose[:, 3] = poses[0, :, 3]
+        cv2.imwrite(str(image(sequence, number)), render(SMALL, pose, layers))
+    assert build(sequence, tmp_path / "p.txt", "--keyframes", choice, "--frames", "0:6") == 2
+    message = capsys.readouterr().err
+    assert "hardly moves in frames 0 to 5" in message or "have enough parallax to start from" in message
+    assert message.count("\n") == 1
+
+
+def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
+    path = image(sequence, 3)
+    good = path.read_bytes()
+    for data, words in (
+        (good[: len(good) // 2], "is no image"),
+        (b"", "is no image"),
+        (b"not a png", "is no image"),
+        (b"\x89PNG\r\n\x1a\n" + b"x" * 50, "is no image"),
+    ):
+        path.write_bytes(data)
+        assert build(sequence, tmp_path / "p.txt") == 2
+        message = capfd.readouterr().err
+        assert f"000003.png: {words}" in message
+        assert message.count("\n") == 1
+    cv2.imwrite(str(path), np.zeros((40, 60), np.uint8))
+    assert build(sequence, tmp_path / "p.txt") == 2
+    assert "000003.png: is 60 x 40 pixels, the first is 320 x 160" in capfd.readouterr().err
+    path.write_bytes(good)
+    assert build(sequence, tmp_path / "p.txt") == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--start", "poses"], "--start poses needs --poses"),
+        (["--stride", "3"], "--stride needs --window"),
+        (["--keypoints", "0"], "--keypoints must be positive"),
+        (["--min-views", "1"], "--min-views must be at least 2"),
+        (["--out", "p.ply"], "the problem is a BAL file"),
+        (["--out", "nowhere/p.txt"], "does not exist"),
+        (["--seed", "-1"], "--seed must lie"),
+        (["--frames", "0:99"], "ends after the last frame, 13"),
+        (["--poses", "nowhere.txt"], "cannot be read"),
+        (["--keyframes", "few", "--frames", "0:3"], "--keyframes must be"),
+        (["--min-matches", "3000", "--frames", "0:3"], "at least 3000 are needed"),
+        (
+            ["--window", "99", "--frames", "0:5", "--keyframes", "all"],
+            "--window must lie between 2 and the 5 key-frames",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_said_in_one_line(rendered, tmp_path, monkeypatch, capsys, options, words):
+    monkeypatch.chdir(tmp_path)
+    assert run([str(rendered[SMALL]), *options]) == 2
+    message = capsys.readouterr().err
+    assert words in message
+    assert message.startswith("error: ")
+    assert message.count("\n") == 1
+    assert not [p for p in tmp_path.iterdir() if p.suffix != ".work"]
+
+
+def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, capsys):
+    out, other = tmp_path / "p.txt", tmp_path / "q.txt"
+    assert build(rendered[SMALL], out) == 0
+    assert build(rendered[SMALL], other, "--keyframes", "all") == 0
+    short = tmp_path / "short.txt"
+    short.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
+    capsys.readouterr()
+    for arguments, words in (
+        ([str(out), str(other)], "the side file names"),
+        ([str(out), str(tmp_path / "none.txt")], "No such file"),
+        ([str(tmp_path / "none.txt")], "jaxba-kitti writes it"),
+        ([str(out), "--poses", str(short)], "has 1 poses"),
+        ([str(out), "--lengths", "-1"], "--lengths must be positive"),
+    ):
+        assert run(["evaluate", *arguments, "--out", str(tmp_path / "e")]) == 2
+        message = capsys.readouterr().err
+        assert words in message
+        assert message.count("\n") == 1
+        assert not (tmp_path / "e").exists()
+    (tmp_path / "p.frames.json").write_text("{}")
+    assert run(["evaluate", str(out)]) == 2
+    assert "is no side file" in capsys.readouterr().err
+
+
+# Real frames
+
+
+@needs_data
+@pytest.mark.parametrize("features", ["sift", "klt"])
+def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys, features):
+    """Frames 0 to 19 of sequence 00: 16 m of nearly straight road."""
+    assert DATA is not None
+    root = Path(DATA) / "kitti"
+    out, poses = tmp_path / "kitti00.txt.bz2", str(root / "poses" / "00.txt")
+    options = ["--frames", "0:20", "--features", features, "--poses", poses, "--out", str(out)]
+    assert run([str(root / "seq00"), *options]) == 0
+    assert start_error(capsys.readouterr().out) < 0.5
+
+
+@needs_data
+@pytest.mark.slow
+def test_bundle_adjustment_brings_the_real_drive_nearer_to_the_truth(tmp_path, capsys):
+    """200 frames, 145 m with a right turn, by the three commands of the documentation."""
+    assert DATA is not None
+    root = Path(DATA) / "kitti"
+    out, solved, poses = tmp_path / "k.txt.bz2", tmp_path / "s.txt.bz2", str(root / "poses" / "00.txt")
+    assert run([str(root / "seq00"), "--frames", "0:200", "--poses", poses, "--out", str(out)]) == 0
+    assert solve([str(out), "--output", str(solved)]) == 0
+    assert run(["evaluate", str(out), str(solved), "--poses", poses, "--out", str(tmp_path / "e")]) == 0
+    before, after = json.loads((tmp_path / "e" / "evaluation.json").read_text())["results"]
+    assert after["ate_m"]["rmse"] < before["ate_m"]["rmse"]
+    assert after["rms_px"] < before["rms_px"]

@@ -1,0 +1,310 @@
+"""Tracks, key-frames, triangulation, starts and the problem made of them: on points that are known exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from jaxba import geometry
+from jaxba.kitti import keyframes
+from jaxba.kitti.assemble import assemble, poses_of_cameras, windows
+from jaxba.kitti.sequence import Calibration
+from jaxba.kitti.starts import drift
+from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
+from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate, triangulate_robustly
+from jaxba.problem import ProblemError
+
+CALIBRATION = Calibration(700.0, 650.0, 600.0, 180.0)
+NEARLY_ALL = Filters(angle=1e-3)
+
+
+def street(views: int = 6, points: int = 40, seed: int = 0) -> tuple[np.ndarray, Views, np.ndarray]:
+    """Poses (camera to world) of a bent drive far from the origin, the same as views, and points before all of them."""
+    random = np.random.default_rng(seed)
+    rotation = Rotation.from_rotvec(np.arange(views)[:, None] * [0.01, 0.05, -0.005]).as_matrix()
+    centers = np.array([500.0, 10.0, -300.0]) + np.arange(views)[:, None] * [0.1, 0.02, 1.0]
+    local = random.uniform([-6, -3, 12], [6, 2, 40], (points, 3))
+    poses = np.concatenate([rotation, centers[:, :, None]], axis=2)
+    inverse = rotation.transpose(0, 2, 1)
+    return poses, Views(inverse, -np.einsum("nij,nj->ni", inverse, centers)), local + centers[0]
+
+
+def sight(views: Views, points: np.ndarray) -> Sightings:
+    """Every point seen in every view."""
+    count = len(views.rotation)
+    camera, track = np.tile(np.arange(count), len(points)), np.repeat(np.arange(len(points)), count)
+    local = np.einsum("nij,nj->ni", views.rotation[camera], points[track]) + views.translation[camera]
+    return Sightings(camera, track, local[:, :2] / local[:, 2:])
+
+
+def as_tracks(sightings: Sightings) -> Tracks:
+    pixels = sightings.rays * [CALIBRATION.fx, CALIBRATION.fy] + [CALIBRATION.cx, CALIBRATION.cy]
+    return Tracks(sightings.camera, sightings.track, pixels)
+
+
+# Tracks
+
+
+def places(*counts: int) -> list[np.ndarray]:
+    """Key-points whose pixel says which they are: (image, number)."""
+    return [np.column_stack([np.full(n, float(i)), np.arange(float(n))]) for i, n in enumerate(counts)]
+
+
+def arrays(matches: dict) -> dict:
+    return {pair: np.array(found) for pair, found in matches.items()}
+
+
+def members(tracks: Tracks) -> set[tuple]:
+    """The key-points of every track."""
+    return {tuple(map(tuple, tracks.pixels[tracks.track == t].tolist())) for t in range(tracks.count)}
+
+
+def test_matches_of_neighbours_and_over_gaps_make_one_track():
+    matches = {(0, 1): [[0, 2]], (1, 2): [[0, 1], [2, 0]], (0, 2): [[2, 1]]}
+    assert members(join_matches(places(3, 3, 3), arrays(matches))) == {
+        ((0.0, 0.0), (1.0, 2.0), (2.0, 0.0)),
+        ((0.0, 2.0), (1.0, 0.0), (2.0, 1.0)),
+    }
+
+
+def test_a_track_that_is_twice_in_an_image_is_split_into_the_chains_of_neighbours():
+    """0:0 - 1:0 - 2:0 along neighbours, but 0:0 - 2:1 over the gap, and 2:1 - 3:1."""
+    matches = {(0, 1): [[0, 0]], (1, 2): [[0, 0]], (0, 2): [[0, 1]], (2, 3): [[1, 1], [0, 0]]}
+    assert members(join_matches(places(1, 1, 2, 2), arrays(matches))) == {
+        ((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0)),
+        ((2.0, 1.0), (3.0, 1.0)),
+    }
+
+
+def test_no_track_is_ever_twice_in_an_image():
+    """Random one-to-one matches contradict each other all the time."""
+    random = np.random.default_rng(0)
+    pairs = [(i, j) for j in range(8) for i in range(max(0, j - 3), j)]
+    matches = {pair: np.stack([random.permutation(30)[:12], random.permutation(30)[:12]], axis=1) for pair in pairs}
+    tracks = join_matches(places(*[30] * 8), matches)
+    assert len(np.unique(tracks.track * 8 + tracks.image)) == len(tracks.track) > 0
+    assert tracks.lengths().min() >= 2
+    assert (np.diff(tracks.track * 8 + tracks.image) > 0).all()
+
+
+def test_restricting_renumbers_images_and_drops_short_tracks():
+    tracks = make_tracks(np.array([0, 1, 2, 1, 2, 0]), np.array([5, 5, 5, 9, 9, 7]), np.zeros((6, 2)))
+    assert tracks.count == 2  # track 7 is seen once
+    part = tracks.restrict([0, 2])
+    assert part.image.tolist() == [0, 1]
+    assert part.track.tolist() == [0, 0]
+    assert [rows.tolist() for rows in tracks.shared(1, 2)] == [[1, 3], [2, 4]]
+
+
+# Key-frames
+
+
+def test_a_camera_that_only_turns_has_no_parallax():
+    _, _, points = street()
+    local = (points - points.mean(axis=0)) + [0, 0, 30]
+    turn = Rotation.from_rotvec([0.02, 0.15, -0.03]).as_matrix()
+    turned = local @ turn.T
+    rays = [x[:, :2] / x[:, 2:] for x in (local, turned)]
+    assert keyframes.parallax(*rays, focal=700.0) < 1e-9
+    assert 700 * np.median(np.linalg.norm(rays[0] - rays[1], axis=1)) > 50
+
+
+def test_a_sideways_step_has_the_parallax_of_its_depth():
+    """Points at depth 20 in a plane, seen after a step of 0.5: the rotation can hide some of 700 * 0.5 / 20 pixels."""
+    random = np.random.default_rng(1)
+    local = np.column_stack([random.uniform(-8, 8, (200, 2)), np.where(np.arange(200) % 2, 10.0, 1000.0)])
+    after = local - [0.5, 0, 0]
+    found = keyframes.parallax(local[:, :2] / local[:, 2:], after[:, :2] / after[:, 2:], 700.0)
+    assert 10 < found < 35
+
+
+def test_automatic_keyframes_skip_frames_that_stand_still():
+    _, views, points = street(views=6, points=200)
+    still = [0, 0, 0, 1, 2, 2, 3, 4, 5, 5]
+    views = Views(views.rotation[still], views.translation[still])
+    tracks = as_tracks(sight(views, points))
+    chosen = keyframes.choose(tracks, 10, "auto", CALIBRATION, tuple(range(10)))
+    assert len(chosen) >= 2
+    assert not {1, 2, 5, 9} & set(chosen)  # the frames whose pose is that of the frame before
+    assert keyframes.choose(tracks, 10, "4", CALIBRATION, tuple(range(10))) == [0, 4, 8]
+    assert keyframes.choose(tracks, 10, "all", CALIBRATION, tuple(range(10))) == list(range(10))
+    with pytest.raises(ProblemError, match="hardly moves in frames 0 to 2"):
+        keyframes.choose(tracks.restrict([0, 1, 2]), 3, "auto", CALIBRATION, (0, 1, 2))
+    for choice in ("0", "some", "-1", "1.5"):
+        with pytest.raises(ProblemError, match="--keyframes must be"):
+            keyframes.choose(tracks, 10, choice, CALIBRATION, tuple(range(10)))
+
+
+def test_keyframes_that_share_too_little_are_named():
+    tracks = make_tracks(
+        np.repeat([0, 1, 1, 2], 30), np.repeat([0, 100], 60) + np.tile(np.arange(30), 4), np.zeros((120, 2))
+    )
+    with pytest.raises(ProblemError, match="key-frames 7 and 9 share 0 tracks"):
+        keyframes.choose(tracks, 3, "2", CALIBRATION, (7, 8, 9))
+
+
+# Triangulation
+
+
+def test_exact_rays_give_exact_points():
+    _, views, points = street()
+    sightings = sight(views, points)
+    found = triangulate(views, sightings)
+    np.testing.assert_allclose(found.points, points, rtol=1e-9)
+    assert found.error.max() < 1e-12
+    local = np.einsum("nij,nj->ni", views.rotation[sightings.camera], points[sightings.track])
+    np.testing.assert_allclose(found.depth, (local + views.translation[sightings.camera])[:, 2], rtol=1e-8)
+
+
+def test_noisy_rays_give_the_least_squares_point():
+    """The same minimum by SciPy."""
+    _, views, points = street(points=5)
+    sightings = sight(views, points)
+    rays = sightings.rays + 1e-3 * np.random.default_rng(2).standard_normal(sightings.rays.shape)
+    found = triangulate(views, Sightings(sightings.camera, sightings.track, rays))
+    for track in range(5):
+        rows = sightings.track == track
+
+        def residual(x, rows=rows):
+            local = views.rotation[sightings.camera[rows]] @ x + views.translation[sightings.camera[rows]]
+            return (local[:, :2] / local[:, 2:] - rays[rows]).ravel()
+
+        best = least_squares(residual, points[track], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        cost = 0.5 * (found.error[rows] ** 2).sum()
+        assert cost == pytest.approx(best.cost, rel=1e-6)
+
+
+def test_the_angle_is_that_between_the_farthest_views():
+    """Two cameras one apart, a point at depth d on the perpendicular through the middle: 2 atan(1 / 2d)."""
+    views = Views(np.tile(np.eye(3), (2, 1, 1)), np.array([[0.5, 0, 0], [-0.5, 0, 0]]))
+    depth = np.array([3.0, 10.0])
+    found = triangulate(views, sight(views, np.array([[0, 0, 3.0], [0, 0, 10.0]])))
+    np.testing.assert_allclose(found.angle, np.rad2deg(2 * np.arctan(0.5 / depth)), rtol=1e-9)
+
+
+def test_filters_refuse_points_behind_far_and_wrong():
+    _, views, points = street(points=4)
+    focal = 700.0
+    behind, far = points.copy(), points.copy()
+    behind[0] = points[0] - [0, 0, 200]
+    far[1] = points[1] + [0, 0, 5000]
+    where = np.array([behind[0], far[1], points[2], points[3]])
+    sightings = sight(views, where)
+    rays = sightings.rays.copy()
+    wrong = np.flatnonzero((sightings.track == 2) & (sightings.camera == 3))
+    rays[wrong] += 0.1
+    spoiled = Sightings(sightings.camera, sightings.track, rays)
+    good = triangulate(views, spoiled).good(spoiled.track, Filters(), focal)
+    assert good.tolist() == [False, False, False, True]
+
+
+def test_one_wrong_sighting_costs_a_long_track_only_itself():
+    _, views, points = street(views=8, points=3)
+    sightings = sight(views, points)
+    rays = sightings.rays.copy()
+    wrong = np.flatnonzero((sightings.track == 1) & (sightings.camera == 7))
+    rays[wrong] += 6 / 700
+    found, keep = triangulate_robustly(views, Sightings(sightings.camera, sightings.track, rays), Filters(), 700.0)
+    assert np.flatnonzero(~keep).tolist() == wrong.tolist()
+    np.testing.assert_allclose(found, points, rtol=1e-6)
+
+
+def test_no_tracks_are_no_error():
+    _, views, _ = street()
+    empty = Sightings(np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
+    points, keep = triangulate_robustly(views, empty, Filters(), 700.0)
+    assert points.shape == (0, 3)
+    assert keep.shape == (0,)
+
+
+# Starts
+
+
+def test_no_drift_leaves_the_poses():
+    poses, _, _ = street(views=20)
+    np.testing.assert_allclose(drift(poses, 0.0, 0.0, 0), poses, atol=1e-9)
+
+
+def test_drift_accumulates_and_is_repeatable():
+    poses, _, _ = street(views=101)
+    assert np.array_equal(drift(poses, 0.1, 0.05, 3), drift(poses, 0.1, 0.05, 3))
+    assert not np.array_equal(drift(poses, 0.1, 0.05, 3), drift(poses, 0.1, 0.05, 4))
+    runs = np.array([drift(poses, 0.0, 0.05, seed)[:, :, 3] - poses[:, :, 3] for seed in range(400)])
+    spread = (runs**2).sum(axis=2).mean(axis=0)
+    step = np.linalg.norm(poses[1, :, 3] - poses[0, :, 3])
+    for count in (25, 100):  # a random walk: its variance is that of one step times their number
+        assert spread[count] == pytest.approx(3 * count * (0.05 * step) ** 2, rel=0.15)
+    assert spread[0] == 0
+    turns = np.array([(drift(poses, 0.1, 0.0, s)[-1, :, :3] @ poses[-1, :, :3].T) for s in range(400)])
+    angles = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turns).as_rotvec(), axis=1))
+    assert np.sqrt((angles**2).mean()) == pytest.approx(0.1 * np.sqrt(300), rel=0.1)
+
+
+@pytest.mark.parametrize("sigmas", [(-1.0, 0.0), (0.0, float("nan"))])
+def test_a_sigma_that_makes_no_sense_is_refused(sigmas):
+    with pytest.raises(ProblemError, match="must not be negative"):
+        drift(street()[0], *sigmas, 0)
+
+
+# The problem
+
+
+def test_the_problem_reprojects_exactly_through_bals_camera():
+    """`jaxba.geometry`'s camera looks down -z with y up; fy differs from fx."""
+    _, views, points = street()
+    sightings = sight(views, points)
+    made = assemble(as_tracks(sightings), views, CALIBRATION, (3, 4, 5, 6, 7, 9), NEARLY_ALL, 2)
+    problem = made.problem
+    assert made.frames == (3, 4, 5, 6, 7, 9)
+    assert (problem.num_points, problem.num_observations) == (len(points), len(sightings.track))
+    np.testing.assert_allclose(geometry.residuals(problem), 0, atol=1e-6)
+    np.testing.assert_allclose(problem.observations, CALIBRATION.fx * sightings.rays * [1, -1], atol=1e-9)
+    assert (geometry.depths(problem) > 0).all()
+    assert (problem.cameras[:, 6:] == [CALIBRATION.fx, 0, 0]).all()
+
+
+def test_cameras_and_poses_are_the_same_thing():
+    poses, views, points = street()
+    made = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(6)), NEARLY_ALL, 2)
+    np.testing.assert_allclose(poses_of_cameras(np.asarray(made.problem.cameras)), poses, atol=1e-9)
+
+
+def test_points_drift_with_the_first_camera_that_sees_them():
+    poses, views, points = street()
+    sightings = sight(views, points)
+    late = sightings.camera >= np.where(sightings.track % 2, 2, 0)  # odd points are first seen by camera 2
+    tracks = as_tracks(Sightings(*(part[late] for part in sightings)))
+    noisy = drift(poses, 0.3, 0.1, 5)
+    inverse = noisy[:, :, :3].transpose(0, 2, 1)
+    start = Views(inverse, -np.einsum("nij,nj->ni", inverse, noisy[:, :, 3]))
+    made = assemble(tracks, views, CALIBRATION, tuple(range(6)), NEARLY_ALL, 2, start).problem
+    np.testing.assert_allclose(poses_of_cameras(np.asarray(made.cameras)), noisy, atol=1e-9)
+    error = np.linalg.norm(geometry.residuals(made), axis=1)
+    first = np.where(np.asarray(made.point_index) % 2, 2, 0) == made.camera_index
+    assert error[first].max() < 1e-6
+    assert np.median(error[~first]) > 0.5
+
+
+def test_a_frame_without_points_is_named():
+    _, views, points = street()
+    tracks = as_tracks(sight(views, points))
+    lonely = tracks.keep((tracks.image != 4) | (tracks.track < 9), 2)
+    with pytest.raises(ProblemError, match="frame 40 sees 9 good ones, at least 10"):
+        assemble(lonely, views, CALIBRATION, (0, 10, 20, 30, 40, 50), NEARLY_ALL, 2)
+
+
+def test_windows_cover_all_cameras_and_keep_residuals():
+    _, views, points = street(views=9)
+    whole = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(0, 18, 2)), Filters(), 2)
+    parts = windows(whole, 4, 3, 2)
+    assert [part.frames for part in parts] == [(0, 2, 4, 6), (6, 8, 10, 12), (10, 12, 14, 16)]
+    for part in parts:
+        assert part.problem.num_cameras == 4
+        np.testing.assert_allclose(geometry.residuals(part.problem), 0, atol=1e-6)
+    assert len(windows(whole, 9, 1, 2)) == 1
+    assert [part.frames[0] for part in windows(whole, 3, 3, 2)] == [0, 6, 12]
+    for size, stride, words in ((1, 1, "--window"), (10, 1, "--window"), (4, 0, "--stride")):
+        with pytest.raises(ProblemError, match=words):
+            windows(whole, size, stride, 2)
