@@ -6,7 +6,8 @@ bold camera step threw far away come back in one pass over the observations each
 
 Projection does not see the difference between a point and its mirror image behind the camera, and a point far away
 comes to the other side by way of infinity. There it may fit for a while and never find back: kittistereo00s ended 1.8%
-above the best known cost with 61 such points. So no point is sent behind a camera that it was in front of (`Home`).
+above the best known cost with 61 such points. So a point that the step sent behind a camera starts again from where it
+was before the step (`Home`).
 
 Source: "embedded point iterations", Jeong et al., "Pushing the Envelope of Modern Methods for Bundle
 Adjustment", PAMI 2012; Ceres calls the same idea inner iterations.
@@ -67,8 +68,7 @@ def refine_points(
         points: where to start.
         loss: robust loss.
         iterations: steps per point; each costs one pass over the observations.
-        home: a point that lies behind a camera from which it was visible at home starts from there, and no step takes
-            one behind. Where home itself has come to lie behind a camera, the point goes where it likes.
+        home: a point that lies behind a camera in front of which it was at home starts from there.
 
     Returns:
         Points, and the cost of each point's observations there (pixels squared), never larger than where it started.
@@ -90,8 +90,8 @@ def refine_points(
         factor = cholesky3(matrix)
         step = factor.backward(factor.forward([carry.system[k] for k in range(6, 9)]))
         trial = carry.points - jnp.stack(step)
-        system, costs, lost = evaluate(trial)
-        better = (costs < carry.costs) & (free | ~lost)
+        system, costs, _ = evaluate(trial)
+        better = costs < carry.costs
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
         return _Carry(
             jnp.where(better, trial, carry.points),
@@ -101,15 +101,14 @@ def refine_points(
         )
 
     system, costs, lost = evaluate(points)
-    free = lost
     if home is not None:
 
-        def return_home() -> tuple[Array, Array, Array, Array]:
-            at_home = evaluate(home.points)
-            back = lambda there, here: jnp.where(lost, there, here)
-            return back(home.points, points), back(at_home[0], system), back(at_home[1], costs), lost & at_home[2]
+        def return_home() -> tuple[Array, Array, Array]:
+            there = (home.points, *evaluate(home.points)[:2])
+            here = (points, system, costs)
+            return tuple(jnp.where(lost, new, old) for new, old in zip(there, here, strict=True))
 
-        points, system, costs, free = lax.cond(jnp.any(lost), return_home, lambda: (points, system, costs, lost))
+        points, system, costs = lax.cond(jnp.any(lost), return_home, lambda: (points, system, costs))
     carry = _Carry(points, costs, system, jnp.full_like(costs, INITIAL_DAMPING))
     carry = lax.fori_loop(0, iterations, body, carry)
     return carry.points, carry.costs

@@ -3,7 +3,8 @@
 The linear model is wrong far from where it was made, and mostly wrong locally: points fly off, cameras turn away from
 what they see. Repairing that locally is cheap beside a linear solve, and lets bolder steps pass:
 
-1. `refine_points`: every point re-optimised alone at the new cameras, none of them sent behind one.
+1. `refine_points`: every point re-optimised alone at the new cameras; one that the step sent behind a camera starts
+   from where it was.
 2. `camera_rounds`: where the step did less than half of what the model promised and is not hopeless, cameras alone,
    then points alone again, a few times over. A step along a curved valley comes back to its floor.
 3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 but without 2.
