@@ -24,7 +24,7 @@ from jaxba.game.scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.linearize import cost
 from jaxba.losses import Loss
-from jaxba.options import StepOptions
+from jaxba.options import Intrinsics, StepOptions
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose best cost counts, each with point iterations."""
@@ -106,6 +106,14 @@ class BankConfig:
 
     dtype: str = "float64"
     """Arithmetic of the game's solves."""
+
+    intrinsics: Intrinsics = "free"
+    """Whether focal lengths and distortions are unknowns of the game's solves."""
+
+    @property
+    def options(self) -> StepOptions:
+        """Of the portfolio's steps; those of plain rules without the point iterations."""
+        return StepOptions(refine_points=self.refine_points, intrinsics=self.intrinsics)
 
     def __post_init__(self) -> None:
         if len(self.classes) != len(self.scenes) or not self.classes:
