@@ -199,7 +199,7 @@ def make_banks(
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
         where = f"{kind.cameras} cameras x {kind.points} points"
         say = lambda rule, where=where, count=count: on_progress(f"{count} scenes of {where}: {rule}")
-        made = draft(kind, jax.random.fold_in(key, number), count, options, limit, config.dtype, on_rule=say)
+        made = draft(kind, jax.random.fold_in(key, number), count, options, limit, config.dtype, PORTFOLIO, say)
         rows = np.flatnonzero(made.useful)
         held = max(1, round(HELD_OUT * len(rows)))
         if len(rows) <= held:

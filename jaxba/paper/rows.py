@@ -134,7 +134,7 @@ def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Out
     return found
 
 
-def _outcome(iterations: float, converged: bool, near: float, end: float, seconds: float = math.nan) -> Outcome:
+def _outcome(iterations: int, converged: bool, near: float, end: float, seconds: float = math.nan) -> Outcome:
     good = converged and iterations <= ITERATION_LIMIT
     return Outcome(
         iterations=float(iterations) if good else float(ITERATION_LIMIT),
