@@ -10,6 +10,7 @@ from jaxba.bench.run import machine
 from jaxba.bench.summary import write_text
 from jaxba.bench.tables import number
 from jaxba.paper.claims import CRITERION
+from jaxba.paper.config import to_yaml
 from jaxba.paper.markdown import Section, claims_table, table
 from jaxba.paper.pieces import figures
 from jaxba.paper.workshop import Workshop
@@ -141,6 +142,7 @@ def _text(shop: Workshop, sections: Sequence[Section], command: str, seconds: Ma
     ]
     for section in sections:
         parts += [f"## {section.title}", *(paragraph for paragraph in section.body if paragraph)]
+    parts += ["## Settings", f"```yaml\n{to_yaml(config).strip()}\n```"]
     if seconds:
         parts += ["## Time", table(("piece", "s"), [(name, number(value)) for name, value in seconds.items()])]
         parts.append(

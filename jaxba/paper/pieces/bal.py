@@ -55,7 +55,7 @@ def _section(shop: Workshop) -> Section:
     if reason or not any(row.solves for row in rows.values()):
         return Section("BAL", (f"BAL: {reason}." if reason else base.NOT_YET,), found)
     body = [
-        f"{len(sources)} problems: {', '.join(source.name for source in sources)}. {missing(shop)}",
+        f"{base.problems(len(sources))}: {', '.join(source.name for source in sources)}. {missing(shop)}",
         *real.real_tables(shop, _methods(), sources),
         _headroom(rows),
         disagreements(found, WHY),

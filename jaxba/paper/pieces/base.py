@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from jaxba.bench.sources import Source
 from jaxba.paper import places
 from jaxba.paper.agents import OURS
-from jaxba.paper.markdown import Line, Section, lines_table
+from jaxba.paper.claims import Claim
+from jaxba.paper.markdown import Line, Section, counted, lines_table
+from jaxba.paper.rows import Row
 from jaxba.paper.workshop import Method, Workshop, named
 
 CLASSIC, CERES, LEARNED, PLAIN = "classic", "ceres", "learned", "learned+refine0"
@@ -48,16 +50,46 @@ def agent_lines(
     return [Line(label, pick(method), paper) for label, method, paper in methods]
 
 
-def line_of(lines: Sequence[Line], method: str) -> Line | None:
-    """The row of a method, where it was run."""
-    return next((line for line in lines if line.row.method == method and line.row.solves), None)
-
-
 def ablation_work(shop: Workshop, methods: Sequence[tuple[str, Method, float | None]]) -> None:
     """Plays all methods on the tables' own scenes and solves the problems of BAL with them."""
     for _, method, _ in methods:
         shop.play(method)
     shop.solve(places.bal(shop.config.real), [method for _, method, _ in methods])
+
+
+def on_both(
+    shop: Workshop,
+    methods: Sequence[tuple[str, Method, float | None]],
+    judge: Callable[[str, Callable[[str], Row | None]], list[Claim]],
+) -> tuple[Claim, ...]:
+    """The claims of an ablation on the tables' own scenes, and on BAL.
+
+    Args:
+        shop: of the run.
+        methods: rows of the ablation.
+        judge: given the name of the set of problems and the rows by method (None where it was not run).
+    """
+    found = []
+    for name, sources in (("synthetic", None), ("BAL", places.bal(shop.config.real))):
+        known = {line.row.method: line.row for line in agent_lines(shop, methods, sources) if line.row.solves}
+        found += judge(name, known.get)
+    return tuple(found)
+
+
+def problems(count: int) -> str:
+    """A number of problems in words."""
+    return f"{count} problem{'' if count == 1 else 's'}"
+
+
+def headroom(shop: Workshop) -> str:
+    """What next to no damping needs on the tables' own scenes, where that was run."""
+    bold, ceres = shop.row_on_scenes(named("gauss-newton")), shop.row_on_scenes(named(CERES))
+    if not (bold.solves and ceres.solves):
+        return ""
+    return (
+        f"For scale: on these scenes Gauss-Newton (1e-10 throughout) takes {counted(bold.iterations)} iterations and Ceres' "
+        f"rule {counted(ceres.iterations)}, without having learned anything."
+    )
 
 
 def ablation_body(shop: Workshop, methods: Sequence[tuple[str, Method, float | None]]) -> list[str]:
@@ -70,6 +102,7 @@ def ablation_body(shop: Workshop, methods: Sequence[tuple[str, Method, float | N
             f"**{count} synthetic scenes** of the kind that the agents train on, none of them seen in training:"
         )
         body.append(_table(lines))
+        body.append(headroom(shop))
     else:
         body.append(NOT_YET)
     reason = places.why_no_bal(shop.config.real)
@@ -79,7 +112,7 @@ def ablation_body(shop: Workshop, methods: Sequence[tuple[str, Method, float | N
     sources = places.bal(shop.config.real)
     lines = agent_lines(shop, methods, sources)
     if any(line.row.solves for line in lines):
-        body.append(f"**BAL**, {len(sources)} problems ({', '.join(source.name for source in sources)}):")
+        body.append(f"**BAL**, {problems(len(sources))} ({', '.join(source.name for source in sources)}):")
         body.append(_table(lines))
     return body
 

@@ -42,10 +42,10 @@ def _section(shop: Workshop) -> Section:
         caption = f"{problem.name}: cost over time and iterations; above dashed at τ = 0.1 and 0.001"
         body.append(figures.picture(shop, drawn, file, caption))
         if file != "convergence":
+            sizes = f"{records[0].cameras} cameras, {records[0].points} points, {records[0].observations} observations"
             body.append(
-                f"A random scene of Ladybug-1197's size ({records[0].cameras} cameras, {records[0].points} points, "
-                f"{records[0].observations} observations), since the file is not here; at most "
-                f"{config.large_iterations} iterations."
+                f"`{config.large_scene}` ({sizes}) stands in for Ladybug-1197; at most {config.large_iterations} "
+                "iterations."
             )
     return Section("Convergence with explicit and implicit solvers", tuple(body))
 

@@ -51,7 +51,7 @@ def _section(shop: Workshop) -> Section:
     if place.reason or not any(row.solves for row in rows.values()):
         return Section("KITTI", (f"KITTI: {place.reason}." if place.reason else base.NOT_YET,), found)
     body = [
-        f"{len(sources)} problems: {', '.join(source.name for source in sources)}. `-firstN` is the part of N "
+        f"{base.problems(len(sources))}: {', '.join(source.name for source in sources)}. `-firstN` is the part of N "
         "neighbouring "
         "cameras, begun with the camera that sees most.",
         *real.real_tables(shop, _methods(), sources),

@@ -40,7 +40,8 @@ def _section(shop: Workshop) -> Section:
     count = len(profile.problem_names(records))
     reason = places.why_no_bal(shop.config.real)
     body = [
-        f"{count} problems: those of BAL at hand and their parts, and {shop.config.figures.profile_scenes} random "
+        f"{base.problems(count)}: those of BAL at hand and their parts, and {shop.config.figures.profile_scenes} "
+        "random "
         "scenes like "
         f"{shop.config.figures.scene.removeprefix('scene:')}.{f' BAL: {reason}.' if reason else ''} Times without "
         "compilation.",

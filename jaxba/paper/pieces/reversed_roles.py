@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from jaxba.paper import agents, claims
 from jaxba.paper.markdown import Section, disagreements
 from jaxba.paper.pieces import base
 from jaxba.paper.pieces.base import Piece
+from jaxba.paper.rows import Row
 from jaxba.paper.workshop import Method, Workshop
 
 
@@ -21,18 +23,19 @@ def _work(shop: Workshop) -> None:
 
 def _section(shop: Workshop) -> Section:
     methods = _methods(shop)
-    lines = base.agent_lines(shop, methods, None)
-    ours, turned, classic = (
-        base.line_of(lines, name) for name in (agents.OURS.name, agents.REVERSED.name, base.CLASSIC)
-    )
-    found = (
-        claims.order_claim("Reversed roles accelerate less", "4 against 10", ours and ours.row, turned and turned.row),
-        claims.ratio_claim(
-            "Reversed roles still halve classic's iterations", 0.5, turned and turned.row, classic and classic.row
-        ),
-        claims.share_claim("Reversed roles succeed less often", 0.7, turned.row.success if turned else math.nan),
-        claims.share_claim("Our agent always succeeds", 1.0, ours.row.success if ours else math.nan),
-    )
+
+    def judge(where: str, row: Callable[[str], Row | None]) -> list[claims.Claim]:
+        ours, turned = row(agents.OURS.name), row(agents.REVERSED.name)
+        success = lambda one: one.success if one else math.nan
+        half = f"Reversed roles still halve classic's iterations ({where})"
+        return [
+            claims.order_claim(f"Reversed roles accelerate less ({where})", "4 against 10", ours, turned),
+            claims.ratio_claim(half, 0.5, turned, row(base.CLASSIC)),
+            claims.share_claim(f"Reversed roles succeed less often ({where})", 0.7, success(turned)),
+            claims.share_claim(f"Our agent always succeeds ({where})", 1.0, success(ours)),
+        ]
+
+    found = base.on_both(shop, methods, judge)
     body = (
         "Read as: the state is minus the time of each of the last five iterations, which our deterministic clock "
         "makes 1, "

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from jaxba.paper import agents, claims
 from jaxba.paper.markdown import Section, disagreements
 from jaxba.paper.pieces import base
 from jaxba.paper.pieces.base import Piece
+from jaxba.paper.rows import Row
 from jaxba.paper.workshop import Method, Workshop
 
 
@@ -23,19 +26,15 @@ def _work(shop: Workshop) -> None:
 
 def _section(shop: Workshop) -> Section:
     methods = _methods(shop)
-    lines = base.agent_lines(shop, methods, None)
-    row = lambda agent: (line := base.line_of(lines, agent.name)) and line.row
-    found = (
-        claims.Claim(
-            "The duration is a better reward than a constant", "4 against 5", "the same reward in our game", "not run"
-        ),
-        claims.order_claim(
-            "The duration is a better reward than a shrinking bonus",
-            "4 against 4.2",
-            row(agents.OURS),
-            row(agents.REDUCTION),
-        ),
+
+    def judge(where: str, row: Callable[[str], Row | None]) -> list[claims.Claim]:
+        text = f"The duration is a better reward than a shrinking bonus ({where})"
+        return [claims.order_claim(text, "4 against 4.2", row(agents.OURS.name), row(agents.REDUCTION.name))]
+
+    same = claims.Claim(
+        "The duration is a better reward than a constant", "4 against 5", "the same reward in our game", "not run"
     )
+    found = (same, *base.on_both(shop, methods, judge))
     body = (
         "In a compiled game the time of an iteration is a deterministic cost, 1 for a plain step. **Duration and "
         "constant "

@@ -46,7 +46,7 @@ def _section(shop: Workshop) -> Section:
             cells.append([family.family, family.reason or base.NOT_YET, *[number(x) for x in paper], *["-"] * 4])
             continue
         counts = [f"{number(row.seconds)} s, {counted(row.iterations)} its, {share(row.success)}" for row in rows]
-        sizes = f"{rows[0].solves} problems"
+        sizes = base.problems(rows[0].solves)
         cells.append([family.family, sizes, *[number(x) for x in paper], *counts])
         cg, deep, driven, _ = rows
         if math.isfinite(paper[0]):

@@ -71,7 +71,7 @@ def _section(shop: Workshop) -> Section:
             body.append(f"**{name}**: {reason or base.NOT_YET}")
             continue
         body += [
-            f"**{name}**, {len(sources)} problems:",
+            f"**{name}**, {base.problems(len(sources))}:",
             lines_table(lines, known.get("classic"), known.get("ceres"), True),
         ]
     body.append(disagreements(found, WHY))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from jaxba.paper import agents, claims
 from jaxba.paper.markdown import Section, disagreements
 from jaxba.paper.pieces import base
 from jaxba.paper.pieces.base import Piece
+from jaxba.paper.rows import Row
 from jaxba.paper.workshop import Method, Workshop
 
 
@@ -19,14 +22,17 @@ def _work(shop: Workshop) -> None:
 
 def _section(shop: Workshop) -> Section:
     methods = _methods(shop)
-    lines = base.agent_lines(shop, methods, None)
-    ours, zero, classic = (base.line_of(lines, name) for name in (agents.OURS.name, "zero-net", base.CLASSIC))
-    found = (
-        claims.order_claim("The agent beats the Zero-net", "4 against 8", ours and ours.row, zero and zero.row),
-        claims.ratio_claim(
-            "The Zero-net takes two fifths of classic's iterations", 0.4, zero and zero.row, classic and classic.row
-        ),
-    )
+
+    def judge(where: str, row: Callable[[str], Row | None]) -> list[claims.Claim]:
+        part = f"The Zero-net takes two fifths of classic's iterations ({where})"
+        return [
+            claims.order_claim(
+                f"The agent beats the Zero-net ({where})", "4 against 8", row(agents.OURS.name), row("zero-net")
+            ),
+            claims.ratio_claim(part, 0.4, row("zero-net"), row(base.CLASSIC)),
+        ]
+
+    found = base.on_both(shop, methods, judge)
     net = shop.config.zero_net
     body = (
         f"{net.layers} hidden layers of {net.width} see the last five errors, actions and rewards and are trained to "
