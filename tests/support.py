@@ -257,6 +257,8 @@ def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np
         camera[:, :, :3] = turn
     weight = np.sqrt(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[1])
     count, cameras = problem.num_observations, problem.num_cameras
+    if options.intrinsics == "fixed":
+        camera[:, :, 6:] = 0
     jacobian = np.zeros((count, 2, 9 * cameras + 3 * problem.num_points))
     rows = np.arange(count)
     for k in range(9):
@@ -280,6 +282,9 @@ def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense
     scale = 1 / np.linalg.norm(stacked, axis=0)
     q, r = np.linalg.qr(stacked * scale)
     found = scale * solve_triangular(r, -q.T @ np.concatenate([residual, np.zeros(len(diagonal))]))
+    if options.intrinsics == "fixed":  # uncoupled, with no gradient: zero but for the rounding of QR
+        assert np.abs(found[: problem.cameras.size].reshape(-1, 9)[:, 6:]).max() < 1e-12
+        found[: problem.cameras.size].reshape(-1, 9)[:, 6:] = 0
     return Dense(residual, jacobian, diagonal, damping, found)
 
 

@@ -87,8 +87,8 @@ def headroom(shop: Workshop) -> str:
     if not (bold.solves and ceres.solves):
         return ""
     return (
-        f"For scale: on these scenes Gauss-Newton (1e-10 throughout) takes {counted(bold.iterations)} iterations and Ceres' "
-        f"rule {counted(ceres.iterations)}, without having learned anything."
+        f"For scale: on these scenes Gauss-Newton (1e-10 throughout) takes {counted(bold.iterations)} iterations and "
+        f"Ceres' rule {counted(ceres.iterations)}, without having learned anything."
     )
 
 
