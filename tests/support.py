@@ -279,12 +279,14 @@ def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense
     if options.scaling == "diagonal":
         diagonal = np.clip(np.sum(jacobian**2, axis=0), 1e-6, 1e32)
     stacked = np.vstack([jacobian, np.diag(np.sqrt(damping * diagonal))])
+    free = np.ones(jacobian.shape[1], bool)
+    if options.intrinsics == "fixed":
+        free[: problem.cameras.size].reshape(-1, 9)[:, 6:] = False
+    stacked = stacked[:, free]
     scale = 1 / np.linalg.norm(stacked, axis=0)
     q, r = np.linalg.qr(stacked * scale)
-    found = scale * solve_triangular(r, -q.T @ np.concatenate([residual, np.zeros(len(diagonal))]))
-    if options.intrinsics == "fixed":  # uncoupled, with no gradient: zero but for the rounding of QR
-        assert np.abs(found[: problem.cameras.size].reshape(-1, 9)[:, 6:]).max() < 1e-12
-        found[: problem.cameras.size].reshape(-1, 9)[:, 6:] = 0
+    found = np.zeros(len(free))
+    found[free] = scale * solve_triangular(r, -q.T @ np.concatenate([residual, np.zeros(len(diagonal))]))
     return Dense(residual, jacobian, diagonal, damping, found)
 
 

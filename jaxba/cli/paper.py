@@ -126,13 +126,14 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
         try:
             for number, piece in enumerate(wanted, start=1):
                 console.print(f"{number} of {len(wanted)}: {piece.title}")
-                started, before = time.perf_counter(), shop.done
+                started, cpu, before = time.perf_counter(), time.process_time(), shop.done
                 try:
                     piece.work(shop)
                 finally:
-                    spent = time.perf_counter() - started
+                    spent, cpu = time.perf_counter() - started, time.process_time() - cpu
                     if shop.done > before:
-                        seconds[piece.name] = seconds.get(piece.name, 0.0) + spent
+                        wall, busy = seconds.get(piece.name, (0.0, 0.0))
+                        seconds[piece.name] = wall + spent, busy + cpu
                         _write_times(folder, seconds)
                 console.print(f"  {shop.done - before} runs, {spent:.1f} s")
         except KeyboardInterrupt:
@@ -141,7 +142,10 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
         console.print("drawing")
         sections = [piece.section(shop) for piece in PIECES.values()]
         files = write(shop, sections, report, _command(args), {n: seconds[n] for n in PIECES if n in seconds})
-    console.print(f"wrote {report} and {len(files) - 1} pictures; {sum(seconds.values()):.0f} s of work in {folder}")
+    console.print(
+        f"wrote {report} and {len(files) - 1} pictures; {sum(wall for wall, _ in seconds.values()):.0f} s of work in "
+        f"{folder}"
+    )
     return status
 
 
@@ -151,15 +155,16 @@ def _command(args: Arguments) -> str:
     return f"jaxba-paper{chosen}"
 
 
-def _read_times(folder: Path) -> dict[str, float]:
+def _read_times(folder: Path) -> dict[str, tuple[float, float]]:
+    """Seconds on the wall clock and of the processor by piece."""
     try:
         found = json.loads((folder / TIMES).read_text(encoding="utf-8"))
-        return {str(name): float(value) for name, value in found.items()}
+        return {str(name): (float(wall), float(cpu)) for name, (wall, cpu) in found.items()}
     except (OSError, ValueError, TypeError, AttributeError):
         return {}
 
 
-def _write_times(folder: Path, seconds: dict[str, float]) -> None:
+def _write_times(folder: Path, seconds: dict[str, tuple[float, float]]) -> None:
     from jaxba.bench.summary import write_text
 
     write_text(folder / TIMES, json.dumps(seconds, indent=1) + "\n")

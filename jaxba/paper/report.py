@@ -82,7 +82,7 @@ READINGS: tuple[tuple[str, str, str], ...] = (
 
 
 def write(
-    shop: Workshop, sections: Sequence[Section], path: Path, command: str, seconds: Mapping[str, float]
+    shop: Workshop, sections: Sequence[Section], path: Path, command: str, seconds: Mapping[str, tuple[float, float]]
 ) -> list[Path]:
     """Writes the report and puts the pictures beside it.
 
@@ -91,7 +91,7 @@ def write(
         sections: in order.
         path: of the Markdown file; pictures go into a folder of its stem.
         command: that made it.
-        seconds: spent by this folder on each piece.
+        seconds: of the wall clock and of the processor that this folder spent on each piece.
 
     Returns:
         All files written. Raises OSError.
@@ -112,7 +112,7 @@ def write(
     return [path, *files]
 
 
-def _text(shop: Workshop, sections: Sequence[Section], command: str, seconds: Mapping[str, float]) -> str:
+def _text(shop: Workshop, sections: Sequence[Section], command: str, seconds: Mapping[str, tuple[float, float]]) -> str:
     facts = machine()
     claims = [claim for section in sections for claim in section.claims]
     tally = {
@@ -144,8 +144,11 @@ def _text(shop: Workshop, sections: Sequence[Section], command: str, seconds: Ma
         parts += [f"## {section.title}", *(paragraph for paragraph in section.body if paragraph)]
     parts += ["## Settings", f"```yaml\n{to_yaml(config).strip()}\n```"]
     if seconds:
-        parts += ["## Time", table(("piece", "s"), [(name, number(value)) for name, value in seconds.items()])]
+        wall, cpu = (sum(pair[k] for pair in seconds.values()) for k in (0, 1))
+        cells = [(name, number(pair[0]), number(pair[1])) for name, pair in seconds.items()]
+        parts += ["## Time", table(("piece", "s", "processor s"), [*cells, ("together", number(wall), number(cpu))])]
         parts.append(
-            f"Seconds that this folder took for each piece, compilation included; together {sum(seconds.values()):.0f}."
+            f"Compilation included. The program had {cpu / wall:.2f} processor cores on average"
+            + (": less than one: it had to wait, and all seconds here are too long." if cpu < wall else ".")
         )
     return "\n\n".join(parts) + "\n"
