@@ -73,7 +73,13 @@ def families(config: RealConfig) -> list[Found]:
 
 
 def bal(config: RealConfig) -> tuple[Source, ...]:
-    """All problems of BAL at hand, whole and cut."""
+    """The problems of BAL at hand; parts of them where none enters whole."""
+    found = families(config)
+    return tuple(source for family in found for source in family.whole) or bal_and_parts(config)
+
+
+def bal_and_parts(config: RealConfig) -> tuple[Source, ...]:
+    """The problems of BAL at hand and the parts that were cut from them."""
     return tuple(source for family in families(config) for source in family.all)
 
 

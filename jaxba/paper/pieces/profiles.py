@@ -23,7 +23,7 @@ TAUS = (0.1, 0.001)
 def _problems(shop: Workshop) -> list[Source]:
     config = shop.config
     scenes = [f"{config.figures.scene}:{config.seed + k + 1}" for k in range(config.figures.profile_scenes)]
-    return [*places.bal(config.real), *sources(scenes)]
+    return [*places.bal_and_parts(config.real), *sources(scenes)]
 
 
 def _work(shop: Workshop) -> None:
