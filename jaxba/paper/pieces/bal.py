@@ -21,9 +21,9 @@ METHODS: tuple[tuple[str, str, float | None, float | None], ...] = (
 our lambda alone, since a policy takes the place of the rule and the step is the same."""
 
 WHY = (
-    "the shipped policy was trained on synthetic scenes, the paper's for this table on BAL; the problems are those "
-    "at hand "
-    "and parts of them, not all of BAL; Ceres is its rule in our step, not its C++ library."
+    "the shipped policy was trained on synthetic scenes, the paper's for this table on BAL; the problems are the few "
+    "at hand, "
+    "not all of BAL; Ceres is its rule in our step, not its C++ library."
 )
 
 
