@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 
@@ -336,3 +337,7 @@ def test_files_and_their_parts_are_found_and_what_is_missing_is_told(monkeypatch
     ]
     assert found.missing == ("$JAXBA_DATA/other.txt",)
     assert found.reason == ""
+    names = lambda whole, of: [s.name for s in of(config.RealConfig((dataclasses.replace(family, whole=whole),)))]
+    assert names(True, places.bal) == ["problem-6-40-pre"]
+    assert names(True, places.bal_and_parts) == [source.name for source in found.all]
+    assert names(False, places.bal) == names(False, places.bal_and_parts) == [source.name for source in found.cuts]

@@ -103,6 +103,7 @@ def trained(
         raise AssertionError("a finished training has been evaluated")
     save_policy(own / POLICY, work.policy(outcome.best.actor), {"config": train_configs.to_yaml(settings)})
     shutil.rmtree(own / train.CHECKPOINTS, ignore_errors=True)
+    (own / task.BANK).unlink(missing_ok=True)
     return load_policy(own / POLICY), True
 
 
