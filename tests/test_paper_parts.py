@@ -204,6 +204,16 @@ def test_a_ratio_is_judged_by_the_rule(ours, base, verdict):
 
 
 @pytest.mark.parametrize(
+    ("ours_s", "success", "verdict"),
+    [(2.5, 1.0, "reproduced"), (2.6, 1.0, "partly"), (9.1, 1.0, "not"), (2.0, 0.9, "not"), (math.nan, 1.0, "not run")],
+)
+def test_a_share_of_time_is_judged_as_one_of_iterations(ours_s, success, verdict):
+    ours = dataclasses.replace(of(4, success=success), seconds=ours_s)
+    base = dataclasses.replace(of(20), seconds=10.0)
+    assert claims.time_claim("claim", 0.2, ours, base).verdict == verdict
+
+
+@pytest.mark.parametrize(
     ("better", "worse", "verdict"),
     [
         (of(4, 3, 5), of(8, 7, 9), "reproduced"),
@@ -211,6 +221,7 @@ def test_a_ratio_is_judged_by_the_rule(ours, base, verdict):
         (of(8), of(8), "not"),
         (of(9), of(8), "not"),
         (of(4, success=0.8), of(8), "not"),
+        (of(7.5, 7.4, 7.6), of(8, 7.9, 8.1), "partly"),
         (of(9.5, seeds=0), of(10, seeds=0), "partly"),
         (of(8.9, seeds=0), of(10, seeds=0), "reproduced"),
         (of(4), None, "not run"),

@@ -15,6 +15,9 @@ from jaxba.paper.markdown import Section, claims_table, table
 from jaxba.paper.pieces import figures
 from jaxba.paper.workshop import Workshop
 
+ALONE = 0.9
+"""Processor seconds per second from which on a program was not held up by others."""
+
 READINGS: tuple[tuple[str, str, str], ...] = (
     (
         "damping",
@@ -149,6 +152,6 @@ def _text(shop: Workshop, sections: Sequence[Section], command: str, seconds: Ma
         parts += ["## Time", table(("piece", "s", "processor s"), [*cells, ("together", number(wall), number(cpu))])]
         parts.append(
             f"Compilation included. The program had {cpu / wall:.2f} processor cores on average"
-            + (": less than one: it had to wait, and all seconds here are too long." if cpu < wall else ".")
+            + ("; it had to wait for others, and all seconds here are too long." if cpu < ALONE * wall else ".")
         )
     return "\n\n".join(parts) + "\n"

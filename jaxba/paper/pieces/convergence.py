@@ -47,6 +47,8 @@ def _section(shop: Workshop) -> Section:
                 f"`{config.large_scene}` ({sizes}) stands in for Ladybug-1197; at most {config.large_iterations} "
                 "iterations."
             )
+            if not any(r.solver.endswith("/explicit") for r in records):
+                body.append("This configuration runs no explicit solver at that size.")
     return Section("Convergence with explicit and implicit solvers", tuple(body))
 
 

@@ -14,8 +14,11 @@ from jaxba.paper.workshop import Workshop
 FIGURES = "figures"
 """Folder of the pictures inside the run's."""
 
-DPI = 100
-"""Keeps a picture below 200 kB."""
+RESOLUTIONS = (100, 80, 60)
+"""Dots per inch; the first that keeps a picture below `LARGEST`."""
+
+LARGEST = 200_000
+"""Bytes of a picture."""
 
 
 def main_problem(shop: Workshop) -> Source:
@@ -35,6 +38,9 @@ def picture(shop: Workshop, figure: Figure, name: str, caption: str) -> str:
     folder.mkdir(parents=True, exist_ok=True)
     path: Path = folder / f"{name}.png"
     part = path.with_suffix(".part")
-    figure.savefig(part, dpi=DPI, format="png")
+    for dpi in RESOLUTIONS:
+        figure.savefig(part, dpi=dpi, format="png")
+        if part.stat().st_size < LARGEST:
+            break
     part.replace(path)
     return f"![{caption}]({FIGURES}/{name}.png)\n\n*{caption}*"

@@ -51,10 +51,14 @@ def _section(shop: Workshop) -> Section:
         cg, deep, driven, _ = rows
         if math.isfinite(paper[0]):
             found.append(
-                _time_claim(f"{family.family}: DeepLM + ours over Ceres-CG, seconds", paper[2] / paper[0], driven, cg)
+                claims.time_claim(
+                    f"{family.family}: DeepLM + ours over Ceres-CG, seconds", paper[2] / paper[0], driven, cg
+                )
             )
             found.append(
-                _time_claim(f"{family.family}: DeepLM + ours over DeepLM, seconds", paper[2] / paper[1], driven, deep)
+                claims.time_claim(
+                    f"{family.family}: DeepLM + ours over DeepLM, seconds", paper[2] / paper[1], driven, deep
+                )
             )
     header = ["family", "here", *(f"paper: {label}, s" for label in LABELS[:3]), *LABELS]
     body.append(
@@ -65,20 +69,6 @@ def _section(shop: Workshop) -> Section:
     body.append(table(header, cells, 2) if cells else "The configuration names no family.")
     body.append(disagreements(found, WHY))
     return Section("BAL's families against Ceres with conjugate gradients", tuple(body), tuple(found))
-
-
-def _time_claim(text: str, paper: float, ours, other) -> claims.Claim:
-    if not (ours.seconds > 0 and other.seconds > 0):
-        return claims.Claim(text, f"{paper:.2f}", "-", "not run")
-    found = ours.seconds / other.seconds
-    verdict: claims.Verdict = (
-        "reproduced" if found <= claims.AS_STRONG * paper else "partly" if found <= claims.ANY_GAIN else "not"
-    )
-    if ours.success < other.success - claims.SHARE:
-        verdict = "not"
-    return claims.Claim(
-        text, f"{paper:.2f}", f"{found:.2f} ({number(ours.seconds)} / {number(other.seconds)} s)", verdict
-    )
 
 
 PIECE = Piece("subproblems", "Table: BAL's families against Ceres-CG", _work, _section)
