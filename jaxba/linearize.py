@@ -112,6 +112,13 @@ def linearize(
     return Linearization(residual, by_camera, by_point, costs, in_front(projection))
 
 
+def without_intrinsics(linear: Linearization) -> Linearization:
+    """The same where no residual depends on f, k1 and k2: their part of the damped system is the clamped damping alone,
+    their gradient zero, and so is their step."""
+    zero = jnp.zeros_like(linear.residual[0])
+    return linear._replace(camera_jacobian=[[*row[:6], zero, zero, zero] for row in linear.camera_jacobian])
+
+
 def _whiten(layout: Layout, pair: list[Array]) -> list[Array]:
     if layout.whitening is None:
         return pair

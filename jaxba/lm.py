@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.decompose import decomposed_round
 from jaxba.layout import Layout, partition_of
-from jaxba.linearize import cost, linearize
+from jaxba.linearize import cost, linearize, without_intrinsics
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.schur import solve_step
@@ -89,6 +89,8 @@ def lm_step(
     if options.linear_solver == "decomposed":
         return _round(layout, state, damping, options, min_gain, turn)
     linear = linearize(layout, state.cameras, state.points, options.loss)
+    if options.intrinsics == "fixed":
+        linear = without_intrinsics(linear)
     step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn)
     trial = best_trial(layout, state.cameras, state.points, state.cost, linear, step, options, min_gain)
     accepted = trial.accepted

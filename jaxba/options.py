@@ -16,6 +16,7 @@ Preconditioner = Literal["two-level", "schur-jacobi", "jacobi", "power-series"]
 Scaling = Literal["diagonal", "identity"]
 Rotation = Literal["angle-axis", "manifold"]
 Algebra = Literal["full", "mixed"]
+Intrinsics = Literal["free", "fixed"]
 
 DIAGONAL_MINIMUM = 1e-6
 """Smallest diagonal entry that damping multiplies. Source: Ceres min_lm_diagonal."""
@@ -71,6 +72,10 @@ class StepOptions:
     """Rounds in which first every camera, then every point is re-optimised alone, where a step did much less than the
     linear model promised; see `trial.py`."""
 
+    intrinsics: Intrinsics = "free"
+    """Whether focal lengths and distortions are optimised, as in BAL, or stay: the seed paper optimises poses and
+    points. `fixed` works with the explicit solver and without camera rounds."""
+
     loss: Loss = field(default_factory=Loss)
     """Robust loss of the squared whitened residual."""
 
@@ -95,6 +100,7 @@ class StepOptions:
             ("scaling", get_args(Scaling)),
             ("rotation", get_args(Rotation)),
             ("algebra", get_args(Algebra)),
+            ("intrinsics", get_args(Intrinsics)),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
@@ -107,6 +113,8 @@ class StepOptions:
         for name in ("preconditioner_order", "power_order", "repairs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
+        if self.intrinsics == "fixed" and (self.linear_solver != "explicit" or self.camera_rounds):
+            raise ValueError("fixed intrinsics need the explicit solver, and no camera rounds")
         if self.cg_max_iterations < 1:
             raise ValueError(f"cg_max_iterations must be at least 1, is {self.cg_max_iterations}")
 

@@ -102,7 +102,7 @@ class Solution:
 
 
 class _Carry(NamedTuple):
-    state: LMState
+    state: Any  # LMState, or None where only the policy's part is wanted
     policy: Any
     damping: Float[Array, ""]
     iteration: Int[Array, ""]
@@ -157,9 +157,10 @@ def solve(
         options, dtype = replace(options, algebra="mixed"), "float64"
     with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
-        layout = jax.device_put(layout_for(problem, options))
-        state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
-        setup_s = time.perf_counter() - started
+        with CompileClock() as clock:
+            layout = jax.device_put(layout_for(problem, options))
+            state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
+        setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))
         run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)
@@ -175,7 +176,7 @@ def solve(
             history=History(*(np.asarray(field)[:count] for field in history)),
             linear_solver=options.linear_solver,
             setup_s=setup_s,
-            compile_s=compile_s,
+            compile_s=compile_s + clock.seconds,
             total_s=total_s,
         )
 
@@ -200,8 +201,8 @@ def _initial(layout: Layout, problem: BundleProblem, options: StepOptions, dtype
 
 
 @functools.partial(jax.jit, static_argnames=("options", "max_iterations"))
-def _start(layout: Layout, state: LMState, policy: DampingPolicy, options: StepOptions, max_iterations: int) -> _Carry:
-    """Carry before the first iteration."""
+def _info(layout: Layout, state: LMState, options: StepOptions, max_iterations: int) -> ProblemInfo:
+    """What a policy may know before the first iteration."""
     unit = jnp.ones_like(state.cost)
     if options.scaling == "identity":
         unit = largest_diagonal(layout, linearize(layout, state.cameras, state.points, options.loss))
@@ -215,9 +216,17 @@ def _start(layout: Layout, state: LMState, policy: DampingPolicy, options: StepO
         focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
         max_iterations=count(max_iterations),
     )
+    return info
+
+
+def _begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> _Carry:
+    """Carry before the first iteration."""
     policy_state, damping = policy.init(info)
+    count = lambda n: jnp.asarray(n, jnp.int32)
     return _Carry(state, policy_state, damping, count(0), count(Termination.RUNNING))
 
+
+_begin_jit = jax.jit(_begin)
 
 _step = jax.jit(lm_step, static_argnames=("options",))
 
@@ -239,9 +248,12 @@ def after_step(
 
 
 def _advance(
-    carry: _Carry, state: LMState, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
+    carry: _Carry, state: Any, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
 ) -> _Carry:
-    """Everything of an iteration that follows the step."""
+    """Everything of an iteration that follows the step.
+
+    The parameters are handed on and not looked at; None leaves them out.
+    """
     iteration = carry.iteration + 1
     policy_state, damping, end = after_step(policy, carry.policy, step, iteration, tolerances, max_iterations)
     return _Carry(state, policy_state, damping, iteration, end)
@@ -277,7 +289,7 @@ def solve_loop(
     Returns:
         Final carry, and histories of length `max_iterations`, zero past the last iteration.
     """
-    carry = _start(layout, state, policy, options, max_iterations)
+    carry = _begin(_info(layout, state, options, max_iterations), policy, state)
     step_of = lambda c: lm_step(layout, c.state, c.damping, options, policy.min_gain, c.iteration)
     shapes = jax.eval_shape(lambda c: _history(step_of(c)[1]), carry)
     empty = jax.tree.map(lambda s: jnp.zeros((max_iterations, *s.shape), s.dtype), shapes)
@@ -300,14 +312,16 @@ def _run_compiled(layout, state, policy, tolerances, options, max_iterations):
 
 def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *, callback):
     with CompileClock() as clock:
-        carry = jax.block_until_ready(_start(layout, state, policy, options, max_iterations))
+        # without the parameters what is the policy's compiles once for all problems
+        carry = _begin_jit(_info(layout, state, options, max_iterations), policy, None)
+        carry = jax.block_until_ready(carry._replace(state=state))
         min_gain = jnp.asarray(policy.min_gain, state.cost.dtype)
         limit = jnp.asarray(max_iterations, jnp.int32)
 
         def iterate(carry: _Carry) -> tuple[_Carry, StepInfo]:
             state, step = _step(layout, carry.state, carry.damping, options, min_gain, carry.iteration)
-            carry = _advance_jit(carry, state, step, policy, tolerances, limit)
-            return carry, jax.tree.map(lambda x: x.item(), jax.device_get(step))
+            carry = _advance_jit(carry._replace(state=None), None, step, policy, tolerances, limit)
+            return carry._replace(state=state), jax.tree.map(lambda x: x.item(), jax.device_get(step))
 
         before, started = clock.seconds, time.perf_counter()
         after, step = iterate(carry)

@@ -257,6 +257,8 @@ def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np
         camera[:, :, :3] = turn
     weight = np.sqrt(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[1])
     count, cameras = problem.num_observations, problem.num_cameras
+    if options.intrinsics == "fixed":
+        camera[:, :, 6:] = 0
     jacobian = np.zeros((count, 2, 9 * cameras + 3 * problem.num_points))
     rows = np.arange(count)
     for k in range(9):
@@ -277,9 +279,14 @@ def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense
     if options.scaling == "diagonal":
         diagonal = np.clip(np.sum(jacobian**2, axis=0), 1e-6, 1e32)
     stacked = np.vstack([jacobian, np.diag(np.sqrt(damping * diagonal))])
+    free = np.ones(jacobian.shape[1], bool)
+    if options.intrinsics == "fixed":
+        free[: problem.cameras.size].reshape(-1, 9)[:, 6:] = False
+    stacked = stacked[:, free]
     scale = 1 / np.linalg.norm(stacked, axis=0)
     q, r = np.linalg.qr(stacked * scale)
-    found = scale * solve_triangular(r, -q.T @ np.concatenate([residual, np.zeros(len(diagonal))]))
+    found = np.zeros(len(free))
+    found[free] = scale * solve_triangular(r, -q.T @ np.concatenate([residual, np.zeros(len(diagonal))]))
     return Dense(residual, jacobian, diagonal, damping, found)
 
 

@@ -252,7 +252,7 @@ def test_an_observation_is_finite_and_bounded_whatever_a_step_says(cost, steps):
 
 
 def test_an_observation_has_the_size_that_was_promised():
-    for name in ("scale-free", "paper", "released-code"):
+    for name in ("scale-free", "paper", "released-code", "duration"):
         for history in range(1, 21):
             config = AgentConfig(observation=name, history=history)
             seen = jax.eval_shape(lambda i, config=config: observe(config, begin(config, i)), info())
@@ -320,11 +320,20 @@ def test_the_released_code_s_observation_is_what_the_linear_model_promised():
     np.testing.assert_allclose(_observe(config, memory), [2.0, 0.0, 4.0])
 
 
+def test_the_duration_of_every_iteration_is_one():
+    config = AgentConfig(observation="duration", history=3)
+    memory = _begin(config, info())
+    np.testing.assert_array_equal(_observe(config, memory), np.zeros(3))
+    for accepted, seen in ((True, [-1, 0, 0]), (False, [-1, -1, 0]), (True, [-1, -1, -1]), (True, [-1, -1, -1])):
+        memory = _record(config, memory, step_info(accepted))
+        np.testing.assert_array_equal(_observe(config, memory), seen)
+
+
 # Its configuration
 
 configs = st.builds(
     AgentConfig,
-    observation=st.sampled_from(["scale-free", "paper", "released-code"]),
+    observation=st.sampled_from(["scale-free", "paper", "released-code", "duration"]),
     history=st.integers(1, 20),
     low=st.floats(-15, -3),
     high=st.floats(-2, 10),

@@ -55,7 +55,7 @@ def random_policy(seed: int, agent: AgentConfig = AGENT, width: int = 16, spread
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 99), st.sampled_from(["scale-free", "paper", "released-code"]), st.integers(1, 20))
+@given(st.integers(0, 99), st.sampled_from(["scale-free", "paper", "released-code", "duration"]), st.integers(1, 20))
 def test_a_policy_comes_back_from_its_file_bit_by_bit(tmp_path_factory, seed, observation, history):
     path = tmp_path_factory.mktemp("policy") / "some.safetensors"
     policy = random_policy(seed, AgentConfig(observation=observation, history=history, guard="pause", trials=2))

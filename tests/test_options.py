@@ -19,6 +19,12 @@ from jaxba import Loss, StepOptions
         ({"refine_points": -1}, "refine_points must be at least 0"),
         ({"camera_rounds": -1}, "camera_rounds must be at least 0"),
         ({"trials": 0}, "trials must be at least 1"),
+        ({"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
+        (
+            {"intrinsics": "fixed", "camera_rounds": 1},
+            "fixed intrinsics need the explicit solver, and no camera rounds",
+        ),
+        ({"intrinsics": "fixed", "linear_solver": "implicit"}, "fixed intrinsics need the explicit solver"),
         ({"cg_max_iterations": 0}, "cg_max_iterations must be at least 1"),
     ],
 )
@@ -39,8 +45,9 @@ def test_equal_options_are_one_key_and_different_ones_are_not():
         StepOptions(refine_points=1),
         StepOptions(loss=Loss("huber")),
         StepOptions(cg_forcing=0.5),
+        StepOptions(intrinsics="fixed"),
     }
-    assert len(different) == 7
+    assert len(different) == 8
 
 
 def test_options_cannot_change_under_a_compiled_program():

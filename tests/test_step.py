@@ -42,6 +42,7 @@ CASES = [
     *(pytest.param(support.tiny, options, id=f"tiny-{solver}") for solver, options in SOLVERS.items()),
     *(pytest.param(support.tiny, options, id=f"tiny-{loss}") for loss, options in LOSSES.items()),
     *(pytest.param(make, EXACT, id=name) for name, make in PROBLEMS.items()),
+    pytest.param(support.tiny, replace(EXACT, intrinsics="fixed"), id="tiny-fixed-intrinsics"),
     pytest.param(support.odd, TO_THE_END, id="odd-implicit"),
     pytest.param(support.odd, SOLVERS["sparse"], id="odd-sparse"),
     pytest.param(support.whitened, EXACT, id="whitened"),

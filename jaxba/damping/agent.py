@@ -20,7 +20,7 @@ from jaxba.lm import StepInfo
 from jaxba.options import StepOptions
 from jaxba.trial import SHORTER
 
-Observation = Literal["scale-free", "paper", "released-code"]
+Observation = Literal["scale-free", "paper", "released-code", "duration"]
 ActionMode = Literal["absolute", "relative"]
 GuardMode = Literal["off", "pause", "hand-over"]
 
@@ -46,7 +46,8 @@ class AgentConfig:
 
     observation: Observation = "scale-free"
     """`scale-free`: decreases, gain ratios and lambdas of the last steps as ratios and logarithms. `paper`: the last
-    errors. `released-code`: the decrease that the linear model promised, as in the authors' code."""
+    errors. `released-code`: the decrease that the linear model promised, as in the authors' code. `duration`: minus the
+    time of each of the last iterations, which by the game's deterministic clock is one (the paper's reversed roles)."""
 
     history: int = 5
     """Steps that an observation goes back; the paper's state size."""
@@ -181,7 +182,7 @@ class Memory(NamedTuple):
 
     info: ProblemInfo
     facts: Float[Array, "history features"]  # newest first
-    errors: Float[Array, " history"]  # of `paper` and `released-code`, newest first
+    errors: Float[Array, " history"]  # what observations other than `scale-free` are made of, newest first
     cost: Float[Array, ""]
     damping: Float[Array, ""]  # log10 of the last lambda
     iteration: Int[Array, ""]
@@ -296,6 +297,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     error = {
         "paper": lambda: jnp.minimum(_error(memory.info, step.cost), PAPER_LIMIT),
         "released-code": lambda: jnp.nan_to_num(step.predicted),
+        "duration": lambda: -jnp.ones((), dtype),
         "scale-free": lambda: jnp.zeros((), dtype),
     }[config.observation]()
     shifted = lambda old, new: jnp.concatenate([new[None].astype(dtype), old[:-1]])

@@ -24,7 +24,7 @@ from jaxba.game.scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.linearize import cost
 from jaxba.losses import Loss
-from jaxba.options import StepOptions
+from jaxba.options import Intrinsics, StepOptions
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose best cost counts, each with point iterations."""
@@ -106,6 +106,14 @@ class BankConfig:
 
     dtype: str = "float64"
     """Arithmetic of the game's solves."""
+
+    intrinsics: Intrinsics = "free"
+    """Whether focal lengths and distortions are unknowns of the game's solves."""
+
+    @property
+    def options(self) -> StepOptions:
+        """Of the portfolio's steps; those of plain rules without the point iterations."""
+        return StepOptions(refine_points=self.refine_points, intrinsics=self.intrinsics)
 
     def __post_init__(self) -> None:
         if len(self.classes) != len(self.scenes) or not self.classes:
@@ -191,7 +199,7 @@ def make_banks(
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
         where = f"{kind.cameras} cameras x {kind.points} points"
         say = lambda rule, where=where, count=count: on_progress(f"{count} scenes of {where}: {rule}")
-        made = draft(kind, jax.random.fold_in(key, number), count, options, limit, config.dtype, on_rule=say)
+        made = draft(kind, jax.random.fold_in(key, number), count, options, limit, config.dtype, PORTFOLIO, say)
         rows = np.flatnonzero(made.useful)
         held = max(1, round(HELD_OUT * len(rows)))
         if len(rows) <= held:

@@ -8,7 +8,7 @@ to that folder, so that there is one copy.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -71,8 +71,10 @@ class TrainConfig:
     @property
     def step_options(self) -> StepOptions:
         """Of the method's steps, without embedded iterations."""
-        base = StepOptions(cluster_cameras=self.cluster_cameras)
-        return make_method(self.method).options(base) if self.method != DEFAULT_METHOD else StepOptions()
+        plain = StepOptions(intrinsics=self.bank.intrinsics)
+        if self.method == DEFAULT_METHOD:
+            return plain
+        return make_method(self.method).options(replace(plain, cluster_cameras=self.cluster_cameras))
 
     def __post_init__(self) -> None:
         for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep", "cluster_cameras"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from jaxba.game.config import TrainConfig
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Score, compare, evaluate
 from jaxba.game.sac import Learner
-from jaxba.methods import make_method
+from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.options import StepOptions
 
 BANK = "bank.npz"
@@ -77,13 +77,19 @@ class Task:
         return {LEARNED: with_policy[LEARNED], **self.rules}
 
 
-def build(config: TrainConfig, folder: Path, say: Callable[[str], None] = lambda _: None) -> Task:
+def build(
+    config: TrainConfig,
+    folder: Path,
+    say: Callable[[str], None] = lambda _: None,
+    yardsticks: Sequence[str] | None = None,
+) -> Task:
     """Makes banks and yardsticks, or reads those that an earlier call left in the folder.
 
     Args:
         config: of the run that the folder belongs to.
         folder: of the run.
         say: told in words what begins.
+        yardsticks: rules to measure against where that has not been done yet; `YARDSTICKS` if None.
 
     Raises:
         ValueError: too few scenes are of use. One line for a person.
@@ -93,27 +99,32 @@ def build(config: TrainConfig, folder: Path, say: Callable[[str], None] = lambda
         say("reading the scenes")
         splits = read_banks(path)
     else:
-        options = StepOptions(refine_points=config.bank.refine_points)
-        splits = make_banks(config.bank, jax.random.key(config.seed), options, config.game.max_iterations, say)
+        key = jax.random.key(config.seed)
+        splits = make_banks(config.bank, key, config.bank.options, config.game.max_iterations, say)
         _write_banks(path, splits)
-    game = make_game(
-        config.game, config.bank.classes, [split.train for split in splits], config.envs, config.step_options
-    )
+    banks = [split.train for split in splits]
+    game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
     held_out = tuple(split.held_out for split in splits)
-    return Task(config, game, held_out, _rules(config, game, held_out, folder / RULES, say))
+    return Task(config, game, held_out, _rules(config, game, held_out, folder / RULES, say, yardsticks or YARDSTICKS))
 
 
 def _rules(
-    config: TrainConfig, game: Game, held_out: tuple[Bank, ...], path: Path, say: Callable[[str], None]
+    config: TrainConfig,
+    game: Game,
+    held_out: tuple[Bank, ...],
+    path: Path,
+    say: Callable[[str], None],
+    yardsticks: Sequence[str],
 ) -> dict[str, Score]:
     if path.is_file():
         return {name: Score(**numbers) for name, numbers in json.loads(path.read_text(encoding="utf-8")).items()}
     say("hand-written rules on the held-out scenes")
     plain = config.step_options
-    names = dict.fromkeys((make_method(config.method).rule, *YARDSTICKS))
+    own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
+    names = tuple(dict.fromkeys((*own, *yardsticks)))
     policies: dict[str, tuple[DampingPolicy, StepOptions]] = {name: (make_policy(name), plain) for name in names}
     if game.options != plain:
-        policies[YARDSTICKS[0] + EMBEDDED] = make_policy(YARDSTICKS[0]), game.options
+        policies[yardsticks[0] + EMBEDDED] = make_policy(yardsticks[0]), game.options
     scores = _compare(config, held_out, policies)
     part = path.with_suffix(".part")
     part.write_text(json.dumps({name: score._asdict() for name, score in scores.items()}, indent=1), encoding="utf-8")

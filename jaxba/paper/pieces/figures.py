@@ -1,0 +1,46 @@
+"""What the figures have in common: their problems, and files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from jaxba.bench.sources import Source, sources
+from jaxba.paper import places
+from jaxba.paper.workshop import Workshop
+
+FIGURES = "figures"
+"""Folder of the pictures inside the run's."""
+
+RESOLUTIONS = (100, 80, 60)
+"""Dots per inch; the first that keeps a picture below `LARGEST`."""
+
+LARGEST = 200_000
+"""Bytes of a picture."""
+
+
+def main_problem(shop: Workshop) -> Source:
+    """The largest Ladybug at hand; where there is none, a random scene of that kind."""
+    found = [s for family in places.families(shop.config.real) if family.family == "Ladybug" for s in family.whole]
+    return max(found, key=_cameras) if found else sources([shop.config.figures.scene])[0]
+
+
+def _cameras(source: Source) -> int:
+    digits = re.findall(r"\d+", source.name)
+    return int(digits[0]) if digits else 0
+
+
+def picture(shop: Workshop, figure: Figure, name: str, caption: str) -> str:
+    """Draws a figure into the run's folder and returns the Markdown that shows it."""
+    folder = shop.folder / FIGURES
+    folder.mkdir(parents=True, exist_ok=True)
+    path: Path = folder / f"{name}.png"
+    part = path.with_suffix(".part")
+    for dpi in RESOLUTIONS:
+        figure.savefig(part, dpi=dpi, format="png")
+        if part.stat().st_size < LARGEST:
+            break
+    part.replace(path)
+    return f"![{caption}]({FIGURES}/{name}.png)\n\n*{caption}*"

@@ -1,0 +1,95 @@
+"""Parts of a problem: some of its cameras, and the points that at least two of them see."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int
+from scipy.sparse import csr_matrix
+
+from jaxba.bench.sources import Source
+from jaxba.problem import BundleProblem, ProblemError
+from jaxba.transform import MIN_TRACK
+
+
+def sub_problem(
+    problem: BundleProblem, cameras: Sequence[int] | Int[np.ndarray, " kept"], points: Sequence[int] | None = None
+) -> BundleProblem:
+    """The problem of some cameras and of the points that they determine, numbered anew in their old order.
+
+    Args:
+        problem: the whole.
+        cameras: numbers of the cameras that stay.
+        points: numbers of the points that may stay, all if None; of them those that two of the cameras see.
+
+    Raises:
+        ProblemError: a number out of range, or no point would be left.
+    """
+    kept = np.unique(np.asarray(cameras, int))
+    allowed = np.arange(problem.num_points) if points is None else np.unique(np.asarray(points, int))
+    for name, numbers, count in (("camera", kept, problem.num_cameras), ("point", allowed, problem.num_points)):
+        if numbers.size and not 0 <= numbers[0] <= numbers[-1] < count:
+            raise ProblemError(f"there is no {name} {numbers[0] if numbers[0] < 0 else numbers[-1]} among {count}")
+    camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    keep = np.isin(camera_index, kept) & np.isin(point_index, allowed)
+    pairs = np.unique(np.stack([point_index[keep], camera_index[keep]]), axis=1)
+    tracks = np.bincount(pairs[0], minlength=problem.num_points)  # cameras, not observations: both may be of one camera
+    keep &= tracks[point_index] >= MIN_TRACK
+    if not keep.any():
+        raise ProblemError(f"no point is seen by two of these {len(kept)} cameras")
+    used = np.flatnonzero(tracks >= MIN_TRACK)
+    return problem.replace(
+        cameras=np.asarray(problem.cameras)[kept],
+        points=np.asarray(problem.points)[used],
+        observations=np.asarray(problem.observations)[keep],
+        camera_index=np.searchsorted(kept, camera_index[keep]).astype(np.int32),
+        point_index=np.searchsorted(used, point_index[keep]).astype(np.int32),
+        whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
+    )
+
+
+def neighbours(problem: BundleProblem, count: int) -> Int[np.ndarray, " cameras"]:
+    """Cameras that belong together: the one that sees most, then always the one that shares most points with those.
+
+    Args:
+        problem: at least `count` cameras.
+        count: how many cameras; of equals the first is taken, so that the choice is the same everywhere.
+
+    Raises:
+        ProblemError: there are not as many cameras.
+    """
+    if not 1 <= count <= problem.num_cameras:
+        raise ProblemError(f"cannot take {count} of {problem.num_cameras} cameras")
+    pairs = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    seen = csr_matrix((np.ones(len(pairs[0]), np.int64), pairs), (problem.num_cameras, problem.num_points))
+    seen.data[:] = 1  # a camera that sees a point twice
+    chosen = [int(np.argmax(seen.getnnz(axis=1)))]
+    shared, covered = np.zeros(problem.num_cameras, int), np.zeros(problem.num_points, bool)
+    free = np.ones(problem.num_cameras, bool)
+    while len(chosen) < count:
+        free[chosen[-1]] = False
+        new = np.zeros(problem.num_points, np.int64)
+        new[seen[chosen[-1]].indices] = 1
+        shared += seen @ (new * ~covered)
+        covered |= new > 0
+        chosen.append(int(np.argmax(np.where(free, shared, -1))))
+    return np.sort(np.array(chosen))
+
+
+@dataclass(frozen=True)
+class Cut(Source):
+    """A sub-problem of neighbouring cameras that has a name and is cut when its turn comes."""
+
+    cameras: int = 0
+    """How many."""
+
+    def read(self) -> BundleProblem:
+        """Reads the whole and cuts.
+
+        Raises:
+            ProblemError: bad input, in one line.
+        """
+        whole = Source(self.name, self.family, self.location).read()
+        return sub_problem(whole, neighbours(whole, self.cameras))

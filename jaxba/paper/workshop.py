@@ -1,0 +1,233 @@
+"""Does what a table or figure needs and is not yet on the disk, and hands out rows of what is."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxba.bench import profile
+from jaxba.bench.records import Record
+from jaxba.bench.run import record_of
+from jaxba.bench.sources import Source
+from jaxba.damping import DampingPolicy
+from jaxba.game.bank import Bank, reach
+from jaxba.game.play import play
+from jaxba.methods import make_method
+from jaxba.naming import SolverName, parse_solver
+from jaxba.options import StepOptions
+from jaxba.paper import agents, rows, zero_net
+from jaxba.paper.agents import Agent
+from jaxba.paper.config import PaperConfig
+from jaxba.paper.rows import NEAR, Row
+from jaxba.paper.schedule import LENGTH
+from jaxba.paper.store import Play, Store
+from jaxba.problem import BundleProblem, ProblemError
+from jaxba.solve import IterationRecord, solve
+
+LIMIT = profile.ITERATION_LIMIT
+
+TEST = "test"
+"""Name of the tables' own scenes in records."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row's solver: a policy, perhaps of several training runs, and the step that it drives."""
+
+    name: str
+    """In records."""
+
+    build: Callable[[int], tuple[DampingPolicy, StepOptions]]
+    """Policy and options of a training run; rules ignore the number. Called only where something is to be run."""
+
+    seeds: int = 0
+    """Training runs; 0 for a rule."""
+
+    linear_solver: str | None = "auto"
+    """Of plain LM steps; None where the method of the step has its own."""
+
+    @property
+    def numbers(self) -> range:
+        """Of the training runs; one for a rule."""
+        return range(max(1, self.seeds))
+
+    def label(self, seed: int) -> str:
+        """The solver's name in records of solves."""
+        return f"{self.name}#{seed}" if self.seeds else self.name
+
+
+def named(name: str) -> Method:
+    """A solver by the name that `jaxba-bench` uses, perhaps with `/linear solver` behind it."""
+    solver, slash, linear = name.partition("/")
+    parsed = parse_solver(solver)
+    return Method(name, lambda _: parsed.build(), 0, linear if slash else "auto" if parsed.method == "lm" else None)
+
+
+class Workshop:
+    """A reproduction run: its settings, its folder and what it has."""
+
+    def __init__(self, config: PaperConfig, folder: Path, say: Callable[[str], None] = lambda _: None) -> None:
+        """Opens the folder.
+
+        Args:
+            config: of the run.
+            folder: holds all that is kept; must exist.
+            say: told in words what begins.
+
+        Raises:
+            ProblemError: a record is damaged.
+        """
+        self.config, self.folder, self.say = config, folder, say
+        self.store = Store(folder)
+        self.done = 0
+        """Solves, plays and trainings that this process had to do."""
+        self._test: Bank | None = None
+        self._read: tuple[Source, BundleProblem] | None = None
+
+    # Policies
+
+    def agent(self, agent: Agent, method: str = "lm") -> Method:
+        """A trained agent, all of its training runs."""
+
+        def build(seed: int) -> tuple[DampingPolicy, StepOptions]:
+            policy, fresh = agents.trained(self.config, agent, seed, self.folder, self.say)
+            self.done += fresh
+            return policy, make_method(method).options(policy.config.step_options(StepOptions()))
+
+        name = agent.name if method == "lm" else f"{method}+{agent.name}"
+        return Method(name, build, self.config.agents.seeds, "auto" if method == "lm" else None)
+
+    def zero_net(self) -> Method:
+        """The non-holistic network, as many training runs as of an agent."""
+        return Method("zero-net", self._zero_net, self.config.agents.seeds)
+
+    def _zero_net(self, seed: int) -> tuple[DampingPolicy, StepOptions]:
+        agent = agents.train_config(self.config, agents.OURS, seed).game.agent
+        path = self.folder / "agents" / f"zero-net-{seed}.npz"
+        if path.is_file():
+            net = zero_net.restore(path, agent)
+        else:
+            self.say(f"zero-net {seed + 1}: training")
+            settings = agents.train_config(self.config, agents.OURS, 0)
+            train_on = agents.scenes(self.config, self.folder, self.say)[0]
+            game = agents.game(self.config, agents.OURS, settings, train_on)
+            key = jax.random.fold_in(jax.random.key(self.config.seed), 2000 + seed)
+            net, _ = zero_net.train(self.config.zero_net, game, agent, key)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            zero_net.save(path, net)
+            self.done += 1
+        return net, agent.step_options(StepOptions())
+
+    # Work
+
+    def test_scenes(self) -> Bank:
+        """The tables' own scenes, made when first needed."""
+        if self._test is None:
+            self._test = agents.scenes(self.config, self.folder, self.say)[1]
+        return self._test
+
+    def play(self, method: Method) -> None:
+        """Plays a method on the tables' own scenes, where that has not been done."""
+        for seed in method.numbers:
+            if self.store.play(TEST, method.name, seed):
+                continue
+            policy, options = method.build(seed)
+            settings = agents.train_config(self.config, agents.OURS, 0)
+            options = replace(options, intrinsics=settings.bank.intrinsics)
+            bank = self.test_scenes()
+            self.say(f"{method.label(seed)} on {len(bank.initial_cost)} scenes")
+            started = time.perf_counter()
+            found = play(settings.bank.classes[0], bank, policy, options, LIMIT)
+            best = np.asarray(bank.best_cost)
+            first = [row[: min(LENGTH, count)] for row, count in zip(found.dampings, found.iterations, strict=True)]
+            self.store.add_play(
+                Play(
+                    scenes=TEST,
+                    method=method.name,
+                    seed=seed,
+                    iterations=tuple(int(x) for x in found.iterations),
+                    converged=tuple(bool(x) for x in found.converged),
+                    near=tuple(float(x) for x in reach(found.costs, best, NEAR)),
+                    end=tuple(float(x) for x in found.costs[:, -1] / best - 1),
+                    first=tuple(tuple(float(x) for x in row) for row in first),
+                    seconds=time.perf_counter() - started,
+                )
+            )
+            self.done += 1
+
+    def solve(self, sources: Iterable[Source], methods: Sequence[Method], limit: int = LIMIT, repeats: int = 0) -> None:
+        """Solves problems by methods, where that has not been done; a problem that cannot be read is told and skipped.
+
+        Args:
+            sources: problems.
+            methods: solvers.
+            limit: linear solves at most.
+            repeats: of each; those of the configuration if 0.
+        """
+        for source in sources:
+            for method in methods:
+                for seed in method.numbers:
+                    for repeat in range(repeats or self.config.real.repeats):
+                        if self.store.solve(source.name, method.label(seed), repeat) is None:
+                            try:
+                                self._solve(source, method, seed, repeat, limit)
+                            except ProblemError as error:
+                                self.say(f"{source.name}: left out: {error}")
+
+    def _solve(self, source: Source, method: Method, seed: int, repeat: int, limit: int) -> None:
+        policy, options = method.build(seed)
+        if self._read is None or self._read[0] != source:
+            self._read = source, source.read()
+        problem = self._read[1]
+        self.say(f"{source.name} by {method.label(seed)}")
+        steps: list[IterationRecord] = []
+        solution = solve(
+            problem,
+            policy,
+            options,
+            linear_solver=method.linear_solver,
+            max_iterations=limit,
+            callback=lambda step: steps.append(step),
+        )
+        known: Any = {"name": source.name, "family": source.family, "repeat": repeat, "solver": SolverName("ceres")}
+        self.store.add_solve(replace(record_of(solution, steps, **known), solver=method.label(seed)))
+        self.done += 1
+
+    # Rows
+
+    def row_on_scenes(self, method: Method) -> Row:
+        """What is known of a method on the tables' own scenes."""
+        plays = [self.store.play(TEST, method.name, seed) for seed in method.numbers]
+        return rows.row(method.name, {p.seed: rows.of_play(p) for p in plays if p is not None}, method.seeds > 0)
+
+    def row_on(self, sources: Iterable[Source], method: Method) -> Row:
+        """What is known of a method on real problems."""
+        names = [source.name for source in sources]
+        best = profile.best_cost(self.store.solves)
+        found = {}
+        for seed in method.numbers:
+            records = self.store.solves_of(names, [method.label(seed)])
+            if records:
+                found[seed] = rows.of_records(records, best)
+        return rows.row(method.name, found, method.seeds > 0)
+
+    def records_on(self, sources: Iterable[Source], methods: Iterable[Method], seed: int = 0) -> list[Record]:
+        """Solves under the methods' own names, those of one training run."""
+        labels = {method.label(seed): method.name for method in methods}
+        found = self.store.solves_of([source.name for source in sources], list(labels))
+        return [replace(record, solver=labels[record.solver]) for record in found]
+
+    def first_dampings(self, method: Method) -> list[tuple[float, ...]]:
+        """First lambdas of a method on every scene, of its first training run."""
+        known = self.store.play(TEST, method.name, 0)
+        return [] if known is None else list(known.first)
+
+    def scenes_known(self) -> int:
+        """How many scenes the plays in the store are on."""
+        return max((len(p.iterations) for p in self.store.plays if p.scenes == TEST), default=0)

@@ -1,0 +1,95 @@
+"""Agents of the reproduction run: one thing changed in each, scenes kept for the tables, known lenses."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from support import paper
+
+from jaxba import StepOptions, solve
+from jaxba.game import settings
+from jaxba.game.bank import BankConfig, Split, make_banks
+from jaxba.game.scenes import SceneClass
+from jaxba.paper import agents, config
+from jaxba.paper.config import AgentsConfig, PaperConfig
+from jaxba.paper.pieces.small import SmallScene
+
+CONFIG = config.load("fast")
+
+
+@pytest.mark.parametrize(
+    ("agent", "changed"),
+    [
+        (agents.of_state(5), []),
+        (agents.of_state(20), ["game.agent.history"]),
+        (agents.REDUCTION, ["game.reward"]),
+        (agents.REVERSED, ["game.agent.observation", "game.reward"]),
+        (agents.FEW, []),
+    ],
+)
+def test_agents_differ_in_what_their_table_is_about_and_nothing_else(agent, changed):
+    ours, theirs = (agents.train_config(CONFIG, one, 0) for one in (agents.OURS, agent))
+    assert sorted(settings.differences(ours, theirs)) == changed
+
+
+def test_seeds_are_training_runs_of_one_agent_each():
+    first, second = (agents.train_config(CONFIG, agents.OURS, seed) for seed in (0, 1))
+    assert settings.differences(first, second) == ["seed"]
+    assert first.seeds == 1
+
+
+def test_ours_is_the_papers_agent():
+    found = agents.train_config(CONFIG, agents.OURS, 0)
+    assert (found.game.agent.observation, found.game.agent.history, found.game.reward) == ("paper", 5, "duration")
+    assert (found.game.bonus, found.loop.warmup_steps, found.sac.variant, found.sac.width) == (10.0, 500, "value", 256)
+    assert found.bank.classes == (SceneClass(10, 10, "paper"),)
+    assert found.bank.intrinsics == "fixed"
+    assert found.game.max_iterations == 100
+
+
+@pytest.fixture(scope="module")
+def split() -> Split:
+    kind = SceneClass(4, 12, "paper")
+    made = BankConfig(classes=(kind,), scenes=(60,), refine_points=0, intrinsics="fixed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxba.game.bank.PORTFOLIO", ("ceres",))
+        return make_banks(made, jax.random.key(0), made.options, 40)[0]
+
+
+def test_the_tables_scenes_are_no_agents(split, monkeypatch, tmp_path):
+    monkeypatch.setattr(agents, "_shared", lambda *_: split)
+    train_on, test = agents.scenes(CONFIG, tmp_path, lambda _: None)
+    costs = [set(np.asarray(bank.initial_cost).tolist()) for bank in (train_on, test, split.held_out)]
+    assert len(costs[1]) == len(costs[2]) == len(split.held_out.initial_cost)
+    assert not costs[0] & costs[1]
+    assert not costs[1] & costs[2]
+    assert costs[0] | costs[1] == set(np.asarray(split.train.initial_cost).tolist())
+
+
+def test_the_agent_of_few_scenes_plays_the_first_ones(split):
+    few = PaperConfig(agents=AgentsConfig(trajectories=3))
+    wanted = agents.train_config(few, agents.FEW, 0)
+    game = agents.game(few, agents.FEW, wanted, split.train)
+    np.testing.assert_array_equal(game.banks[0].initial_cost, split.train.initial_cost[:3])
+    assert game.options == StepOptions(intrinsics="fixed")
+    whole = agents.game(few, agents.OURS, wanted, split.train)
+    assert len(whole.banks[0].initial_cost) == len(split.train.initial_cost)
+
+
+def test_a_known_lens_stays_bit_for_bit_and_poses_move():
+    problem = paper(0)
+    found = solve(problem, "ceres", StepOptions(intrinsics="fixed"), max_iterations=10).problem
+    assert found.cameras[:, 6:].tobytes() == np.asarray(problem.cameras[:, 6:]).tobytes()
+    assert (np.asarray(found.cameras[:, :6]) != problem.cameras[:, :6]).all()
+
+
+def test_a_small_scene_is_determined_by_its_known_lens():
+    problem = SmallScene("s", "small", "5 x 5", 5, 3).read()
+    assert (problem.num_cameras, problem.num_points, problem.num_observations) == (5, 5, 25)
+    assert 2 * problem.num_observations > 6 * 5 + 3 * 5 - 7
+    assert 2 * problem.num_observations < 9 * 5 + 3 * 5 - 7
+    truth = solve(problem, "ceres", StepOptions(intrinsics="fixed"))
+    assert truth.converged
+    # half a pixel of noise on each of 50 numbers, of which 38 unknowns take their share
+    assert truth.final_cost < 0.5 * 0.25 * 50

@@ -1,0 +1,354 @@
+"""Parts of the reproduction run by hand: sub-problems, schedules, rows, claims, records, settings and places."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from jaxba import BundleProblem, ProblemError
+from jaxba.bench.records import Record, TracePoint
+from jaxba.game.settings import SettingsError
+from jaxba.paper import claims, config, places, rows
+from jaxba.paper.markdown import Line, disagreements, lines_table
+from jaxba.paper.rows import Outcome, Row
+from jaxba.paper.schedule import average_schedule
+from jaxba.paper.store import PLAYS, SOLVES, Play, Store
+from jaxba.paper.subproblem import Cut, neighbours, sub_problem
+
+# Sub-problems
+
+
+def hand_made() -> BundleProblem:
+    """Who sees which point: 0: cameras 0, 1, 2; 1: 0, 1; 2: 2, 3; 3: camera 3 twice; 4: 1, 3."""
+    seen = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 2), (3, 2), (3, 3), (3, 3), (1, 4), (3, 4)]
+    cameras = np.zeros((4, 9))
+    cameras[:, 0], cameras[:, 6] = np.arange(4), 100.0
+    points = np.stack([np.arange(5.0), np.zeros(5), -10.0 - np.arange(5)], axis=1)
+    pixels = np.arange(22.0).reshape(11, 2)
+    return BundleProblem.create(cameras, points, pixels, [c for c, _ in seen], [p for _, p in seen])
+
+
+def test_a_sub_problem_has_the_cameras_asked_for_and_points_that_two_of_them_see():
+    whole = hand_made()
+    part = sub_problem(whole, [0, 1, 3])
+    assert part.cameras[:, 0].tolist() == [0.0, 1.0, 3.0]
+    assert part.points[:, 0].tolist() == [0.0, 1.0, 4.0]  # 2 keeps one camera, 3 has two observations of a single one
+    pairs = list(zip(part.camera_index.tolist(), part.point_index.tolist(), strict=True))
+    assert pairs == [(0, 0), (1, 0), (0, 1), (1, 1), (1, 2), (2, 2)]
+    assert part.observations[:, 0].tolist() == [0.0, 2.0, 6.0, 8.0, 18.0, 20.0]
+
+
+def test_points_that_were_not_asked_for_are_left_out():
+    part = sub_problem(hand_made(), [0, 1, 2], points=[1, 2])
+    assert part.points[:, 0].tolist() == [1.0]
+    assert part.num_observations == 2
+
+
+def test_a_sub_problem_of_everything_that_tracks_is_the_problem():
+    whole = hand_made()
+    part = sub_problem(sub_problem(whole, range(4)), range(4))
+    assert part.num_points == 4
+    assert part.cameras.tobytes() == whole.cameras.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("cameras", "points", "words"),
+    [
+        ([0, 4], None, "no camera 4 among 4"),
+        ([-1], None, "no camera -1"),
+        ([0, 1], [9], "no point 9"),
+        ([0, 3], None, "no point is seen"),
+    ],
+)
+def test_a_sub_problem_that_cannot_be_is_one_line(cameras, points, words):
+    with pytest.raises(ProblemError, match=words):
+        sub_problem(hand_made(), cameras, points)
+
+
+def test_neighbours_grow_from_the_camera_that_sees_most():
+    # camera 1 and 3 see three points each, the first of them is 1; it shares two points with 0, one with 2 and with 3
+    assert neighbours(hand_made(), 1).tolist() == [1]
+    assert neighbours(hand_made(), 2).tolist() == [0, 1]
+    assert neighbours(hand_made(), 4).tolist() == [0, 1, 2, 3]
+    with pytest.raises(ProblemError, match="cannot take 5 of 4"):
+        neighbours(hand_made(), 5)
+
+
+def test_a_cut_of_a_scene_is_made_when_it_is_read():
+    part = Cut("part", "scene", "scene:tiny", cameras=3).read()
+    assert part.num_cameras == 3
+    tracks = np.bincount(part.point_index)
+    assert tracks.min() >= 2
+
+
+# The schedule made the paper's way
+
+
+def test_a_schedule_is_the_arithmetic_mean_of_each_place():
+    assert average_schedule([[1.0, 2.0, 3.0, 4.0, 9.0], [3.0, 4.0, 5.0, 8.0]]) == (2.0, 3.0, 4.0, 6.0)
+
+
+def test_a_solve_that_ended_early_does_not_enter_the_later_means():
+    assert average_schedule([[1e-15, 1e-15], [1e-15, 3e-15, 0.4, 0.6], [1e-15]]) == pytest.approx(
+        (1e-15, 2e-15, 0.4, 0.6)
+    )
+
+
+def test_a_schedule_is_as_long_as_the_longest_solve_at_most():
+    assert average_schedule([[0.5], [1.5, 2.0]]) == (1.0, 2.0)
+    with pytest.raises(ValueError, match="no solve has a lambda"):
+        average_schedule([[], []])
+
+
+# Rows
+
+
+def solved(
+    iterations: float, converged: bool = True, near: float = 2.0, end: float = 0.0, seconds: float = 1.0
+) -> Outcome:
+    return Outcome(float(iterations), converged, near, end, seconds)
+
+
+def test_a_row_averages_over_problems_and_spreads_over_seeds():
+    found = rows.row(
+        "x", {0: [solved(4), solved(6)], 1: [solved(8, end=0.02), solved(100, False, near=100.0)]}, trained=True
+    )
+    assert (found.iterations, found.low, found.high) == (29.5, 5.0, 54.0)
+    assert (found.success, found.good_ends, found.near) == (0.75, 0.75, 26.5)
+    assert (found.seeds, found.solves, found.seconds) == (2, 2, 1.0)
+
+
+def test_a_rule_has_no_seeds_and_nothing_run_is_no_number():
+    assert rows.row("x", {0: [solved(4)]}, trained=False).seeds == 0
+    nothing = rows.row("x", {}, trained=True)
+    assert nothing.solves == 0
+    assert math.isnan(nothing.iterations)
+
+
+def test_a_failure_counts_as_the_limit_in_a_play():
+    play = Play(
+        "test", "x", 0, (3, 100, 120), (True, False, True), (0.0, math.inf, 4.0), (0.0, 0.5, 0.0), ((), (), ()), 0.0
+    )
+    found = rows.of_play(play)
+    assert [o.iterations for o in found] == [3.0, 100.0, 100.0]
+    assert [o.converged for o in found] == [True, False, False]
+    assert [o.near for o in found] == [1.0, 100.0, 4.0]
+
+
+def record(
+    problem: str,
+    costs: list[float],
+    setup_s: float = 0.5,
+    repeat: int = 0,
+    termination: str = "cost",
+    step_s: float = 1.0,
+) -> Record:
+    trace = tuple(TracePoint(k, k * step_s, c, 1.0, True, 0, 1.0) for k, c in enumerate(costs))
+    sizes = {"cameras": 2, "points": 3, "observations": 6}
+    where = {
+        "solver": "s",
+        "backend": "b",
+        "device": "d",
+        "dtype": "float64",
+        "threads": 1,
+        "repeat": repeat,
+        "family": "f",
+    }
+    ends = {"initial_cost": costs[0], "final_cost": costs[-1], "iterations": len(costs) - 1, "accepted": len(costs) - 1}
+    times = {"setup_s": setup_s, "compile_s": 9.0, "total_s": 99.0, "cg_iterations": 0, "termination": termination}
+    return Record(problem=problem, trace=trace, **sizes, **where, **ends, **times)
+
+
+def test_outcomes_of_records_by_hand():
+    records = [
+        record("a", [100.0, 50.0, 10.005, 10.0]),
+        record("a", [100.0, 50.0, 10.005, 10.0], repeat=1, step_s=3.0),
+        record("b", [8.0, 4.0], termination="max_iterations"),
+    ]
+    a, b = rows.of_records(records, {"a": 10.0, "b": 2.0})
+    assert (a.iterations, a.converged, a.near, a.end, a.seconds) == (3.0, True, 2.0, 0.0, 0.5 + 6.0)
+    assert (b.iterations, b.converged, b.near, b.end, b.seconds) == (100.0, False, 100.0, 1.0, 1.5)
+
+
+# Claims
+
+
+def of(
+    iterations: float, low: float | None = None, high: float | None = None, success: float = 1.0, seeds: int = 2
+) -> Row:
+    ends = (iterations if low is None else low, iterations if high is None else high)
+    low, high = map(float, ends)
+    return Row("x", float(iterations), low, high, near=1.0, success=success, good_ends=1.0, seeds=seeds, solves=3)
+
+
+@pytest.mark.parametrize(
+    ("ours", "base", "verdict"),
+    [
+        (of(4), of(20), "reproduced"),
+        (of(5), of(20), "reproduced"),
+        (of(5.1), of(20), "partly"),
+        (of(18), of(20), "partly"),
+        (of(18.1), of(20), "not"),
+        (of(4, success=0.9), of(20), "not"),
+        (of(4, success=0.96), of(20), "reproduced"),
+        (None, of(20), "not run"),
+        (of(math.nan), of(20), "not run"),
+    ],
+)
+def test_a_ratio_is_judged_by_the_rule(ours, base, verdict):
+    assert claims.ratio_claim("claim", 0.2, ours, base).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("ours_s", "success", "verdict"),
+    [(2.5, 1.0, "reproduced"), (2.6, 1.0, "partly"), (9.1, 1.0, "not"), (2.0, 0.9, "not"), (math.nan, 1.0, "not run")],
+)
+def test_a_share_of_time_is_judged_as_one_of_iterations(ours_s, success, verdict):
+    ours = dataclasses.replace(of(4, success=success), seconds=ours_s)
+    base = dataclasses.replace(of(20), seconds=10.0)
+    assert claims.time_claim("claim", 0.2, ours, base).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("better", "worse", "verdict"),
+    [
+        (of(4, 3, 5), of(8, 7, 9), "reproduced"),
+        (of(4, 3, 7.5), of(8, 7, 9), "partly"),
+        (of(8), of(8), "not"),
+        (of(9), of(8), "not"),
+        (of(4, success=0.8), of(8), "not"),
+        (of(7.5, 7.4, 7.6), of(8, 7.9, 8.1), "partly"),
+        (of(9.5, seeds=0), of(10, seeds=0), "partly"),
+        (of(8.9, seeds=0), of(10, seeds=0), "reproduced"),
+        (of(4), None, "not run"),
+    ],
+)
+def test_an_order_is_judged_by_the_ranges_over_the_seeds(better, worse, verdict):
+    assert claims.order_claim("claim", "4 against 8", better, worse).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("ours", "verdict"), [(0.66, "reproduced"), (0.6, "partly"), (0.5, "not"), (math.nan, "not run")]
+)
+def test_a_share_is_judged_by_its_distance(ours, verdict):
+    assert claims.share_claim("claim", 0.7, ours).verdict == verdict
+
+
+def test_only_claims_that_failed_are_disagreements():
+    good, bad = claims.ratio_claim("good one", 0.2, of(4), of(20)), claims.ratio_claim("bad one", 0.2, of(19), of(20))
+    assert disagreements([good], "why") == ""
+    said = disagreements([good, bad], "another machine.")
+    assert "bad one: no (paper 0.20, ours 0.95" in said
+    assert said.endswith("another machine.")
+    assert "good one" not in said
+
+
+def test_a_table_has_the_papers_figure_and_both_ratios():
+    classic, ceres = of(20, seeds=0), of(8, seeds=0)
+    lines = [Line("classic", Row("classic", *[20.0] * 3, 1.0, 1.0, 1.0, 0, 3), 20.0), Line("ours", of(4, 3, 5), 4.0)]
+    text = lines_table(lines, lines[0].row, ceres)
+    assert classic.iterations == lines[0].row.iterations
+    cells = [cell.strip() for cell in text.splitlines()[-1].strip("|").split("|")]
+    assert cells == ["ours", "4", "4", "2: 3 to 5", "100 %", "1", "100 %", "0.2", "0.2", "0.5"]
+
+
+# Records
+
+
+def test_lines_come_back_as_they_were_written(tmp_path):
+    play = Play("test", "x", 1, (3, 4), (True, False), (1.0, math.inf), (0.0, 1e-3), ((1e-15, 2.0), ()), 0.25)
+    store = Store(tmp_path)
+    store.add_play(play)
+    store.add_solve(record("a", [4.0, 2.0]))
+    again = Store(tmp_path)
+    assert again.play("test", "x", 1) == play
+    assert again.play("test", "x", 0) is None
+    assert again.solve("a", "s", 0).final_cost == 2.0
+    assert json.loads((tmp_path / PLAYS).read_text())["near"] == [1.0, None]
+
+
+def test_a_half_written_line_is_dropped_and_the_next_one_is_whole(tmp_path):
+    play = Play("test", "x", 1, (3,), (True,), (1.0,), (0.0,), ((1.0,),), 0.25)
+    Store(tmp_path).add_play(play)
+    with (tmp_path / PLAYS).open("a") as file:
+        file.write('{"scenes": "test", "meth')
+    store = Store(tmp_path)
+    assert store.plays == [play]
+    store.add_play(Play("test", "y", 0, (3,), (True,), (1.0,), (0.0,), ((1.0,),), 0.25))
+    assert [p.method for p in Store(tmp_path).plays] == ["x", "y"]
+
+
+def test_a_damaged_line_is_named(tmp_path):
+    (tmp_path / PLAYS).write_text("{}\n")
+    with pytest.raises(ProblemError, match=r"plays.jsonl, line 1: not a line of this program"):
+        Store(tmp_path)
+    assert not (tmp_path / SOLVES).exists()
+
+
+# Settings and places
+
+
+@pytest.mark.parametrize("name", config.preset_names())
+def test_presets_load_and_come_back(name, tmp_path):
+    loaded = config.load(name)
+    path = tmp_path / "again.yaml"
+    path.write_text(config.to_yaml(loaded))
+    assert config.load(str(path)) == loaded
+
+
+def test_the_presets_are_full_and_fast():
+    assert config.preset_names() == ["fast", "full"]
+    assert config.load("fast").agents.seeds < config.load("full").agents.seeds
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("agent: {}", "unknown key agent; did you mean agents"),
+        ("agents: {seed: 2}", "unknown key agents.seed"),
+        ("real: {bal: [{name: X, files: [], sizes: [1]}]}", r"unknown key real.bal\[0\].sizes"),
+        ("agents: {seeds: 0}", "agents.seeds must be at least 1"),
+        ("agents: {state_sizes: [1, 10]}", "must have 5"),
+        ("agents: [", "not YAML"),
+    ],
+)
+def test_a_wrong_file_is_one_line(text, words, tmp_path):
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(SettingsError, match=words):
+        config.load(str(path))
+
+
+def test_an_unknown_preset_is_named():
+    with pytest.raises(SettingsError, match="no configuration 'quick'; known: fast, full"):
+        config.load("quick")
+
+
+def test_real_problems_come_through_the_variable_alone(monkeypatch):
+    monkeypatch.delenv("JAXBA_DATA", raising=False)
+    settings = config.load("fast").real
+    assert places.find(settings.kitti).reason == "not run: JAXBA_DATA is not set"
+    assert places.why_no_bal(settings) == "not run: JAXBA_DATA is not set"
+    assert places.bal(settings) == ()
+
+
+def test_files_and_their_parts_are_found_and_what_is_missing_is_told(monkeypatch, tmp_path):
+    monkeypatch.setenv("JAXBA_DATA", str(tmp_path))
+    (tmp_path / "problem-6-40-pre.txt").write_text("")
+    family = config.FamilyConfig("Ladybug", ("$JAXBA_DATA/problem-*.txt", "$JAXBA_DATA/other.txt"), (3, 4))
+    found = places.find(family)
+    assert [source.name for source in found.all] == [
+        "problem-6-40-pre",
+        "problem-6-40-pre-first3",
+        "problem-6-40-pre-first4",
+    ]
+    assert found.missing == ("$JAXBA_DATA/other.txt",)
+    assert found.reason == ""
+    names = lambda whole, of: [s.name for s in of(config.RealConfig((dataclasses.replace(family, whole=whole),)))]
+    assert names(True, places.bal) == ["problem-6-40-pre"]
+    assert names(True, places.bal_and_parts) == [source.name for source in found.all]
+    assert names(False, places.bal) == names(False, places.bal_and_parts) == [source.name for source in found.cuts]

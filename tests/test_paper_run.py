@@ -1,0 +1,149 @@
+"""`jaxba-paper` in this process: one table on tiny scenes, a second call, a record lost, and one-line errors."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from jaxba.cli.paper import run
+from jaxba.game import bank, play
+from jaxba.paper.pieces import PIECES
+from jaxba.paper.store import PLAYS
+
+TINY = """
+agents:
+  preset: fast
+  overrides:
+    - chunks=1
+    - evaluate_every=1
+    - checkpoint_every=1
+    - envs=[8]
+    - "bank.classes=[{cameras: 4, points: 12, family: paper}]"
+    - bank.scenes=[160]
+    - bank.refine_points=0
+    - game.max_iterations=100
+    - game.agent.refine_points=0
+    - game.agent.trials=1
+    - game.agent.camera_rounds=0
+    - sac.width=8
+    - sac.batch=16
+    - loop.replay_capacity=500
+    - loop.warmup_steps=16
+    - loop.steps_per_chunk=8
+  seeds: 1
+  state_sizes: [5]
+real:
+  bal: [{name: Ladybug, files: [$JAXBA_DATA/bal/problem-49-7776-pre.txt.bz2]}]
+  kitti: {name: KITTI, files: [$JAXBA_DATA/nothing.txt]}
+figures: {scene: "scene:tiny", large_scene: "scene:tiny:1", profile_scenes: 1}
+"""
+
+
+@pytest.fixture(autouse=True)
+def without_data(monkeypatch):
+    monkeypatch.delenv("JAXBA_DATA", raising=False)
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("settings") / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+def command(settings: Path, folder: Path) -> list[str]:
+    report = folder.parent / "docs" / "paper.md"
+    report.parent.mkdir(exist_ok=True)
+    where = ["--out", str(folder), "--report", str(report)]
+    return ["--config", str(settings), *where, "--only", "state-size"]
+
+
+@pytest.fixture(scope="module")
+def finished(settings, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("paper") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("JAXBA_DATA", raising=False)
+        patch.setattr(play, "LANES", play.GROUP)
+        patch.setattr(bank, "PORTFOLIO", ("ceres",))  # every rule is a program of its own
+        assert run(command(settings, folder)) == 0
+    return folder
+
+
+def runs(capsys) -> int:
+    found = re.findall(r"^  (\d+) runs, ", capsys.readouterr().out, re.MULTILINE)
+    assert len(found) == 1
+    return int(found[0])
+
+
+def test_one_table_is_made_from_nothing(finished):
+    plays = [json.loads(line) for line in (finished / PLAYS).read_text().splitlines()]
+    assert [(p["method"], p["seed"]) for p in plays] == [("classic", 0), ("ceres", 0), ("agent", 0)]
+    assert len({len(p["iterations"]) for p in plays}) == 1
+    text = (finished.parent / "docs" / "paper.md").read_text()
+    assert "`jaxba-paper --config tiny.yaml`" in text
+    assert "Machine: cpu" in text
+    assert str(finished.parent) not in text
+    assert "BAL: not run: JAXBA_DATA is not set." in text
+    assert "**BAL**: not run: JAXBA_DATA is not set." in text
+    row = next(line for line in text.splitlines() if line.startswith("| classic | 20 |"))
+    mean = sum(i if c else 100 for i, c in zip(plays[0]["iterations"], plays[0]["converged"], strict=True))
+    assert row.split("|")[3].strip() == f"{mean / len(plays[0]['iterations']):.1f}".removesuffix(".0")
+    for piece in PIECES.values():
+        assert piece.title
+    assert text.count("\n## ") >= len(PIECES)
+
+
+def test_a_second_call_does_no_work(finished, settings, capsys):
+    before = (finished / PLAYS).read_bytes()
+    assert run(command(settings, finished)) == 0
+    assert runs(capsys) == 0
+    assert (finished / PLAYS).read_bytes() == before
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+def test_a_record_that_is_lost_is_the_only_one_made_again(finished, settings, capsys, lost, monkeypatch):
+    monkeypatch.setattr(play, "LANES", play.GROUP)
+    lines = (finished / PLAYS).read_text().splitlines(keepends=True)
+    (finished / PLAYS).write_text("".join(line for k, line in enumerate(lines) if k != lost))
+    assert run(command(settings, finished)) == 0
+    assert runs(capsys) == 1
+    again = (finished / PLAYS).read_text().splitlines(keepends=True)
+    old, new = json.loads(lines[lost]), json.loads(again[-1])
+    assert {**old, "seconds": 0} == {**new, "seconds": 0}
+    (finished / PLAYS).write_text("".join(lines))
+
+
+def error_of(capsys, *argv: str) -> str:
+    assert run(list(argv)) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    return error
+
+
+def test_a_folder_of_another_run_is_refused(finished, tmp_path, capsys):
+    other = tmp_path / "other.yaml"
+    other.write_text(TINY.replace("seeds: 1", "seeds: 2"))
+    error = error_of(capsys, "--config", str(other), "--out", str(finished))
+    assert "holds a run with another agents.seeds" in error
+
+
+def test_wrong_arguments_are_one_line(capsys, tmp_path):
+    assert "--only tables: unknown; known: kitti, bal" in error_of(capsys, "--only", "tables")
+    assert "give one of them" in error_of(capsys, "--fast", "--config", "full")
+    wrong = tmp_path / "wrong.yaml"
+    wrong.write_text("seeds: 3")
+    assert "unknown key seeds" in error_of(capsys, "--config", str(wrong), "--out", str(tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+    missing = str(tmp_path / "none" / "paper.md")
+    assert "does not exist" in error_of(capsys, "--fast", "--out", str(tmp_path / "run"), "--report", missing)
+
+
+def test_the_list_names_every_table_and_figure(capsys):
+    assert run(["--list"]) == 0
+    listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert listed == list(PIECES)
+    tables = "kitti bal synthetic subproblems zero-net state-size reversed rewards schedule small"
+    assert listed == [*tables.split(), "lambda", "profiles", "convergence"]
