@@ -123,7 +123,7 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_so
         problem: decides `auto`.
         options: of the step.
         linear_solver: a name, `auto`, or None to keep what the options say. A method that is a linear solver itself
-            (methods.py) has no choice to make: `auto` keeps it.
+            (methods.py) has no choice to make: `auto` keeps it. Fixed intrinsics leave the explicit one.
 
     Raises:
         ValueError: such a method, and another solver asked for by name.
@@ -134,7 +134,9 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_so
         if linear_solver == "auto":
             return options
         raise ValueError(f"linear solver {linear_solver!r} is for plain LM steps; this method has its own")
-    return replace(options, linear_solver=choose(problem) if linear_solver == "auto" else linear_solver)
+    if linear_solver == "auto":
+        linear_solver = choose(problem) if options.intrinsics == "free" else "explicit"
+    return replace(options, linear_solver=linear_solver)
 
 
 def _within(size: float, seconds: float) -> float:

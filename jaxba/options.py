@@ -74,7 +74,7 @@ class StepOptions:
 
     intrinsics: Intrinsics = "free"
     """Whether focal lengths and distortions are optimised, as in BAL, or stay: the seed paper optimises poses and
-    points. `fixed` works with the explicit solver and without camera rounds."""
+    points. `fixed` works with the explicit solver."""
 
     loss: Loss = field(default_factory=Loss)
     """Robust loss of the squared whitened residual."""
@@ -113,8 +113,8 @@ class StepOptions:
         for name in ("preconditioner_order", "power_order", "repairs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
-        if self.intrinsics == "fixed" and (self.linear_solver != "explicit" or self.camera_rounds):
-            raise ValueError("fixed intrinsics need the explicit solver, and no camera rounds")
+        if self.intrinsics == "fixed" and self.linear_solver != "explicit":
+            raise ValueError(f"fixed intrinsics need the explicit solver, not {self.linear_solver}")
         if self.cg_max_iterations < 1:
             raise ValueError(f"cg_max_iterations must be at least 1, is {self.cg_max_iterations}")
 

@@ -104,9 +104,9 @@ def refine_points(
     if home is not None:
 
         def return_home() -> tuple[Array, Array, Array]:
-            there = (home.points, *evaluate(home.points)[:2])
-            here = (points, system, costs)
-            return tuple(jnp.where(lost, new, old) for new, old in zip(there, here, strict=True))
+            system_there, costs_there, _ = evaluate(home.points)
+            choose = lambda there, here: jnp.where(lost, there, here)
+            return choose(home.points, points), choose(system_there, system), choose(costs_there, costs)
 
         points, system, costs = lax.cond(jnp.any(lost), return_home, lambda: (points, system, costs))
     carry = _Carry(points, costs, system, jnp.full_like(costs, INITIAL_DAMPING))

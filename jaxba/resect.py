@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxba import camera
 from jaxba.layout import Layout
-from jaxba.linearize import linearize, residuals, slot_costs, slot_frames
+from jaxba.linearize import linearize, residuals, slot_costs, slot_frames, without_intrinsics
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.sums import outer_sum, take_rows, tree_sum
 
@@ -35,12 +35,14 @@ def refine_cameras(
         layout: slots.
         cameras: where to start.
         points: they stand still.
-        options: only the loss matters.
+        options: loss, and whether intrinsics stay.
 
     Returns:
         Cameras; the total cost is never larger than before.
     """
     linear = linearize(layout, cameras, points, options.loss)
+    if options.intrinsics == "fixed":
+        linear = without_intrinsics(linear)
     rows = [entry for k in range(2) for entry in (*linear.camera_jacobian[k], linear.residual[k])]
     level, *levels = layout.camera_levels
     gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 10)

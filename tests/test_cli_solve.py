@@ -122,6 +122,15 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     assert "method stba:3" in capsys.readouterr().out
 
 
+def test_fixed_intrinsics_stay_to_the_last_bit_and_the_rest_is_optimised(tiny, tmp_path):
+    out = tmp_path / "out.txt"
+    assert run([str(tiny), "--intrinsics", "fixed", "--output", str(out)]) == 0
+    before, after = read_bal(tiny), read_bal(out)
+    np.testing.assert_array_equal(after.cameras[:, 6:], before.cameras[:, 6:])
+    assert (after.cameras[:, :6] != before.cameras[:, :6]).any(axis=1).all()
+    assert geometry.cost(after) < 0.5 * geometry.cost(before)
+
+
 def test_what_is_odd_about_the_data_is_counted(tmp_path, capsys):
     problem = support.odd()
     path, output = tmp_path / "odd.txt", tmp_path / "out.txt"
@@ -217,6 +226,10 @@ BAD = {
     "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm, ddlm, poba"),
     "size of no clusters": (lambda tiny: [str(tiny), "--method", "poba:3"], "no clusters"),
     "solver of a method": (lambda tiny: [str(tiny), "--method", "poba", "--linear-solver", "sparse"], "has its own"),
+    "fixed intrinsics of a method": (
+        lambda tiny: [str(tiny), "--intrinsics", "fixed", "--method", "ddlm"],
+        "--intrinsics",
+    ),
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must not be negative"),
     "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be positive"),
     "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be positive"),

@@ -20,10 +20,6 @@ from jaxba import Loss, StepOptions
         ({"camera_rounds": -1}, "camera_rounds must be at least 0"),
         ({"trials": 0}, "trials must be at least 1"),
         ({"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
-        (
-            {"intrinsics": "fixed", "camera_rounds": 1},
-            "fixed intrinsics need the explicit solver, and no camera rounds",
-        ),
         ({"intrinsics": "fixed", "linear_solver": "implicit"}, "fixed intrinsics need the explicit solver"),
         ({"cg_max_iterations": 0}, "cg_max_iterations must be at least 1"),
     ],

@@ -14,7 +14,7 @@ import tyro
 
 from jaxba.cli import common
 from jaxba.methods import DEFAULT_METHOD
-from jaxba.options import LinearSolverChoice, Preconditioner
+from jaxba.options import Intrinsics, LinearSolverChoice, Preconditioner
 
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
 """What is solved where no problem is named."""
@@ -69,6 +69,10 @@ class Arguments:
     rotation: Literal["angle-axis", "manifold"] = "angle-axis"
     """Coordinates of rotation steps: those of the file, as Ceres, or multiplication by exp(step)."""
 
+    intrinsics: Intrinsics = "free"
+    """free: focal length and distortion of every camera are optimised, as in BAL. fixed: they stay, as they should with
+    calibrated cameras; the reduced camera system is then always formed and factored."""
+
     loss: Literal["squared", "huber", "soft_l1", "cauchy", "tukey"] = "squared"
     """Robust loss of the squared residual."""
 
@@ -100,6 +104,8 @@ def _solve(args: Arguments) -> int:
         raise common.UsageError(f"--refine-points must not be negative, is {args.refine_points}")
     if args.method != DEFAULT_METHOD and args.linear_solver != "auto":
         raise common.UsageError(f"--linear-solver is for --method lm; {args.method} has its own")
+    if args.intrinsics == "fixed" and (args.method != DEFAULT_METHOD or args.linear_solver not in ("auto", "explicit")):
+        raise common.UsageError("--intrinsics fixed needs --method lm and the explicit linear solver")
     common.check_writable("--output", args.output)
     common.check_writable("--log", args.log)
     if args.output and args.log and Path(args.output).resolve() == Path(args.log).resolve():
@@ -126,6 +132,7 @@ def _solve(args: Arguments) -> int:
         scaling=args.scaling,
         rotation=args.rotation,
         preconditioner=args.preconditioner,
+        intrinsics=args.intrinsics,
         loss=Loss(args.loss, args.loss_scale),
     )
     print(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
