@@ -12,6 +12,8 @@ import jax
 import jaxtyping
 import pytest
 
+from jaxba import host
+
 
 def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_enable_x64", True)
@@ -41,6 +43,13 @@ def _machine() -> str:
     if cpus.is_file():
         facts += "".join(sorted({line for line in cpus.read_text().splitlines() if line.startswith("flags")}))
     return hashlib.sha256(facts.encode()).hexdigest()[:12]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    """Many modules compile more programs than one process may map."""
+    yield
+    host.release_programs()
 
 
 @pytest.fixture
