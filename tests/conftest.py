@@ -12,8 +12,6 @@ import jax
 import jaxtyping
 import pytest
 
-from jaxba import host
-
 
 def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_enable_x64", True)
@@ -49,6 +47,8 @@ def _machine() -> str:
 def few_programs():
     """Many modules compile more programs than one process may map."""
     yield
+    from jaxba import host  # not before `pytest_configure` has prepared what its classes are registered with
+
     host.release_programs()
 
 
