@@ -60,6 +60,20 @@ def test_stba_with_one_cluster_is_the_exact_step(make, damping):
     check_step(make(), replace(CLUSTERED, cluster_cameras=100), damping)
 
 
+@pytest.mark.parametrize("damping", [1e-4, 1e-2, 1.0])
+def test_stba_with_one_cluster_and_plain_lm_make_the_same_step(damping):
+    """To 1e-10 of the step, in the norm of the damped Hessian, which both solve."""
+    problem, options = support.tiny(), replace(CLUSTERED, cluster_cameras=100)
+    made = []
+    for kind in (options, StepOptions()):
+        layout, before = start(problem, kind)
+        after, info = step(layout, before, damping, kind)
+        assert info.accepted
+        made.append(support.difference(problem, support.back(problem, before, after), kind))
+    truth = support.dense(problem, options, damping)
+    assert truth.norm(made[0] - made[1]) <= 1e-10 * truth.norm(made[1])
+
+
 @pytest.mark.parametrize("damping", [1e-6, 1e-3, 0.5])
 def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
     """Below lambda 1 the step is that of a dense solution in which nothing holds the pieces of a point together."""
