@@ -46,6 +46,7 @@ class StepInfo(NamedTuple):
     cg_iterations: Int[Array, ""]
     share: Float[Array, ""]  # length of the candidate relative to the whole step, below 1 after further trials
     damping_share: Float[Array, ""]  # share of the step's curvature that is damping's, 0 (Gauss-Newton) to 1
+    repairs: Int[Array, ""]  # camera rounds and further trials after the first candidate
 
 
 def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
@@ -111,6 +112,7 @@ def lm_step(
         cg_iterations=step.cg_iterations,
         share=trial.share,
         damping_share=jnp.clip(step.damped / step.slope, 0, 1),
+        repairs=trial.repairs,
     )
 
 
@@ -143,4 +145,5 @@ def _round(
         cg_iterations=jnp.zeros((), jnp.int32),
         share=one,
         damping_share=jnp.clip(1 - found.curvature / found.slope, 0, 1),
+        repairs=jnp.zeros((), jnp.int32),
     )

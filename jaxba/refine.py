@@ -15,6 +15,7 @@ Adjustment", PAMI 2012; Ceres calls the same idea inner iterations.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -67,29 +68,33 @@ def refine_points(
         frames: camera of every slot (`linearize.slot_frames`).
         points: where to start.
         loss: robust loss.
-        iterations: steps per point; each costs one pass over the observations.
+        iterations: steps per point, at least one; each costs one pass over the observations.
         home: a point that lies behind a camera in front of which it was at home starts from there.
 
     Returns:
         Points, and the cost of each point's observations there (pixels squared), never larger than where it started.
     """
 
-    def evaluate(points: Array) -> tuple[Array, Array, Bool[Array, " points"]]:
+    def look(points: Array) -> tuple[camera.Projection, list[Array], Array]:
         projection, residual = residuals(layout, frames, points)
-        entries = point_normal_equations(layout, frames, projection, residual, loss)
-        hidden = jnp.zeros_like(residual[0])
-        if home is not None:
-            hidden = (home.front & behind(projection)).astype(hidden.dtype)
-        sums = point_sum(layout, jnp.stack([*entries, slot_costs(loss, residual), hidden]))
-        return sums[:9], sums[9], sums[10] > 0
+        return projection, residual, slot_costs(loss, residual)
 
-    def body(_: Array, carry: _Carry) -> _Carry:
+    def evaluate(points: Array, *more: Callable[[camera.Projection], Array]) -> tuple[Array, Array, list[Array]]:
+        projection, residual, costs = look(points)
+        entries = point_normal_equations(layout, frames, projection, residual, loss)
+        sums = point_sum(layout, jnp.stack([*entries, costs, *(extra(projection) for extra in more)]))
+        return sums[:9], sums[9], list(sums[10:])
+
+    def proposed(carry: _Carry) -> Float[Array, "3 points"]:
         matrix = [carry.system[k] for k in range(6)]
         for k in (0, 2, 5):
             matrix[k] = matrix[k] * (1 + carry.damping)
         factor = cholesky3(matrix)
         step = factor.backward(factor.forward([carry.system[k] for k in range(6, 9)]))
-        trial = carry.points - jnp.stack(step)
+        return carry.points - jnp.stack(step)
+
+    def body(_: Array, carry: _Carry) -> _Carry:
+        trial = proposed(carry)
         system, costs, _ = evaluate(trial)
         better = costs < carry.costs
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
@@ -100,15 +105,22 @@ def refine_points(
             jnp.where(better, carry.damping / DAMPING_FACTOR, grown),
         )
 
-    system, costs, lost = evaluate(points)
-    if home is not None:
+    if home is None:
+        system, costs, _ = evaluate(points)
+    else:
+        astray = lambda projection: (home.front & behind(projection)).astype(points.dtype)
+        system, costs, (lost,) = evaluate(points, astray)
 
         def return_home() -> tuple[Array, Array, Array]:
             system_there, costs_there, _ = evaluate(home.points)
-            choose = lambda there, here: jnp.where(lost, there, here)
+            choose = lambda there, here: jnp.where(lost > 0, there, here)
             return choose(home.points, points), choose(system_there, system), choose(costs_there, costs)
 
-        points, system, costs = lax.cond(jnp.any(lost), return_home, lambda: (points, system, costs))
+        points, system, costs = lax.cond(jnp.any(lost > 0), return_home, lambda: (points, system, costs))
     carry = _Carry(points, costs, system, jnp.full_like(costs, INITIAL_DAMPING))
-    carry = lax.fori_loop(0, iterations, body, carry)
-    return carry.points, carry.costs
+    carry = lax.fori_loop(0, iterations - 1, body, carry)
+    # nothing follows the last step, so that its cost is all there is to know
+    trial = proposed(carry)
+    costs = point_sum(layout, look(trial)[2][None])[0]
+    better = costs < carry.costs
+    return jnp.where(better, trial, carry.points), jnp.where(better, costs, carry.costs)

@@ -55,6 +55,7 @@ class Trial(NamedTuple):
     gain: Float[Array, ""]  # actual over predicted decrease
     accepted: Bool[Array, ""]
     share: Float[Array, ""]  # length relative to the whole step
+    repairs: Int[Array, ""]  # camera rounds and further trials that it took
 
 
 def best_trial(
@@ -88,7 +89,7 @@ def best_trial(
         candidate, decrease, predicted = total(costs), total(before - costs), step.predicted(share)
         gain = decrease / predicted
         accepted = (decrease > 0) & (candidate <= cost) & (predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
-        return Trial(cameras, points, candidate, predicted, gain, accepted, share)
+        return Trial(cameras, points, candidate, predicted, gain, accepted, share, jnp.zeros((), jnp.int32))
 
     home = Home(points, linear.front)
 
@@ -100,24 +101,23 @@ def best_trial(
             costs = slot_costs(options.loss, residuals(layout, frames, points)[1])
         return judge(cameras, points, costs, share)
 
-    def repair(carry: tuple[Int[Array, ""], Trial]) -> tuple[Int[Array, ""], Trial]:
-        count, trial = carry
+    def repair(trial: Trial) -> Trial:
         moved = refine_cameras(layout, trial.cameras, trial.points, options)
-        return count + 1, settle(moved, trial.points, trial.share)
+        return settle(moved, trial.points, trial.share)._replace(repairs=trial.repairs + 1)
 
-    def worth_it(carry: tuple[Int[Array, ""], Trial]) -> Bool[Array, ""]:
-        count, trial = carry
+    def worth_it(trial: Trial) -> Bool[Array, ""]:
         open_ = (trial.gain < GOOD_GAIN) & (trial.cost < HOPELESS * cost)
-        return (count < options.camera_rounds) & open_ & matters
+        return (trial.repairs < options.camera_rounds) & open_ & matters
 
     def attempt(share: Array) -> Trial:
         return settle(move_cameras(cameras, share * step.cameras, options), points + share * step.points, share)
 
     trial = attempt(jnp.ones((), cost.dtype))
     if options.camera_rounds:
-        trial = lax.while_loop(worth_it, repair, (jnp.zeros((), jnp.int32), trial))[1]
+        trial = lax.while_loop(worth_it, repair, trial)
     if options.trials > 1:
         last = 1.5 * SHORTER ** (options.trials - 1)
         again = lambda trial: ~trial.accepted & (trial.share > last) & matters
-        trial = lax.while_loop(again, lambda trial: attempt(SHORTER * trial.share), trial)
+        shorter = lambda trial: attempt(SHORTER * trial.share)._replace(repairs=trial.repairs + 1)
+        trial = lax.while_loop(again, shorter, trial)
     return trial

@@ -39,6 +39,10 @@ POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
 Ladybug-49: three take 3.9 of 12.6 ms (docs/performance.md)."""
 
+REPAIR_COST = 0.4
+"""Cost of a camera round or a further trial, in the same unit. Measured on two COLMAP models (48 and 92 cameras):
+iterations with four to six of them took 25 to 57 ms longer than the 14 to 22 ms of those without."""
+
 BONUS_DECAY = 0.01
 """Share of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023, ablation."""
 
@@ -212,7 +216,7 @@ class Game:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
-            reward = bonus - (1 + POINT_ITERATION_COST * self.options.refine_points)
+            reward = bonus - (1 + POINT_ITERATION_COST * self.options.refine_points + REPAIR_COST * step.repairs)
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":

@@ -139,6 +139,7 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
         "cg_iterations": 0,
         "share": 1.0,
         "damping_share": np.nan,
+        "repairs": 0,
     }
     return StepInfo(**{**facts, **known})
 

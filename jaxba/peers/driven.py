@@ -155,7 +155,7 @@ def _idle(cost: float, damping: float, gradient_max: float = np.nan) -> StepInfo
 
 def _answer(policy: DampingPolicy, state: Any, step: StepInfo, iteration: int, tolerances: Any, limit: int) -> Any:
     """`after_step` on arrays of fixed types, so that it compiles once."""
-    kinds = {"accepted": np.bool_, "cg_iterations": np.int32}
+    kinds = {"accepted": np.bool_, "cg_iterations": np.int32, "repairs": np.int32}
     arrays = StepInfo(**{k: jnp.asarray(x, kinds.get(k, np.float64)) for k, x in step._asdict().items()})
     limits = Tolerances(*(np.float64(x) for x in tolerances))
     return _after_step(policy, state, arrays, np.int32(iteration), limits, np.int32(limit))
