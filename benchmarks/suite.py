@@ -149,7 +149,9 @@ def time_to_tolerance(repeats: int, threads: int) -> Iterator[Metric]:
                 ratios[name].append(ours / max(theirs, 1e-6))
     for name, both in ratios.items():
         mean = math.exp(statistics.fmean(map(math.log, both))) if both else math.inf
-        yield Metric(f"tolerance/geometric mean, {name} over ceres", mean, "ratio", "lower", GATE_TOLERANCE, target=0.25)
+        yield Metric(
+            f"tolerance/geometric mean, {name} over ceres", mean, "ratio", "lower", GATE_TOLERANCE, target=0.25
+        )
         yield Metric(f"tolerance/problems that {name} and ceres reached", len(both), "count", "higher")
 
 

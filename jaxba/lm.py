@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.decompose import decomposed_round
+from jaxba.decompose import Round, decomposed_round
 from jaxba.layout import Layout, partition_of
 from jaxba.linearize import cost, linearize, without_intrinsics
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.schur import solve_step
-from jaxba.trial import best_trial
+from jaxba.trial import Trial, best_trial
 
 
 class LMState(NamedTuple):
@@ -94,21 +94,13 @@ def lm_step(
         linear = without_intrinsics(linear)
     step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn)
     trial = best_trial(layout, state.cameras, state.points, state.cost, linear, step, options, min_gain)
-    accepted = trial.accepted
-    choose = lambda new, old: jnp.where(accepted, new, old)
     moved = [trial.share * step.cameras, trial.points - state.points]
-    after = LMState(*(choose(*pair) for pair in zip(trial[:3], state, strict=True)))
-    return after, StepInfo(
-        cost=after.cost,
-        previous_cost=state.cost,
-        candidate_cost=trial.cost,
-        predicted=trial.predicted,
-        gain_ratio=trial.gain,
-        accepted=accepted,
-        damping=damping,
+    return _verdict(
+        state,
+        trial,
+        moved,
+        damping,
         gradient_max=step.gradient_max,
-        step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in moved)),
-        parameter_norm=jnp.sqrt(jnp.sum(state.cameras**2) + jnp.sum(state.points**2)),
         cg_iterations=step.cg_iterations,
         share=trial.share,
         damping_share=jnp.clip(step.damped / step.slope, 0, 1),
@@ -127,10 +119,26 @@ def _round(
     """A round of domain decomposition in the place of a step: parts of it are accepted, each by itself."""
     partition = partition_of(layout).at(turn)
     found = decomposed_round(layout, *state, damping, partition, options, min_gain)
+    none = jnp.zeros((), jnp.int32)
+    return _verdict(
+        state,
+        found,
+        [found.cameras - state.cameras, found.points - state.points],
+        damping,
+        gradient_max=found.gradient_max,
+        cg_iterations=none,
+        share=jnp.ones_like(state.cost),
+        damping_share=jnp.clip(1 - found.curvature / found.slope, 0, 1),
+        repairs=none,
+    )
+
+
+def _verdict(
+    state: LMState, found: Trial | Round, moved: list[Array], damping: Float[Array, ""], **facts: Array
+) -> tuple[LMState, StepInfo]:
+    """The state after a candidate was accepted or not, and the record of it; `moved` is the step that was tried."""
     choose = lambda new, old: jnp.where(found.accepted, new, old)
     after = LMState(*(choose(*pair) for pair in zip(found[:3], state, strict=True)))
-    moved = [found.cameras - state.cameras, found.points - state.points]
-    one = jnp.ones_like(state.cost)
     return after, StepInfo(
         cost=after.cost,
         previous_cost=state.cost,
@@ -139,11 +147,7 @@ def _round(
         gain_ratio=found.gain,
         accepted=found.accepted,
         damping=damping,
-        gradient_max=found.gradient_max,
         step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in moved)),
         parameter_norm=jnp.sqrt(jnp.sum(state.cameras**2) + jnp.sum(state.points**2)),
-        cg_iterations=jnp.zeros((), jnp.int32),
-        share=one,
-        damping_share=jnp.clip(1 - found.curvature / found.slope, 0, 1),
-        repairs=jnp.zeros((), jnp.int32),
+        **facts,
     )

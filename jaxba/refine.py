@@ -109,7 +109,8 @@ def refine_points(
         system, costs, _ = evaluate(points)
     else:
         astray = lambda projection: (home.front & behind(projection)).astype(points.dtype)
-        system, costs, (lost,) = evaluate(points, astray)
+        system, costs, more = evaluate(points, astray)
+        lost = more[0]
 
         def return_home() -> tuple[Array, Array, Array]:
             system_there, costs_there, _ = evaluate(home.points)

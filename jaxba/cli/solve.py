@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Annotated, Literal
 import tyro
 
 from jaxba.cli import common
+from jaxba.cli.interrupt import Interrupt
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.options import Intrinsics, LinearSolverChoice, Preconditioner
 
@@ -137,7 +136,7 @@ def _solve(args: Arguments) -> int:
     )
     print(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
     steps: list[IterationRecord] = []
-    with _Interrupt() as interrupt:
+    with Interrupt("iteration", gentle=True) as interrupt:
 
         def show(record: IterationRecord) -> bool:
             if not steps:
@@ -171,23 +170,3 @@ def _solve(args: Arguments) -> int:
             raise common.UsageError(f"--log {args.log}: {error.strerror or error}") from None
         print(f"wrote {args.log}")
     return 0
-
-
-class _Interrupt:
-    """Turns the first Ctrl-C into a request to stop after the current iteration; the second one is real."""
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def __enter__(self) -> _Interrupt:
-        self._before = signal.signal(signal.SIGINT, self._handle)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
-
-    def _handle(self, *_: object) -> None:
-        if self.asked:
-            raise KeyboardInterrupt
-        self.asked = True
-        print("stopping after this iteration", file=sys.stderr)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from jaxba.cli import common
+from jaxba.cli.interrupt import Interrupt
 
 DEFAULT_CONFIG = "default"
 """Preset of a new run where none is named."""
@@ -73,7 +72,7 @@ def _train(args: Arguments) -> int:
     console = Console(soft_wrap=True, highlight=False)
     if not console.is_terminal:
         console = Console(soft_wrap=True, highlight=False, width=FILE_WIDTH)
-    with host.calm_blas(), _Interrupt() as interrupt, _Progress(console, config) as progress:
+    with host.calm_blas(), Interrupt("chunk", gentle=False) as interrupt, _Progress(console, config) as progress:
         try:
             work = task.build(config, folder, progress.stage)
             progress.rules = work.rules
@@ -151,27 +150,6 @@ def _table(scores: Mapping[str, Any], tolerance: float, count: int) -> Any:
             name, *numbers, f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}"
         )
     return table
-
-
-class _Interrupt:
-    """Ctrl-C ends at once while things are built; in training it asks for an end after the chunk, the second time it
-    is real."""
-
-    def __init__(self) -> None:
-        self.asked, self.gentle = False, False
-
-    def __enter__(self) -> _Interrupt:
-        self._before = signal.signal(signal.SIGINT, self._handle)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
-
-    def _handle(self, *_: object) -> None:
-        if self.asked or not self.gentle:
-            raise KeyboardInterrupt
-        self.asked = True
-        print("stopping after this chunk; Ctrl-C again stops at once", file=sys.stderr)
 
 
 class _Progress:

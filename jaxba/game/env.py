@@ -61,8 +61,8 @@ class GameConfig:
     """Added where the episode ends in success. Source: Belder et al. 2023."""
 
     repair_cost: float = 0.0
-    """Charged by `duration` for each camera round or further trial of a step, relative to a linear solve. By the clock it
-    would be 0.4, but then giving up is cheaper than crossing a valley (docs/game.md)."""
+    """Charged by `duration` for each camera round or further trial of a step, relative to a linear solve. By the clock
+    it would be 0.4, but then giving up is cheaper than crossing a valley (docs/game.md)."""
 
     scale: float = 0.1
     """Factor on every reward, so that returns stay within a few units."""
