@@ -58,6 +58,14 @@ def summary(problem: BundleProblem, solution: Solution) -> str:
     return "\n".join([*lines, *remarks(problem, solution)])
 
 
+def padding(solution: Solution) -> str:
+    """Sizes of the program where they were asked to be rounded up."""
+    if solution.capacity is not None:
+        return f"padded to {solution.capacity}"
+    why = "it is too large" if solution.linear_solver == "explicit" else "that is for the explicit linear solver"
+    return f"note: not padded: {why}"
+
+
 def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     """What a user should know about the data: unobserved, seen once, behind a camera."""
     cameras = np.bincount(np.asarray(problem.camera_index), minlength=problem.num_cameras)
