@@ -86,7 +86,8 @@ def padded_slots(
     column[seen] = np.arange(len(seen))
     members = np.full(capacity.points, capacity.points, np.int32)
     members[: len(seen)] = seen
-    slot_point = np.full(capacity.observations, capacity.points - 1, np.int32)
+    # empty slots belong to a point that is there, whose block can be factored
+    slot_point = np.zeros(capacity.observations, np.int32)
     slot_point[: len(point)] = column[point]
     slot, empty = np.arange(len(point)), capacity.observations - 1
     counts = np.zeros(capacity.points, np.int64)

@@ -193,6 +193,13 @@ def test_cameras_that_see_points_many_times_get_deeper_trees_and_not_wrong_sums(
     assert np.array_equal(found[:3, :3], blocks_by_brute_force(problem, layout, weights))
 
 
+def test_an_empty_slot_that_is_not_a_number_spoils_no_point():
+    """As where a trial sends the first point, to which empty slots belong, out of range."""
+    layout = build_layout(problem_of(np.full(9, 3), 4, seed=0), capacity=SMALL)
+    values = np.where(layout.slot_mask, 1.0, np.nan)[None]
+    assert np.array_equal(point_sum(layout, jnp.asarray(values))[0], np.append(np.full(9, 3.0), np.zeros(55)))
+
+
 def test_a_problem_larger_than_the_capacity_is_refused():
     problem = problem_of(np.full(64, 8), 8, seed=0)  # 512 observations, and none of the 512 slots would be empty
     with pytest.raises(ValueError, match="larger than the capacity: 8 cameras, 64 points"):
