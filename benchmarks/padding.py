@@ -44,7 +44,7 @@ def windows(problem: BundleProblem, count: int, cameras: int) -> list[BundleProb
 def solve_all(problems: list[BundleProblem], solve: Callable[[BundleProblem], jaxba.Solution]) -> FirstSolves:
     """Solves every window once, beginning without compiled programs."""
     programs: list[str] = []
-    listen = lambda event, duration, **_: programs.append(event) if event == PROGRAM else None
+    listen = lambda event, duration_secs, **_: programs.append(event) if event == PROGRAM else None
     jax.clear_caches()
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:

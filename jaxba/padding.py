@@ -5,7 +5,7 @@ pairs), so that every problem compiles its own, in seconds, where solving it may
 follow from a `Capacity` alone, four numbers on a coarse grid. Padding holds no observations: it adds exact zeros to
 sums, and its cameras and points never move.
 
-Up to half of a padded array is waste, which makes an iteration up to twice as long. That is a good bargain while a
+Up to half of the slots are waste, which makes an iteration up to twice as long or a little more. That is a good bargain while a
 solve is quicker than a compilation, so larger problems are left as they are (`capacity_of`).
 """
 
@@ -21,10 +21,18 @@ from jaxba.problem import CAMERA_SIZE, POINT_SIZE, BundleProblem
 from jaxba.trees import Room
 
 LEAST_CAMERAS = 8
-LEAST_POINTS = 256
+"""Smallest number of cameras."""
+
 LEAST_OBSERVATIONS = 1024
-LEAST_PAIRS = 4096
-"""Smallest sizes: a step of these takes about a millisecond whatever is in it."""
+"""Smallest number of slots: a step of so many takes a millisecond whatever is in it."""
+
+LEAST_TRACK = 2
+"""Observations per point for which there is room anyway: points are rounded up to at least slots over this. Real windows
+have 3 to 5, but then points nearly always follow from observations, and there are fewer cells. A padding point costs
+little: what a step does with a point is a quarter of what it does with its observations."""
+
+LEAST_PAIRS = 4
+"""Pairs per slot for which there is room anyway: 20 cameras of kitti00vo have 3.4 per observation."""
 
 MAX_CAMERAS = 128
 """More cameras are not padded: 1152 unknowns are factored in 10 ms, and only beyond that bands save much."""
@@ -58,7 +66,11 @@ class Capacity:
 
 
 def capacity_of(problem: BundleProblem) -> Capacity | None:
-    """The grid cell of a problem: cameras are rounded up to 8, 12, 16, 24, ..., the rest to powers of two.
+    """The grid cell of a problem.
+
+    Cameras are rounded up to 8, 12, 16, 24, ..., observations to a power of two. Points and pairs mostly follow from
+    that; where they do not, they are rounded up to powers of two themselves. Each free number more would cut a sequence
+    of windows into more cells: of 20 windows of kitti00vo there were 5, now there are 2.
 
     Returns:
         None for problems with more than `MAX_CAMERAS`, `MAX_OBSERVATIONS` (points count too) or `MAX_PAIRS`.
@@ -74,11 +86,12 @@ def capacity_of(problem: BundleProblem) -> Capacity | None:
         return None
     cameras = max(LEAST_CAMERAS, _power(problem.num_cameras))
     between = max(LEAST_CAMERAS, cameras * 3 // 4)
+    slots = max(LEAST_OBSERVATIONS, _power(problem.num_observations + 1))
     return Capacity(
         cameras=between if problem.num_cameras <= between else cameras,
-        points=max(LEAST_POINTS, _power(problem.num_points)),
-        observations=max(LEAST_OBSERVATIONS, _power(problem.num_observations + 1)),
-        pairs=max(LEAST_PAIRS, _power(pairs)),
+        points=max(slots // LEAST_TRACK, _power(problem.num_points)),
+        observations=slots,
+        pairs=max(slots * LEAST_PAIRS, _power(pairs)),
     )
 
 

@@ -179,14 +179,15 @@ def solve(
         run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)
         final, history, compile_s, total_s = run(layout, state, policy, tolerances, options, max_iterations)
         count = int(final.iteration)
+        history = History(*(np.asarray(field)[:count] for field in history))
         return Solution(
             problem=_write_back(problem, layout, final.state),
             initial_cost=float(state.cost),
             final_cost=float(final.state.cost),
             iterations=count,
-            accepted=int(np.sum(history.accepted[:count])),
+            accepted=int(np.sum(history.accepted)),
             termination=Termination(int(final.termination)),
-            history=History(*(np.asarray(field)[:count] for field in history)),
+            history=history,
             linear_solver=options.linear_solver,
             setup_s=setup_s,
             compile_s=compile_s + clock.seconds,

@@ -164,7 +164,7 @@ def _solve(args: Arguments) -> int:
         )
     print(table.summary(problem, solution))
     if args.pad:
-        print(table.padding(solution))
+        print(table.padding(problem, solution))
     if args.output:
         try:
             write_problem(solution.problem, args.output)
