@@ -5,8 +5,8 @@ pairs), so that every problem compiles its own, in seconds, where solving it may
 follow from a `Capacity` alone, four numbers on a coarse grid. Padding holds no observations: it adds exact zeros to
 sums, and its cameras and points never move.
 
-Up to half of the slots are waste, which makes an iteration up to twice as long or a little more. That is a good bargain while a
-solve is quicker than a compilation, so larger problems are left as they are (`capacity_of`).
+Up to half of the slots are waste, which makes an iteration up to twice as long or a little more. That is a good bargain
+while a solve is quicker than a compilation, so larger problems are left as they are (`capacity_of`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ LEAST_OBSERVATIONS = 1024
 """Smallest number of slots: a step of so many takes a millisecond whatever is in it."""
 
 LEAST_TRACK = 2
-"""Observations per point for which there is room anyway: points are rounded up to at least slots over this. Real windows
-have 3 to 5, but then points nearly always follow from observations, and there are fewer cells. A padding point costs
-little: what a step does with a point is a quarter of what it does with its observations."""
+"""There is room for a point in so many slots at least. Windows of real sequences have 3 to 5 observations a point, but
+so points nearly always follow from observations, and a padding point costs little."""
 
 LEAST_PAIRS = 4
 """Pairs per slot for which there is room anyway: 20 cameras of kitti00vo have 3.4 per observation."""

@@ -80,9 +80,7 @@ def test_cameras_are_rounded_up_to_two_sizes_an_octave(count, room):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.integers(2, 40), st.integers(1, 3000), st.integers(0, 50))
-def test_a_capacity_holds_its_problem_and_is_at_most_twice_as_large_or_follows_from_the_slots(
-    seed, cameras, points, duplicates
-):
+def test_a_capacity_holds_its_problem_and_no_more_than_twice_that_or_its_slots_worth(seed, cameras, points, duplicates):
     rng = np.random.default_rng(seed)
     problem = problem_of(np.append(1, rng.integers(0, min(cameras, 9) + 1, points)), cameras, seed, duplicates)
     found = capacity_of(problem)
