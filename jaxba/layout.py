@@ -5,7 +5,7 @@ up to `t` observations owns `t x n` slots, so the sum over a point's observation
 `t`. Sums over a camera, or over a block of the reduced camera system, are trees: rows are gathered in
 chunks of fixed width that belong to one target, summed densely, and the partial sums again, until one row
 a target is left. Nothing is ever scattered. Padding points at a slot without observation, whose values are
-exactly zero.
+exactly zero. Where sizes are padded (padding.py) there are no buckets, and sums over points are trees too.
 
 Everything is made once per problem on the host with vectorised NumPy.
 """
@@ -20,13 +20,12 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.clusters import ClusterLayout, cluster_layout
 from jaxba.options import StepOptions
+from jaxba.padding import Capacity, room_for
 from jaxba.pairs import PairLayout, pair_layout
 from jaxba.partition import Partition, partition_layout
 from jaxba.problem import AnyArray, BundleProblem
+from jaxba.slots import bucket_slots, padded_slots
 from jaxba.trees import sum_tree
-
-MAX_PADDING = 0.10
-"""Largest share of slots that may be empty because track lengths share a bucket (design, section 3)."""
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
@@ -61,6 +60,9 @@ class Layout:
     bucket_points: tuple[Int[AnyArray, "_"], ...]
     """Problem index of the points of each bucket; padding repeats an index out of range."""
 
+    point_levels: tuple[Int[AnyArray, "_ _"], ...] | None
+    """Tree from slots to points where sizes are padded (padding.py); buckets are summed as they stand."""
+
     camera_levels: tuple[Int[AnyArray, "_ _"], ...]
     """Tree from slots to cameras."""
 
@@ -81,7 +83,7 @@ class Layout:
     """Random clusterings, one behind the other; None where no method asks for them."""
 
     buckets: tuple[tuple[int, int], ...] = field(metadata={"static": True})
-    """(slots per point, points) of each bucket."""
+    """(slots per point, points) of each bucket; none where sizes are padded."""
 
     @property
     def num_slots(self) -> int:
@@ -91,7 +93,7 @@ class Layout:
     @property
     def num_points(self) -> int:
         """Points in layout order, padding included."""
-        return sum(points for _, points in self.buckets)
+        return sum(members.shape[-1] for members in self.bucket_points)
 
     @property
     def num_cameras(self) -> int:
@@ -107,6 +109,7 @@ def build_layout(
     clusters: bool = False,
     grid: bool = True,
     partitions: int | None = None,
+    capacity: Capacity | None = None,
 ) -> Layout:
     """Sorts a problem's observations into slots.
 
@@ -119,43 +122,34 @@ def build_layout(
         grid: whether a factored system may be formed as one dense product, where nearly all cameras see nearly all
             points; pairs are not listed then.
         partitions: cameras of a cluster at most, to draw random partitions of the cameras; needs pairs.
+        capacity: pads all sizes, for a system that is factored: no clusters, no partitions. Where the system is a band,
+            it is factored dense all the same.
 
     Returns:
-        A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths.
+        A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths. Those of a padded
+        layout follow from the capacity and whether there is whitening, whether the system is one dense product
+        (`is_dense`) and whether a camera sees points twice so often that a tree needs more levels (`room_for`).
+
+    Raises:
+        ValueError: parts that do not go together, or a problem larger than the capacity.
     """
+    if capacity is not None and (clusters or partitions is not None or not factor):
+        raise ValueError("only layouts for a factored system are padded: no clusters, no partitions, factor=True")
+    if capacity is not None and not capacity.holds(problem):
+        raise ValueError(f"the problem is larger than the capacity: {capacity}")
     camera = np.asarray(problem.camera_index)
     point = np.asarray(problem.point_index)
+    cameras = problem.num_cameras if capacity is None else capacity.cameras
     tracks = np.bincount(point, minlength=problem.num_points)
     # by point, then by camera: pairs of a track then come with sorted cameras
     order = np.argsort(point.astype(np.int64) * problem.num_cameras + camera, kind="stable")
     camera, point = camera[order], point[order]
     start = np.concatenate([[0], np.cumsum(tracks)])
+    seen = np.bincount(camera, minlength=cameras)
 
-    lengths = _bucket_lengths(tracks)
-    which = np.searchsorted(lengths, tracks)
-    column = np.zeros(problem.num_points, np.int64)  # column of a point in its bucket
-    bucket_points, offsets, columns_before = [], [], []
-    slots = columns = 0
-    for number, length in enumerate(lengths):
-        members = np.flatnonzero((which == number) & (tracks > 0))
-        column[members] = np.arange(len(members))
-        if number == 0:  # one empty point, so that there always is an empty slot
-            members = np.append(members, problem.num_points)
-        bucket_points.append(members.astype(np.int32))
-        offsets.append(slots)
-        columns_before.append(columns)
-        slots += length * len(members)
-        columns += len(members)
-    size = np.array([len(members) for members in bucket_points])
-    step = np.arange(len(point)) - start[point]
-    slot = np.array(offsets)[which[point]] + step * size[which[point]] + column[point]
-
-    slot_point = np.concatenate(
-        [
-            np.tile(np.arange(len(members), dtype=np.int32) + before, length)
-            for members, length, before in zip(bucket_points, lengths, columns_before, strict=True)
-        ]
-    )
+    made = bucket_slots(tracks, point) if capacity is None else padded_slots(tracks, point, capacity)
+    slot, slot_point, empty = made.slot, made.point, made.empty
+    slots = len(slot_point)
     mask = np.zeros(slots, bool)
     mask[slot] = True
     slot_camera = np.zeros(slots, np.int32)
@@ -166,22 +160,21 @@ def build_layout(
     if problem.whitening is not None:
         whitening = np.zeros((2, 2, slots))
         whitening[:, :, slot] = np.moveaxis(np.asarray(problem.whitening)[order], 0, -1)
-    empty = int(len(bucket_points[0]) - 1)  # the first bucket's empty point
     by_camera = np.argsort(camera, kind="stable")
-    seen = np.bincount(camera, minlength=problem.num_cameras)
+    room = None if capacity is None else room_for(seen, capacity.observations, capacity.points)
     table = None
-    if pairs and factor and grid and is_dense(camera, point, tracks, len(seen)):
-        table = np.full((columns, len(seen)), empty, np.int32)
+    if pairs and factor and grid and is_dense(camera, point, tracks, cameras):
+        table = np.full((sum(map(len, made.members)), cameras), empty, np.int32)
         table[slot_point[slot], camera] = slot
     listed = None
     if pairs and table is None:
-        listed = pair_layout(camera, slot, tracks, start, problem.num_cameras, empty, factor=factor)
+        listed = pair_layout(camera, slot, tracks, start, cameras, empty, factor=factor, capacity=capacity)
     drawn = None
     if partitions is not None:
         if listed is None:
             raise ValueError("partitions need pairs that are listed: pairs=True, factor=False")
         drawn = partition_layout(
-            camera, point, slot, len(seen), len(tracks), slot_point, empty, listed, largest=partitions
+            camera, point, slot, cameras, len(tracks), slot_point, empty, listed, largest=partitions
         )
     return Layout(
         slot_camera=slot_camera,
@@ -189,25 +182,27 @@ def build_layout(
         slot_mask=mask,
         pixels=pixels,
         whitening=whitening,
-        bucket_points=tuple(bucket_points),
-        camera_levels=sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK),
+        bucket_points=made.members,
+        point_levels=made.levels,
+        camera_levels=sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room),
         camera_seen=seen > 0,
         pairs=listed,
         grid=table,
-        clusters=cluster_layout(camera, point, slot, len(seen), len(tracks), slot_point, empty) if clusters else None,
+        clusters=cluster_layout(camera, point, slot, cameras, len(tracks), slot_point, empty) if clusters else None,
         partitions=drawn,
-        buckets=tuple((int(length), len(members)) for length, members in zip(lengths, bucket_points, strict=True)),
+        buckets=made.buckets,
     )
 
 
-def layout_for(problem: BundleProblem, options: StepOptions) -> Layout:
-    """The layout that a step with these options needs, and nothing more."""
+def layout_for(problem: BundleProblem, options: StepOptions, capacity: Capacity | None = None) -> Layout:
+    """The layout that a step with these options needs, and nothing more; padded where there is a capacity."""
     return build_layout(
         problem,
         pairs=options.forms_reduced_system,
         factor=options.linear_solver == "explicit",
         clusters=options.uses_clusters,
         partitions=options.cluster_cameras if options.uses_partitions else None,
+        capacity=capacity,
     )
 
 
@@ -231,29 +226,3 @@ def is_dense(camera: np.ndarray, point: np.ndarray, tracks: np.ndarray, cameras:
     twice = (camera[1:] == camera[:-1]) & (point[1:] == point[:-1])
     few = 9 * cameras <= DENSE_UNKNOWNS
     return bool(few and not twice.any() and pairs > DENSE_SHARE * np.count_nonzero(tracks) * cameras**2)
-
-
-def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
-    """Largest track length of each bucket: few buckets with little padding.
-
-    Dynamic programme over the distinct lengths; a bucket costs as many slots as `MAX_PADDING / 10` of
-    all observations, halved until padding stays below `MAX_PADDING`.
-    """
-    values, counts = np.unique(tracks[tracks > 0], return_counts=True)
-    total = int(values @ counts)
-    before = np.concatenate([[0], np.cumsum(counts)])
-    price = total * MAX_PADDING / 10
-    while True:
-        best = np.zeros(len(values) + 1)
-        cut = np.zeros(len(values) + 1, int)
-        for end in range(1, len(values) + 1):
-            cost = best[:end] + values[end - 1] * (before[end] - before[:end]) + price
-            cut[end] = np.argmin(cost)
-            best[end] = cost[cut[end]]
-        ends, end = [], len(values)
-        while end:
-            ends.append(end - 1)
-            end = cut[end]
-        if best[-1] - price * len(ends) <= (1 + MAX_PADDING) * total:
-            return values[ends[::-1]]
-        price /= 2

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxba.ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
+from jaxba.padding import Capacity, room_for
 from jaxba.problem import AnyArray
-from jaxba.trees import TREE_WIDTH, sum_tree
+from jaxba.trees import TREE_WIDTH, Room, chunks_at_most, sum_tree
 
 PAIR_CHUNKS = (4, 8)
 """Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
@@ -68,6 +69,7 @@ def pair_layout(
     *,
     factor: bool,
     banded: bool = True,
+    capacity: Capacity | None = None,
 ) -> PairLayout:
     """Lists all pairs of observations of one point, sorted by the block they add to.
 
@@ -80,6 +82,7 @@ def pair_layout(
         empty: a slot that holds no observation.
         factor: whether the system will be factored.
         banded: whether it may be factored as a band, where that is cheaper.
+        capacity: makes all shapes follow from it: every block of the lower triangle is there, and no band.
     """
     lefts, rights = [], []
     for length in np.unique(tracks[tracks > 0]):
@@ -94,10 +97,12 @@ def pair_layout(
     diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
     block = camera[left].astype(np.int64) * cameras + camera[right]
     names = np.union1d(block, diagonal)
+    if capacity is not None:
+        names, banded = np.ravel_multi_index(np.tril_indices(cameras), (cameras, cameras)), False
     rank, reach = np.arange(cameras), cameras
     if factor and banded and cameras >= MIN_BAND_CAMERAS:
         rank, reach = camera_order(*np.divmod(names, cameras), cameras)
-    banded = is_banded(cameras, reach)
+    banded = banded and is_banded(cameras, reach)
     if banded:  # from here on cameras go by their rank, and the lower triangle is that of the ranks
         swap = rank[camera[left]] < rank[camera[right]]
         left, right = np.where(swap, right, left), np.where(swap, left, right)
@@ -107,12 +112,14 @@ def pair_layout(
         rank = np.arange(cameras)
     order = np.argsort(block, kind="stable")
     counts = np.bincount(np.searchsorted(names, block), minlength=len(names))
-    width = min(PAIR_CHUNKS, key=lambda w: int((-(-counts // w)).sum()) * (w + PAIR_ITEM_COST))
-    width = max(1, min(width, int(counts.max())))
+    room = None if capacity is None else room_for(counts, capacity.pairs, capacity.points)
+    number_of = lambda w: int((-(-counts // w)).sum()) if room is None else chunks_at_most(room.items, len(names), w)
+    width = min(PAIR_CHUNKS, key=lambda w: number_of(w) * (w + PAIR_ITEM_COST))
+    width = max(1, min(width, int(counts.max()) if room is None else room.most))
     chunks = -(-counts // width)
     row = np.repeat(np.cumsum(chunks) - chunks, counts)
     position = np.arange(len(left)) - np.repeat(np.cumsum(counts) - counts, counts)
-    total = int(chunks.sum()) + 1  # at least one chunk is all padding
+    used, total = int(chunks.sum()), number_of(width) + 1  # at least one chunk is all padding
     batches = -(-total // PAIR_BATCH)
     batch = -(-total // batches)
     padded = []
@@ -137,7 +144,13 @@ def pair_layout(
     return PairLayout(
         left=padded[0],
         right=padded[1],
-        levels=sum_tree(np.arange(total - 1), np.append(chunks, 0), total - 1, TREE_WIDTH),
+        levels=sum_tree(
+            np.arange(used),
+            np.append(chunks, 0),
+            total - 1,
+            TREE_WIDTH,
+            None if room is None else Room(total - 1, -(-room.most // width)),
+        ),
         block_camera=block_camera,
         block_row=block_row,
         block_column=block_column,

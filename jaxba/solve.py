@@ -28,6 +28,7 @@ from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES
 from jaxba.options import StepOptions
+from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import AnyArray, BundleProblem, ProblemError
 from jaxba.schur import largest_diagonal
 from jaxba.sums import point_sum
@@ -95,6 +96,9 @@ class Solution:
     total_s: float
     """Seconds for the iterations."""
 
+    capacity: Capacity | None = None
+    """Sizes to which the problem was padded; None where it was not."""
+
     @property
     def converged(self) -> bool:
         """Whether a convergence test ended the solve."""
@@ -120,6 +124,7 @@ def solve(
     tolerances: Tolerances | None = None,
     dtype: str = "float64",
     callback: Callable[[IterationRecord], bool | None] | None = None,
+    pad: bool = False,
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
 
@@ -135,6 +140,10 @@ def solve(
             in float32 (`StepOptions.algebra`).
         callback: called after every iteration, which then run one by one; a true return value stops the
             solve.
+        pad: rounds sizes up to a coarse grid, so that similar problems share one compiled program, also through a
+            persistent compilation cache; results differ by rounding alone. For many small problems with the explicit
+            solver, which `auto` then means. Other solvers and larger problems are left as they are:
+            `Solution.capacity` is None then. See padding.py.
 
     Returns:
         Parameters as NumPy float64 arrays, histories and timings.
@@ -151,6 +160,9 @@ def solve(
     if options is None:
         options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
     options = make_method(method).options(options)
+    capacity = None
+    if pad:
+        capacity, linear_solver = with_padded_solver(capacity_of(problem), options, linear_solver)
     options = choose_linear_solver(problem, options, linear_solver)
     tolerances = tolerances or Tolerances()
     if dtype == "mixed":
@@ -158,26 +170,29 @@ def solve(
     with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
         with CompileClock() as clock:
-            layout = jax.device_put(layout_for(problem, options))
-            state = jax.block_until_ready(_initial(layout, problem, options, jnp.dtype(dtype)))
+            layout = jax.device_put(layout_for(problem, options, capacity))
+            begin = problem if capacity is None else padded_parameters(problem, capacity)
+            state = jax.block_until_ready(_initial(layout, begin, options, jnp.dtype(dtype)))
         setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))
         run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)
         final, history, compile_s, total_s = run(layout, state, policy, tolerances, options, max_iterations)
         count = int(final.iteration)
+        history = History(*(np.asarray(field)[:count] for field in history))
         return Solution(
             problem=_write_back(problem, layout, final.state),
             initial_cost=float(state.cost),
             final_cost=float(final.state.cost),
             iterations=count,
-            accepted=int(np.sum(history.accepted[:count])),
+            accepted=int(np.sum(history.accepted)),
             termination=Termination(int(final.termination)),
-            history=History(*(np.asarray(field)[:count] for field in history)),
+            history=history,
             linear_solver=options.linear_solver,
             setup_s=setup_s,
             compile_s=compile_s + clock.seconds,
             total_s=total_s,
+            capacity=capacity,
         )
 
 
@@ -347,7 +362,7 @@ def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *,
 def _write_back(problem: BundleProblem, layout: Layout, state: LMState) -> BundleProblem:
     """Optimised parameters in the problem's own order; what was not optimised is copied bit by bit."""
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
-    seen = np.asarray(layout.camera_seen)
+    seen = np.flatnonzero(layout.camera_seen)  # cameras of padding are not seen
     cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
     order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = order < problem.num_points

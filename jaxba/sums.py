@@ -57,7 +57,10 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
 
 
 def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "k points"]:
-    """Sums each point's slots; every bucket is a dense sum."""
+    """Sums each point's slots; every bucket is a dense sum, a padded layout has a tree."""
+    if layout.point_levels is not None:
+        # every point of the tree reads the empty slot: were it not a number for one, it would be for all
+        return tree_sum(jnp.where(layout.slot_mask, values, jnp.zeros_like(values)).T, layout.point_levels).T
     parts, start = [], 0
     for length, points in layout.buckets:
         block = values[:, start : start + length * points]

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 TREE_WIDTH = 8
 """Partial sums added at once on the higher levels of a tree."""
 
 
-def sum_tree(items: np.ndarray, counts: np.ndarray, empty: int, width: int) -> tuple[np.ndarray, ...]:
+class Room(NamedTuple):
+    """What a tree has room for, so that its shape does not depend on what it sums."""
+
+    items: int
+    """Most items of all targets together."""
+
+    most: int
+    """Most items of one target."""
+
+
+def sum_tree(
+    items: np.ndarray, counts: np.ndarray, empty: int, width: int, room: Room | None = None
+) -> tuple[np.ndarray, ...]:
     """Index arrays that sum `items` into targets, `width` at a time, then `TREE_WIDTH` at a time.
 
     Args:
@@ -16,18 +30,26 @@ def sum_tree(items: np.ndarray, counts: np.ndarray, empty: int, width: int) -> t
         counts: number of items of each target; zero is allowed.
         empty: a row that is known to be zero, for padding.
         width: items summed at once on the first level.
+        room: makes the shapes follow from itself, the number of targets and the width alone.
 
     Returns:
         Arrays [targets, width]; level l + 1 indexes the sums of level l. Every level but the last ends with
         an all-padding row; the last has exactly one row a target, in order.
+
+    Raises:
+        ValueError: there is no room for the items.
     """
     levels = []
+    space, most = room or Room(len(items), int(counts.max(initial=1)))
+    if len(items) > space or counts.max(initial=0) > most:
+        raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
     while True:
-        width = max(1, min(width, int(counts.max(initial=1))))
+        width = max(1, min(width, most))
         chunks = -(-counts // width)
-        last = bool((chunks <= 1).all())
+        used, last = int(chunks.sum()), most <= width
+        space = used if room is None else chunks_at_most(space, len(counts), width)
         rows = np.arange(len(counts)) if last else np.cumsum(chunks) - chunks
-        total = len(counts) if last else int(chunks.sum()) + 1
+        total = len(counts) if last else space + 1
         target = np.repeat(np.arange(len(counts)), counts)
         rank = np.arange(len(items)) - np.repeat(np.cumsum(counts) - counts, counts)
         level = np.full((total, width), empty, np.int32)
@@ -35,4 +57,10 @@ def sum_tree(items: np.ndarray, counts: np.ndarray, empty: int, width: int) -> t
         levels.append(level)
         if last:
             return tuple(levels)
-        items, counts, empty, width = np.arange(total - 1), chunks, total - 1, TREE_WIDTH
+        items, counts, empty = np.arange(used), chunks, total - 1
+        most, width = -(-most // width), TREE_WIDTH
+
+
+def chunks_at_most(items: int, targets: int, width: int) -> int:
+    """Most chunks of a width that items make, however they belong to targets: the sum of `ceil(count / width)`."""
+    return min(items, (items + targets * (width - 1)) // width)

@@ -75,6 +75,14 @@ def test_without_a_problem_a_built_in_scene_is_solved(capsys):
     assert printed.err == ""
 
 
+def test_padded_sizes_are_said_and_so_is_why_there_are_none(tiny, capsys):
+    fast = [str(tiny), "--max-iterations", "1", "--damping", "ceres", "--pad"]
+    assert run(fast) == 0
+    assert "padded to 8 cameras, 512 points, 1024 observations, 4096 pairs\n" in capsys.readouterr().out
+    assert run([*fast, "--linear-solver", "implicit"]) == 0
+    assert "note: not padded: that is for the explicit linear solver\n" in capsys.readouterr().out
+
+
 def test_the_iteration_limit_is_no_error_and_is_said(tiny, tmp_path, capsys):
     output = tmp_path / "out.txt"
     assert run([str(tiny), "--max-iterations", "2", "--ftol", "0", "--output", str(output)]) == 0

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxba import BundleProblem, Layout, build_layout
-from jaxba.layout import CAMERA_CHUNK, MAX_PADDING
+from jaxba.layout import CAMERA_CHUNK
+from jaxba.slots import MAX_PADDING
 from jaxba.sums import point_sum, tree_sum
 from jaxba.trees import TREE_WIDTH, sum_tree
 

@@ -50,6 +50,11 @@ class Arguments:
     dtype: Literal["float64", "float32", "mixed"] = "float64"
     """Type of all arithmetic. mixed: float64, but the reduced camera system in float32."""
 
+    pad: bool = False
+    """Round sizes up to a coarse grid, so that problems of similar size share one compiled program, also from one call
+    of this command to the next; auto then means explicit. For many small problems: large ones and those for other
+    solvers are left as they are, and the summary says so."""
+
     max_iterations: int = 100
     """Linear solves before giving up."""
 
@@ -154,8 +159,11 @@ def _solve(args: Arguments) -> int:
             tolerances=Tolerances(args.ftol, args.xtol, args.gtol),
             dtype=args.dtype,
             callback=show,
+            pad=args.pad,
         )
     print(table.summary(problem, solution))
+    if args.pad:
+        print(table.padding(problem, solution))
     if args.output:
         try:
             write_problem(solution.problem, args.output)

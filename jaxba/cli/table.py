@@ -9,6 +9,7 @@ import numpy as np
 from jaxba import geometry
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.options import StepOptions
+from jaxba.padding import capacity_of
 from jaxba.problem import BundleProblem
 from jaxba.solve import IterationRecord, Solution
 
@@ -56,6 +57,14 @@ def summary(problem: BundleProblem, solution: Solution) -> str:
         f"iterations {solution.total_s:.2f} s",
     ]
     return "\n".join([*lines, *remarks(problem, solution)])
+
+
+def padding(problem: BundleProblem, solution: Solution) -> str:
+    """Sizes of the program where they were asked to be rounded up, or why they were not."""
+    if solution.capacity is not None:
+        return f"padded to {solution.capacity}"
+    why = "the problem is too large" if capacity_of(problem) is None else "that is for the explicit linear solver"
+    return f"note: not padded: {why}"
 
 
 def remarks(problem: BundleProblem, solution: Solution) -> list[str]:

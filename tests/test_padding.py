@@ -1,0 +1,362 @@
+"""Padded sizes: the same solve to rounding, one program for all problems of a cell of the grid."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import support
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_layout import blocks_by_brute_force, blocks_by_layout, problem_of, rows_of, rows_of_problem, sum_by_levels
+
+from jaxba import Ceres, Loss, StepOptions, Tolerances, build_layout, initial_state, random_scene, solve, solve_loop
+from jaxba.layout import layout_for
+from jaxba.padding import (
+    LEAST_OBSERVATIONS,
+    LEAST_PAIRS,
+    LEAST_TRACK,
+    MAX_CAMERAS,
+    MAX_PAIRS,
+    Capacity,
+    capacity_of,
+    padded_parameters,
+)
+from jaxba.paper.subproblem import sub_problem
+from jaxba.scenes import SceneConfig
+from jaxba.sums import point_sum, tree_sum
+from jaxba.trees import Room, sum_tree
+
+SMALL = Capacity(cameras=8, points=64, observations=512, pairs=4096)
+
+
+def windows(count: int, cameras: int = 10) -> list:
+    """Neighbouring cameras of a sequence."""
+    scene = random_scene(SceneConfig(40, 900, 3600, max_depth=4.0, gap_share=0.1, revisit_share=0.0), 0)
+    return [sub_problem(scene, np.arange(first, first + cameras)) for first in np.linspace(0, 30, count).astype(int)]
+
+
+def mates(dense: bool) -> tuple:
+    """Two problems of one cell that differ in every size."""
+    if dense:
+        one, other = support.tiny(), sub_problem(support.tiny(), np.arange(5))
+        extra = np.vstack([other.points, np.ones((3, 3))])  # nobody observes these
+        other = other.replace(points=extra)
+    else:
+        one, *others = windows(31)
+        alike = [other for other in others if capacity_of(other) == capacity_of(one)]
+        other = sub_problem(alike[-1], np.arange(9))
+        other = other.replace(cameras=np.vstack([other.cameras, np.ones((2, 9))]))
+    assert capacity_of(one) == capacity_of(other)
+    sizes = [(p.num_cameras, p.num_points, p.num_observations) for p in (one, other)]
+    assert all(a != b for a, b in zip(*sizes, strict=True))
+    assert all((build_layout(p, capacity=capacity_of(p)).grid is not None) == dense for p in (one, other))
+    return one, other
+
+
+def shapes(tree) -> list:
+    """What a compiled program depends on."""
+    return [jax.tree.structure(tree), *((x.shape, x.dtype) for x in jax.tree.leaves(tree))]
+
+
+def stepwise(problem, damping="ceres", options=None, **settings):
+    """A solve step by step: the compiled step is shared by policies."""
+    return solve(problem, damping, options, callback=lambda record: None, **settings)
+
+
+# The grid
+
+
+@pytest.mark.parametrize(
+    ("count", "room"),
+    [(1, 8), (8, 8), (9, 12), (12, 12), (13, 16), (17, 24), (25, 32), (33, 48), (49, 64), (65, 96), (97, 128)],
+)
+def test_cameras_are_rounded_up_to_two_sizes_an_octave(count, room):
+    assert capacity_of(problem_of(np.full(3, 1), count, seed=0)) == Capacity(room, 512, 1024, 4096)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 40), st.integers(1, 3000), st.integers(0, 50))
+def test_a_capacity_holds_its_problem_and_no_more_than_twice_that_or_its_slots_worth(seed, cameras, points, duplicates):
+    rng = np.random.default_rng(seed)
+    problem = problem_of(np.append(1, rng.integers(0, min(cameras, 9) + 1, points)), cameras, seed, duplicates)
+    found = capacity_of(problem)
+    layout = build_layout(problem, grid=False)
+    pairs = np.sum(layout.slot_mask[layout.pairs.left] & layout.slot_mask[layout.pairs.right])
+    counts = (problem.num_observations + 1, problem.num_points, int(pairs))
+    rooms = (found.observations, found.points, found.pairs)
+    least = (LEAST_OBSERVATIONS, found.observations // LEAST_TRACK, found.observations * LEAST_PAIRS)
+    assert all(n <= room and (room < 2 * n or room == low) for n, room, low in zip(counts, rooms, least, strict=True))
+    assert problem.num_cameras <= found.cameras
+    assert found.cameras <= max(8, 1.5 * problem.num_cameras)
+
+
+# Layouts
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(0, 40), min_size=1, max_size=12), st.sampled_from([1, 3, 8, 16]), st.integers(0, 10**6))
+def test_a_tree_with_room_sums_every_target_once_in_one_shape(counts, width, seed):
+    counts = np.array(counts)
+    rng = np.random.default_rng(seed)
+    items, empty = rng.permutation(counts.sum()), int(counts.sum())
+    rows = np.append(rng.integers(-1000, 1000, counts.sum()), 0)
+    expected = np.zeros(len(counts), int)
+    np.add.at(expected, np.repeat(np.arange(len(counts)), counts), rows[items])
+    room = Room(500, 45)
+    levels = sum_tree(items, counts, empty, width, room)
+    assert np.array_equal(sum_by_levels(rows, levels), expected)
+    nothing = sum_tree(np.zeros(0, int), np.zeros(len(counts), int), empty, width, room)
+    assert [level.shape for level in levels] == [level.shape for level in nothing]
+
+
+def test_a_tree_without_room_is_refused():
+    with pytest.raises(ValueError, match="no room for 5 items, 3 of one target"):
+        sum_tree(np.arange(5), np.array([3, 2]), 5, 2, Room(8, 2))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 8), st.integers(1, 60), st.integers(0, 6))
+def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, cameras, points, duplicates):
+    rng = np.random.default_rng(seed)
+    problem = problem_of(np.append(1, rng.integers(0, cameras + 1, points)), cameras, seed, duplicates)
+    layout = build_layout(problem, grid=False, capacity=SMALL)
+    assert rows_of(layout) == rows_of_problem(problem)
+    empty = ~np.asarray(layout.slot_mask)
+    assert empty.any()
+    assert not np.any(layout.pixels[:, empty])
+    assert not np.any(layout.whitening[:, :, empty])
+    values = np.where(layout.slot_mask, rng.normal(size=(3, layout.num_slots)), 0)
+    column = np.zeros((3, SMALL.points))
+    np.add.at(column.T, layout.slot_point, values.T)
+    np.testing.assert_allclose(point_sum(layout, jnp.asarray(values)), column, rtol=1e-12, atol=1e-13)
+    camera = np.zeros((SMALL.cameras, 3))
+    np.add.at(camera, layout.slot_camera, values.T)
+    np.testing.assert_allclose(tree_sum(jnp.asarray(values.T), layout.camera_levels), camera, rtol=1e-12, atol=1e-13)
+    weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
+    found = blocks_by_layout(layout, weights)
+    assert np.array_equal(found[:cameras, :cameras], blocks_by_brute_force(problem, layout, weights))
+    assert not found[cameras:].any()
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 10**6), st.booleans())
+def test_shapes_follow_from_the_capacity_alone(one, other, grid):
+    """Random sub-problems: any cameras, any points. Where the whole may be one dense product, it is so for both."""
+    made = []
+    for seed in (one, other):
+        rng = np.random.default_rng(seed)
+        cameras = rng.integers(1, 9)
+        low = cameras if grid else 0
+        tracks = np.append(cameras if grid else 1, rng.integers(low, cameras + 1, rng.integers(1, 60)))
+        if grid:  # every camera sees every point, and there are no cameras to pad
+            cameras, tracks = 8, np.full(len(tracks), 8)
+        made.append(build_layout(problem_of(tracks, cameras, seed), grid=grid, capacity=SMALL))
+    assert shapes(made[0]) == shapes(made[1])
+    assert (made[0].grid is not None) == grid
+
+
+def test_windows_of_a_sequence_share_shapes_wherever_they_share_a_cell():
+    seen: dict = {}
+    for problem in windows(31):
+        capacity = capacity_of(problem)
+        layout = layout_for(problem, StepOptions(), capacity)
+        state = jax.eval_shape(
+            lambda p, layout=layout: initial_state(layout, p, StepOptions()), padded_parameters(problem, capacity)
+        )
+        seen.setdefault((capacity, layout.grid is None), []).append(shapes((layout, state)))
+    assert all(made == same[0] for same in seen.values() for made in same)
+    assert len(seen) <= 6
+
+
+def test_cameras_that_see_points_many_times_get_deeper_trees_and_not_wrong_sums():
+    """Tracks of 40 observations by three cameras, where eight would be the most."""
+    base = problem_of(np.full(6, 3), 3, seed=0)
+    times = np.tile(np.arange(base.num_observations), 14)[:240]
+    problem = base.replace(
+        observations=np.random.default_rng(0).normal(size=(240, 2)),
+        camera_index=base.camera_index[times],
+        point_index=base.point_index[times],
+        whitening=base.whitening[times],
+    )
+    layout = build_layout(problem, capacity=replace(SMALL, pairs=8192))
+    column = np.bincount(layout.slot_point[layout.slot_mask], minlength=SMALL.points)
+    assert column.max() > SMALL.cameras
+    assert np.array_equal(point_sum(layout, jnp.asarray(layout.slot_mask, float)[None])[0], column)
+    weights = np.random.default_rng(1).integers(1, 1 << 10, layout.num_slots).astype(np.float64)
+    found = blocks_by_layout(layout, weights)
+    assert np.array_equal(found[:3, :3], blocks_by_brute_force(problem, layout, weights))
+
+
+def test_an_empty_slot_that_is_not_a_number_spoils_no_point():
+    """As where a trial sends the first point, to which empty slots belong, out of range."""
+    layout = build_layout(problem_of(np.full(9, 3), 4, seed=0), capacity=SMALL)
+    values = np.where(layout.slot_mask, 1.0, np.nan)[None]
+    assert np.array_equal(point_sum(layout, jnp.asarray(values))[0], np.append(np.full(9, 3.0), np.zeros(55)))
+
+
+def test_a_problem_larger_than_the_capacity_is_refused():
+    problem = problem_of(np.full(64, 8), 8, seed=0)  # 512 observations, and none of the 512 slots would be empty
+    with pytest.raises(ValueError, match="larger than the capacity: 8 cameras, 64 points"):
+        build_layout(problem, capacity=SMALL)
+
+
+@pytest.mark.parametrize("parts", [{"clusters": True}, {"factor": False}, {"factor": False, "partitions": 3}])
+def test_only_layouts_for_a_factored_system_are_padded(parts):
+    with pytest.raises(ValueError, match="only layouts for a factored system"):
+        build_layout(support.tiny(), capacity=SMALL, **parts)
+
+
+# Solves
+
+
+def check_same(padded, plain, rtol: float = 1e-9) -> None:
+    """The same solve to rounding."""
+    assert padded.capacity is not None
+    assert plain.capacity is None
+    assert (padded.iterations, padded.accepted) == (plain.iterations, plain.accepted)
+    assert padded.termination == plain.termination
+    np.testing.assert_allclose(padded.initial_cost, plain.initial_cost, rtol=1e-12)
+    np.testing.assert_allclose(padded.history.cost, plain.history.cost, rtol=rtol)
+    np.testing.assert_allclose(padded.history.damping, plain.history.damping, rtol=1e-6)
+    np.testing.assert_allclose(padded.problem.cameras, plain.problem.cameras, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(padded.problem.points, plain.problem.points, rtol=1e-5, atol=1e-6)
+
+
+KINDS = {
+    "tiny": (support.tiny, StepOptions()),
+    "dense product": (lambda: support.paper(0), StepOptions()),
+    "whitened": (support.whitened, StepOptions()),
+    "loss": (support.tiny, StepOptions(loss=Loss("huber", 1.7))),
+    "identity": (support.tiny, StepOptions(scaling="identity")),
+    "embedded": (support.odd, StepOptions(refine_points=3, camera_rounds=2, trials=3)),
+    "fixed intrinsics": (support.tiny, StepOptions(intrinsics="fixed")),
+}
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_a_padded_solve_equals_the_one_of_the_given_sizes(kind):
+    make, options = KINDS[kind]
+    check_same(stepwise(make(), "ceres", options, pad=True), stepwise(make(), "ceres", options))
+
+
+def test_in_mixed_arithmetic_it_is_the_same_to_float32():
+    """The preconditioner is a factorisation in float32, behind which conjugate gradients stop at 1e-3."""
+    padded, plain = (stepwise(support.tiny(), dtype="mixed", pad=pad) for pad in (True, False))
+    check_same(padded, plain, rtol=float(np.finfo(np.float32).eps))
+
+
+@pytest.mark.parametrize("damping", ["learned", "classic", "nielsen"])
+def test_policies_see_the_true_problem(damping):
+    """The learned one observes numbers of cameras, points and observations."""
+    problem = windows(1)[0]
+    check_same(stepwise(problem, damping, pad=True), stepwise(problem, damping))
+
+
+def test_a_band_is_factored_dense_to_the_same_end():
+    scene = random_scene(SceneConfig(70, 200, 800, max_depth=4.0, gap_share=0.0, revisit_share=0.0), 0)
+    padded, plain = (stepwise(scene, max_iterations=4, pad=pad) for pad in (True, False))
+    assert layout_for(scene, StepOptions()).pairs.band is not None
+    check_same(padded, plain)
+
+
+def test_what_nobody_observes_comes_back_bit_by_bit_and_the_rest_moves():
+    problem = support.odd()
+    solution = stepwise(problem, max_iterations=10, pad=True)
+    assert solution.capacity is not None
+    assert solution.accepted > 0
+    lonely = np.setdiff1d(np.arange(problem.num_cameras), problem.camera_index)
+    unseen = np.setdiff1d(np.arange(problem.num_points), problem.point_index)
+    assert (len(lonely), len(unseen)) == (1, 2)
+    assert solution.problem.cameras.shape == problem.cameras.shape
+    assert solution.problem.points.shape == problem.points.shape
+    assert solution.problem.cameras[lonely].tobytes() == problem.cameras[lonely].tobytes()
+    assert solution.problem.points[unseen].tobytes() == problem.points[unseen].tobytes()
+    assert (solution.problem.points[problem.point_index] != problem.points[problem.point_index]).any(axis=1).all()
+
+
+# Programs
+
+
+def compilations(run) -> int:
+    """Programs that JAX traced or compiled meanwhile."""
+    events = []
+    listen = lambda event, seconds, **_: events.append(event) if "compile" in event else None
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        run()
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    return len(events)
+
+
+@pytest.mark.parametrize("run", [solve, stepwise])
+@pytest.mark.parametrize("dense", [False, True], ids=["pairs", "dense product"])
+def test_another_problem_of_the_same_cell_compiles_nothing(run, dense):
+    """Other numbers of cameras, points and observations, other tracks; some cameras or points unobserved."""
+    one, other = mates(dense)
+    run(one, "ceres", pad=True, max_iterations=3)
+    again = lambda **how: compilations(lambda: run(other, Ceres(initial=0.7), max_iterations=3, **how))
+    assert again(pad=True) == 0
+    assert again(pad=False) > 0
+
+
+def test_a_program_is_the_same_text_for_every_problem_of_a_cell():
+    """So that a persistent cache, which goes by the text, serves the next process too."""
+    texts = set()
+    for problem in mates(dense=False):
+        capacity = capacity_of(problem)
+        layout = layout_for(problem, StepOptions(), capacity)
+        state = initial_state(layout, padded_parameters(problem, capacity), StepOptions())
+        texts.add(solve_loop.lower(layout, state, Ceres(), Tolerances(), StepOptions(), 10).as_text())
+    assert len(texts) == 1
+
+
+# What is left as it is
+
+
+@pytest.mark.parametrize("asked", [{"linear_solver": "implicit"}, {"method": "stba"}])
+def test_other_solvers_are_left_as_they_are(asked):
+    padded = stepwise(support.tiny(), max_iterations=2, pad=True, **asked)
+    plain = stepwise(support.tiny(), max_iterations=2, **asked)
+    assert padded.capacity is None
+    assert padded.linear_solver == plain.linear_solver
+    assert np.array_equal(padded.history.cost, plain.history.cost)
+
+
+def test_where_there_is_a_choice_padding_takes_the_explicit_solver():
+    solution = stepwise(support.tiny(), max_iterations=2, pad=True, linear_solver="auto")
+    assert (solution.linear_solver, solution.capacity) == ("explicit", capacity_of(support.tiny()))
+    options = StepOptions(linear_solver="implicit")
+    assert stepwise(support.tiny(), "ceres", options, max_iterations=2, pad=True, linear_solver="auto").capacity
+
+
+def test_large_problems_have_no_capacity():
+    assert capacity_of(problem_of(np.full(3, 1), MAX_CAMERAS, seed=0)) is not None
+    assert capacity_of(problem_of(np.full(3, 1), MAX_CAMERAS + 1, seed=0)) is None
+    long = problem_of(np.full(3, 1), 4, seed=0)
+    many = 131_072
+    at = np.random.default_rng(0).integers(3, size=many)
+    crowded = replace(
+        long,
+        observations=np.zeros((many, 2)),
+        camera_index=np.zeros(many, np.int32),
+        point_index=at.astype(np.int32),
+        whitening=None,
+    )
+    assert capacity_of(crowded) is None
+    tracks = np.full(MAX_PAIRS // 210 + 1, 20)  # 210 pairs each
+    assert capacity_of(problem_of(tracks, 20, seed=0)) is None
+    assert capacity_of(problem_of(tracks[:-1], 20, seed=0)).pairs == MAX_PAIRS
+
+
+def test_a_large_problem_is_solved_as_it_is():
+    """More cameras than are padded, most of them unobserved, so that it is quick all the same."""
+    tiny = support.tiny()
+    many = tiny.replace(cameras=np.vstack([tiny.cameras, np.ones((MAX_CAMERAS, 9))]))
+    padded, plain = (stepwise(many, max_iterations=2, pad=pad) for pad in (True, False))
+    assert padded.capacity is None
+    assert np.array_equal(padded.history.cost, plain.history.cost)
