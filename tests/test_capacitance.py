@@ -115,7 +115,7 @@ def test_float32_is_solved_to_single_precision():
     wide, blocks, right = system(smallest=0.1)
     found = solve(*(part.astype(np.float32) for part in (wide, blocks, right)))
     assert found.dtype == jnp.float32
-    check(found, wide, blocks, right, 300 * np.finfo(np.float32).eps)
+    check(found, wide, blocks, right, 300 * float(np.finfo(np.float32).eps))
 
 
 @pytest.mark.parametrize("damping", [1e-6, 1e-3, 1.0])
