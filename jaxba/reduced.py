@@ -21,6 +21,7 @@ from jaxtyping import Float, Int
 
 from jaxba.band import band_factor, band_factor_and_solve
 from jaxba.blocks import dense_blocks, pair_products
+from jaxba.capacitance import capacitance_solve, worthwhile
 from jaxba.cg import conjugate_gradients
 from jaxba.coarse import Anchor
 from jaxba.dense import factor_and_solve, factor_panels
@@ -60,8 +61,7 @@ def solve_reduced(
         return _power_series(product, system, options)
     if options.algebra == "full":
         if options.linear_solver == "explicit" and layout.grid is not None:
-            matrix = dense_system(layout.grid, linear, points, system)
-            return factor_and_solve(matrix, system.right.reshape(-1)).reshape(system.right.shape), _no_iterations()
+            return solve_dense(layout.grid, linear, points, system), _no_iterations()
         if options.linear_solver == "explicit":
             return factor_blocks(layout, reduced_blocks(layout, linear, points, system), system.right), _no_iterations()
         return _iterate_reduced(layout, linear, points, system, anchor, options)
@@ -114,13 +114,31 @@ def reduced_blocks(
     return blocks.reshape(-1, 9, 9)
 
 
+def solve_dense(
+    grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
+) -> Float[Array, "cameras 9"]:
+    """Solves the reduced camera system of a dense scene, by way of the smaller one of two matrices."""
+    if worthwhile(*grid.shape):
+        return capacitance_solve(dense_coupling(grid, linear, points), system)
+    matrix = dense_system(grid, linear, points, system)
+    return factor_and_solve(matrix, system.right.reshape(-1)).reshape(system.right.shape)
+
+
+def dense_coupling(
+    grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem
+) -> Float[Array, "unknowns columns"]:
+    """W, which couples cameras and points: a row per camera unknown, a column per coordinate of each point."""
+    count, cameras = grid.shape
+    rows = take_rows(coupling_rows(linear, points), grid).reshape(count, cameras, 3, 9)
+    return rows.transpose(1, 3, 0, 2).reshape(9 * cameras, 3 * count)
+
+
 def dense_system(
     grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "unknowns unknowns"]:
-    """The reduced camera system as one product `diag(B) - W W^T`; W has a column per coordinate of each point."""
-    count, cameras = grid.shape
-    rows = take_rows(coupling_rows(linear, points), grid).reshape(count, cameras, 3, 9)
-    wide = rows.transpose(1, 3, 0, 2).reshape(9 * cameras, 3 * count)
+    """The reduced camera system as one product `diag(B) - W W^T`."""
+    cameras = grid.shape[1]
+    wide = dense_coupling(grid, linear, points)
     product = jnp.matmul(wide, wide.T, precision="highest")
     own = system.blocks[:, :, None, :] * jnp.eye(cameras, dtype=product.dtype)[:, None, :, None]
     return own.reshape(9 * cameras, 9 * cameras) - product
