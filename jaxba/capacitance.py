@@ -22,15 +22,6 @@ from jaxtyping import Float
 from jaxba.dense import factor_and_solve
 from jaxba.eliminate import CameraSystem
 
-LARGEST_SHARE = 2 / 3
-"""Columns of W over rows up to which the capacitance matrix is the cheaper one: of 10 or 40 cameras alone the time of
-both was equal near 0.7, in batches of 256 scenes near 0.85."""
-
-
-def worthwhile(points: int, cameras: int) -> bool:
-    """Whether the points of a scene, padding included, are few enough beside its cameras."""
-    return 3 * points <= LARGEST_SHARE * 9 * cameras
-
 
 def capacitance_solve(wide: Float[Array, "unknowns columns"], system: CameraSystem) -> Float[Array, "cameras 9"]:
     """Solves `(B - W W^T) x = b`.

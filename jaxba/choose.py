@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxba.density import has_small_capacitance
 from jaxba.options import REDUCED_SOLVERS, LinearSolver, StepOptions
 from jaxba.ordering import camera_order, is_banded
 from jaxba.problem import BundleProblem
@@ -30,12 +31,22 @@ COARSE_SECONDS_PER_OBSERVATION = 2e-7
 SECONDS_PER_CUBE = 4.5e-12
 """Dense Cholesky factorisation, per cube of the number of unknowns."""
 
+SECONDS_PER_PRODUCT = 1.2e-11
+"""A multiplication and addition in a dense product: 170 GFLOP/s (docs/performance.md)."""
+
 SECONDS_PER_BAND = 3.3e-11
 """Band factorisation, per unknown times the square of the band's unknowns."""
 
 ASSUMED_PRODUCTS = 12
 """Conjugate gradient iterations assumed for one step with the two-level preconditioner, which takes 6 to 20 on the
 problems at hand."""
+
+SHARED_SECONDS_PER_OBSERVATION = 2e-7
+"""What all solvers do beside the linear solve, per observation: 6.5 ms on a COLMAP model with 36 k observations."""
+
+INEXACT_ITERATIONS = 1.2
+"""Iterations that truncated conjugate gradients take, relative to a factorisation: geometric mean over three COLMAP
+models and three damping rules, from 0.8 to 2.0 (docs/performance.md)."""
 
 MAX_BYTES = 4e9
 """A solver that would need more memory than this is not chosen."""
@@ -75,12 +86,24 @@ def predict(problem: BundleProblem) -> SolverCosts:
         factoring, factor_bytes = SECONDS_PER_BAND * unknowns * band**2, 3 * 8 * unknowns * band
     else:
         factoring, factor_bytes = SECONDS_PER_CUBE * unknowns**3, 4 * 8 * unknowns**2
+    if _few_points_once_each(problem):
+        coordinates = 3.0 * (problem.num_points + 1)
+        forming, factoring = unknowns * coordinates**2 * SECONDS_PER_PRODUCT, SECONDS_PER_CUBE * coordinates**3
+        formed_bytes, factor_bytes = 0.0, 3 * 8 * unknowns * coordinates
     coarse = COARSE_SECONDS_PER_OBSERVATION * problem.num_observations
     return SolverCosts(
         explicit=_within(formed_bytes + factor_bytes, forming + factoring),
         sparse=_within(formed_bytes, forming + coarse + ASSUMED_PRODUCTS * SECONDS_PER_BLOCK * counts.blocks),
         implicit=coarse + ASSUMED_PRODUCTS * SECONDS_PER_OBSERVATION * problem.num_observations,
     )
+
+
+def _few_points_once_each(problem: BundleProblem) -> bool:
+    """Whether the explicit solver will factor a matrix of the points' size (`density.is_dense`)."""
+    point, cameras = np.asarray(problem.point_index, np.int64), problem.num_cameras
+    if not has_small_capacitance(problem.num_points + 1, cameras):
+        return False
+    return len(np.unique(point * cameras + problem.camera_index)) == len(point)
 
 
 class PairCounts(NamedTuple):
@@ -111,9 +134,12 @@ def count_pairs(problem: BundleProblem) -> PairCounts:
 
 
 def choose(problem: BundleProblem) -> LinearSolver:
-    """The solver with the lowest predicted cost; a tie goes to the more exact one."""
-    costs = predict(problem)._asdict()
-    return min(costs, key=lambda name: costs[name])  # type: ignore[return-value]
+    """The solver with the lowest predicted time to the end; a tie goes to the more exact one."""
+    shared = SHARED_SECONDS_PER_OBSERVATION * problem.num_observations
+    costs = predict(problem)
+    times = {name: shared + seconds for name, seconds in costs._asdict().items()}
+    times = {name: time * (1 if name == "explicit" else INEXACT_ITERATIONS) for name, time in times.items()}
+    return min(times, key=lambda name: times[name])  # type: ignore[return-value]
 
 
 def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_solver: str | None) -> StepOptions:

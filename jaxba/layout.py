@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba.clusters import ClusterLayout, cluster_layout
+from jaxba.density import is_dense
 from jaxba.options import StepOptions
 from jaxba.padding import Capacity, room_for
 from jaxba.pairs import PairLayout, pair_layout
@@ -29,14 +30,6 @@ from jaxba.trees import sum_tree
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
-
-
-DENSE_SHARE = 0.1
-"""Pairs per point and pair of cameras from which on a dense product forms the system: it runs 17 times as fast an
-operation as the products of chosen pairs, and doubles each of them."""
-
-DENSE_UNKNOWNS = 512
-"""Larger systems are formed from pairs: the dense operand takes 72 bytes a point and unknown."""
 
 
 @jax.tree_util.register_dataclass
@@ -163,8 +156,9 @@ def build_layout(
     by_camera = np.argsort(camera, kind="stable")
     room = None if capacity is None else room_for(seen, capacity.observations, capacity.points)
     table = None
-    if pairs and factor and grid and is_dense(camera, point, tracks, cameras):
-        table = np.full((sum(map(len, made.members)), cameras), empty, np.int32)
+    columns = sum(map(len, made.members))
+    if pairs and factor and grid and is_dense(camera, point, tracks, cameras, columns):
+        table = np.full((columns, cameras), empty, np.int32)
         table[slot_point[slot], camera] = slot
     listed = None
     if pairs and table is None:
@@ -211,18 +205,3 @@ def partition_of(layout: Layout) -> Partition:
     if layout.partitions is None:
         raise ValueError("this layout has no partitions: build it with partitions=, the cameras of a cluster at most")
     return layout.partitions
-
-
-def is_dense(camera: np.ndarray, point: np.ndarray, tracks: np.ndarray, cameras: int) -> bool:
-    """Whether nearly every camera sees nearly every point, so that one dense product is cheaper than chosen pairs.
-
-    Args:
-        camera: of each observation, sorted by point, then by camera.
-        point: of each observation.
-        tracks: observations of each point.
-        cameras: number of cameras.
-    """
-    pairs = float(np.sum(tracks * (tracks + 1.0)) / 2)
-    twice = (camera[1:] == camera[:-1]) & (point[1:] == point[:-1])
-    few = 9 * cameras <= DENSE_UNKNOWNS
-    return bool(few and not twice.any() and pairs > DENSE_SHARE * np.count_nonzero(tracks) * cameras**2)

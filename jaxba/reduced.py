@@ -21,10 +21,11 @@ from jaxtyping import Float, Int
 
 from jaxba.band import band_factor, band_factor_and_solve
 from jaxba.blocks import dense_blocks, pair_products
-from jaxba.capacitance import capacitance_solve, worthwhile
+from jaxba.capacitance import capacitance_solve
 from jaxba.cg import conjugate_gradients
 from jaxba.coarse import Anchor
 from jaxba.dense import factor_and_solve, factor_panels
+from jaxba.density import has_few_points
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_rows
 from jaxba.layout import Layout, PairLayout
 from jaxba.linearize import Linearization
@@ -59,18 +60,20 @@ def solve_reduced(
     product = lambda x: apply_reduced(layout, linear, points, system, x)
     if options.linear_solver == "power":
         return _power_series(product, system, options)
+    explicit, grid = options.linear_solver == "explicit", layout.grid
+    # a small capacitance matrix is not worth rounding to float32
+    if explicit and grid is not None and (options.algebra == "full" or has_few_points(*grid.shape)):
+        return solve_dense(grid, linear, points, system), _no_iterations()
     if options.algebra == "full":
-        if options.linear_solver == "explicit" and layout.grid is not None:
-            return solve_dense(layout.grid, linear, points, system), _no_iterations()
-        if options.linear_solver == "explicit":
+        if explicit:
             return factor_blocks(layout, reduced_blocks(layout, linear, points, system), system.right), _no_iterations()
         return _iterate_reduced(layout, linear, points, system, anchor, options)
     rough_linear, rough_points, rough_system, rough_anchor = to_single((linear, points, system, anchor))
-    if options.linear_solver == "explicit":
-        if layout.grid is None:
+    if explicit:
+        if grid is None:
             solve = factored(layout, reduced_blocks(layout, rough_linear, rough_points, rough_system))
         else:
-            solve = factored_dense(dense_system(layout.grid, rough_linear, rough_points, rough_system))
+            solve = factored_dense(dense_system(grid, rough_linear, rough_points, rough_system))
         precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
         return _iterate(product, precondition, system, replace(options, cg_forcing=REPAIR_FORCING))
     step, iterations = _iterate_reduced(layout, rough_linear, rough_points, rough_system, rough_anchor, options)
@@ -118,7 +121,7 @@ def solve_dense(
     grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "cameras 9"]:
     """Solves the reduced camera system of a dense scene, by way of the smaller one of two matrices."""
-    if worthwhile(*grid.shape):
+    if has_few_points(*grid.shape):
         return capacitance_solve(dense_coupling(grid, linear, points), system)
     matrix = dense_system(grid, linear, points, system)
     return factor_and_solve(matrix, system.right.reshape(-1)).reshape(system.right.shape)

@@ -95,7 +95,7 @@ def refine_points(
 
     def body(_: Array, carry: _Carry) -> _Carry:
         trial = proposed(carry)
-        system, costs, _ = evaluate(trial)
+        system, costs = evaluate(trial)[:2]
         better = costs < carry.costs
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
         return _Carry(

@@ -9,7 +9,8 @@ import pytest
 import support
 
 from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene, reduced
-from jaxba.capacitance import capacitance_solve, worthwhile
+from jaxba.capacitance import capacitance_solve
+from jaxba.density import has_few_points
 from jaxba.eliminate import CameraSystem
 from jaxba.host import calm_blas
 
@@ -130,10 +131,10 @@ def test_a_step_by_way_of_the_points_is_the_step_by_way_of_the_cameras(monkeypat
     )
     layout = jax.tree.map(jnp.asarray, build_layout(problem))
     assert layout.grid is not None
-    assert worthwhile(*layout.grid.shape)
+    assert has_few_points(*layout.grid.shape)
     before = initial_state(layout, problem, StepOptions())
     one = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
-    monkeypatch.setattr(reduced, "worthwhile", lambda points, cameras: False)
+    monkeypatch.setattr(reduced, "has_few_points", lambda points, cameras: False)
     other = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
     moved = lambda after: [np.asarray(a - b) for a, b in zip(after, before, strict=True)]
     for found, truth in zip(moved(one), moved(other), strict=True):
@@ -143,5 +144,5 @@ def test_a_step_by_way_of_the_points_is_the_step_by_way_of_the_cameras(monkeypat
 
 
 def test_scenes_with_many_points_are_left_to_the_cameras_side():
-    assert worthwhile(11, 10)
-    assert not worthwhile(41, 10)
+    assert has_few_points(11, 10)
+    assert not has_few_points(41, 10)

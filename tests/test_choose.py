@@ -113,6 +113,17 @@ def test_a_few_cameras_are_factored():
         assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "explicit"
 
 
+def test_many_cameras_that_see_few_points_are_factored_by_way_of_the_points():
+    """As with the corners of a calibration board; without that way 2700 unknowns would be factored."""
+    board = problem_of(300, 20, 0)
+    assert predict(board).explicit < 0.5 * min(predict(board).sparse, predict(board).implicit)
+    assert choose_linear_solver(board, StepOptions(), "auto").linear_solver == "explicit"
+    assert build_layout(board).grid is not None
+    twice = problem_of(300, 20, 0, duplicates=1)
+    assert build_layout(twice).grid is None
+    assert predict(twice).explicit > 100 * predict(board).explicit
+
+
 def test_a_solver_without_the_memory_for_it_is_not_chosen(monkeypatch):
     problem = random_scene(SEQUENCE, 0)
     monkeypatch.setattr("jaxba.choose.MAX_BYTES", 1e6)
