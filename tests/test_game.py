@@ -344,11 +344,20 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
     assert len(scenes) > 10  # of the whole bank, not the same ones again
 
 
-def _reward(config: GameConfig, cost: float, before: float, best: float, iteration: int, success: bool, over: bool):
+def _reward(
+    config: GameConfig,
+    cost: float,
+    before: float,
+    best: float,
+    iteration: int,
+    success: bool,
+    over: bool,
+    repairs: int = 0,
+):
     """By hand; `iteration` counts from one."""
     bonus = config.bonus if success else 0.0
     value = {
-        "duration": bonus - 1,  # no point iterations in this game
+        "duration": bonus - 1 - config.repair_cost * repairs,  # no point iterations in this game
         "constant": bonus - 1,
         "reduction": bonus * (1 - 0.01 * (iteration - 1)),
         "reversed": bonus - np.log10(cost / best),
@@ -363,12 +372,15 @@ def _reward(config: GameConfig, cost: float, before: float, best: float, iterati
     "config",
     [
         replace(RULES, reward="duration"),
+        replace(RULES, reward="duration", repair_cost=0.4),
         replace(RULES, reward="constant", bonus=3.0, scale=1.0),
         replace(RULES, reward="reduction"),
         replace(RULES, reward="reversed"),
         replace(RULES, reward="constant", shaping=0.5, limit_is_failure=True),
     ],
-    ids=lambda config: config.reward + ("+shaping" if config.shaping else ""),
+    ids=lambda config: (
+        config.reward + ("+shaping" if config.shaping else "") + ("+repairs" if config.repair_cost else "")
+    ),
 )
 def test_rewards_are_those_of_the_contract(config):
     """By `Game._reward` alone, on made-up steps: no program of its own for each."""
@@ -384,7 +396,8 @@ def test_rewards_are_those_of_the_contract(config):
     ):
         success = cost <= best * (1 + config.tolerance)
         over = success or (config.limit_is_failure and iteration >= config.max_iterations)
-        step = step_info(True, cost=cost, previous_cost=before)
+        repairs = iteration - 1
+        step = step_info(True, cost=cost, previous_cost=before)._replace(repairs=jnp.asarray(repairs, jnp.int32))
         found = game._reward(
             step,
             memory._replace(iteration=jnp.asarray(iteration, jnp.int32)),
@@ -392,7 +405,8 @@ def test_rewards_are_those_of_the_contract(config):
             jnp.asarray(success),
             jnp.asarray(over),
         )
-        np.testing.assert_allclose(found, _reward(config, cost, before, best, iteration, success, over), rtol=1e-9)
+        want = _reward(config, cost, before, best, iteration, success, over, repairs)
+        np.testing.assert_allclose(found, want, rtol=1e-9)
 
 
 def tiny_info():
@@ -463,7 +477,15 @@ def test_demonstrations_are_actions_of_which_some_follow_ceres_rule():
 
 
 @pytest.mark.parametrize(
-    "change", [{"reward": "fame"}, {"max_iterations": 0}, {"tolerance": 0.0}, {"scale": -1.0}, {"tolerance": -1e-3}]
+    "change",
+    [
+        {"reward": "fame"},
+        {"max_iterations": 0},
+        {"tolerance": 0.0},
+        {"scale": -1.0},
+        {"tolerance": -1e-3},
+        {"repair_cost": -0.1},
+    ],
 )
 @pytest.mark.usefixtures("unchecked")
 def test_impossible_rules_are_refused(change):

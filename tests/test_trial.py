@@ -206,6 +206,8 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
             assert same_bits(after, before)
             continue
         saved += 1
+        assert once.repairs == 0
+        assert info.repairs == round(float(np.log(info.share) / np.log(SHORTER)))
         linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
         whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(BOLD), PLAIN)
         power = round(float(np.log(info.step_norm / once.step_norm) / np.log(SHORTER)))
@@ -259,6 +261,9 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
         if plain.gain_ratio > GOOD_GAIN or plain.candidate_cost > HOPELESS * before.cost:
             trusted += 1  # the model was right, or it is past mending
             assert mended.candidate_cost == plain.candidate_cost
+        # rounds, and nothing else, make a candidate better here
+        assert (mended.repairs > 0) >= (mended.candidate_cost < plain.candidate_cost)
+        assert 0 <= mended.repairs <= 3
     assert better >= 1
     assert trusted >= 5
 
