@@ -15,7 +15,6 @@ Adjustment", PAMI 2012; Ceres calls the same idea inner iterations.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -47,10 +46,11 @@ class Home(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    points: Float[Array, "3 points"]
+    points: Float[Array, "3 points"]  # best so far
     costs: Float[Array, " points"]
-    system: Float[Array, "9 points"]  # lower triangle of the block, then the gradient
+    system: Float[Array, "9 points"]  # lower triangle of the block, then the gradient, there
     damping: Float[Array, " points"]
+    trial: Float[Array, "3 points"]  # where to look next
 
 
 def refine_points(
@@ -75,53 +75,47 @@ def refine_points(
         Points, and the cost of each point's observations there (pixels squared), never larger than where it started.
     """
 
-    def look(points: Array) -> tuple[camera.Projection, list[Array], Array]:
-        projection, residual = residuals(layout, frames, points)
-        return projection, residual, slot_costs(loss, residual)
+    if home is not None:
+        points = _brought_home(layout, frames, points, home)
 
-    def evaluate(points: Array, *more: Callable[[camera.Projection], Array]) -> tuple[Array, Array, list[Array]]:
-        projection, residual, costs = look(points)
-        entries = point_normal_equations(layout, frames, projection, residual, loss)
-        sums = point_sum(layout, jnp.stack([*entries, costs, *(extra(projection) for extra in more)]))
-        return sums[:9], sums[9], list(sums[10:])
-
-    def proposed(carry: _Carry) -> Float[Array, "3 points"]:
-        matrix = [carry.system[k] for k in range(6)]
+    def propose(best: _Carry) -> _Carry:
+        matrix = [best.system[k] for k in range(6)]
         for k in (0, 2, 5):
-            matrix[k] = matrix[k] * (1 + carry.damping)
+            matrix[k] = matrix[k] * (1 + best.damping)
         factor = cholesky3(matrix)
-        step = factor.backward(factor.forward([carry.system[k] for k in range(6, 9)]))
-        return carry.points - jnp.stack(step)
+        step = factor.backward(factor.forward([best.system[k] for k in range(6, 9)]))
+        return best._replace(trial=best.points - jnp.stack(step))
 
     def body(_: Array, carry: _Carry) -> _Carry:
-        trial = proposed(carry)
-        system, costs = evaluate(trial)[:2]
-        better = costs < carry.costs
+        projection, residual = residuals(layout, frames, carry.trial)
+        entries = point_normal_equations(layout, frames, projection, residual, loss)
+        sums = point_sum(layout, jnp.stack([*entries, slot_costs(loss, residual)]))
+        better = sums[9] < carry.costs
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
-        return _Carry(
-            jnp.where(better, trial, carry.points),
-            jnp.where(better, costs, carry.costs),
-            jnp.where(better, system, carry.system),
-            jnp.where(better, carry.damping / DAMPING_FACTOR, grown),
+        best = _Carry(
+            points=jnp.where(better, carry.trial, carry.points),
+            costs=jnp.where(better, sums[9], carry.costs),
+            system=jnp.where(better, sums[:9], carry.system),
+            damping=jnp.where(better, carry.damping / DAMPING_FACTOR, grown),
+            trial=carry.trial,
         )
+        return propose(best)
 
-    if home is None:
-        system, costs, _ = evaluate(points)
-    else:
-        astray = lambda projection: (home.front & behind(projection)).astype(points.dtype)
-        system, costs, more = evaluate(points, astray)
-        lost = more[0]
-
-        def return_home() -> tuple[Array, Array, Array]:
-            system_there, costs_there, _ = evaluate(home.points)
-            choose = lambda there, here: jnp.where(lost > 0, there, here)
-            return choose(home.points, points), choose(system_there, system), choose(costs_there, costs)
-
-        points, system, costs = lax.cond(jnp.any(lost > 0), return_home, lambda: (points, system, costs))
-    carry = _Carry(points, costs, system, jnp.full_like(costs, INITIAL_DAMPING))
-    carry = lax.fori_loop(0, iterations - 1, body, carry)
+    # the start is a trial better than nothing: one copy of the body in the program, and less to compile
+    nothing = jnp.full_like(points[0], jnp.inf)
+    first = jnp.full_like(nothing, DAMPING_FACTOR * INITIAL_DAMPING)
+    carry = _Carry(points, nothing, jnp.zeros((9, nothing.shape[0]), points.dtype), first, points)
+    carry = lax.fori_loop(0, iterations, body, carry)
     # nothing follows the last step, so that its cost is all there is to know
-    trial = proposed(carry)
-    costs = point_sum(layout, look(trial)[2][None])[0]
+    costs = point_sum(layout, slot_costs(loss, residuals(layout, frames, carry.trial)[1])[None])[0]
     better = costs < carry.costs
-    return jnp.where(better, trial, carry.points), jnp.where(better, costs, carry.costs)
+    return jnp.where(better, carry.trial, carry.points), jnp.where(better, costs, carry.costs)
+
+
+def _brought_home(
+    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], home: Home
+) -> Float[Array, "3 points"]:
+    """Points, but those that lie behind a camera in front of which they were at home, which are taken back."""
+    projection, _ = residuals(layout, frames, points)
+    lost = point_sum(layout, (home.front & behind(projection)).astype(points.dtype)[None])[0]
+    return jnp.where(lost > 0, home.points, points)

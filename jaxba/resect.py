@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
 from jaxba import camera
@@ -51,16 +51,20 @@ def refine_cameras(
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     own_cost = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
     before = own_cost(linear.costs)
-    best, done = cameras, ~layout.camera_seen
-    for damping in DAMPINGS:
+
+    def attempt(carry: tuple[Array, Array], damping: Array) -> tuple[tuple[Array, Array], None]:
+        best, done = carry
         damped = blocks + (damping * diagonal)[:, :, None] * jnp.eye(9, dtype=blocks.dtype)
         step = -solve_positive(damped, gradient).T
         # on the manifold, in which the Jacobian is written
         moved = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
         costs = slot_costs(options.loss, residuals(layout, slot_frames(layout, moved), points)[1])
         better = (own_cost(costs) < before) & ~done
-        best, done = jnp.where(better, moved, best), done | better
-    return best
+        return (jnp.where(better, moved, best), done | better), None
+
+    # a scan and not two copies: half of it to compile
+    unseen = ~jnp.asarray(layout.camera_seen)
+    return lax.scan(attempt, (cameras, unseen), jnp.asarray(DAMPINGS, cameras.dtype))[0][0]
 
 
 def solve_positive(matrix: Float[Array, "n k k"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:

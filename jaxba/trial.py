@@ -107,17 +107,20 @@ def best_trial(
 
     def worth_it(trial: Trial) -> Bool[Array, ""]:
         open_ = (trial.gain < GOOD_GAIN) & (trial.cost < HOPELESS * cost)
-        return (trial.repairs < options.camera_rounds) & open_ & matters
+        return (trial.repairs < options.camera_rounds) & (trial.share == 1) & open_ & matters
 
-    def attempt(share: Array) -> Trial:
-        return settle(move_cameras(cameras, share * step.cameras, options), points + share * step.points, share)
+    def attempt(share: Array, repairs: Array) -> Trial:
+        moved = move_cameras(cameras, share * step.cameras, options)
+        trial = settle(moved, points + share * step.points, share)._replace(repairs=repairs)
+        return lax.while_loop(worth_it, repair, trial) if options.camera_rounds else trial
 
-    trial = attempt(jnp.ones((), cost.dtype))
-    if options.camera_rounds:
-        trial = lax.while_loop(worth_it, repair, trial)
-    if options.trials > 1:
-        last = 1.5 * SHORTER ** (options.trials - 1)
-        again = lambda trial: ~trial.accepted & (trial.share > last) & matters
-        shorter = lambda trial: attempt(SHORTER * trial.share)._replace(repairs=trial.repairs + 1)
-        trial = lax.while_loop(again, shorter, trial)
-    return trial
+    one, none = jnp.ones((), cost.dtype), jnp.zeros((), jnp.int32)
+    if options.trials == 1:
+        return attempt(one, none)
+    # the whole step is the first turn of the loop, so that the program has one copy of all this
+    last = 1.5 * SHORTER ** (options.trials - 1)
+    again = lambda trial: ~trial.accepted & (trial.share > last) & (matters | (trial.share > 1))
+    shorter = lambda trial: attempt(SHORTER * trial.share, trial.repairs + 1)
+    bad = jnp.full_like(cost, jnp.inf)
+    nothing = Trial(cameras, points, bad, -one, -bad, jnp.zeros((), bool), one / SHORTER, none - 1)
+    return lax.while_loop(again, shorter, nothing)
