@@ -199,7 +199,9 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         same, once = step(layout, before, BOLD, PLAIN)
         after, info = step(layout, before, BOLD, SHORTER_ONLY)
         if once.accepted:  # then nothing is tried again
-            assert same_bits(same, after)
+            assert (info.repairs, info.share) == (0, 1)
+            for found, truth in zip(after, same, strict=True):  # another program, which rounds in another order
+                np.testing.assert_allclose(found, truth, rtol=1e-9, atol=1e-9)
             continue
         assert same_bits(same, before)
         if not info.accepted:
