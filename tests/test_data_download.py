@@ -77,8 +77,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(body) - start))
         self.end_headers()
         part = body[start:][: server.break_after]
+        server.sent += len(part)  # before the last byte is on its way, after which a test may ask
         self.wfile.write(part)
-        server.sent += len(part)
         self.close_connection = True
 
     def log_message(self, *_: object) -> None:
