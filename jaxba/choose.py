@@ -42,11 +42,11 @@ ASSUMED_PRODUCTS = 12
 problems at hand."""
 
 SHARED_SECONDS_PER_OBSERVATION = 2e-7
-"""What all solvers do beside the linear solve, per observation: 6.5 ms on a COLMAP model with 36 k observations."""
+"""What all solvers do beside the linear solve, per observation: 6.5 ms on bulani1 with its 36 k observations."""
 
 INEXACT_ITERATIONS = 1.2
-"""Iterations that truncated conjugate gradients take, relative to a factorisation: geometric mean over three COLMAP
-models and three damping rules, from 0.8 to 2.0 (docs/performance.md)."""
+"""Iterations to convergence that truncated conjugate gradients take, relative to a factorisation: geometric mean over
+bulani1, bulani2, bulani4 and the rules ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
 
 MAX_BYTES = 4e9
 """A solver that would need more memory than this is not chosen."""
@@ -87,7 +87,7 @@ def predict(problem: BundleProblem) -> SolverCosts:
     else:
         factoring, factor_bytes = SECONDS_PER_CUBE * unknowns**3, 4 * 8 * unknowns**2
     if _few_points_once_each(problem):
-        coordinates = 3.0 * (problem.num_points + 1)
+        coordinates = 3.0 * (_observed_points(problem) + 1)
         forming, factoring = unknowns * coordinates**2 * SECONDS_PER_PRODUCT, SECONDS_PER_CUBE * coordinates**3
         formed_bytes, factor_bytes = 0.0, 3 * 8 * unknowns * coordinates
     coarse = COARSE_SECONDS_PER_OBSERVATION * problem.num_observations
@@ -98,10 +98,14 @@ def predict(problem: BundleProblem) -> SolverCosts:
     )
 
 
+def _observed_points(problem: BundleProblem) -> int:
+    return int(np.count_nonzero(np.bincount(problem.point_index, minlength=1)))
+
+
 def _few_points_once_each(problem: BundleProblem) -> bool:
     """Whether the explicit solver will factor a matrix of the points' size (`density.is_dense`)."""
     point, cameras = np.asarray(problem.point_index, np.int64), problem.num_cameras
-    if not has_small_capacitance(problem.num_points + 1, cameras):
+    if not has_small_capacitance(_observed_points(problem) + 1, cameras):
         return False
     return len(np.unique(point * cameras + problem.camera_index)) == len(point)
 

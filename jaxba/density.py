@@ -9,7 +9,8 @@ DENSE_SHARE = 0.1
 operation as the products of chosen pairs, and doubles each of them."""
 
 DENSE_UNKNOWNS = 512
-"""Larger systems are formed from pairs: the dense operand takes 72 bytes a point and unknown."""
+"""Larger systems are formed from pairs, but where points are few: the dense operand takes 72 bytes a point and unknown.
+It is the most columns of a capacitance matrix besides, which LAPACK factors in a millisecond."""
 
 LARGEST_SHARE = 2 / 3
 """Coordinates of points over unknowns of cameras up to which the capacitance matrix is the cheaper one: of 10 or 40

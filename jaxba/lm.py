@@ -136,7 +136,10 @@ def _round(
 def _verdict(
     state: LMState, found: Trial | Round, moved: list[Array], damping: Float[Array, ""], **facts: Array
 ) -> tuple[LMState, StepInfo]:
-    """The state after a candidate was accepted or not, and the record of it; `moved` is the step that was tried."""
+    """The state after a candidate was accepted or not, and the record of it.
+
+    `moved` is the step that was tried; `facts` are the fields of `StepInfo` that are not set here.
+    """
     choose = lambda new, old: jnp.where(found.accepted, new, old)
     after = LMState(*(choose(*pair) for pair in zip(found[:3], state, strict=True)))
     return after, StepInfo(

@@ -6,7 +6,8 @@ follow from a `Capacity` alone, four numbers on a coarse grid. Padding holds no 
 sums, and its cameras and points never move.
 
 Up to half of the slots are waste, which makes an iteration up to twice as long or a little more. That is a good bargain
-while a solve is quicker than a compilation, so larger problems are left as they are (`capacity_of`).
+while a solve is quicker than a compilation, so larger problems are left as they are (`capacity_of`). Few points lose
+more: with their padding they are too many for a matrix of their own size (`density.py`).
 """
 
 from __future__ import annotations

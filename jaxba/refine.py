@@ -72,7 +72,8 @@ def refine_points(
         home: a point that lies behind a camera in front of which it was at home starts from there.
 
     Returns:
-        Points, and the cost of each point's observations there (pixels squared), never larger than where it started.
+        Points, and the cost of each point's observations there (pixels squared), never larger than where it
+        started, which is its home for a point that was taken there.
     """
 
     if home is not None:

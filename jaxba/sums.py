@@ -49,7 +49,7 @@ def total(values: Float[Array, " n"]) -> Float[Array, ""]:
 
 
 def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
-    """Sums rows into targets along a tree made by `layout.sum_tree`."""
+    """Sums rows into targets along a tree made by `trees.sum_tree`."""
     for level in levels:
         parts = [take_rows(rows, level[:, k]) for k in range(level.shape[1])]
         rows = functools.reduce(operator.add, parts)

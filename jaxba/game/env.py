@@ -88,7 +88,7 @@ class GameConfig:
             raise ValueError(f"reward must be one of {', '.join(get_args(Reward))}, not {self.reward!r}")
         if self.max_iterations < 1 or self.tolerance <= 0 or self.scale <= 0:
             raise ValueError("max_iterations, tolerance and scale must be positive")
-        if self.repair_cost < 0:
+        if not self.repair_cost >= 0:
             raise ValueError(f"repair_cost must not be negative, is {self.repair_cost}")
 
 
