@@ -19,8 +19,9 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
 from jaxba import BundleProblem, LMState, StepOptions, initial_state, like, lm_step, random_scene
-from jaxba.layout import layout_for
+from jaxba.layout import Layout, layout_for
 from jaxba.lm import StepInfo
+from jaxba.sums import point_sum, tree_sum
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
@@ -319,3 +320,14 @@ def difference(problem: BundleProblem, after: BundleProblem, options: StepOption
         )
         cameras[:, :3] = turned.as_rotvec()
     return np.concatenate([cameras.ravel(), (after.points - problem.points).ravel()])
+
+
+def check_sums(layout: Layout, rng: np.random.Generator) -> None:
+    """Sums over points and over cameras equal `np.add.at`, for random values in every slot that is used."""
+    values = np.where(layout.slot_mask, rng.normal(size=(4, layout.num_slots)), 0)
+    column = np.zeros((4, layout.num_points))
+    np.add.at(column.T, layout.slot_point, values.T)
+    np.testing.assert_allclose(point_sum(layout, jnp.asarray(values)), column, rtol=1e-12, atol=1e-13)
+    camera = np.zeros((layout.num_cameras, 4))
+    np.add.at(camera, layout.slot_camera, values.T)
+    np.testing.assert_allclose(tree_sum(jnp.asarray(values.T), layout.camera_levels), camera, rtol=1e-12, atol=1e-13)

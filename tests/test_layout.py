@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 from jaxba import BundleProblem, Layout, build_layout
 from jaxba.layout import CAMERA_CHUNK
 from jaxba.slots import MAX_PADDING
-from jaxba.sums import point_sum, tree_sum
 from jaxba.trees import TREE_WIDTH, sum_tree
 
 # Problems from track lengths
@@ -175,16 +173,7 @@ def test_a_sum_tree_sums_every_target_once(counts, width, seed):
 
 @pytest.mark.parametrize("make", [support.tiny, support.odd], ids=["tiny", "odd"])
 def test_point_and_camera_sums_equal_add_at(make):
-    problem = make()
-    layout = build_layout(problem)
-    rng = np.random.default_rng(0)
-    values = np.where(layout.slot_mask, rng.normal(size=(4, layout.num_slots)), 0)
-    column = np.zeros((4, layout.num_points))
-    np.add.at(column.T, layout.slot_point, values.T)
-    np.testing.assert_allclose(point_sum(layout, jnp.asarray(values)), column, rtol=1e-12, atol=1e-13)
-    camera = np.zeros((problem.num_cameras, 4))
-    np.add.at(camera, layout.slot_camera, values.T)
-    np.testing.assert_allclose(tree_sum(jnp.asarray(values.T), layout.camera_levels), camera, rtol=1e-12, atol=1e-13)
+    support.check_sums(build_layout(make()), np.random.default_rng(0))
 
 
 def test_a_camera_with_thousands_of_observations_is_summed_in_chunks():

@@ -27,7 +27,7 @@ from jaxba.padding import (
 )
 from jaxba.paper.subproblem import sub_problem
 from jaxba.scenes import SceneConfig
-from jaxba.sums import point_sum, tree_sum
+from jaxba.sums import point_sum
 from jaxba.trees import Room, sum_tree
 
 SMALL = Capacity(cameras=8, points=64, observations=512, pairs=4096)
@@ -129,13 +129,7 @@ def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, ca
     assert empty.any()
     assert not np.any(layout.pixels[:, empty])
     assert not np.any(layout.whitening[:, :, empty])
-    values = np.where(layout.slot_mask, rng.normal(size=(3, layout.num_slots)), 0)
-    column = np.zeros((3, SMALL.points))
-    np.add.at(column.T, layout.slot_point, values.T)
-    np.testing.assert_allclose(point_sum(layout, jnp.asarray(values)), column, rtol=1e-12, atol=1e-13)
-    camera = np.zeros((SMALL.cameras, 3))
-    np.add.at(camera, layout.slot_camera, values.T)
-    np.testing.assert_allclose(tree_sum(jnp.asarray(values.T), layout.camera_levels), camera, rtol=1e-12, atol=1e-13)
+    support.check_sums(layout, rng)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     found = blocks_by_layout(layout, weights)
     assert np.array_equal(found[:cameras, :cameras], blocks_by_brute_force(problem, layout, weights))
