@@ -7,7 +7,8 @@ what they see. Repairing that locally is cheap beside a linear solve, and lets b
    from where it was.
 2. `camera_rounds`: where the step did less than half of what the model promised and is not hopeless, cameras alone,
    then points alone again, a few times over. A step along a curved valley comes back to its floor.
-3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 but without 2.
+3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 and at most one round
+   of 2.
 
 None of it takes another linear solve, so it is all one iteration (design, section 2). Source: 1 is Jeong et al. 2012,
 "embedded point iterations", and Ceres' inner iterations; 2 is resection and intersection (Chen, Chen, Wang 2019,
@@ -39,6 +40,11 @@ GOOD_GAIN = 0.5
 HOPELESS = 1.5
 """Candidates that cost more than this times the present cost get no camera rounds: wild points would pull the cameras
 after them. On Ladybug-49 under lambda 1e-6 a limit of 10 led into a minimum 19% above, 1.5 did not."""
+
+ROUNDS_OF_SHORTER = 1
+"""Camera rounds of a shortened candidate. On 457 held-out scenes `learned` came within 1e-4 of the best in 6.40
+iterations on average without any, 6.02 with one, 5.88 with three; on real problems three took a tenth more work than
+one."""
 
 NEGLIGIBLE = 1e-6
 """Promised decrease relative to the cost that is not worth repairs or further trials. Source: Ceres
@@ -101,18 +107,22 @@ def best_trial(
             costs = slot_costs(options.loss, residuals(layout, frames, points)[1])
         return judge(cameras, points, costs, share)
 
-    def repair(trial: Trial) -> Trial:
+    def repair(turn: tuple[Trial, Array]) -> tuple[Trial, Array]:
+        trial, left = turn
         moved = refine_cameras(layout, trial.cameras, trial.points, options)
-        return settle(moved, trial.points, trial.share)._replace(repairs=trial.repairs + 1)
+        return settle(moved, trial.points, trial.share)._replace(repairs=trial.repairs + 1), left - 1
 
-    def worth_it(trial: Trial) -> Bool[Array, ""]:
-        open_ = (trial.gain < GOOD_GAIN) & (trial.cost < HOPELESS * cost)
-        return (trial.repairs < options.camera_rounds) & (trial.share == 1) & open_ & matters
+    def worth_it(turn: tuple[Trial, Array]) -> Bool[Array, ""]:
+        trial, left = turn
+        return (left > 0) & (trial.gain < GOOD_GAIN) & (trial.cost < HOPELESS * cost) & matters
 
     def attempt(share: Array, repairs: Array) -> Trial:
         moved = move_cameras(cameras, share * step.cameras, options)
         trial = settle(moved, points + share * step.points, share)._replace(repairs=repairs)
-        return lax.while_loop(worth_it, repair, trial) if options.camera_rounds else trial
+        if not options.camera_rounds:
+            return trial
+        rounds = jnp.where(share == 1, options.camera_rounds, min(ROUNDS_OF_SHORTER, options.camera_rounds))
+        return lax.while_loop(worth_it, repair, (trial, rounds))[0]
 
     one, none = jnp.ones((), cost.dtype), jnp.zeros((), jnp.int32)
     if options.trials == 1:

@@ -21,7 +21,7 @@ from jaxba.game.slots import class_layout, with_scene
 from jaxba.linearize import cost, linearize
 from jaxba.resect import DAMPINGS, refine_cameras, solve_positive
 from jaxba.schur import solve_step
-from jaxba.trial import GOOD_GAIN, HOPELESS, NEGLIGIBLE, SHORTER
+from jaxba.trial import GOOD_GAIN, HOPELESS, NEGLIGIBLE, ROUNDS_OF_SHORTER, SHORTER
 
 PLAIN = StepOptions()
 SHORTER_ONLY = StepOptions(trials=4)
@@ -268,6 +268,21 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
         assert 0 <= mended.repairs <= 3
     assert better >= 1
     assert trusted >= 5
+
+
+def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
+    with_rounds = StepOptions(trials=4, camera_rounds=3)
+    better = 0
+    for layout, before in wide():
+        bare = step(layout, before, BOLD, SHORTER_ONLY, min_gain=0.25)[1]
+        full = step(layout, before, BOLD, with_rounds, min_gain=0.25)[1]
+        shortened = round(float(np.log(full.share) / np.log(SHORTER)))
+        assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_SHORTER)
+        assert full.share >= bare.share  # what a round brings in need not be shortened further
+        if full.share == bare.share:
+            assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-12)
+        better += bool(bare.share < 1 and (full.share > bare.share or full.candidate_cost < bare.candidate_cost))
+    assert better >= 1
 
 
 def test_a_promise_too_small_to_matter_is_tried_once():
