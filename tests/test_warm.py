@@ -1,0 +1,57 @@
+"""Warm starts of the game's scenes. Costs come from NumPy (`jaxba.geometry`)."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+from support import same_bits
+from test_game import problem_of
+from tiny_game import KIND, tiny_bank
+
+from jaxba import StepOptions, geometry
+from jaxba.game.bank import BankConfig, draft
+from jaxba.game.warm import warm_starts
+
+OPTIONS = StepOptions()
+
+
+def warmed(share: float, key: int = 0):
+    bank = tiny_bank()
+    return bank, *warm_starts(KIND, bank.scenes, bank.initial_cost, jax.random.key(key), share, OPTIONS)
+
+
+def test_a_warm_start_is_the_same_scene_at_a_lower_cost():
+    bank, scenes, cost = warmed(1.0)
+    assert same_bits(scenes._replace(cameras=0, points=0), bank.scenes._replace(cameras=0, points=0))
+    before, after = np.asarray(bank.initial_cost), np.asarray(cost)
+    assert (after <= before).all()
+    assert (after < before).mean() > 0.5
+    for k in range(len(after)):
+        np.testing.assert_allclose(after[k], geometry.cost(problem_of(KIND, scenes, k)), rtol=1e-9)
+
+
+def test_the_share_says_how_many_scenes_move():
+    bank, scenes, cost = warmed(0.0)
+    assert same_bits((scenes, cost), (bank.scenes, bank.initial_cost))
+    moved = np.mean([np.asarray(warmed(0.3, key)[2]) != np.asarray(bank.initial_cost) for key in range(3)])
+    all_moved = np.mean([np.asarray(warmed(1.0, key)[2]) != np.asarray(bank.initial_cost) for key in range(3)])
+    assert moved == pytest.approx(0.3 * all_moved, abs=0.1)
+
+
+def test_the_same_key_gives_the_same_warm_starts_and_another_one_others():
+    first, again, other = (warmed(1.0, key)[1:] for key in (1, 1, 2))
+    assert same_bits(first, again)
+    assert not same_bits(first, other)
+
+
+def test_a_bank_with_warm_starts_begins_nearer_the_best_cost_and_says_so_to_the_policy():
+    cold, warm = (draft(KIND, jax.random.key(5), 120, OPTIONS, 40, rules=("ceres",), warm_share=s) for s in (0.0, 1.0))
+    ratio = lambda made: np.median(np.asarray(made.bank.initial_cost / made.bank.best_cost))
+    assert ratio(warm) < 0.1 * ratio(cold)
+    assert same_bits(warm.bank.info.cost, warm.bank.initial_cost)
+
+
+def test_a_share_above_one_is_refused():
+    with pytest.raises(ValueError, match=r"warm_share must be 0 to 1, is 1\.5"):
+        BankConfig(warm_share=1.5)
