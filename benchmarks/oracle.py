@@ -1,0 +1,99 @@
+"""The look-ahead oracle on real problems: how many iterations the damping alone could save.
+
+    python -m benchmarks.oracle $JAXBA_DATA/bal/problem-*.txt.bz2 --iterations 40
+
+Beam search over lambda (`jaxba/game/oracle.py` does the same for scenes), its greedy cousin, `learned` and Ceres' rule,
+all with the same step: that of `learned`, or plain steps with `--plain`. Iterations until the cost is within 1e-3, 1e-4
+and 1e-6 of the lowest that any of them, or a file of costs given with `--best`, reached. An iteration of the search
+takes `width x grid` linear solves and counts as one.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxba import DampingPolicy, LMState, StepOptions, initial_state, lm_step, make_policy, read_problem, solve
+from jaxba.choose import choose_linear_solver
+from jaxba.cli.common import prepare_process
+from jaxba.damping.learned import Learned
+from jaxba.game.oracle import GRID, WIDTH
+from jaxba.layout import layout_for
+from jaxba.problem import BundleProblem
+
+TOLERANCES = (1e-3, 1e-4, 1e-6)
+LIMIT = 100
+
+_step = jax.jit(lm_step, static_argnames=("options",))
+
+
+def main() -> None:
+    """Prints one Markdown row a problem, and the geometric means."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("problems", type=Path, nargs="+", help="BAL files")
+    parser.add_argument("--plain", action="store_true", help="plain steps, lambda alone, as `learned+refine0`")
+    parser.add_argument("--iterations", type=int, default=40, help="of the search")
+    parser.add_argument("--best", type=Path, help="best known costs, one `NAME COST` a line")
+    args = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    prepare_process()
+    policy = make_policy("learned+refine0" if args.plain else "learned")
+    assert isinstance(policy, Learned)
+    options = policy.config.step_options(StepOptions())
+    known = dict(line.split() for line in args.best.read_text().splitlines()) if args.best else {}
+    names = (f"beam of {WIDTH}", "greedy", "learned", "ceres")
+    print("| problem |" + "".join(f" {name} |" for name in names) + "\n| --- |" + " --- |" * len(names))
+    rows = []
+    for path in args.problems:
+        problem = read_problem(path)
+        runs = [search(problem, options, policy.min_gain, args.iterations, width) for width in (WIDTH, 1)]
+        runs += [_rule(problem, rule, options) for rule in (policy, make_policy("ceres"))]
+        name = path.name.removesuffix(".txt.bz2")
+        best = min(float(known.get(name, np.inf)), *(run[-1] for run in runs))
+        rows.append([[_reached(run, best * (1 + t)) for t in TOLERANCES] for run in runs])
+        cells = (" / ".join("never" if n == LIMIT else str(n) for n in row) for row in rows[-1])
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+    means = np.exp(np.log(np.array(rows, float)).mean(axis=0))
+    print("| geometric mean | " + " | ".join(" / ".join(f"{x:.2f}" for x in row) for row in means) + " |")
+
+
+def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterations: int, width: int) -> np.ndarray:
+    """Lowest accepted cost after each number of iterations, the start first; pixels squared.
+
+    It ends early where no lambda of the grid lowers the cost of the best state by a millionth.
+    """
+    options = choose_linear_solver(problem, options, "auto")
+    layout = jax.device_put(layout_for(problem, options))
+    start = jax.jit(initial_state, static_argnums=(2, 3))(layout, problem, options, jnp.dtype("float64"))
+    number = lambda x: jnp.asarray(x, start.cost.dtype)
+    take: Callable[[LMState, float, int], LMState] = lambda state, damping, turn: _step(
+        layout, state, number(damping), options, number(min_gain), jnp.asarray(turn, jnp.int32)
+    )[0]
+    beam, costs = [start], [float(start.cost)]
+    for turn in range(iterations):
+        after = [take(state, damping, turn) for state in beam for damping in GRID]
+        distinct = {float(state.cost): state for state in (*after, *beam)}  # a refused step is its own start
+        beam = [distinct[cost] for cost in sorted(distinct)[:width]]
+        costs.append(float(beam[0].cost))
+        if costs[-1] > costs[-2] * (1 - 1e-6):
+            break
+    return np.array(costs)
+
+
+def _rule(problem: BundleProblem, policy: DampingPolicy, options: StepOptions) -> np.ndarray:
+    solution = solve(problem, policy, options, linear_solver="auto", max_iterations=LIMIT)
+    return np.append(solution.initial_cost, solution.history.cost)
+
+
+def _reached(costs: np.ndarray, target: float) -> int:
+    """Iterations to a cost, at least one; a failure counts as the limit."""
+    return max(1, int(np.argmax(costs <= target))) if costs[-1] <= target else LIMIT
+
+
+if __name__ == "__main__":
+    main()
