@@ -195,7 +195,7 @@ class Memory(NamedTuple):
     gain: Float[Array, ""]  # of the last step
     shortened: Float[Array, ""]  # how often the last step was shortened
     hand_over: Bool[Array, ""]  # the guard decides to the end
-    capped: Bool[Array, ""]  # the last step was short because of its lambda
+    capped: Bool[Array, ""]  # the last step was short because of its lambda, and of nothing else
 
 
 def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
@@ -326,13 +326,14 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         gain=gain.astype(dtype),
         shortened=shortened.astype(dtype),
         hand_over=memory.hand_over | over,
-        capped=step.accepted & (decrease < HEAVY_DECREASE) & (step.damping_share > HEAVY_SHARE),
+        capped=step.accepted & (step.share == 1) & (decrease < HEAVY_DECREASE) & (step.damping_share > HEAVY_SHARE),
     )
 
 
 HEAVY_DECREASE, HEAVY_SHARE = 1e-2, 0.5
-"""A step that lowers the cost by less, and is short for damping more than this share, must be followed by a lambda ten
-times smaller: else a solve could stand still without having converged."""
+"""A whole step that lowers the cost by less, and is short for damping more than this share, must be followed by a lambda
+ten times smaller: else a solve could stand still without having converged. Not one that had to be shortened: on a narrow
+valley (bulani7) a smaller lambda still was refused twice, and the guard took over in iteration 8."""
 
 
 def _log(x: Any) -> Array:
