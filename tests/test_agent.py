@@ -202,7 +202,7 @@ def test_a_solve_cannot_stand_still_under_a_large_lambda():
     capped = after(config, memory, ACCEPTED, 1.0, **tiny)
     np.testing.assert_allclose(decades(config, capped, 1), 0.0, atol=1e-6)
     np.testing.assert_allclose(decades(config, capped, -1), config.low, atol=1e-6)
-    for change in ({"cost": 99.0}, {"damping_share": 0.9 * HEAVY_SHARE}):
+    for change in ({"cost": 99.0}, {"damping_share": 0.9 * HEAVY_SHARE}, {"share": 0.25}):
         free = after(config, memory, ACCEPTED, 1.0, **{**tiny, **change})
         np.testing.assert_allclose(decades(config, free, 1), config.high, atol=1e-6)
 

@@ -331,9 +331,9 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
 
 
 HEAVY_DECREASE, HEAVY_SHARE = 1e-2, 0.5
-"""A whole step that lowers the cost by less, and is short for damping more than this share, must be followed by a lambda
-ten times smaller: else a solve could stand still without having converged. Not one that had to be shortened: on a narrow
-valley (bulani7) a smaller lambda still was refused twice, and the guard took over in iteration 8."""
+"""A whole step that lowers the cost by less, and is short for damping more than this share, must be followed by a
+lambda ten times smaller: else a solve could stand still without having converged. Not one that had to be shortened: in
+a narrow valley (bulani7) a smaller lambda still was refused twice, and the guard took over in iteration 8."""
 
 
 def _log(x: Any) -> Array:
