@@ -158,12 +158,18 @@ def test_in_charge_the_guard_is_ceres_rule(steps):
         np.testing.assert_allclose(decades(config, memory, 0.9), np.log10(damping), atol=1e-6)
 
 
-def test_a_rescue_does_not_start_below_ceres_first_lambda():
+@pytest.mark.parametrize(
+    ("worked", "rescue"), [(None, FIRST_DAMPING), (-6.0, -6.0), (-2.0, -2.0), (-9.9, FIRST_DAMPING)]
+)
+def test_a_rescue_starts_at_the_last_lambda_that_worked_or_else_at_ceres_first(worked, rescue):
+    """One that worked is no help where a larger one was refused since."""
     config = AgentConfig(patience=2, **RANGE)
     memory = _begin(config, info())
-    for log_damping in (-10.0, -9.5):
+    if worked is not None:
+        memory = after(config, memory, ACCEPTED, worked)
+    for log_damping in (-9.5, -9.0):
         memory = after(config, memory, REJECTED, log_damping)
-    np.testing.assert_allclose(decades(config, memory, -1), FIRST_DAMPING, atol=1e-9)
+    np.testing.assert_allclose(decades(config, memory, -1), rescue, atol=1e-6)
 
 
 @settings(max_examples=40, deadline=None)

@@ -267,8 +267,9 @@ def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) ->
     wanted = jnp.where(memory.capped, jnp.minimum(wanted, memory.damping - 1), wanted)
     shrink = Ceres().after_success(memory.gain)
     guard = memory.damping + jnp.log10(jnp.where(rejected, memory.growth, shrink))
-    # what is smaller than the rule's own first lambda is not where a rescue starts
-    guard = jnp.where(memory.row == config.patience, jnp.maximum(guard, FIRST_DAMPING), guard)
+    # a rescue starts at the last lambda that worked, or, where the refused one was no smaller, at the rule's own first
+    rescue = jnp.where(memory.worked > guard, memory.worked, FIRST_DAMPING)
+    guard = jnp.where(memory.row == config.patience, jnp.maximum(guard, rescue), guard)
     guarded = memory.hand_over | (memory.row >= config.patience)
     return jnp.clip(10 ** jnp.where(guarded, guard, wanted), 10**config.low, LARGEST)
 
