@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxba.barrier import after
 from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.dense import MIN_UNKNOWNS, factor_and_solve
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, damping_diagonal
@@ -159,6 +160,6 @@ def repair(
 ) -> Float[Array, "cameras 9"]:
     """Richardson steps `x + B^-1 (b - S x)` on the true system: the error shrinks by the spectral radius of
     `B^-1 E C^-1 E^T`, which is below one."""
-    inverse = block_inverse(system.blocks)
+    inverse = block_inverse(after(step, system.blocks))
     again = lambda _, x: x + inverse(system.right - apply_reduced(layout, linear, points, system, x))
     return lax.fori_loop(0, rounds, again, step)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import itertools
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax
@@ -320,3 +322,18 @@ def test_random_clusters_are_one_program_for_all_turns(method):
             state, info = step(layout, state, 1e-3, options, turn=turn)
             assert info.cost <= info.previous_cost
     assert clock.seconds == 0
+
+
+def test_many_clusters_and_camera_blocks_factored_in_one_program_do_not_wait_for_each_other_for_ever():
+    """Two batched factorisations side by side stood still on two threads; in a process of its own, which can be killed."""
+    script = """
+import jax
+jax.config.update("jax_enable_x64", True)
+from jaxba import random_scene, solve
+from jaxba.scenes import SceneConfig
+scene = random_scene(SceneConfig(336, 2500, 9000), 0)
+solution = solve(scene, "constant:1e-2", method="stba:16", max_iterations=30)
+print(solution.final_cost < 0.5 * solution.initial_cost)
+"""
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=240, check=True)
+    assert found.stdout.split() == ["True"]
