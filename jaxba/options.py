@@ -70,7 +70,7 @@ class StepOptions:
 
     camera_rounds: int = 0
     """Rounds in which first every camera, then every point is re-optimised alone, where a step did much less than the
-    linear model promised; see `trial.py`."""
+    linear model promised; one at most for a shortened candidate; see `trial.py`."""
 
     intrinsics: Intrinsics = "free"
     """Whether focal lengths and distortions are optimised, as in BAL, or stay: the seed paper optimises poses and

@@ -325,7 +325,7 @@ def test_random_clusters_are_one_program_for_all_turns(method):
 
 
 def test_many_clusters_and_camera_blocks_factored_in_one_program_do_not_wait_for_each_other_for_ever():
-    """Two batched factorisations side by side stood still on two threads; in a process of its own, which can be killed."""
+    """Two batched factorisations side by side stood still on two threads. In a process of its own, to be killed."""
     script = """
 import jax
 jax.config.update("jax_enable_x64", True)

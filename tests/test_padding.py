@@ -129,6 +129,7 @@ def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, ca
     assert empty.any()
     assert not np.any(layout.pixels[:, empty])
     assert not np.any(layout.whitening[:, :, empty])
+    assert (layout.num_points, layout.num_cameras) == (SMALL.points, SMALL.cameras)
     support.check_sums(layout, rng)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     found = blocks_by_layout(layout, weights)

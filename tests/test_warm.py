@@ -10,7 +10,7 @@ from test_game import problem_of
 from tiny_game import KIND, tiny_bank
 
 from jaxba import StepOptions, geometry
-from jaxba.game.bank import BankConfig, draft
+from jaxba.game.bank import BankConfig, draft, make_banks
 from jaxba.game.warm import warm_starts
 
 OPTIONS = StepOptions()
@@ -52,6 +52,15 @@ def test_a_bank_with_warm_starts_begins_nearer_the_best_cost_and_says_so_to_the_
     assert same_bits(warm.bank.info.cost, warm.bank.initial_cost)
 
 
-def test_a_share_above_one_is_refused():
-    with pytest.raises(ValueError, match=r"warm_share must be 0 to 1, is 1\.5"):
-        BankConfig(warm_share=1.5)
+@pytest.mark.parametrize("share", [-0.5, 1.5])
+def test_a_share_that_is_none_is_refused(share):
+    with pytest.raises(ValueError, match=f"warm_share must be 0 to 1, is {share}"):
+        BankConfig(warm_share=share)
+
+
+def test_the_share_of_the_settings_reaches_the_bank(monkeypatch):
+    monkeypatch.setattr("jaxba.game.bank.PORTFOLIO", ("ceres",))
+    banks = [BankConfig((KIND,), (60,), 0, share) for share in (0.0, 1.0)]
+    made = [make_banks(bank, jax.random.key(0), OPTIONS, 40)[0].train for bank in banks]
+    cold, warm = (np.median(np.asarray(bank.initial_cost / bank.best_cost)) for bank in made)
+    assert warm < 0.1 * cold

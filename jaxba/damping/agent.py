@@ -75,7 +75,8 @@ class AgentConfig:
 
     guard: GuardMode = "hand-over"
     """`off`: nothing is done to the agent's choices. Otherwise, after `patience` rejections in a row, Ceres' rule
-    decides: until a step is accepted (`pause`), or to the end (`hand-over`)."""
+    decides: until a step is accepted (`pause`), or to the end (`hand-over`). It starts at the last lambda that worked,
+    or at its own first one where twice the refused lambda is larger."""
 
     patience: int = 2
     """Rejections in a row that call the guard."""
@@ -267,7 +268,8 @@ def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) ->
     wanted = jnp.where(memory.capped, jnp.minimum(wanted, memory.damping - 1), wanted)
     shrink = Ceres().after_success(memory.gain)
     guard = memory.damping + jnp.log10(jnp.where(rejected, memory.growth, shrink))
-    # a rescue starts at the last lambda that worked, or, where the refused one was no smaller, at the rule's own first
+    # a rescue starts at the last lambda that worked, or at the rule's own first one where twice the refused one is
+    # larger; so does a later one, when the rule in charge is refused as often in a row
     rescue = jnp.where(memory.worked > guard, memory.worked, FIRST_DAMPING)
     guard = jnp.where(memory.row == config.patience, jnp.maximum(guard, rescue), guard)
     guarded = memory.hand_over | (memory.row >= config.patience)
