@@ -443,4 +443,8 @@ def test_the_learned_policy_drives_ladybug_as_with_our_step_also_where_points_pa
     ours = solve(real(LADYBUG), policy, MANIFOLD, max_iterations=12)
     np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
     np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-2)
-    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
+    # the network turns differences of rounding into ones of lambda, so costs are compared under the same lambdas
+    same = Schedule(values=tuple(float(x) for x in found.history.damping))
+    again = solve(real(LADYBUG), same, MANIFOLD, max_iterations=12, tolerances=NEVER)
+    np.testing.assert_array_equal(found.history.accepted, again.history.accepted)
+    np.testing.assert_allclose(found.history.cost, again.history.cost, rtol=1e-6)
