@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+import jaxba
 from jaxba import host
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells the mappings of a process")
@@ -34,13 +36,41 @@ def test_programs_are_dropped_near_the_limit_and_only_there():
 
 @linux
 def test_dropping_programs_gives_their_mappings_back():
-    def compile_some() -> None:
-        for k in range(20):
-            jax.jit(lambda x, k=k: jnp.linalg.cholesky(jnp.eye(3) + x * k) @ jnp.sin(x))(jnp.ones((3, 3)))
-
     host.release_programs(share=0.0)
     before = mappings()
-    compile_some()
+    jaxba.solve(jaxba.random_scene(jaxba.like("tiny"), 0), "ceres", max_iterations=1)  # some 500
     during = mappings()
     assert host.release_programs(share=0.0)
     assert mappings() - before < 0.5 * (during - before)
+
+
+ARENAS = """
+import ctypes, sys, threading
+from jaxba import host
+if not host.keep_memory():
+    sys.exit(3)  # no glibc
+import jax
+assert not jax.config.values["jax_cpu_enable_async_dispatch"]
+libc = ctypes.CDLL(None)
+libc.malloc.restype = libc.fopen.restype = ctypes.c_void_p
+both = threading.Barrier(2)
+def work():
+    libc.malloc(1000)
+    both.wait()  # a thread that ends hands its arena on
+threads = [threading.Thread(target=work) for _ in range(2)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+file = ctypes.c_void_p(libc.fopen(sys.argv[1].encode(), b"w"))
+libc.malloc_info(0, file)
+libc.fclose(file)
+"""
+
+
+@linux
+def test_threads_that_compile_have_arenas_of_their_own_while_memory_is_kept(tmp_path):
+    report = tmp_path / "arenas.xml"
+    status = subprocess.run([sys.executable, "-c", ARENAS, str(report)], check=False).returncode
+    if status == 3:
+        pytest.skip("only glibc has arenas")
+    assert status == 0
+    assert report.read_text().count("<heap nr=") > 1
