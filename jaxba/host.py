@@ -29,7 +29,7 @@ def keep_memory() -> bool:
     That holds for glibc's main arena, the one of the process's first thread; another thread's holds 64 MiB and is given
     back when it empties. So XLA is told to run programs in the thread that calls them, for which no program may have
     run before. (One arena for all threads does as well, but those that compile then wait for each other: 7.8 s instead
-    of 4.7 s for the step of `learned` on Ladybug-49.)
+    of 4.9 s for the step of `learned` on Ladybug-49.)
 
     Returns:
         Whether it took effect; false where the C library is another one.

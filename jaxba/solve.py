@@ -330,10 +330,10 @@ def _run_compiled(layout, state, policy, tolerances, options, max_iterations):
 
 
 def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *, callback):
-    know, begin, advance = _small(_info, "options", "max_iterations"), _small(_begin), _small(_advance)
+    inform, begin, advance = _small(_info, "options", "max_iterations"), _small(_begin), _small(_advance)
     with CompileClock() as clock:
         # without the parameters what is the policy's compiles once for all problems
-        carry = begin(know(layout, state, options, max_iterations), policy, None)
+        carry = begin(inform(layout, state, options, max_iterations), policy, None)
         carry = jax.block_until_ready(carry._replace(state=state))
         min_gain = jnp.asarray(policy.min_gain, state.cost.dtype)
         limit = jnp.asarray(max_iterations, jnp.int32)

@@ -7,7 +7,6 @@ import contextlib
 import hashlib
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -149,21 +148,23 @@ def test_a_second_run_uses_the_cache_without_any_request(server, folder, entry):
     assert server.asked == []
 
 
-def test_a_second_run_beside_the_first_waits_for_it_and_asks_for_nothing(server, folder):
-    """The first one holds its file until the second one has begun."""
-    begun, results = threading.Event(), []
+def test_a_second_run_beside_the_first_waits_for_it_and_asks_for_nothing(server, folder, monkeypatch):
+    """The first one holds its file until the second one has come to the lock."""
+    fcntl = pytest.importorskip("fcntl")
+    waits, results, lock = threading.Event(), [], fcntl.flock
+
+    def flock(*arguments) -> None:
+        if threading.current_thread() is second:
+            waits.set()
+        lock(*arguments)
 
     def first(done: int, total: int | None) -> None:
         if done == 0:
             second.start()
-            assert begun.wait(10)
-            time.sleep(0.3)  # so that it comes to wait; without that the test would hold all the same, and show less
+            assert waits.wait(10)
 
-    def run_second() -> None:
-        begun.set()
-        results.append(get(server, folder))
-
-    second = threading.Thread(target=run_second)
+    monkeypatch.setattr(download.fcntl, "flock", flock)
+    second = threading.Thread(target=lambda: results.append(get(server, folder)))
     path, new = fetch(ENTRY, folder, first, server.url)
     second.join()
     assert new
