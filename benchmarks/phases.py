@@ -118,7 +118,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     if plain.uses_clusters:
         coarse = lambda li, po, sy, x: coarse_preconditioner(layout, li, po, sy, anchor)(x)
         yield phase("coarse system", coarse, linear, points, system, system.right)
-    whole = lambda li, po, sy: reduced.solve_reduced(layout, li, po, sy, anchor, plain)
+    whole = lambda li, po, sy: reduced.solve_reduced(layout, li, po, sy, anchor, plain, plain.cg_forcing)
     yield phase("reduced solve", whole, linear, points, system)
     back = lambda li, po, x: eliminate.back_substitute(layout, li, po, x)
     yield phase("back-substitute", back, linear, points, system.right)

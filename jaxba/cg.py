@@ -30,7 +30,7 @@ def conjugate_gradients(
     right: Float[Array, "..."],
     precondition: Callable[[Array], Array],
     *,
-    forcing: float,
+    forcing: float | Float[Array, ""],
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Array, "..."], Int[Array, ""]]:

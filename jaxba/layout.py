@@ -50,7 +50,7 @@ class Layout:
     whitening: Float[AnyArray, "2 2 slots"] | None
     """`Sigma^(-1/2)` of each observation."""
 
-    bucket_points: tuple[Int[AnyArray, "_"], ...]
+    bucket_points: tuple[Int[AnyArray, " _"], ...]
     """Problem index of the points of each bucket; padding repeats an index out of range."""
 
     point_levels: tuple[Int[AnyArray, "_ _"], ...] | None

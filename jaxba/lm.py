@@ -14,6 +14,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.decompose import Round, decomposed_round
+from jaxba.effort import Effort
 from jaxba.layout import Layout, partition_of
 from jaxba.linearize import cost, linearize, without_intrinsics
 from jaxba.options import StepOptions
@@ -72,6 +73,7 @@ def lm_step(
     options: StepOptions,
     min_gain: float | Float[Array, ""] = 0.0,
     turn: int | Int[Array, ""] = 0,
+    effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """One iteration: one linear solve with one lambda, accepted or rejected (design, section 2).
 
@@ -82,6 +84,7 @@ def lm_step(
         options: static.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
         turn: iterations done before, for methods that draw new clusters in each.
+        effort: what the step may cost, instead of what the options say; not heard in domain decomposition.
 
     Returns:
         The next state (the same one after a rejection) and a record of what happened.
@@ -92,8 +95,8 @@ def lm_step(
     linear = linearize(layout, state.cameras, state.points, options.loss)
     if options.intrinsics == "fixed":
         linear = without_intrinsics(linear)
-    step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn)
-    trial = best_trial(layout, state.cameras, state.points, state.cost, linear, step, options, min_gain)
+    step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn, effort)
+    trial = best_trial(layout, state.cameras, state.points, state.cost, linear, step, options, min_gain, effort)
     moved = [trial.share * step.cameras, trial.points - state.points]
     return _verdict(
         state,

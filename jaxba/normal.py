@@ -38,7 +38,12 @@ def image(
 
 
 def solve_normal(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, options: StepOptions
+    layout: Layout,
+    linear: Linearization,
+    points: PointSystem,
+    system: CameraSystem,
+    options: StepOptions,
+    forcing: float | Float[Array, ""],
 ) -> tuple[Float[Array, "cameras 9"], Float[Array, "3 points"], Int[Array, ""]]:
     """Solves for cameras (manifold coordinates) and points at once.
 
@@ -47,7 +52,8 @@ def solve_normal(
         linear: Jacobians and residuals.
         points: factored diagonal blocks and damping of the points.
         system: damped diagonal blocks of the cameras.
-        options: stopping rule of conjugate gradients.
+        options: stopping rule of conjugate gradients ...
+        forcing: ... and its forcing term.
 
     Returns:
         The two parts of the step and the number of iterations.
@@ -75,7 +81,7 @@ def solve_normal(
         apply,
         right,
         precondition,
-        forcing=options.cg_forcing,
+        forcing=forcing,
         tolerance=options.cg_tolerance,
         max_iterations=options.cg_max_iterations,
     )

@@ -11,7 +11,6 @@ Source: Agarwal et al. 2010 (implicit and explicit), Weber et al. 2023, "Power B
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TypeVar
 
 import jax
@@ -50,8 +49,11 @@ def solve_reduced(
     system: CameraSystem,
     anchor: Anchor,
     options: StepOptions,
+    forcing: float | Float[Array, ""],
 ) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
     """Solves for the camera step, in manifold coordinates, with the solver that the options name.
+
+    Conjugate gradients, where they are all of the solver, end by `forcing`.
 
     Returns:
         The step, and the number of iterations (0 after a factorisation, the order of a power series). Not finite where
@@ -67,7 +69,7 @@ def solve_reduced(
     if options.algebra == "full":
         if explicit:
             return factor_blocks(layout, reduced_blocks(layout, linear, points, system), system.right), _no_iterations()
-        return _iterate_reduced(layout, linear, points, system, anchor, options)
+        return _iterate_reduced(layout, linear, points, system, anchor, options, forcing)
     rough_linear, rough_points, rough_system, rough_anchor = to_single((linear, points, system, anchor))
     if explicit:
         if grid is None:
@@ -75,8 +77,10 @@ def solve_reduced(
         else:
             solve = factored_dense(dense_system(grid, rough_linear, rough_points, rough_system))
         precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
-        return _iterate(product, precondition, system, replace(options, cg_forcing=REPAIR_FORCING))
-    step, iterations = _iterate_reduced(layout, rough_linear, rough_points, rough_system, rough_anchor, options)
+        return _iterate(product, precondition, system, options, REPAIR_FORCING)
+    step, iterations = _iterate_reduced(
+        layout, rough_linear, rough_points, rough_system, rough_anchor, options, forcing
+    )
     return step.astype(system.right.dtype), iterations
 
 
@@ -92,6 +96,7 @@ def _iterate_reduced(
     system: CameraSystem,
     anchor: Anchor,
     options: StepOptions,
+    forcing: float | Float[Array, ""],
 ) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
     blocks = None
     apply = lambda x: apply_reduced(layout, linear, points, system, x)
@@ -99,7 +104,7 @@ def _iterate_reduced(
         formed = blocks = reduced_blocks(layout, linear, points, system)
         apply = lambda x: apply_blocks(layout, formed, x)
     precondition = preconditioner(layout, linear, points, system, anchor, blocks, apply, options)
-    return _iterate(apply, precondition, system, options)
+    return _iterate(apply, precondition, system, options, forcing)
 
 
 def _no_iterations() -> Int[Array, ""]:
@@ -199,13 +204,17 @@ def _pairs(layout: Layout) -> PairLayout:
 
 
 def _iterate(
-    apply: Callable[[Array], Array], precondition: Callable[[Array], Array], system: CameraSystem, options: StepOptions
+    apply: Callable[[Array], Array],
+    precondition: Callable[[Array], Array],
+    system: CameraSystem,
+    options: StepOptions,
+    forcing: float | Float[Array, ""],
 ) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
     return conjugate_gradients(
         apply,
         system.right,
         precondition,
-        forcing=options.cg_forcing,
+        forcing=forcing,
         tolerance=options.cg_tolerance,
         max_iterations=options.cg_max_iterations,
     )

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxba import camera
 from jaxba.blocks3 import cholesky3
@@ -58,7 +58,7 @@ def refine_points(
     frames: camera.Frames,
     points: Float[Array, "3 points"],
     loss: Loss,
-    iterations: int,
+    iterations: int | Int[Array, ""],
     home: Home | None = None,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """Improves every point by `iterations` steps of its own.
@@ -68,7 +68,7 @@ def refine_points(
         frames: camera of every slot (`linearize.slot_frames`).
         points: where to start.
         loss: robust loss.
-        iterations: steps per point, at least one; each costs one pass over the observations.
+        iterations: steps per point, none or more; each costs one pass over the observations.
         home: a point that lies behind a camera in front of which it was at home starts from there.
 
     Returns:

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxba import camera
 from jaxba.coarse import Anchor
+from jaxba.effort import Effort
 from jaxba.eliminate import (
     CameraSystem,
     Coordinates,
@@ -54,6 +55,7 @@ def solve_step(
     damping: Float[Array, ""],
     options: StepOptions,
     turn: int | Int[Array, ""] = 0,
+    effort: Effort | None = None,
 ) -> Step:
     """One damped step.
 
@@ -65,24 +67,26 @@ def solve_step(
         damping: lambda, dimensionless for diagonal scaling.
         options: solver, scaling, coordinates.
         turn: number of the iteration, where the step depends on it (random clusters).
+        effort: forcing term of conjugate gradients, where it is not that of the options.
 
     Returns:
         The step; not finite where the factorisation failed, which the caller treats as a rejection.
     """
+    forcing = options.cg_forcing if effort is None else effort.forcing
     coordinates = Coordinates.of(cameras, options)
     frames = camera.frames(cameras)
     anchor = Anchor(frames.rotation, frames.translation, points)
     eliminated = eliminate_points(layout, linear, damping, options)
     system = camera_system(layout, linear, eliminated, coordinates, damping, options)
     if options.linear_solver == "normal":
-        step, moves, iterations = solve_normal(layout, linear, eliminated, system, options)
+        step, moves, iterations = solve_normal(layout, linear, eliminated, system, options, forcing)
         point_step = list(moves)
     elif options.linear_solver == "clustered":
         partition = partition_of(layout).at(turn)
         step = clustered_step(layout, linear, eliminated, system, damping, partition, options)
         iterations = jnp.zeros((), jnp.int32)
     else:
-        step, iterations = solve_reduced(layout, linear, eliminated, system, anchor, options)
+        step, iterations = solve_reduced(layout, linear, eliminated, system, anchor, options, forcing)
     step = jnp.where(layout.camera_seen[:, None], step, jnp.zeros_like(step))
     if options.linear_solver != "normal":
         point_step = back_substitute(layout, linear, eliminated, step)

@@ -23,7 +23,7 @@ class Slots(NamedTuple):
     point: Int[np.ndarray, " slots"]
     """Column of the point of each slot, empty ones included."""
 
-    members: tuple[Int[np.ndarray, "_"], ...]
+    members: tuple[Int[np.ndarray, " _"], ...]
     """Problem index of the point of each column, by bucket; padding repeats an index out of range."""
 
     buckets: tuple[tuple[int, int], ...]

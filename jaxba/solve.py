@@ -21,7 +21,7 @@ from jaxtyping import Float, Int
 from jaxba import geometry, host
 from jaxba.choose import choose_linear_solver
 from jaxba.clock import CompileClock
-from jaxba.damping import DampingPolicy, Learned, ProblemInfo, make_policy
+from jaxba.damping import DampingPolicy, Learned, ProblemInfo, effort_of, make_policy
 from jaxba.layout import Layout, layout_for
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
@@ -309,7 +309,11 @@ def solve_loop(
         Final carry, and histories of length `max_iterations`, zero past the last iteration.
     """
     carry = _begin(_info(layout, state, options, max_iterations), policy, state)
-    step_of = lambda c: lm_step(layout, c.state, c.damping, options, policy.min_gain, c.iteration)
+
+    def step_of(c: _Carry) -> tuple[LMState, StepInfo]:
+        effort = effort_of(policy, c.policy)
+        return lm_step(layout, c.state, c.damping, options, policy.min_gain, c.iteration, effort)
+
     shapes = jax.eval_shape(lambda c: _history(step_of(c)[1]), carry)
     empty = jax.tree.map(lambda s: jnp.zeros((max_iterations, *s.shape), s.dtype), shapes)
 
@@ -339,7 +343,8 @@ def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *,
         limit = jnp.asarray(max_iterations, jnp.int32)
 
         def iterate(carry: _Carry) -> tuple[_Carry, StepInfo]:
-            state, step = _step(layout, carry.state, carry.damping, options, min_gain, carry.iteration)
+            effort = effort_of(policy, carry.policy)
+            state, step = _step(layout, carry.state, carry.damping, options, min_gain, carry.iteration, effort)
             carry = advance(carry._replace(state=None), None, step, policy, tolerances, limit)
             return carry._replace(state=state), jax.tree.map(lambda x: x.item(), jax.device_get(step))
 

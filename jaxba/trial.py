@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from jaxba.effort import Effort
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, residuals, slot_costs, slot_frames
 from jaxba.options import StepOptions
@@ -73,6 +74,7 @@ def best_trial(
     step: Step,
     options: StepOptions,
     min_gain: float | Float[Array, ""],
+    effort: Effort | None = None,
 ) -> Trial:
     """The first accepted candidate, or the last refused one.
 
@@ -85,7 +87,9 @@ def best_trial(
         step: the solution of the damped system.
         options: static.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
+        effort: number of point iterations, where it is not that of the options.
     """
+    point_iterations = options.refine_points if effort is None else effort.point_iterations
     # costs are compared term by term: two sums would cancel in float32. A term is a point where points are refined.
     before = point_sum(layout, linear.costs[None])[0] if options.refine_points else linear.costs
 
@@ -102,7 +106,7 @@ def best_trial(
     def settle(cameras: Array, points: Array, share: Array) -> Trial:
         frames = slot_frames(layout, cameras)
         if options.refine_points:
-            points, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home)
+            points, costs = refine_points(layout, frames, points, options.loss, point_iterations, home)
         else:
             costs = slot_costs(options.loss, residuals(layout, frames, points)[1])
         return judge(cameras, points, costs, share)

@@ -303,7 +303,7 @@ def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else(limit_is_f
 
 @functools.partial(jax.jit, static_argnames=("game_rules", "kind"))
 def _iterate(game, kind, bank, episode, action, game_rules):
-    after, step = game.iterate(kind, bank, episode, action)
+    after, step = game.iterate(kind, bank, episode, action[None])
     return after, step
 
 

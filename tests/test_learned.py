@@ -40,7 +40,7 @@ AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.
 def random_policy(seed: int, agent: AgentConfig = AGENT, width: int = 16, spread: float = 1.0) -> Learned:
     """Two hidden layers of noise; its actions are anything in (-1, 1)."""
     rng = np.random.default_rng(seed)
-    sizes = [agent.observation_size, width, width, 2]
+    sizes = [agent.observation_size, width, width, 2 * agent.action_size]
     layers = [
         Layer(
             (spread * rng.normal(size=(a, b)) * np.sqrt(2 / a)).astype(np.float32),

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.policy import ProblemInfo
 from jaxba.damping.rules import LARGEST, Ceres
+from jaxba.effort import Effort
 from jaxba.lm import StepInfo
 from jaxba.options import StepOptions
 from jaxba.trial import SHORTER
@@ -23,6 +24,7 @@ from jaxba.trial import SHORTER
 Observation = Literal["scale-free", "paper", "released-code", "duration"]
 ActionMode = Literal["absolute", "relative"]
 GuardMode = Literal["off", "pause", "hand-over"]
+EffortMode = Literal["fixed", "points", "points+forcing"]
 
 FLOOR = 1e-9
 """Smallest relative decrease that a feature tells from none."""
@@ -32,6 +34,9 @@ PAPER_LIMIT = 1000.0
 
 RELATIVE_REACH = 3.0
 """Decades by which a relative action changes lambda at most."""
+
+FORCING = (-3.0, -0.3)
+"""log10 of the forcing terms that a third number of an action ranges over: from DeepLM's to half."""
 
 LARGEST_ESCALATION = 12.0
 """Decades; more than the whole range of lambda means nothing."""
@@ -97,8 +102,17 @@ class AgentConfig:
     camera_rounds: int = 3
     """Camera rounds of the step that it drives, see `StepOptions`."""
 
+    effort: EffortMode = "fixed"
+    """What an action decides beside lambda: nothing, or with a second number how many of the point iterations a step
+    has, and with a third the forcing term of conjugate gradients. The guard's rule has the full effort."""
+
     def __post_init__(self) -> None:
-        for name, known in (("observation", Observation), ("action", ActionMode), ("guard", GuardMode)):
+        for name, known in (
+            ("observation", Observation),
+            ("action", ActionMode),
+            ("guard", GuardMode),
+            ("effort", EffortMode),
+        ):
             if getattr(self, name) not in get_args(known):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
         if not 1 <= self.history <= 20:
@@ -113,6 +127,8 @@ class AgentConfig:
             raise ValueError(f"descent must be positive, is {self.descent}")
         if not 0 <= self.escalate <= LARGEST_ESCALATION:
             raise ValueError(f"escalate must be 0 to {LARGEST_ESCALATION:g}, is {self.escalate}")
+        if self.effort != "fixed" and not self.refine_points:
+            raise ValueError(f"effort {self.effort!r} needs embedded point iterations to choose from: refine_points")
         self.step_options(StepOptions())
 
     def step_options(self, options: StepOptions) -> StepOptions:
@@ -125,10 +141,15 @@ class AgentConfig:
         return self.guard != "off"
 
     @property
+    def action_size(self) -> int:
+        """Numbers of an action."""
+        return 1 + get_args(EffortMode).index(self.effort)
+
+    @property
     def observation_size(self) -> int:
         """Numbers in an observation."""
         if self.observation == "scale-free":
-            return len(StepFacts._fields) * self.history + len(_GLOBALS)
+            return len(StepFacts._fields) * self.history + len(_GLOBALS) + self.action_size - 1
         return self.history
 
 
@@ -197,6 +218,7 @@ class Memory(NamedTuple):
     shortened: Float[Array, ""]  # how often the last step was shortened
     hand_over: Bool[Array, ""]  # the guard decides to the end
     capped: Bool[Array, ""]  # the last step was short because of its lambda, and of nothing else
+    effort: Effort | None  # of the last step, once it is chosen; None where it is fixed
 
 
 def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
@@ -223,6 +245,7 @@ def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
         shortened=number(0.0),
         hand_over=no,
         capped=no,
+        effort=None if config.effort == "fixed" else _full_effort(config, dtype),
     )
 
 
@@ -245,18 +268,30 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
         _decades(memory.smallest_worked),
         _decades(memory.failed),
     ]
+    if memory.effort is not None:
+        points, forcing = memory.effort
+        whole += [points / max(config.refine_points, 1), _log(forcing) + 1][: config.action_size - 1]
     features = jnp.concatenate([memory.facts.reshape(-1), jnp.stack([jnp.asarray(x) for x in whole])])
     return jnp.clip(jnp.nan_to_num(features), -2, 2).astype(jnp.float32)
 
 
+def _scale(config: AgentConfig, memory: Memory) -> tuple[Any, Any]:
+    """log10 of the lambda that the action 0 means, and how many decades the action 1 lies above it."""
+    if config.action == "absolute":
+        return 0.5 * (config.low + config.high), 0.5 * (config.high - config.low)
+    return memory.damping, jnp.where(memory.iteration == 0, 2 * RELATIVE_REACH, RELATIVE_REACH)
+
+
+def action_of(config: AgentConfig, memory: Memory, decades: Float[Array, ""]) -> Float[Array, ""]:
+    """The action that asks for a lambda of `10**decades`; beyond (-1, 1) where no action does."""
+    middle, half = _scale(config, memory)
+    return (decades - middle) / half
+
+
 def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) -> Float[Array, ""]:
     """Lambda for an action in (-1, 1), the guard's word included."""
-    action = action.astype(memory.cost.dtype)
-    middle, half = 0.5 * (config.low + config.high), 0.5 * (config.high - config.low)
-    wanted = middle + half * action
-    if config.action == "relative":
-        reach = jnp.where(memory.iteration == 0, 2 * RELATIVE_REACH, RELATIVE_REACH)
-        wanted = jnp.clip(memory.damping + reach * action, config.low, config.high)
+    middle, half = _scale(config, memory)
+    wanted = jnp.clip(middle + half * action.astype(memory.cost.dtype), config.low, config.high)
     if not config.guarded:
         return 10**wanted
     lowest = jnp.where(memory.iteration == 0, config.first_low, memory.damping - config.descent)
@@ -272,8 +307,31 @@ def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) ->
     # larger; so does a later one, when the rule in charge is refused as often in a row
     rescue = jnp.where(memory.worked > guard, memory.worked, FIRST_DAMPING)
     guard = jnp.where(memory.row == config.patience, jnp.maximum(guard, rescue), guard)
-    guarded = memory.hand_over | (memory.row >= config.patience)
-    return jnp.clip(10 ** jnp.where(guarded, guard, wanted), 10**config.low, LARGEST)
+    return jnp.clip(10 ** jnp.where(_guarding(config, memory), guard, wanted), 10**config.low, LARGEST)
+
+
+def _guarding(config: AgentConfig, memory: Memory) -> Bool[Array, ""]:
+    """Whether Ceres' rule chooses lambda, if there is a guard."""
+    return memory.hand_over | (memory.row >= config.patience)
+
+
+def _full_effort(config: AgentConfig, dtype: Any) -> Effort:
+    return Effort(jnp.asarray(config.refine_points, jnp.int32), jnp.asarray(StepOptions().cg_forcing, dtype))
+
+
+def with_effort(config: AgentConfig, memory: Memory, action: Float[Array, " actions"]) -> Memory:
+    """Memory with the effort that an action decides, if it decides any."""
+    if memory.effort is None:
+        return memory
+    full = _full_effort(config, memory.cost.dtype)
+    share = 0.5 + 0.5 * action.astype(memory.cost.dtype)
+    points, forcing = jnp.round(share[1] * config.refine_points).astype(jnp.int32), full.forcing
+    if config.effort == "points+forcing":
+        low, high = FORCING
+        forcing = 10 ** (low + (high - low) * share[2])
+    guarded = _guarding(config, memory) & config.guarded
+    chosen = Effort(jnp.where(guarded, full.point_iterations, points), jnp.where(guarded, full.forcing, forcing))
+    return memory._replace(effort=chosen)
 
 
 def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
@@ -309,7 +367,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     over = rejections >= config.max_rejections
     if config.guard == "hand-over":
         over = over | (in_row >= config.patience)
-    guarding = memory.hand_over | (memory.row >= config.patience)
+    guarding = _guarding(config, memory)
     growth = jnp.where(guarding, 2 * memory.growth, Ceres().reject_growth)
     growth = jnp.where(step.accepted, 0.5 * Ceres().reject_growth, growth).astype(dtype)
     pick = lambda yes, no: jnp.where(step.accepted, yes, no).astype(dtype)
@@ -329,6 +387,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         gain=gain.astype(dtype),
         shortened=shortened.astype(dtype),
         hand_over=memory.hand_over | over,
+        effort=memory.effort,
         capped=step.accepted & (step.share == 1) & (decrease < HEAVY_DECREASE) & (step.damping_share > HEAVY_SHARE),
     )
 

@@ -17,8 +17,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.damping.agent import AgentConfig, Memory, begin, config_from, damping_of, observe, record
+from jaxba.damping.agent import AgentConfig, Memory, begin, config_from, damping_of, observe, record, with_effort
 from jaxba.damping.policy import ProblemInfo
+from jaxba.effort import Effort
 from jaxba.lm import StepInfo
 from jaxba.problem import AnyArray
 
@@ -64,18 +65,21 @@ class Learned:
         outputs = x @ self.layers[-1].kernel + self.layers[-1].bias
         return jnp.tanh(outputs[: outputs.shape[0] // 2])
 
-    def _choose(self, memory: Memory) -> Array:
-        return damping_of(self.config, memory, self.act(observe(self.config, memory))[0])
+    def effort(self, state: Memory) -> Effort | None:
+        """What the next step may cost; None where that is not the policy's to decide."""
+        return state.effort
+
+    def _choose(self, memory: Memory) -> tuple[Memory, Float[Array, ""]]:
+        action = self.act(observe(self.config, memory))
+        return with_effort(self.config, memory, action), damping_of(self.config, memory, action[0])
 
     def init(self, info: ProblemInfo) -> tuple[Memory, Float[Array, ""]]:
         """See `DampingPolicy`."""
-        memory = begin(self.config, info)
-        return memory, self._choose(memory)
+        return self._choose(begin(self.config, info))
 
     def propose(self, state: Memory, step: StepInfo) -> tuple[Memory, Float[Array, ""]]:
         """See `DampingPolicy`."""
-        memory = record(self.config, state, step)
-        return memory, self._choose(memory)
+        return self._choose(record(self.config, state, step))
 
 
 def learned_from(config: AgentConfig, actor: Any) -> Learned:
@@ -141,8 +145,8 @@ def load_policy(path: str | Path) -> Learned:
         if not (np.isfinite(layer.kernel).all() and np.isfinite(layer.bias).all()):
             raise PolicyFileError(f"{path}: layer {k} holds numbers that are not finite")
         size = layer.kernel.shape[1]
-    if not layers or size != 2:
-        raise PolicyFileError(f"{path}: the last layer must give 2 numbers, not {size}")
+    if not layers or size != 2 * config.action_size:
+        raise PolicyFileError(f"{path}: the last layer must give {2 * config.action_size} numbers, not {size}")
     return Learned(tuple(layers), config)
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxba.effort import Effort
 from jaxba.lm import StepInfo
 
 
@@ -42,3 +43,9 @@ class DampingPolicy(Protocol):
     def propose(self, state: Any, step: StepInfo) -> tuple[Any, Float[Array, ""]]:
         """State and lambda of the next iteration, after the step that used the last lambda."""
         ...
+
+
+def effort_of(policy: DampingPolicy, state: Any) -> Effort | None:
+    """What the iteration that follows may cost, if the policy decides that; None where `StepOptions` do."""
+    decide = getattr(policy, "effort", None)
+    return None if decide is None else decide(state)

@@ -13,6 +13,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from jaxba.damping.agent import EffortMode
 from jaxba.game import settings
 from jaxba.game.bank import BankConfig
 from jaxba.game.env import GameConfig
@@ -91,8 +92,19 @@ class TrainConfig:
         if self.bank.dtype not in ("float64", "float32"):
             raise ValueError(f"bank.dtype must be float64 or float32, not {self.bank.dtype!r}")
         _check_agent(self.sac)
+        _check_effort(self.game.agent.effort, self.method, self.step_options)
         if self.game.shaping and self.game.discount != self.sac.gamma:
             raise ValueError(f"game.discount must be sac.gamma, {self.sac.gamma}, where there is shaping")
+
+
+def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None:
+    """What an agent chooses must be something that the method has."""
+    if effort != "fixed" and options.linear_solver == "decomposed":
+        raise ValueError(
+            f"game.agent.effort: {effort!r} means nothing to method {method}, which has no such iterations"
+        )
+    if effort == "points+forcing" and options.linear_solver != "normal":
+        raise ValueError("game.agent.effort: a forcing term needs conjugate gradients, as method deeplm has them")
 
 
 def _check_agent(sac: SacConfig) -> None:

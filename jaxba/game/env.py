@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping.agent import AgentConfig, Memory, begin, damping_of, observe, record
+from jaxba.damping.agent import AgentConfig, Memory, action_of, begin, damping_of, observe, record, with_effort
 from jaxba.damping.rules import Ceres
 from jaxba.game.bank import Bank
 from jaxba.game.play import step_groups
@@ -38,6 +38,10 @@ Reward = Literal["duration", "constant", "reduction", "reversed"]
 POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
 Ladybug-49: three take 3.9 of 12.6 ms (docs/performance.md)."""
+
+CG_ITERATION_COST = 0.06
+"""The same for an iteration of conjugate gradients, charged where the agent chooses their number: 20 to 25 of 351 ms on
+a scene of Ladybug-1197's size (docs/performance.md)."""
 
 BONUS_DECAY = 0.01
 """Share of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023, ablation."""
@@ -140,7 +144,7 @@ class Game:
     @property
     def action_size(self) -> int:
         """Numbers of an action."""
-        return 1
+        return self.config.agent.action_size
 
     def reset(self, key: Array) -> tuple[GameState, Float[Array, "envs features"]]:
         """New episodes everywhere."""
@@ -166,22 +170,25 @@ class Game:
         state = LMState(scenes.cameras, scenes.points, initial)
         return Episode(scene, state, begin(self.config.agent, info))
 
-    def iterate(self, kind: SceneClass, bank: Bank, episode: Episode, action: Array) -> tuple[Episode, StepInfo]:
+    def iterate(
+        self, kind: SceneClass, bank: Bank, episode: Episode, action: Float[Array, " actions"]
+    ) -> tuple[Episode, StepInfo]:
         """One LM iteration of one scene."""
+        agent = self.config.agent
         layout = class_layout(kind, self.options)
         own = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
-        damping = damping_of(self.config.agent, episode.memory, action)
-        state, step = lm_step(
-            own, episode.state, damping, self.options, self.config.agent.min_gain, episode.memory.iteration
-        )
-        return Episode(episode.scene, state, record(self.config.agent, episode.memory, step)), step
+        memory = with_effort(agent, episode.memory, action)
+        damping = damping_of(agent, memory, action[0])
+        turn, effort = memory.iteration, memory.effort
+        state, step = lm_step(own, episode.state, damping, self.options, agent.min_gain, turn, effort)
+        return Episode(episode.scene, state, record(agent, memory, step)), step
 
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
         """Plays one action everywhere."""
         key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
         parts, after, start = [], [], 0
         for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
-            own, start = action[start : start + count, 0], start + count
+            own, start = action[start : start + count], start + count
 
             def one(episode: Episode, action: Array, key: Array, kind=kind, bank=bank) -> tuple[Episode, Step]:
                 return self._play(kind, bank, episode, action, key)
@@ -218,7 +225,9 @@ class Game:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
-            reward = bonus - (1 + POINT_ITERATION_COST * self.options.refine_points + rules.repair_cost * step.repairs)
+            points = self.options.refine_points if memory.effort is None else memory.effort.point_iterations
+            inner = CG_ITERATION_COST * step.cg_iterations if rules.agent.effort == "points+forcing" else 0.0
+            reward = bonus - (1 + POINT_ITERATION_COST * points + rules.repair_cost * step.repairs + inner)
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":
@@ -233,17 +242,17 @@ class Game:
         return rules.scale * reward
 
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
-        """Uniform actions on half of the environments; on the others Ceres' rule, with random boldness."""
+        """Uniform actions on half of the environments; on the others Ceres' rule, with random boldness.
+
+        What else there is in an action is uniform on all of them.
+        """
         agent = self.config.agent
-        uniform = jax.random.uniform(key, (self.num_envs,), minval=-1.0, maxval=1.0)
-        memory = [jax.vmap(lambda m: _rule_damping(agent, m))(part.memory) for part in state.episodes]
-        rule = jnp.concatenate(memory) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
-        middle, half = 0.5 * (agent.low + agent.high), 0.5 * (agent.high - agent.low)
-        action = jnp.clip((rule - middle) / half, -0.99, 0.99).astype(jnp.float32)
-        chosen = jnp.where(jnp.arange(self.num_envs) % 2 == 0, uniform, action)
-        if agent.action == "relative":
-            chosen = uniform
-        return chosen[:, None]
+        uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
+        memory = jax.tree.map(lambda *x: jnp.concatenate(x), *(part.memory for part in state.episodes))
+        rule = jax.vmap(lambda m: _rule_damping(agent, m))(memory) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
+        action = jax.vmap(lambda m, decades: action_of(agent, m, decades))(memory, rule)
+        action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
+        return uniform.at[1::2, 0].set(action[1::2])
 
 
 def _rule_damping(agent: AgentConfig, memory: Memory) -> Array:

@@ -103,7 +103,7 @@ class Critic(nn.Module):
     @nn.compact
     def __call__(
         self, observation: Float[Array, "*batch features"], action: Float[Array, "*batch actions"]
-    ) -> Float[Array, "members *batch"]:
+    ) -> Float[Array, "members *batch"]:  # noqa: F821 - reads as a product
         """Each member's opinion."""
         ensemble = nn.vmap(
             Value,

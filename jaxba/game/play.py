@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping import DampingPolicy
+from jaxba.damping import DampingPolicy, effort_of
 from jaxba.game.scenes import SceneClass
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.lm import LMState, StepInfo, lm_step
@@ -118,7 +118,8 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
     def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:
         row = jnp.minimum(lane.scene, count - 1)
         own = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
-        state, step = lm_step(own, lane.state, lane.damping, options, policy.min_gain, lane.iteration)
+        effort = effort_of(policy, lane.policy)
+        state, step = lm_step(own, lane.state, lane.damping, options, policy.min_gain, lane.iteration, effort)
         policy_state, damping = policy.propose(lane.policy, step)
         return _Lane(lane.scene, state, policy_state, damping, lane.iteration + 1), step
 

@@ -102,7 +102,7 @@ def slope_of_next_cost(
     """
 
     def play(action: Array) -> tuple[Array, tuple[Episode, StepInfo]]:
-        after, step = game.iterate(game.kinds[0], game.banks[0], episode, action)
+        after, step = game.iterate(game.kinds[0], game.banks[0], episode, action[None])
         return jnp.log10(step.candidate_cost / step.previous_cost), (after, step)
 
     action = action.astype(episode.state.cost.dtype)

@@ -1,0 +1,194 @@
+"""Policies that decide with lambda what an iteration may cost: point iterations and the forcing term."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support import start, step, tiny
+from test_agent import ACCEPTED, REJECTED, after, info
+from test_learned import random_policy
+from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
+
+from jaxba import Schedule, StepOptions, lm_step, solve
+from jaxba.damping.agent import FORCING, AgentConfig, begin, observe, with_effort
+from jaxba.damping.learned import Layer, Learned, PolicyFileError, load_policy, save_policy
+from jaxba.effort import Effort
+from jaxba.game import config as configs
+from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
+from jaxba.game.settings import SettingsError
+
+POINTS = replace(AGENT, effort="points", refine_points=3)
+BOTH = replace(POINTS, effort="points+forcing")
+
+_step = jax.jit(lm_step, static_argnames=("options",))
+_jitted_reset = jax.jit(lambda game, key: game.reset(key))
+_jitted_play = jax.jit(lambda game, state, action: game.step(state, action))
+_with_effort = jax.jit(with_effort, static_argnums=0)
+
+
+def effort(points: int, forcing: float = 0.1) -> Effort:
+    return Effort(jnp.asarray(points, jnp.int32), jnp.asarray(forcing))
+
+
+# The step
+
+
+def test_a_step_with_fewer_point_iterations_is_that_of_options_with_fewer_and_compiles_nothing():
+    options = StepOptions(refine_points=3)
+    layout, state = start(tiny(), options)
+    damping = jnp.asarray(1e-3)
+    costs = []
+    for count in (1, 3):
+        expected, _ = step(layout, state, 1e-3, replace(options, refine_points=count))
+        found, _ = _step(layout, state, damping, options, effort=effort(count))
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
+        np.testing.assert_allclose(found.points, expected.points, rtol=1e-9, atol=1e-12)
+        costs.append(float(found.cost))
+    assert costs[1] < costs[0]
+    compiled = _step._cache_size()
+    none, _ = _step(layout, state, damping, options, effort=effort(0))
+    assert _step._cache_size() == compiled
+    plain, _ = step(layout, state, 1e-3, StepOptions())
+    np.testing.assert_allclose(none.cost, plain.cost, rtol=1e-12)
+    assert none.cost > costs[0]
+
+
+@pytest.mark.parametrize("solver", ["implicit", "normal"])
+def test_a_step_with_another_forcing_term_is_that_of_options_with_it(solver):
+    options = StepOptions(linear_solver=solver, refine_points=1, cg_forcing=1e-3)
+    layout, state = start(tiny(), options)
+    iterations = []
+    for forcing in (0.5, 1e-6):
+        expected, one = step(layout, state, 1e-6, replace(options, cg_forcing=forcing))
+        found, other = _step(layout, state, jnp.asarray(1e-6), options, effort=effort(1, forcing))
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
+        assert int(one.cg_iterations) == int(other.cg_iterations)
+        iterations.append(int(other.cg_iterations))
+    assert iterations[0] < iterations[1]
+
+
+# The agent
+
+
+def _chosen(config: AgentConfig, memory, *action: float) -> tuple[int, float]:
+    found = _with_effort(config, memory, jnp.asarray(action, jnp.float32)).effort
+    return int(found.point_iterations), float(jnp.log10(found.forcing))
+
+
+def test_an_action_ranges_from_no_point_iteration_to_all_and_over_the_forcing_terms():
+    assert (AGENT.action_size, POINTS.action_size, BOTH.action_size) == (1, 2, 3)
+    memory = begin(BOTH, info())
+    found = [_chosen(BOTH, memory, 0.3, share, share) for share in (-1, -0.4, 0.4, 1)]
+    assert [points for points, _ in found] == [0, 1, 2, 3]
+    np.testing.assert_allclose([forcing for _, forcing in found], np.interp([-1, -0.4, 0.4, 1], [-1, 1], FORCING))
+    fixed = np.log10(StepOptions().cg_forcing)
+    np.testing.assert_allclose(_chosen(POINTS, begin(POINTS, info()), 0.3, -1), (0, fixed))
+    assert with_effort(AGENT, begin(AGENT, info()), jnp.zeros(1)).effort is None
+
+
+def test_the_guards_rule_has_the_whole_effort():
+    config = replace(BOTH, guard="pause", patience=2)
+    memory = begin(config, info())
+    least, full = (0, FORCING[0]), (3, np.log10(StepOptions().cg_forcing))
+    for accepted, expected in ((REJECTED, least), (REJECTED, full), (ACCEPTED, least)):
+        memory = after(config, memory, accepted, -3.0)
+        np.testing.assert_allclose(_chosen(config, memory, -1, -1, -1), expected)
+
+
+def test_the_effort_of_the_last_step_is_observed():
+    for config in (POINTS, BOTH):
+        memory = begin(config, info())
+        seen = []
+        for share in (-1.0, 1.0):
+            chosen = with_effort(config, memory, jnp.full(config.action_size, share, jnp.float32))
+            seen.append(np.asarray(observe(config, after(config, chosen, ACCEPTED, -3.0))))
+            assert seen[-1].shape == (config.observation_size,)
+        assert config.observation_size == AGENT.observation_size + config.action_size - 1
+        different = np.flatnonzero(seen[0] != seen[1])
+        np.testing.assert_array_equal(different, np.arange(AGENT.observation_size, config.observation_size))
+
+
+# Policies
+
+
+def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_one_does(tmp_path):
+    """In both loops of a solve, and after it was written to a file and read."""
+    config = replace(POINTS, guard="off")
+    zero = [Layer(0 * layer.kernel, 0 * layer.bias) for layer in random_policy(4, config).layers]
+    bias = np.arctanh([1 / 6, -0.4]).astype(np.float32)  # a lambda of 1e-3, and one of three
+    zero[-1] = zero[-1]._replace(bias=np.concatenate([bias, bias]))
+    path = tmp_path / "two.safetensors"
+    save_policy(path, Learned(tuple(zero), config))
+    options = config.step_options(StepOptions())
+    rule = Schedule(values=(1e-3,), min_gain=config.min_gain)
+    expected = solve(tiny(), rule, replace(options, refine_points=1), max_iterations=8).history
+    for callback in (None, lambda _: None):
+        found = solve(tiny(), load_policy(path), options, max_iterations=8, callback=callback).history
+        np.testing.assert_allclose(found.damping, 1e-3, rtol=1e-5)
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-5)
+
+
+def test_a_file_with_too_few_numbers_for_its_effort_is_refused(tmp_path):
+    path = tmp_path / "wrong.safetensors"
+    policy = random_policy(4, POINTS)
+    last = policy.layers[-1]
+    short = (*policy.layers[:-1], last._replace(kernel=last.kernel[:, :2], bias=last.bias[:2]))
+    save_policy(path, replace(policy, layers=short))
+    with pytest.raises(PolicyFileError, match="must give 4 numbers, not 2"):
+        load_policy(path)
+
+
+# The game
+
+
+def test_an_iteration_is_paid_by_the_point_iterations_that_the_action_chose():
+    game = tiny_game(replace(RULES, agent=replace(POINTS, guard="off")), 6)
+    assert game.action_size == 2
+    state, seen = _jitted_reset(game, jax.random.key(0))
+    assert seen.shape == (6, game.observation_size)
+    share = jnp.asarray([-1, -0.4, 0.4, 1, -1, 1], jnp.float32)
+    action = jnp.stack([jnp.full(6, 0.9, jnp.float32), share], axis=1)  # a lambda that reaches no goal
+    _, found = _jitted_play(game, state, action)
+    price = -RULES.scale * (1 + POINT_ITERATION_COST * np.array([0, 1, 2, 3, 0, 3]))
+    np.testing.assert_allclose(found.reward - RULES.scale * RULES.bonus * found.metrics["success"], price, rtol=1e-5)
+    assert game.demonstrate(state, jax.random.key(1)).shape == (6, 2)
+
+
+def test_an_iteration_is_paid_by_its_conjugate_gradients_where_the_action_chooses_the_forcing_term():
+    config = replace(RULES, agent=replace(BOTH, guard="off", refine_points=1))
+    game = make_game(config, [KIND], [tiny_bank()], [4], StepOptions(linear_solver="normal"))
+    state, _ = _jitted_reset(game, jax.random.key(0))
+    paid = []
+    for forcing in (-1.0, 1.0):
+        action = jnp.broadcast_to(jnp.asarray([0.9, 1.0, forcing], jnp.float32), (4, 3))
+        _, found = _jitted_play(game, state, action)
+        net = found.reward - RULES.scale * RULES.bonus * found.metrics["success"]
+        iterations = (-net / RULES.scale - 1 - POINT_ITERATION_COST) / CG_ITERATION_COST
+        np.testing.assert_allclose(iterations, np.round(iterations), atol=1e-3)
+        paid.append(np.asarray(iterations))
+    assert (paid[0] > paid[1] + 0.5).all()
+    assert (paid[1] > 0.5).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (("game.agent.effort=all",), "effort must be one of fixed, points"),
+        (("game.agent={effort: points, refine_points: 0}",), "needs embedded point iterations"),
+        (("game.agent.effort=points", "method=ddlm"), "means nothing to method ddlm"),
+        (("game.agent.effort=points+forcing",), "needs conjugate gradients"),
+    ],
+)
+def test_an_effort_that_cannot_be_chosen_is_refused_in_one_line(changes, message):
+    with pytest.raises(SettingsError, match=message) as found:
+        configs.load("default", changes)
+    assert "\n" not in str(found.value)
+
+
+def test_an_effort_that_the_method_has_is_taken():
+    chosen = configs.load("default", ("game.agent.effort=points+forcing", "method=deeplm"))
+    assert chosen.game.agent.action_size == 3
