@@ -281,6 +281,21 @@ def _advance(
     return _Carry(state, policy_state, damping, iteration, end)
 
 
+def _advance_and_tell(
+    carry: _Carry, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
+) -> tuple[_Carry, Float[Array, " facts"]]:
+    """`_advance` without the parameters, and for the host the step and the end, as one array: one transfer, not 15."""
+    after = _advance(carry, None, step, policy, tolerances, max_iterations)
+    return after, jnp.stack([x.astype(step.cost.dtype) for x in (*step, after.termination)])
+
+
+def _told(facts: Float[Array, " facts"], shapes: StepInfo) -> tuple[StepInfo, Termination]:
+    """The other end of `_advance_and_tell`: Python numbers of the types that `shapes` has."""
+    *values, end = np.asarray(facts).tolist()
+    kinds = {"b": bool, "i": int, "f": float}
+    return StepInfo(*(kinds[x.dtype.kind](v) for v, x in zip(values, shapes, strict=True))), Termination(int(end))
+
+
 def _history(step: StepInfo) -> History:
     return History(
         cost=step.cost,
@@ -334,7 +349,7 @@ def _run_compiled(layout, state, policy, tolerances, options, max_iterations):
 
 
 def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *, callback):
-    inform, begin, advance = _small(_info, "options", "max_iterations"), _small(_begin), _small(_advance)
+    inform, begin, advance = _small(_info, "options", "max_iterations"), _small(_begin), _small(_advance_and_tell)
     with CompileClock() as clock:
         # without the parameters what is the policy's compiles once for all problems
         carry = begin(inform(layout, state, options, max_iterations), policy, None)
@@ -342,28 +357,28 @@ def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *,
         min_gain = jnp.asarray(policy.min_gain, state.cost.dtype)
         limit = jnp.asarray(max_iterations, jnp.int32)
 
-        def iterate(carry: _Carry) -> tuple[_Carry, StepInfo]:
+        def iterate(carry: _Carry) -> tuple[_Carry, StepInfo, Termination]:
             effort = effort_of(policy, carry.policy)
             state, step = _step(layout, carry.state, carry.damping, options, min_gain, carry.iteration, effort)
-            carry = advance(carry._replace(state=None), None, step, policy, tolerances, limit)
-            return carry._replace(state=state), jax.tree.map(lambda x: x.item(), jax.device_get(step))
+            carry, facts = advance(carry._replace(state=None), step, policy, tolerances, limit)
+            return carry._replace(state=state), *_told(facts, step)
 
         before, started = clock.seconds, time.perf_counter()
-        after, step = iterate(carry)
+        after, step, end = iterate(carry)
         if clock.seconds > before:  # compiled just now: the iteration is pure, so do it again with the clock running
             started = time.perf_counter()
-            after, step = iterate(carry)
+            after, step, end = iterate(carry)
         records = []
         while True:
             carry = after
             records.append(step)
             wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started, step))
-            if int(carry.termination) != Termination.RUNNING:
+            if end != Termination.RUNNING:
                 break
             if wants_stop:
                 carry = carry._replace(termination=jnp.asarray(int(Termination.STOPPED), jnp.int32))
                 break
-            after, step = iterate(carry)
+            after, step, end = iterate(carry)
         total_s = time.perf_counter() - started
     history = jax.tree.map(lambda *values: np.array(values), *map(_history, records))
     return carry, history, clock.seconds, total_s

@@ -30,6 +30,7 @@ class Termination(enum.IntEnum):
     STALLED = 5
     DAMPING_LIMIT = 6
     STOPPED = 7
+    TARGET = 8
 
     @property
     def converged(self) -> bool:
@@ -50,12 +51,13 @@ _REASONS = {
     Termination.MAX_ITERATIONS: "iteration limit",
     Termination.STALLED: "a rejected step would be repeated unchanged",
     Termination.STOPPED: "stopped by the caller",
+    Termination.TARGET: "cost at or below the target",
     Termination.DAMPING_LIMIT: "lambda at its upper limit, or not a number, and still rejected",
 }
 
 
 class Tolerances(NamedTuple):
-    """Convergence tests, on accepted steps only (design, section 2)."""
+    """Convergence tests, on accepted steps only (design, section 2), and a cost that is good enough."""
 
     ftol: float = 1e-6
     """`|f - f'| <= ftol f`, by a step that is not short for its damping (`converged_in_cost`)."""
@@ -65,6 +67,9 @@ class Tolerances(NamedTuple):
 
     gtol: float = 1e-10
     """Largest gradient entry."""
+
+    target: float = 0.0
+    """Cost in pixels squared at which a solve may end, converged or not; 0 switches it off."""
 
 
 def converged_in_cost(step: StepInfo, ftol: Any) -> Bool[Array, ""]:
@@ -97,6 +102,7 @@ def termination_of(
         (by_gradient, Termination.GRADIENT),
         (limit, Termination.DAMPING_LIMIT),
         (stalled, Termination.STALLED),
+        ((step.cost <= tolerances.target) & (tolerances.target > 0), Termination.TARGET),
         (iteration >= max_iterations, Termination.MAX_ITERATIONS),
     ]
     return jnp.select(

@@ -209,6 +209,24 @@ def test_a_callback_that_returns_true_stops_the_solve():
     np.testing.assert_allclose(geometry.cost(solution.problem), solution.final_cost, rtol=1e-10)
 
 
+@pytest.mark.parametrize("callback", [None, lambda record: None])
+def test_a_solve_ends_at_the_first_cost_that_is_good_enough(callback):
+    """And another target compiles nothing."""
+    costs = stepwise(support.tiny()).history.cost
+    targets = (0.5 * (costs[0] + costs[1]), costs[2])
+    programs = []
+    for target, iterations in zip(targets, (2, 3), strict=True):
+        solution = solve(support.tiny(), tolerances=Tolerances(target=float(target)), callback=callback)
+        assert solution.termination == Termination.TARGET
+        assert not solution.converged
+        assert solution.iterations == iterations
+        assert solution.final_cost <= target
+        programs.append(solve_loop._cache_size())
+    assert programs[0] == programs[1]
+    above = solve(support.tiny(), tolerances=Tolerances(target=0.9 * float(costs[-1])), callback=callback)
+    assert above.termination == Termination.COST
+
+
 def test_convergence_comes_before_the_wish_to_stop():
     solution = solve(support.tiny(), tolerances=Tolerances(ftol=1.0), callback=lambda record: True)
     assert solution.termination == Termination.COST

@@ -228,7 +228,7 @@ def solve_by_ceres(
         problem: start of the optimisation.
         mode: a key of `LINEAR_SOLVERS`.
         max_iterations: limit of linear solves.
-        tolerances: convergence tests.
+        tolerances: convergence tests; Ceres has no target.
         threads: of Ceres.
         callback: called after every iteration; a true return value stops the solve.
 
