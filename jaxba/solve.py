@@ -147,6 +147,9 @@ def solve(
             solver, which `auto` then means. Other solvers and larger problems are left as they are:
             `Solution.capacity` is None then. See padding.py.
 
+    Many problems of many shapes may be solved in one process: before their programs exceed what Linux lets a process
+    map, all compiled programs of JAX are dropped (`host.release_programs`), and compiled anew where they are needed.
+
     Returns:
         Parameters as NumPy float64 arrays, histories and timings.
 
@@ -181,6 +184,8 @@ def solve(
             raise ProblemError(explain_start(problem))
         run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)
         final, history, compile_s, total_s = run(layout, state, policy, tolerances, options, max_iterations)
+        if clock.seconds + compile_s > 0:
+            host.release_programs()  # many problems in one process would end it
         count = int(final.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
         return Solution(

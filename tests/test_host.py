@@ -44,6 +44,16 @@ def test_dropping_programs_gives_their_mappings_back():
     assert mappings() - before < 0.5 * (during - before)
 
 
+def test_a_solve_that_compiled_looks_after_the_mappings_of_its_process(monkeypatch):
+    problem, called = jaxba.random_scene(jaxba.like("tiny"), 0), []
+    monkeypatch.setattr(host, "release_programs", lambda: called.append(1))
+    jax.clear_caches()
+    jaxba.solve(problem, "ceres", max_iterations=2)
+    assert len(called) == 1
+    jaxba.solve(problem, "ceres", max_iterations=2)
+    assert len(called) == 1
+
+
 ARENAS = """
 import ctypes, sys, threading
 from jaxba import host

@@ -13,7 +13,6 @@ from typing import Any
 import jax
 
 import jaxba
-from jaxba import host
 from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import Source
 from jaxba.bench.summary import write_text
@@ -232,7 +231,6 @@ def execute(
         if (job.source.name, str(job.solver), job.repeat) in finished or job.source in broken:
             continue
         on_start(job)
-        host.release_programs()
         if loaded != job.source:
             try:
                 problem, loaded = job.source.read(), job.source
