@@ -180,7 +180,8 @@ def _seconds_to(problem: BundleProblem, name: str, goal: float, repeats: int) ->
     for _ in range(repeats):
         solution = jaxba.solve(problem, policy, options, linear_solver="auto", tolerances=jaxba.Tolerances(target=goal))
         if solution.final_cost > goal:
-            raise RuntimeError(f"{name} reached the goal step by step but not in one program")
+            print(f"{name} reached the goal step by step but not in one program", file=sys.stderr)
+            return math.inf
         times.append(solution.total_s)
     return statistics.median(times)
 

@@ -46,9 +46,13 @@ from jaxba.refine import Home, refine_points
 from jaxba.resect import move_cameras
 from jaxba.split import solve_clusters
 from jaxba.sums import point_sum, take, total, tree_sum
+from jaxba.trial import NEGLIGIBLE
 
 LOCAL_FACTOR = 4.0
 """Factor on a cluster's own lambda after its step failed."""
+
+LEAST_SHARE = 1 / 64
+"""Share of a round in which no cluster was accepted, not zero because policies look at its logarithm."""
 
 
 class Round(NamedTuple):
@@ -62,6 +66,7 @@ class Round(NamedTuple):
     slope: Float[Array, ""]  # -g.d
     curvature: Float[Array, ""]  # d.H d
     gradient_max: Float[Array, ""]  # before the round
+    share: Float[Array, ""]  # of the promised decrease, that of accepted clusters; 1 where the rest is negligible
     accepted: Bool[Array, ""]
 
 
@@ -71,6 +76,7 @@ class _Carry(NamedTuple):
     dampings: Float[Array, " clusters"]
     predicted: Array
     gained: Array
+    refused: Array
     slope: Array
     curvature: Array
     gradient_max: Array
@@ -129,6 +135,7 @@ def decomposed_round(
             jnp.where(good, carry.dampings, LOCAL_FACTOR * carry.dampings),
             carry.predicted + sum_of(predicted),
             carry.gained + sum_of(jnp.where(good, decrease, 0)),
+            carry.refused + jnp.sum(jnp.where(good, 0, jnp.where(jnp.isfinite(predicted), predicted, jnp.inf))),
             carry.slope + sum_of(slopes),
             carry.curvature + sum_of(curvatures),
             jnp.where(count == 0, gradient_max, carry.gradient_max),
@@ -136,9 +143,12 @@ def decomposed_round(
 
     zero = jnp.zeros_like(cost)
     dampings = jnp.full(partition.members.shape[0], damping)
-    start = _Carry(cameras, points, dampings, zero, zero, zero, zero, zero)
+    start = _Carry(cameras, points, dampings, zero, zero, zero, zero, zero, zero)
     end = lax.fori_loop(0, options.block_steps, body, start)
     moved, after = _separators(layout, end.cameras, end.points, damping, partition, options)
+    # points alone may lower the cost a little where every cluster was refused, which is no sign of convergence
+    share = jnp.clip(1 - end.refused / jnp.maximum(end.predicted, end.refused), LEAST_SHARE, 1)
+    share = jnp.where(end.refused > NEGLIGIBLE * cost, jnp.nan_to_num(share, nan=LEAST_SHARE), 1)
     return Round(
         end.cameras,
         moved,
@@ -148,6 +158,7 @@ def decomposed_round(
         end.slope,
         end.curvature,
         end.gradient_max,
+        share.astype(cost.dtype),
         after < cost,
     )
 

@@ -16,4 +16,4 @@ class Effort(NamedTuple):
     """Traced: changing it compiles nothing."""
 
     point_iterations: Int[Array, ""]  # instead of StepOptions.refine_points where there are any, 0 to that
-    forcing: Float[Array, ""]  # instead of StepOptions.cg_forcing
+    forcing: Float[Array, ""] | None  # instead of StepOptions.cg_forcing; None: that stays

@@ -19,6 +19,13 @@ MAPPINGS_SHARE = 0.4
 """One problem under sixteen solvers took a tenth of the limit."""
 
 
+GROWTH_SHARE = 0.1
+"""What must have come since programs were dropped last, so that mappings of others do not drop them again and again."""
+
+_kept = 0
+"""Mappings that were left when programs were dropped last."""
+
+
 def keep_memory() -> bool:
     """Tells glibc to keep freed memory instead of handing it back to the system.
 
@@ -60,19 +67,25 @@ def release_programs(share: float = MAPPINGS_SHARE) -> bool:
     Returns:
         Whether they were; false where the system does not tell.
     """
+    global _kept
     try:
         limit = int(Path("/proc/sys/vm/max_map_count").read_text())
-        with Path("/proc/self/maps").open("rb") as file:
-            count = sum(1 for _ in file)
+        count = _mappings()
     except (OSError, ValueError):
         return False
-    if count <= share * limit:
+    if count <= share * limit or (share and count < _kept + GROWTH_SHARE * limit):
         return False
     import jax
 
     jax.clear_caches()
     gc.collect()
+    _kept = _mappings()
     return True
+
+
+def _mappings() -> int:
+    with Path("/proc/self/maps").open("rb") as file:
+        return sum(1 for _ in file)
 
 
 @contextlib.contextmanager

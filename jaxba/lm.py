@@ -130,7 +130,7 @@ def _round(
         damping,
         gradient_max=found.gradient_max,
         cg_iterations=none,
-        share=jnp.ones_like(state.cost),
+        share=found.share,
         damping_share=jnp.clip(1 - found.curvature / found.slope, 0, 1),
         repairs=none,
     )

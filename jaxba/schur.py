@@ -72,7 +72,7 @@ def solve_step(
     Returns:
         The step; not finite where the factorisation failed, which the caller treats as a rejection.
     """
-    forcing = options.cg_forcing if effort is None else effort.forcing
+    forcing = options.cg_forcing if effort is None or effort.forcing is None else effort.forcing
     coordinates = Coordinates.of(cameras, options)
     frames = camera.frames(cameras)
     anchor = Anchor(frames.rotation, frames.translation, points)

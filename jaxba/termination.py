@@ -92,7 +92,7 @@ def termination_of(
     by_cost = converged_in_cost(step, tolerances.ftol)
     bound = tolerances.xtol * (step.parameter_norm + tolerances.xtol)
     hidden = step.step_norm > HIDDEN_DECREASE * (1 - step.damping_share) * bound
-    by_step = step.accepted & (step.step_norm <= bound) & ~hidden
+    by_step = step.accepted & (step.step_norm <= bound) & ~hidden & ~(step.share < 1)
     by_gradient = step.gradient_max <= tolerances.gtol
     limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
     stalled = ~step.accepted & stuck

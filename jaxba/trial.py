@@ -89,7 +89,9 @@ def best_trial(
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
         effort: number of point iterations, where it is not that of the options.
     """
-    point_iterations = options.refine_points if effort is None else effort.point_iterations
+    point_iterations = options.refine_points
+    if effort is not None:
+        point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     # costs are compared term by term: two sums would cancel in float32. A term is a point where points are refined.
     before = point_sum(layout, linear.costs[None])[0] if options.refine_points else linear.costs
 

@@ -13,7 +13,8 @@ from test_agent import ACCEPTED, REJECTED, after, info
 from test_learned import random_policy
 from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 
-from jaxba import Schedule, StepOptions, lm_step, solve
+from jaxba import Ceres, Safeguard, Schedule, StepOptions, lm_step, solve
+from jaxba.damping import effort_of
 from jaxba.damping.agent import FORCING, AgentConfig, begin, observe, with_effort
 from jaxba.damping.learned import Layer, Learned, PolicyFileError, load_policy, save_policy
 from jaxba.effort import Effort
@@ -30,8 +31,8 @@ _jitted_play = jax.jit(lambda game, state, action: game.step(state, action))
 _with_effort = jax.jit(with_effort, static_argnums=0)
 
 
-def effort(points: int, forcing: float = 0.1) -> Effort:
-    return Effort(jnp.asarray(points, jnp.int32), jnp.asarray(forcing))
+def effort(points: int, forcing: float | None = None) -> Effort:
+    return Effort(jnp.asarray(points, jnp.int32), None if forcing is None else jnp.asarray(forcing))
 
 
 # The step
@@ -51,6 +52,8 @@ def test_a_step_with_fewer_point_iterations_is_that_of_options_with_fewer_and_co
     assert costs[1] < costs[0]
     compiled = _step._cache_size()
     none, _ = _step(layout, state, damping, options, effort=effort(0))
+    more, _ = _step(layout, state, damping, options, effort=effort(9))
+    np.testing.assert_allclose(more.cost, costs[1], rtol=1e-12)  # never more than the options have
     assert _step._cache_size() == compiled
     plain, _ = step(layout, state, 1e-3, StepOptions())
     np.testing.assert_allclose(none.cost, plain.cost, rtol=1e-12)
@@ -62,21 +65,25 @@ def test_a_step_with_another_forcing_term_is_that_of_options_with_it(solver):
     options = StepOptions(linear_solver=solver, refine_points=1, cg_forcing=1e-3)
     layout, state = start(tiny(), options)
     iterations = []
-    for forcing in (0.5, 1e-6):
+    for forcing in (0.5, 1e-6, None):  # None: that of the options
+        if forcing is None:
+            forcing, chosen = options.cg_forcing, effort(1)
+        else:
+            chosen = effort(1, forcing)
         expected, one = step(layout, state, 1e-6, replace(options, cg_forcing=forcing))
-        found, other = _step(layout, state, jnp.asarray(1e-6), options, effort=effort(1, forcing))
+        found, other = _step(layout, state, jnp.asarray(1e-6), options, effort=chosen)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
         assert int(one.cg_iterations) == int(other.cg_iterations)
         iterations.append(int(other.cg_iterations))
-    assert iterations[0] < iterations[1]
+    assert iterations[0] < iterations[2] < iterations[1]
 
 
 # The agent
 
 
-def _chosen(config: AgentConfig, memory, *action: float) -> tuple[int, float]:
+def _chosen(config: AgentConfig, memory, *action: float) -> tuple[int, float | None]:
     found = _with_effort(config, memory, jnp.asarray(action, jnp.float32)).effort
-    return int(found.point_iterations), float(jnp.log10(found.forcing))
+    return int(found.point_iterations), None if found.forcing is None else float(jnp.log10(found.forcing))
 
 
 def test_an_action_ranges_from_no_point_iteration_to_all_and_over_the_forcing_terms():
@@ -85,18 +92,17 @@ def test_an_action_ranges_from_no_point_iteration_to_all_and_over_the_forcing_te
     found = [_chosen(BOTH, memory, 0.3, share, share) for share in (-1, -0.4, 0.4, 1)]
     assert [points for points, _ in found] == [0, 1, 2, 3]
     np.testing.assert_allclose([forcing for _, forcing in found], np.interp([-1, -0.4, 0.4, 1], [-1, 1], FORCING))
-    fixed = np.log10(StepOptions().cg_forcing)
-    np.testing.assert_allclose(_chosen(POINTS, begin(POINTS, info()), 0.3, -1), (0, fixed))
+    assert _chosen(POINTS, begin(POINTS, info()), 0.3, -1) == (0, None)
     assert with_effort(AGENT, begin(AGENT, info()), jnp.zeros(1)).effort is None
 
 
 def test_the_guards_rule_has_the_whole_effort():
     config = replace(BOTH, guard="pause", patience=2)
     memory = begin(config, info())
-    least, full = (0, FORCING[0]), (3, np.log10(StepOptions().cg_forcing))
+    least, full = (0, FORCING[1]), (3, FORCING[0])
     for accepted, expected in ((REJECTED, least), (REJECTED, full), (ACCEPTED, least)):
         memory = after(config, memory, accepted, -3.0)
-        np.testing.assert_allclose(_chosen(config, memory, -1, -1, -1), expected)
+        np.testing.assert_allclose(_chosen(config, memory, -1, -1, 1), expected)
 
 
 def test_the_effort_of_the_last_step_is_observed():
@@ -130,6 +136,14 @@ def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_on
         found = solve(tiny(), load_policy(path), options, max_iterations=8, callback=callback).history
         np.testing.assert_allclose(found.damping, 1e-3, rtol=1e-5)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-5)
+
+
+def test_a_safeguard_lets_the_policy_inside_decide_the_effort():
+    policy = random_policy(4, POINTS)
+    inner, _ = policy.init(info())
+    state, _ = Safeguard(policy).init(info())
+    assert effort_of(Safeguard(policy), state) == effort_of(policy, inner) is not None
+    assert effort_of(Safeguard(Ceres()), Safeguard(Ceres()).init(info())[0]) is None
 
 
 def test_a_file_with_too_few_numbers_for_its_effort_is_refused(tmp_path):

@@ -461,14 +461,16 @@ def _shifted(bank: Bank) -> Bank:
     return jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), bank)
 
 
-def test_demonstrations_are_actions_of_which_some_follow_ceres_rule():
-    game = tiny_game(RULES, 8)
+@pytest.mark.parametrize("action", ["absolute", "relative"])
+def test_demonstrations_are_actions_of_which_some_follow_ceres_rule(action):
+    agent = replace(AGENT, action=action)
+    game = tiny_game(replace(RULES, agent=agent), 8)
     state, _ = _jitted_reset(game, jax.random.key(0))
     found = np.asarray(game.demonstrate(state, jax.random.key(1)))
     assert found.shape == (8, 1)
     assert (np.abs(found) < 1).all()
     lambdas = [
-        float(damping_of(AGENT, jax.tree.map(lambda x, e=e: x[e], state.episodes[0].memory), jnp.asarray(found[e, 0])))
+        float(damping_of(agent, jax.tree.map(lambda x, e=e: x[e], state.episodes[0].memory), jnp.asarray(found[e, 0])))
         for e in range(8)
     ]
     np.testing.assert_allclose([lambdas[1], lambdas[5]], 1e-4, rtol=1e-4)  # Ceres' first lambda

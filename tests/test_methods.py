@@ -18,12 +18,13 @@ from test_step import DAMPINGS, check_step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
 from jaxba.clock import CompileClock
-from jaxba.decompose import decomposed_round
+from jaxba.decompose import LEAST_SHARE, decomposed_round
 from jaxba.eliminate import Coordinates, apply_reduced, camera_system, eliminate_points
 from jaxba.layout import partition_of
 from jaxba.linearize import linearize
 from jaxba.methods import UnknownMethodError
 from jaxba.split import agreed_gradient, clustered_step, eliminate_copies, repair, solve_clusters, split_right
+from jaxba.termination import converged_in_cost
 
 CLUSTERED = StepOptions(linear_solver="clustered", cluster_cameras=2)
 DECOMPOSED = StepOptions(linear_solver="decomposed", cluster_cameras=2)
@@ -212,6 +213,23 @@ def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, chan
         assert state.cost <= before.cost
         assert bool(info.accepted) == (state.cost < before.cost)
         np.testing.assert_allclose(state.cost, support.cost(support.back(problem, first, state), options), rtol=1e-9)
+
+
+def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
+    """Points move on alone, and the cost with them, less and less."""
+    options = replace(DECOMPOSED, refine_points=3)
+    layout, state = start(support.tiny(), options)
+    _, good = step(layout, state, 1e-2, options)
+    assert good.share == 1
+    decreases = []
+    for turn in range(8):
+        state, info = step(layout, state, 1e-2, options, 1e9, turn)  # no gain is enough
+        decreases.append(float(info.previous_cost - info.cost) / float(info.cost))
+        assert info.share == LEAST_SHARE
+        assert not converged_in_cost(info, 1e-6)
+    small = [d for d in decreases if d <= 1e-6]
+    assert decreases[0] > 1e-6
+    assert small
 
 
 @functools.partial(jax.jit, static_argnames=("options",))

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, NamedTuple, get_args
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -104,7 +105,8 @@ class AgentConfig:
 
     effort: EffortMode = "fixed"
     """What an action decides beside lambda: nothing, or with a second number how many of the point iterations a step
-    has, and with a third the forcing term of conjugate gradients. The guard's rule has the full effort."""
+    has, and with a third the forcing term of conjugate gradients. The guard's rule has all of them, and the smallest
+    forcing term."""
 
     def __post_init__(self) -> None:
         for name, known in (
@@ -270,7 +272,7 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
     ]
     if memory.effort is not None:
         points, forcing = memory.effort
-        whole += [points / max(config.refine_points, 1), _log(forcing) + 1][: config.action_size - 1]
+        whole += [points / config.refine_points, *([] if forcing is None else [_log(forcing) + 1])]
     features = jnp.concatenate([memory.facts.reshape(-1), jnp.stack([jnp.asarray(x) for x in whole])])
     return jnp.clip(jnp.nan_to_num(features), -2, 2).astype(jnp.float32)
 
@@ -316,7 +318,8 @@ def _guarding(config: AgentConfig, memory: Memory) -> Bool[Array, ""]:
 
 
 def _full_effort(config: AgentConfig, dtype: Any) -> Effort:
-    return Effort(jnp.asarray(config.refine_points, jnp.int32), jnp.asarray(StepOptions().cg_forcing, dtype))
+    forcing = jnp.asarray(10 ** FORCING[0], dtype) if config.effort == "points+forcing" else None
+    return Effort(jnp.asarray(config.refine_points, jnp.int32), forcing)
 
 
 def with_effort(config: AgentConfig, memory: Memory, action: Float[Array, " actions"]) -> Memory:
@@ -325,13 +328,12 @@ def with_effort(config: AgentConfig, memory: Memory, action: Float[Array, " acti
         return memory
     full = _full_effort(config, memory.cost.dtype)
     share = 0.5 + 0.5 * action.astype(memory.cost.dtype)
-    points, forcing = jnp.round(share[1] * config.refine_points).astype(jnp.int32), full.forcing
+    chosen = Effort(jnp.round(share[1] * config.refine_points).astype(jnp.int32), None)
     if config.effort == "points+forcing":
         low, high = FORCING
-        forcing = 10 ** (low + (high - low) * share[2])
+        chosen = chosen._replace(forcing=10 ** (low + (high - low) * share[2]))
     guarded = _guarding(config, memory) & config.guarded
-    chosen = Effort(jnp.where(guarded, full.point_iterations, points), jnp.where(guarded, full.forcing, forcing))
-    return memory._replace(effort=chosen)
+    return memory._replace(effort=jax.tree.map(lambda all_, some: jnp.where(guarded, all_, some), full, chosen))
 
 
 def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:

@@ -28,7 +28,8 @@ class DampingPolicy(Protocol):
     """Chooses lambda for every iteration.
 
     A policy is a frozen dataclass and a pytree: its numbers are traced, so that changing one never
-    recompiles, and its class selects the code. Both functions are pure and jittable.
+    recompiles, and its class selects the code. Both functions are pure and jittable. A policy may have a third one,
+    `effort(state)`, see `effort_of`.
     """
 
     @property

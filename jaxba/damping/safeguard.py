@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping.policy import DampingPolicy, ProblemInfo
+from jaxba.damping.policy import DampingPolicy, ProblemInfo, effort_of
 from jaxba.damping.rules import Ceres
+from jaxba.effort import Effort
 from jaxba.lm import StepInfo
 
 
@@ -45,6 +46,10 @@ class Safeguard:
     def min_gain(self) -> Any:
         """That of the guarded policy."""
         return self.inner.min_gain
+
+    def effort(self, state: _State) -> Effort | None:
+        """That of the guarded policy."""
+        return effort_of(self.inner, state.inner)
 
     def init(self, info: ProblemInfo) -> tuple[_State, Float[Array, ""]]:
         """See `DampingPolicy`."""

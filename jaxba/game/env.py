@@ -4,7 +4,7 @@
 | --- | --- |
 | state | a scene of the bank, its cameras and points, the agent's memory of the episode |
 | observation | `damping.agent.observe` |
-| action | one number in (-1, 1), lambda by `damping.agent.damping_of`, the guard included |
+| action | numbers in (-1, 1): lambda by `damping.agent.damping_of`, guard included, and the effort if the agent chooses it |
 | terminated | accepted cost within `tolerance` of the scene's best known; or the limit, where that counts as failure |
 | truncated | the limit, where it does not |
 | reward | `GameConfig.reward` |
@@ -40,8 +40,9 @@ POINT_ITERATION_COST = 0.1
 Ladybug-49: three take 3.9 of 12.6 ms (docs/performance.md)."""
 
 CG_ITERATION_COST = 0.06
-"""The same for an iteration of conjugate gradients, charged where the agent chooses their number: 20 to 25 of 351 ms on
-a scene of Ladybug-1197's size (docs/performance.md)."""
+"""The same for an iteration of conjugate gradients, charged where the agent chooses their number. An estimate: one
+product of the reduced system takes 20 to 25 of an implicit step's 351 ms on a scene of Ladybug-1197's size
+(docs/performance.md); those of method `deeplm`, on all variables, were not measured."""
 
 BONUS_DECAY = 0.01
 """Share of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023, ablation."""

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxba import host
 from jaxba.bench import profile
 from jaxba.bench.records import Record
 from jaxba.bench.run import record_of
@@ -137,6 +138,7 @@ class Workshop:
         for seed in method.numbers:
             if self.store.play(TEST, method.name, seed):
                 continue
+            host.release_programs()
             policy, options = method.build(seed)
             settings = agents.train_config(self.config, agents.OURS, 0)
             options = replace(options, intrinsics=settings.bank.intrinsics)
