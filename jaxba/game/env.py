@@ -4,7 +4,7 @@
 | --- | --- |
 | state | a scene of the bank, its cameras and points, the agent's memory of the episode |
 | observation | `damping.agent.observe` |
-| action | numbers in (-1, 1): lambda by `damping.agent.damping_of`, guard included, and the effort if the agent chooses it |
+| action | numbers in (-1, 1): lambda by `damping.agent.damping_of`, guard included; the effort if the agent has it |
 | terminated | accepted cost within `tolerance` of the scene's best known; or the limit, where that counts as failure |
 | truncated | the limit, where it does not |
 | reward | `GameConfig.reward` |
