@@ -54,7 +54,7 @@ def keep_memory() -> bool:
     return all(mallopt(parameter, value) == 1 for parameter, value in settings)
 
 
-def release_programs(share: float = MAPPINGS_SHARE) -> bool:
+def release_programs(share: float | None = None) -> bool:
     """Drops JAX's compiled programs if they come near what Linux lets a process map.
 
     XLA maps a few pages for every kernel of a program, some thousands for a solver and a problem. At `vm.max_map_count`
@@ -62,12 +62,13 @@ def release_programs(share: float = MAPPINGS_SHARE) -> bool:
     problems and a dozen solvers did. What is dropped comes back from the compilation cache when it is needed again.
 
     Args:
-        share: of the limit from which on programs are dropped.
+        share: of the limit from which on programs are dropped; `MAPPINGS_SHARE` if None.
 
     Returns:
         Whether they were; false where the system does not tell.
     """
     global _kept
+    share = MAPPINGS_SHARE if share is None else share
     try:
         limit = int(Path("/proc/sys/vm/max_map_count").read_text())
         count = _mappings()
