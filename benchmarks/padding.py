@@ -49,10 +49,7 @@ def solve_all(problems: list[BundleProblem], solve: Callable[[BundleProblem], ja
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         started = time.perf_counter()
-        solutions = []
-        for problem in problems:
-            host.release_programs()
-            solutions.append(solve(problem))
+        solutions = [solve(problem) for problem in problems]
         wall = time.perf_counter() - started
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)

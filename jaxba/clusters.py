@@ -69,10 +69,6 @@ def cluster_layout(
     wanted = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
     label = agglomerate(shared_points(camera, point, cameras, points)[0], cameras, wanted)
     clusters = int(label.max()) + 1
-    sizes = np.bincount(label, minlength=clusters)
-    members = np.full((clusters, int(sizes.max())), cameras, np.int32)
-    by_label = np.argsort(label, kind="stable")
-    members[label[by_label], np.arange(cameras) - np.repeat(np.cumsum(sizes) - sizes, sizes)] = by_label
     key = point.astype(np.int64) * clusters + label[camera]
     order = np.argsort(key, kind="stable")
     names, first, counts = np.unique(key[order], return_index=True, return_counts=True)
@@ -81,11 +77,22 @@ def cluster_layout(
     coarse = np.arange(len(names))
     return ClusterLayout(
         label=label.astype(np.int32),
-        members=members,
+        members=cluster_members(label, clusters, int(np.bincount(label).max())),
         levels=sum_tree(slot[order], np.append(counts, 0), empty, TREE_WIDTH),
         point=slot_point[np.append(slot[order][first], empty)],
         pairs=pair_layout(names % clusters, coarse, seen_by, start, clusters, len(names), factor=True, banded=False),
     )
+
+
+def cluster_members(
+    label: Int[np.ndarray, " cameras"], clusters: int, size: int
+) -> Int[np.ndarray, "{clusters} {size}"]:
+    """The cameras of every cluster in order, then the number of cameras up to a row's `size`."""
+    table = np.full((clusters, size), len(label), np.int32)
+    order = np.argsort(label, kind="stable")
+    counts = np.bincount(label, minlength=clusters)
+    table[label[order], np.arange(len(label)) - np.repeat(np.cumsum(counts) - counts, counts)] = order
+    return table
 
 
 def shared_points(

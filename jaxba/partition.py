@@ -18,6 +18,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Int
 
+from jaxba.clusters import cluster_members
 from jaxba.communities import camera_graph, clusterings
 from jaxba.pairs import PairLayout
 from jaxba.problem import AnyArray
@@ -107,7 +108,7 @@ def partition_layout(
         first = np.unique(which, return_index=True)[1]
         pieces = np.bincount(slot_point[slot[first]], minlength=int(slot_point.max()) + 1)
         separator.append(pieces > 1)
-    tables = [_members(label, clusters, int(sizes.max())) for label in labels]
+    tables = [cluster_members(label, clusters, int(sizes.max())) for label in labels]
     return Partition(
         label=labels.astype(np.int32),
         members=np.stack(tables),
@@ -122,14 +123,6 @@ def _copies(label: np.ndarray, point: np.ndarray, clusters: int) -> tuple[np.nda
     """The copy of each observation, numbered by point and cluster, and the observations of each copy."""
     _, which, counts = np.unique(point.astype(np.int64) * clusters + label, return_inverse=True, return_counts=True)
     return which, counts
-
-
-def _members(label: np.ndarray, clusters: int, size: int) -> np.ndarray:
-    table = np.full((clusters, size), len(label), np.int32)
-    order = np.argsort(label, kind="stable")
-    counts = np.bincount(label, minlength=clusters)
-    table[label[order], np.arange(len(label)) - np.repeat(np.cumsum(counts) - counts, counts)] = order
-    return table
 
 
 def _blocks(members: np.ndarray, label: np.ndarray, pairs: PairLayout) -> np.ndarray:

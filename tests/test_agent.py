@@ -337,8 +337,14 @@ def test_the_duration_of_every_iteration_is_one():
 
 # Its configuration
 
+
+def _config(effort: str, refine_points: int, **other) -> AgentConfig:
+    return AgentConfig(effort=effort, refine_points=max(refine_points, int(effort != "fixed")), **other)
+
+
 configs = st.builds(
-    AgentConfig,
+    _config,
+    effort=st.sampled_from(["fixed", "points", "points+forcing"]),
     observation=st.sampled_from(["scale-free", "paper", "released-code", "duration"]),
     history=st.integers(1, 20),
     low=st.floats(-15, -3),

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import same_bits
-from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
+from tiny_game import AGENT, KIND, RULES, grid, problem_of, tiny_bank, tiny_game
 
-from jaxba import BundleProblem, StepOptions, geometry, make_method, make_policy, solve
+from jaxba import StepOptions, geometry, make_method, make_policy, solve
 from jaxba.damping.agent import begin, damping_of, observe
 from jaxba.damping.learned import Layer, Learned
 from jaxba.game.bank import Bank, info_of, initial_costs, reach, sieve
@@ -25,30 +25,11 @@ from jaxba.game.env import POINT_ITERATION_COST, SHAPING_FLOOR, Game, GameConfig
 from jaxba.game.evaluate import compare, evaluate, score
 from jaxba.game.play import Trajectories, play
 from jaxba.game.protocol import Environment
-from jaxba.game.scenes import MIN_VIEWS, SceneClass, Scenes, _angle_axis, make_scenes
+from jaxba.game.scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
 from jaxba.game.slots import class_layout
 from jaxba.layout import partition_of
 
 LIMIT = 25
-
-
-def grid(kind: SceneClass, scenes: Scenes) -> np.ndarray:
-    """Which camera sees which point, a matrix per scene, without the empty point."""
-    return np.asarray(scenes.mask).reshape(-1, kind.cameras, kind.points + 1)[:, :, :-1]
-
-
-def problem_of(kind: SceneClass, scenes: Scenes, k: int) -> BundleProblem:
-    """One scene on the host."""
-    seen = grid(kind, scenes)[k]
-    pixels = np.asarray(scenes.pixels[k]).reshape(2, kind.cameras, kind.points + 1)[:, :, :-1]
-    camera, point = np.nonzero(seen)
-    return BundleProblem.create(
-        np.asarray(scenes.cameras[k]).T,
-        np.asarray(scenes.points[k]).T[:-1],
-        pixels[:, camera, point].T,
-        camera,
-        point,
-    )
 
 
 # Scenes

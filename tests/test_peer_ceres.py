@@ -358,6 +358,12 @@ def test_limits_and_callbacks_end_a_solve(run):
     assert geometry.cost(stopped.problem) == stopped.final_cost < limited.final_cost
 
 
+def test_a_driven_solve_ends_at_its_target():
+    costs = driven(support.tiny()).history.cost
+    found = driven(support.tiny(), tolerances=Tolerances(target=float(0.5 * (costs[1] + costs[2]))))
+    assert (found.iterations, found.termination) == (3, Termination.TARGET)
+
+
 @pytest.mark.parametrize("run", [alone, driven])
 def test_ctrl_c_comes_through(run):
     def press(record):

@@ -6,8 +6,7 @@ import jax
 import numpy as np
 import pytest
 from support import same_bits
-from test_game import problem_of
-from tiny_game import KIND, tiny_bank
+from tiny_game import KIND, problem_of, tiny_bank
 
 from jaxba import StepOptions, geometry
 from jaxba.game.bank import BankConfig, draft, make_banks

@@ -5,12 +5,13 @@ from __future__ import annotations
 import functools
 
 import jax
+import numpy as np
 
-from jaxba import StepOptions
+from jaxba import BundleProblem, StepOptions
 from jaxba.damping.agent import AgentConfig
 from jaxba.game.bank import Bank, draft, sieve
 from jaxba.game.env import Game, GameConfig, make_game
-from jaxba.game.scenes import SceneClass
+from jaxba.game.scenes import SceneClass, Scenes
 
 KIND = SceneClass(4, 12)
 AGENT = AgentConfig(
@@ -29,3 +30,22 @@ def tiny_bank() -> Bank:
 def tiny_game(config: GameConfig = RULES, envs: int = 6) -> Game:
     """A game on them."""
     return make_game(config, [KIND], [tiny_bank()], [envs])
+
+
+def grid(kind: SceneClass, scenes: Scenes) -> np.ndarray:
+    """Which camera sees which point, a matrix per scene, without the empty point."""
+    return np.asarray(scenes.mask).reshape(-1, kind.cameras, kind.points + 1)[:, :, :-1]
+
+
+def problem_of(kind: SceneClass, scenes: Scenes, k: int) -> BundleProblem:
+    """One scene on the host."""
+    seen = grid(kind, scenes)[k]
+    pixels = np.asarray(scenes.pixels[k]).reshape(2, kind.cameras, kind.points + 1)[:, :, :-1]
+    camera, point = np.nonzero(seen)
+    return BundleProblem.create(
+        np.asarray(scenes.cameras[k]).T,
+        np.asarray(scenes.points[k]).T[:-1],
+        pixels[:, camera, point].T,
+        camera,
+        point,
+    )

@@ -61,7 +61,7 @@ class Bank(NamedTuple):
     initial_cost: Float[Array, " scenes"]
     best_cost: Float[Array, " scenes"]
     info: ProblemInfo  # a field per scene
-    effort: Float[Array, " scenes"]  # iterations of Ceres' rule to 1e-3 of the best cost
+    ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule to 1e-3 of the best cost
 
 
 def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
@@ -176,7 +176,8 @@ def draft(
         on_rule(rule)
         runs[rule] = play(kind, bank, make_policy(rule), options, PORTFOLIO_ITERATIONS, PORTFOLIO_FTOL)
     best = np.min([run.costs[:, -1] for run in runs.values()], axis=0)
-    bank = bank._replace(best_cost=jnp.asarray(best), effort=jnp.asarray(reach(runs[rules[0]].costs, best, 1e-3)))
+    to_best = reach(runs[rules[0]].costs, best, 1e-3)
+    bank = bank._replace(best_cost=jnp.asarray(best), ceres_iterations=jnp.asarray(to_best))
     ratio = np.asarray(initial) / best
     soonest = np.min([reach(run.costs, best, 1e-3) for run in runs.values()], axis=0)
     floor = SMALLEST_COST_SHARE * np.asarray(info.observations)

@@ -215,7 +215,7 @@ class Game:
             "length": single(after.memory.iteration),
             "success": single(success),
             "rejections": single(after.memory.rejections),
-            "ceres": single(jnp.minimum(bank.effort[episode.scene], rules.max_iterations)),
+            "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
         }
         see = lambda episode: observe(rules.agent, episode.memory)
         return following, Step(see(following), single(reward), terminated, truncated, see(after), metrics)
