@@ -18,6 +18,7 @@ from jaxba.effort import Effort
 from jaxba.layout import Layout, partition_of
 from jaxba.linearize import cost, linearize, without_intrinsics
 from jaxba.options import StepOptions
+from jaxba.parts import Whole
 from jaxba.problem import BundleProblem
 from jaxba.schur import solve_step
 from jaxba.trial import Trial, best_trial
@@ -96,7 +97,7 @@ def lm_step(
     if options.intrinsics == "fixed":
         linear = without_intrinsics(linear)
     step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn, effort)
-    trial = best_trial(layout, state.cameras, state.points, state.cost, linear, step, options, min_gain, effort)
+    trial = best_trial(Whole(layout), *state, linear, step, options, min_gain, effort)
     moved = [trial.share * step.cameras, trial.points - state.points]
     return _verdict(
         state,
@@ -122,17 +123,16 @@ def _round(
     """A round of domain decomposition in the place of a step: parts of it are accepted, each by itself."""
     partition = partition_of(layout).at(turn)
     found = decomposed_round(layout, *state, damping, partition, options, min_gain)
-    none = jnp.zeros((), jnp.int32)
     return _verdict(
         state,
         found,
         [found.cameras - state.cameras, found.points - state.points],
         damping,
         gradient_max=found.gradient_max,
-        cg_iterations=none,
+        cg_iterations=jnp.zeros((), jnp.int32),
         share=found.share,
         damping_share=jnp.clip(1 - found.curvature / found.slope, 0, 1),
-        repairs=none,
+        repairs=found.repairs,
     )
 
 

@@ -37,12 +37,13 @@ class Step(NamedTuple):
 
     cameras: Float[Array, "9 cameras"]  # in the coordinates of the options
     points: Float[Array, "3 points"]
-    slope: Float[Array, ""]  # -g.d = d.(H + D) d, pixels^2
-    damped: Float[Array, ""]  # d.D d, pixels^2; of a step that does not solve the system, what -g.d exceeds d.H d by
+    # of the whole, or of every part that is judged by itself (parts.py):
+    slope: Float[Array, "*parts"]  # -g.d = d.(H + D) d, pixels^2
+    damped: Float[Array, "*parts"]  # d.D d, pixels^2; of a step that solves no system, what -g.d exceeds d.H d by
     gradient_max: Float[Array, ""]  # largest entry of the gradient before the step
     cg_iterations: Int[Array, ""]  # 0 when the system was factored
 
-    def predicted(self, share: Array) -> Float[Array, ""]:
+    def predicted(self, share: Float[Array, "*parts"]) -> Float[Array, "*parts"]:
         """Decrease of the cost that the linear model promises at a share of the step, pixels^2."""
         return share * (0.5 * share * self.damped + (1 - 0.5 * share) * self.slope)
 

@@ -10,7 +10,8 @@ what they see. Repairing that locally is cheap beside a linear solve, and lets b
 3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 and at most one round
    of 2.
 
-None of it takes another linear solve, so it is all one iteration (design, section 2). Source: 1 is Jeong et al. 2012,
+None of it takes another linear solve, so it is all one iteration (design, section 2). Where a problem falls into parts
+that are judged by themselves (`parts.py`), each has its own share, rounds and verdict. Source: 1 is Jeong et al. 2012,
 "embedded point iterations", and Ceres' inner iterations; 2 is resection and intersection (Chen, Chen, Wang 2019,
 "Bundle adjustment revisited"), here as a repair of second-order steps; 3 is a backtracking line search.
 """
@@ -24,13 +25,12 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.effort import Effort
-from jaxba.layout import Layout
-from jaxba.linearize import Linearization, residuals, slot_costs, slot_frames
+from jaxba.linearize import Linearization
 from jaxba.options import StepOptions
-from jaxba.refine import Home, refine_points
+from jaxba.parts import Parts
+from jaxba.refine import Home
 from jaxba.resect import move_cameras, refine_cameras
 from jaxba.schur import Step
-from jaxba.sums import point_sum, total
 
 SHORTER = 0.25
 """Factor on the length of a step that was refused. Measured with 4 trials on Ladybug-49 under lambda 1e-6."""
@@ -53,38 +53,38 @@ function_tolerance."""
 
 
 class Trial(NamedTuple):
-    """A candidate and the verdict on it."""
+    """A candidate and the verdict on it, one for every part."""
 
     cameras: Float[Array, "9 cameras"]
     points: Float[Array, "3 points"]
-    cost: Float[Array, ""]
-    predicted: Float[Array, ""]  # decrease promised by the linear model at this length
-    gain: Float[Array, ""]  # actual over predicted decrease
-    accepted: Bool[Array, ""]
-    share: Float[Array, ""]  # length relative to the whole step
-    repairs: Int[Array, ""]  # camera rounds and further trials that it took
+    cost: Float[Array, "*parts"]
+    predicted: Float[Array, "*parts"]  # decrease promised by the linear model at this length
+    gain: Float[Array, "*parts"]  # actual over predicted decrease
+    accepted: Bool[Array, "*parts"]
+    share: Float[Array, "*parts"]  # length relative to the whole step
+    repairs: Int[Array, "*parts"]  # camera rounds and further trials that it took
 
 
 def best_trial(
-    layout: Layout,
+    parts: Parts,
     cameras: Float[Array, "9 cameras"],
     points: Float[Array, "3 points"],
-    cost: Float[Array, ""],
+    cost: Float[Array, "*parts"],
     linear: Linearization,
     step: Step,
     options: StepOptions,
     min_gain: float | Float[Array, ""],
     effort: Effort | None = None,
 ) -> Trial:
-    """The first accepted candidate, or the last refused one.
+    """The first accepted candidate, or the last refused one, of every part.
 
     Args:
-        layout: the problem's observations.
+        parts: what is judged by itself.
         cameras: present cameras.
         points: present points.
         cost: their cost, pixels squared.
         linear: what was known there; only its costs and what lay in front of its camera are used.
-        step: the solution of the damped system.
+        step: the solution of the damped system; its slope and damped part are those of the parts.
         options: static.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
         effort: number of point iterations, where it is not that of the options.
@@ -92,51 +92,57 @@ def best_trial(
     point_iterations = options.refine_points
     if effort is not None:
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
-    # costs are compared term by term: two sums would cancel in float32. A term is a point where points are refined.
-    before = point_sum(layout, linear.costs[None])[0] if options.refine_points else linear.costs
+    # costs are compared term by term: two sums would cancel in float32
+    before = parts.terms(linear.costs, options)
+    home = Home(points, linear.front)
+    one, none = jnp.ones_like(cost), jnp.zeros(cost.shape, jnp.int32)
+    matters = step.predicted(one) > NEGLIGIBLE * cost
 
-    matters = step.predicted(jnp.ones((), cost.dtype)) > NEGLIGIBLE * cost
-
-    def judge(cameras: Array, points: Array, costs: Array, share: Array) -> Trial:
-        candidate, decrease, predicted = total(costs), total(before - costs), step.predicted(share)
+    def settle(cameras: Array, points: Array, share: Array, repairs: Array) -> Trial:
+        points, terms = parts.settle(cameras, points, home, options, point_iterations)
+        candidate, decrease, predicted = parts.sums(terms), parts.sums(before - terms), step.predicted(share)
         gain = decrease / predicted
         accepted = (decrease > 0) & (candidate <= cost) & (predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
-        return Trial(cameras, points, candidate, predicted, gain, accepted, share, jnp.zeros((), jnp.int32))
-
-    home = Home(points, linear.front)
-
-    def settle(cameras: Array, points: Array, share: Array) -> Trial:
-        frames = slot_frames(layout, cameras)
-        if options.refine_points:
-            points, costs = refine_points(layout, frames, points, options.loss, point_iterations, home)
-        else:
-            costs = slot_costs(options.loss, residuals(layout, frames, points)[1])
-        return judge(cameras, points, costs, share)
+        return Trial(cameras, points, candidate, predicted, gain, accepted, share, repairs)
 
     def repair(turn: tuple[Trial, Array]) -> tuple[Trial, Array]:
         trial, left = turn
-        moved = refine_cameras(layout, trial.cameras, trial.points, options)
-        return settle(moved, trial.points, trial.share)._replace(repairs=trial.repairs + 1), left - 1
+        moved = refine_cameras(parts.layout, trial.cameras, trial.points, options)
+        again = settle(moved, trial.points, trial.share, trial.repairs + 1)
+        return _where(parts, worth_it(turn), again, trial), left - 1
 
-    def worth_it(turn: tuple[Trial, Array]) -> Bool[Array, ""]:
+    def worth_it(turn: tuple[Trial, Array]) -> Bool[Array, "*parts"]:
         trial, left = turn
         return (left > 0) & (trial.gain < GOOD_GAIN) & (trial.cost < HOPELESS * cost) & matters
 
     def attempt(share: Array, repairs: Array) -> Trial:
-        moved = move_cameras(cameras, share * step.cameras, options)
-        trial = settle(moved, points + share * step.points, share)._replace(repairs=repairs)
+        moved = move_cameras(cameras, parts.of_cameras(share) * step.cameras, options)
+        trial = settle(moved, points + parts.of_points(share) * step.points, share, repairs)
         if not options.camera_rounds:
             return trial
         rounds = jnp.where(share == 1, options.camera_rounds, min(ROUNDS_OF_SHORTER, options.camera_rounds))
-        return lax.while_loop(worth_it, repair, (trial, rounds))[0]
+        return lax.while_loop(lambda turn: jnp.any(worth_it(turn)), repair, (trial, rounds))[0]
 
-    one, none = jnp.ones((), cost.dtype), jnp.zeros((), jnp.int32)
     if options.trials == 1:
         return attempt(one, none)
     # the whole step is the first turn of the loop, so that the program has one copy of all this
     last = 1.5 * SHORTER ** (options.trials - 1)
-    again = lambda trial: ~trial.accepted & (trial.share > last) & (matters | (trial.share > 1))
-    shorter = lambda trial: attempt(SHORTER * trial.share, trial.repairs + 1)
+
+    def refused(trial: Trial) -> Bool[Array, "*parts"]:
+        return ~trial.accepted & (trial.share > last) & (matters | (trial.share > 1))
+
+    def shorter(trial: Trial) -> Trial:
+        return _where(parts, refused(trial), attempt(SHORTER * trial.share, trial.repairs + 1), trial)
+
     bad = jnp.full_like(cost, jnp.inf)
-    nothing = Trial(cameras, points, bad, -one, -bad, jnp.zeros((), bool), one / SHORTER, none - 1)
-    return lax.while_loop(again, shorter, nothing)
+    nothing = Trial(cameras, points, bad, -one, -bad, jnp.zeros(cost.shape, bool), one / SHORTER, none - 1)
+    return lax.while_loop(lambda trial: jnp.any(refused(trial)), shorter, nothing)
+
+
+def _where(parts: Parts, which: Bool[Array, "*parts"], new: Trial, old: Trial) -> Trial:
+    """The new trial of some parts, the old one of the others."""
+    if not which.shape:
+        return new  # loops run as long as there are some
+    facts = [jnp.where(which, *pair) for pair in zip(new[2:], old[2:], strict=True)]
+    cameras = jnp.where(parts.of_cameras(which), new.cameras, old.cameras)
+    return Trial(cameras, jnp.where(parts.of_points(which), new.points, old.points), *facts)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
-from support import bal_file, needs_data, start, step
+from support import bal_file, needs_data, paper, start, step
 from test_step import DAMPINGS, check_step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
@@ -23,11 +23,13 @@ from jaxba.eliminate import Coordinates, apply_reduced, camera_system, eliminate
 from jaxba.layout import partition_of
 from jaxba.linearize import linearize
 from jaxba.methods import UnknownMethodError
+from jaxba.schur import solve_step
 from jaxba.split import agreed_gradient, clustered_step, eliminate_copies, repair, solve_clusters, split_right
 from jaxba.termination import converged_in_cost
 
 CLUSTERED = StepOptions(linear_solver="clustered", cluster_cameras=2)
 DECOMPOSED = StepOptions(linear_solver="decomposed", cluster_cameras=2)
+EMBEDDED = {"refine_points": 3, "camera_rounds": 2, "trials": 3}
 NORMAL = StepOptions(linear_solver="normal", cg_forcing=0.0, cg_tolerance=1e-15, cg_max_iterations=20000)
 
 
@@ -201,7 +203,7 @@ def test_ddlm_with_one_block_is_plain_lm():
         np.testing.assert_allclose(state.cameras, same.cameras, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("changes", [{}, {"block_steps": 3}, {"refine_points": 2}])
+@pytest.mark.parametrize("changes", [{}, {"block_steps": 3}, {"refine_points": 2}, EMBEDDED])
 @pytest.mark.parametrize("damping", [1e-10, 1e-4, 1.0])
 def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, changes):
     problem, options = support.odd(), replace(DECOMPOSED, **changes)
@@ -213,6 +215,54 @@ def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, chan
         assert state.cost <= before.cost
         assert bool(info.accepted) == (state.cost < before.cost)
         np.testing.assert_allclose(state.cost, support.cost(support.back(problem, first, state), options), rtol=1e-9)
+
+
+def test_clusters_of_ddlm_have_shares_and_repairs_of_their_own():
+    """Three scenes in one problem: one step passes, one is shortened, one repaired, as each would be alone."""
+    scenes, damping = [paper(2), turned(paper(1)), turned(paper(3))], 1e-3
+    options = StepOptions(linear_solver="decomposed", cluster_cameras=scenes[0].num_cameras, **EMBEDDED)
+    layout, state = start(side_by_side(scenes), options)
+    part = partition_of(layout).at(0)
+    found = _round(layout, state, jnp.asarray(damping), part, options)
+    plain = StepOptions(**EMBEDDED)
+    alone, first = [], 0
+    for problem in scenes:
+        after, info = step(*start(problem, plain), damping, plain)
+        mine = np.arange(first, first + problem.num_cameras)
+        assert len(set(np.asarray(part.label)[mine])) == 1
+        np.testing.assert_allclose(np.asarray(found.cameras)[:, mine], after.cameras, rtol=1e-6, atol=1e-9)
+        first += problem.num_cameras
+        alone.append(info)
+    shares, repairs = (
+        [float(x) for x in column] for column in zip(*[(i.share, i.repairs) for i in alone], strict=True)
+    )
+    assert (shares, repairs) == ([1, 0.25, 1], [0, 1, 1])
+    assert found.repairs == 1
+    np.testing.assert_allclose(found.predicted, sum(info.predicted for info in alone), rtol=1e-6)
+    whole = [_step_of(problem, damping).predicted(jnp.ones(())) for problem in scenes]
+    np.testing.assert_allclose(found.share, np.dot(shares, whole) / np.sum(whole), rtol=1e-6)
+
+
+def _step_of(problem: BundleProblem, damping: float):
+    layout, state = start(problem)
+    linear = linearize(layout, state.cameras, state.points, StepOptions().loss)
+    return solve_step(layout, linear, state.cameras, state.points, jnp.asarray(damping), StepOptions())
+
+
+def turned(problem: BundleProblem) -> BundleProblem:
+    """A start from which bold steps fail: cameras turned by half a radian and more."""
+    turns = 0.6 * np.random.default_rng(0).normal(size=(problem.num_cameras, 3))
+    return problem.replace(cameras=problem.cameras + np.pad(turns, ((0, 0), (0, 6))))
+
+
+def side_by_side(problems: list[BundleProblem]) -> BundleProblem:
+    """Problems that share nothing, as one."""
+    join = lambda name: np.concatenate([getattr(problem, name) for problem in problems])
+    before = lambda name: np.cumsum([0, *(getattr(problem, name) for problem in problems)])
+    camera = [first + problem.camera_index for first, problem in zip(before("num_cameras"), problems, strict=False)]
+    point = [first + problem.point_index for first, problem in zip(before("num_points"), problems, strict=False)]
+    parts = [join(name) for name in ("cameras", "points", "observations")]
+    return BundleProblem.create(*parts, np.concatenate(camera), np.concatenate(point))
 
 
 def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():

@@ -1,0 +1,144 @@
+"""What is judged by itself: the whole problem, or every cluster of a decomposition.
+
+The cost of a part is the sum over its observations, and a candidate is accepted or refused part by part. Numbers of
+parts are arrays of one shape: none for the whole, one entry a cluster else.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from jaxba.layout import Layout
+from jaxba.linearize import residuals, slot_costs, slot_frames
+from jaxba.options import StepOptions
+from jaxba.partition import Partition
+from jaxba.refine import Home, refine_points
+from jaxba.sums import point_sum, take, total, tree_sum
+
+
+@runtime_checkable
+class Parts(Protocol):
+    """How a problem falls into parts."""
+
+    @property
+    def layout(self) -> Layout:
+        """The problem's observations."""
+        ...
+
+    def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " terms"]:
+        """The cost of every observation, in the pieces in which `settle` has it."""
+        ...
+
+    def settle(
+        self,
+        cameras: Float[Array, "9 cameras"],
+        points: Float[Array, "3 points"],
+        home: Home,
+        options: StepOptions,
+        iterations: int | Int[Array, ""],
+    ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
+        """The parts' own points after embedded iterations, if the options have any, and the cost in pieces."""
+        ...
+
+    def sums(self, terms: Float[Array, " terms"]) -> Float[Array, "*parts"]:
+        """Sums pieces over every part."""
+        ...
+
+    def of_cameras(self, values: Array) -> Array:
+        """The number of each camera's part, as far as broadcasting does not say it."""
+        ...
+
+    def of_points(self, values: Array) -> Array:
+        """The number of each point's part; any for a point that several parts see."""
+        ...
+
+
+class Whole(NamedTuple):
+    """One part. Costs are compared point by point where points are refined, as `refine_points` returns them."""
+
+    layout: Layout
+
+    def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " terms"]:
+        """See `Parts`."""
+        return point_sum(self.layout, costs[None])[0] if options.refine_points else costs
+
+    def settle(
+        self,
+        cameras: Float[Array, "9 cameras"],
+        points: Float[Array, "3 points"],
+        home: Home,
+        options: StepOptions,
+        iterations: int | Int[Array, ""],
+    ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
+        """See `Parts`."""
+        frames = slot_frames(self.layout, cameras)
+        if options.refine_points:
+            return refine_points(self.layout, frames, points, options.loss, iterations, home)
+        return points, slot_costs(options.loss, residuals(self.layout, frames, points)[1])
+
+    def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
+        """See `Parts`."""
+        return total(terms)
+
+    def of_cameras(self, values: Array) -> Array:
+        """See `Parts`."""
+        return values
+
+    def of_points(self, values: Array) -> Array:
+        """See `Parts`."""
+        return values
+
+
+class Clusters(NamedTuple):
+    """The clusters of a partition. Points that several of them see stand still."""
+
+    layout: Layout
+    partition: Partition
+    owner: Int[Array, " points"]
+    """The cluster that alone sees a point; any for a separator."""
+
+    @staticmethod
+    def of(layout: Layout, partition: Partition) -> Clusters:
+        """The parts of a partition."""
+        seen = jnp.asarray(layout.slot_mask).astype(jnp.float32)
+        labels = take(jnp.asarray(partition.label), layout.slot_camera) * seen
+        sums = point_sum(layout, jnp.stack([labels, seen]))  # of equal whole numbers: the quotient is exact
+        return Clusters(layout, partition, (sums[0] / jnp.maximum(sums[1], 1)).astype(jnp.int32))
+
+    def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " slots"]:
+        """See `Parts`."""
+        return costs
+
+    def settle(
+        self,
+        cameras: Float[Array, "9 cameras"],
+        points: Float[Array, "3 points"],
+        home: Home,
+        options: StepOptions,
+        iterations: int | Int[Array, ""],
+    ) -> tuple[Float[Array, "3 points"], Float[Array, " slots"]]:
+        """See `Parts`."""
+        frames = slot_frames(self.layout, cameras)
+        if options.refine_points:
+            points = refine_points(self.layout, frames, points, options.loss, iterations, home)[0]
+            points = jnp.where(self.partition.separator, home.points, points)
+        return points, slot_costs(options.loss, residuals(self.layout, frames, points)[1])
+
+    def sums(self, terms: Float[Array, " slots"]) -> Float[Array, " clusters"]:
+        """See `Parts`."""
+        per_camera = tree_sum(terms[:, None], self.layout.camera_levels)[:, 0]
+        members = self.partition.members
+        own = per_camera.at[members].get(mode="clip")
+        return jnp.sum(jnp.where(members < self.layout.num_cameras, own, 0), axis=1)
+
+    def of_cameras(self, values: Array) -> Array:
+        """See `Parts`."""
+        return take(values, self.partition.label)
+
+    def of_points(self, values: Array) -> Array:
+        """See `Parts`."""
+        return take(values, self.owner)
