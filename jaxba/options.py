@@ -129,6 +129,11 @@ class StepOptions:
         return self.linear_solver in ("clustered", "decomposed")
 
     @property
+    def inexactness(self) -> float:
+        """Forcing term of the solver, 0 if it does not end by one (inexact Newton)."""
+        return self.cg_forcing if self.linear_solver in ("sparse", "implicit", "normal") else 0.0
+
+    @property
     def leaves_rest(self) -> bool:
         """Whether a step leaves a residual of the linear system that is not orthogonal to it."""
         return self.linear_solver in ("clustered", "power")

@@ -38,7 +38,7 @@ FREE = AgentConfig(guard="off", **RANGE)
 REJECTED, ACCEPTED = False, True
 
 
-def info(cost: float = 100.0, focal: float = 500.0, limit: int = 100) -> ProblemInfo:
+def info(cost: float = 100.0, focal: float = 500.0, limit: int = 100, forcing: float = 0.0) -> ProblemInfo:
     count = lambda n: jnp.asarray(n, jnp.int32)
     return ProblemInfo(
         cost=jnp.asarray(cost),
@@ -48,6 +48,7 @@ def info(cost: float = 100.0, focal: float = 500.0, limit: int = 100) -> Problem
         unit=jnp.asarray(1.0),
         focal=jnp.asarray(focal),
         max_iterations=count(limit),
+        forcing=jnp.asarray(forcing),
     )
 
 
@@ -211,6 +212,17 @@ def test_a_solve_cannot_stand_still_under_a_large_lambda():
     for change in ({"cost": 99.0}, {"damping_share": 0.9 * HEAVY_SHARE}, {"share": 0.25}):
         free = after(config, memory, ACCEPTED, 1.0, **{**tiny, **change})
         np.testing.assert_allclose(decades(config, free, 1), config.high, atol=1e-6)
+
+
+def test_lambda_does_not_fall_after_an_inexact_step_that_it_hardly_changed():
+    """Conjugate gradients left more open than lambda did; after an exact step it may fall."""
+    config = AgentConfig(**{**RANGE, "descent": 1.5})
+    for forcing, share, lowest in [(0.1, 0.9e-2, -5.0), (0.1, 1.1e-2, -6.5), (1e-3, 0.9e-2, -6.5), (0.0, 0.0, -6.5)]:
+        memory = after(config, _begin(config, info(forcing=forcing)), ACCEPTED, -5.0, damping_share=share)
+        np.testing.assert_allclose(decades(config, memory, -1), lowest, atol=1e-6)
+        np.testing.assert_allclose(decades(config, memory, 1), config.high, atol=1e-6)
+    rejected = after(config, _begin(config, info(forcing=0.1)), REJECTED, -5.0, damping_share=0.0)
+    assert not rejected.idle
 
 
 def test_lambda_falls_from_one_iteration_to_the_next_by_so_many_decades_at_most():

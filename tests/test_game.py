@@ -92,7 +92,7 @@ def test_the_same_key_makes_the_same_scenes_and_another_one_others():
 def test_what_a_policy_is_told_of_a_scene_is_true():
     scenes = make_scenes(KIND, jax.random.key(1), 40)
     cost = initial_costs(KIND, scenes)
-    info = info_of(KIND, scenes, cost, 33)
+    info = info_of(KIND, scenes, cost, 33, StepOptions())
     for k, seen in enumerate(grid(KIND, scenes)):
         if not seen.any():
             continue

@@ -317,7 +317,8 @@ def test_banks_survive_their_file(tmp_path):
             jnp.ones((count, 9, 4)), jnp.ones((count, 3, 11)), jnp.ones((count, 2, 44)), jnp.ones((count, 44), bool)
         )
         whole = number.astype(jnp.int32)
-        return Bank(scenes, number, 2 * number, ProblemInfo(number, whole, whole, whole, number, number, whole), number)
+        info = ProblemInfo(number, whole, whole, whole, number, number, whole, number)
+        return Bank(scenes, number, 2 * number, info, number)
 
     splits = [Split(bank(5), bank(2)), Split(bank(3), bank(1))]
     task._write_banks(tmp_path / "bank.npz", splits)

@@ -39,6 +39,10 @@ RELATIVE_REACH = 3.0
 FORCING = (-3.0, -0.3)
 """log10 of the forcing terms that a third number of an action ranges over: from DeepLM's to half."""
 
+IDLE_SHARE = 0.1
+"""Share of damping in the curvature of an inexact step, relative to the forcing term, below which a smaller lambda is
+taken to change nothing but the length of conjugate gradients (docs/game.md)."""
+
 LARGEST_ESCALATION = 12.0
 """Decades; more than the whole range of lambda means nothing."""
 
@@ -220,6 +224,7 @@ class Memory(NamedTuple):
     shortened: Float[Array, ""]  # how often the last step was shortened
     hand_over: Bool[Array, ""]  # the guard decides to the end
     capped: Bool[Array, ""]  # the last step was short because of its lambda, and of nothing else
+    idle: Bool[Array, ""]  # the last step was left inexact by more than what lambda did to it
     effort: Effort | None  # of the last step, once it is chosen; None where it is fixed
 
 
@@ -247,6 +252,7 @@ def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
         shortened=number(0.0),
         hand_over=no,
         capped=no,
+        idle=no,
         effort=None if config.effort == "fixed" else _full_effort(config, dtype),
     )
 
@@ -297,7 +303,7 @@ def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) ->
     if not config.guarded:
         return 10**wanted
     lowest = jnp.where(memory.iteration == 0, config.first_low, memory.damping - config.descent)
-    wanted = jnp.maximum(wanted, lowest)
+    wanted = jnp.maximum(wanted, jnp.where(memory.idle, memory.damping, lowest))
     rejected = memory.row > 0
     too_bold = rejected | (memory.shortened > 0)
     rise = config.escalate * jnp.where(rejected, 1.0, memory.shortened)
@@ -334,6 +340,12 @@ def with_effort(config: AgentConfig, memory: Memory, action: Float[Array, " acti
         chosen = chosen._replace(forcing=10 ** (low + (high - low) * share[2]))
     guarded = _guarding(config, memory) & config.guarded
     return memory._replace(effort=jax.tree.map(lambda all_, some: jnp.where(guarded, all_, some), full, chosen))
+
+
+def _forcing(memory: Memory) -> Float[Array, ""]:
+    """Forcing term of the last step."""
+    chosen = None if memory.effort is None else memory.effort.forcing
+    return memory.info.forcing if chosen is None else chosen
 
 
 def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
@@ -390,6 +402,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         shortened=shortened.astype(dtype),
         hand_over=memory.hand_over | over,
         effort=memory.effort,
+        idle=step.accepted & (step.damping_share < IDLE_SHARE * _forcing(memory)),
         capped=step.accepted & (step.share == 1) & (decrease < HEAVY_DECREASE) & (step.damping_share > HEAVY_SHARE),
     )
 
