@@ -63,7 +63,7 @@ class Round(NamedTuple):
     cameras: Float[Array, "9 cameras"]
     points: Float[Array, "3 points"]
     cost: Float[Array, ""]  # pixels squared
-    predicted: Float[Array, ""]  # decrease that the clusters' linear models promised, all clusters
+    predicted: Float[Array, ""]  # decrease that linear models promised: of accepted trials, and of whole refused steps
     gain: Float[Array, ""]  # what clusters that were accepted gained, over that
     slope: Float[Array, ""]  # -g.d
     curvature: Float[Array, ""]  # d.H d
@@ -81,7 +81,7 @@ class _Carry(NamedTuple):
     gained: Array
     offered: Array
     taken: Array
-    repairs: Array
+    repairs: Int[Array, " clusters"]
     slope: Array
     curvature: Array
     gradient_max: Array
@@ -114,15 +114,7 @@ def decomposed_round(
 
     def body(count: Array, carry: _Carry) -> _Carry:
         linear = linearize(layout, carry.cameras, carry.points, options.loss)
-        moves, point_moves, gradient_max = _cluster_steps(parts, linear, carry.cameras, carry.dampings, options)
-        coordinates = Coordinates.of(carry.cameras, options)
-        moved = image(layout, linear, moves, point_moves)
-        slopes = parts.sums(-(linear.residual[0] * moved[0] + linear.residual[1] * moved[1]))
-        curvatures = parts.sums(moved[0] * moved[0] + moved[1] * moved[1])
-        turned = jnp.einsum("cij,cj->ci", coordinates.inverse, moves[:, :3])
-        none = jnp.zeros((), jnp.int32)
-        cluster_moves = jnp.concatenate([turned, moves[:, 3:]], axis=1).T
-        step = Step(cluster_moves, point_moves, slopes, slopes - curvatures, gradient_max, none)
+        step, curvatures = _cluster_steps(parts, linear, carry.cameras, carry.dampings, options)
         before = parts.sums(linear.costs)
         trial = best_trial(parts, carry.cameras, carry.points, before, linear, step, options, min_gain)
         good, whole = trial.accepted, step.predicted(jnp.ones_like(before))
@@ -133,19 +125,20 @@ def decomposed_round(
             jnp.where(parts.of_cameras(good), trial.cameras, carry.cameras),
             jnp.where(good_point, trial.points, carry.points),
             jnp.where(good, carry.dampings, LOCAL_FACTOR * carry.dampings),
-            carry.predicted + sum_of(trial.predicted),
+            carry.predicted + sum_of(jnp.where(good, trial.predicted, whole)),
             carry.gained + sum_of(jnp.where(good, trial.gain * trial.predicted, 0)),
             carry.offered + jnp.sum(jnp.where(possible, whole, jnp.inf)),
             carry.taken + sum_of(jnp.where(good, trial.share * whole, 0)),
-            jnp.maximum(carry.repairs, jnp.max(trial.repairs)),
-            carry.slope + sum_of(slopes),
+            carry.repairs + trial.repairs,
+            carry.slope + sum_of(step.slope),
             carry.curvature + sum_of(curvatures),
-            jnp.where(count == 0, gradient_max, carry.gradient_max),
+            jnp.where(count == 0, step.gradient_max, carry.gradient_max),
         )
 
     zero = jnp.zeros_like(cost)
     dampings = jnp.full(partition.members.shape[0], damping)
-    start = _Carry(cameras, points, dampings, zero, zero, zero, zero, jnp.zeros((), jnp.int32), zero, zero, zero)
+    none = jnp.zeros(dampings.shape, jnp.int32)
+    start = _Carry(cameras, points, dampings, zero, zero, zero, zero, none, zero, zero, zero)
     end = lax.fori_loop(0, options.block_steps, body, start)
     moved, after = _separators(layout, end.cameras, end.points, damping, partition, options)
     # points alone may lower the cost a little where every cluster was refused, which is no sign of convergence
@@ -160,7 +153,7 @@ def decomposed_round(
         end.curvature,
         end.gradient_max,
         jnp.clip(share, LEAST_SHARE, 1),
-        end.repairs,
+        jnp.max(end.repairs),
         after < cost,
     )
 
@@ -171,10 +164,10 @@ def _cluster_steps(
     cameras: Array,
     dampings: Float[Array, " clusters"],
     options: StepOptions,
-) -> tuple[Float[Array, "cameras 9"], Float[Array, "3 points"], Float[Array, ""]]:
-    """Steps of all clusters, separators standing still, and the largest entry of the whole gradient.
+) -> tuple[Step, Float[Array, " clusters"]]:
+    """Steps of all clusters, separators standing still, and their `d.H d`; the gradient is that of the whole problem.
 
-    A cluster whose factorisation failed gets a step of nan.
+    A cluster whose factorisation failed stands still, and its slope is nan.
     """
     layout, partition = parts.layout, parts.partition
     coordinates, of_camera = Coordinates.of(cameras, options), parts.of_cameras(dampings)
@@ -184,21 +177,34 @@ def _cluster_steps(
     eliminated = eliminated._replace(projected=projected)
     system = camera_system(layout, linear, eliminated, coordinates, of_camera[:, None], options)
     moves = solve_clusters(layout, linear, eliminated, system, system.right, partition)
-    moves = jnp.where(layout.camera_seen[:, None], moves, 0)
+    # what is no number would spread: empty slots belong to some camera, and padding reads them
+    finite = jnp.all(jnp.isfinite(moves), axis=1).at[partition.members].get(mode="fill", fill_value=True)
+    solved = jnp.all(finite, axis=1)
+    moves = jnp.where(layout.camera_seen[:, None] & parts.of_cameras(solved)[:, None], moves, 0)
     point_moves = jnp.stack(back_substitute(layout, linear, eliminated, moves))
-    return moves, jnp.where(partition.separator, 0, point_moves), largest_gradient(eliminated, system, coordinates)
+    point_moves = jnp.where(partition.separator | ~parts.of_points(solved), 0, point_moves)
+    moved = image(layout, linear, moves, point_moves)
+    slopes = parts.sums(-(linear.residual[0] * moved[0] + linear.residual[1] * moved[1]))
+    slopes = jnp.where(solved, slopes, jnp.nan)
+    curvatures = parts.sums(moved[0] * moved[0] + moved[1] * moved[1])
+    gradient_max = largest_gradient(eliminated, system, coordinates)
+    none = jnp.zeros((), jnp.int32), jnp.zeros_like(gradient_max)
+    step = Step(coordinates.given(moves).T, point_moves, slopes, slopes - curvatures, gradient_max, *none)
+    return step, curvatures
 
 
 def _separators(
     layout: Layout, cameras: Array, points: Array, damping: Array, partition: Partition, options: StepOptions
 ) -> tuple[Float[Array, "3 points"], Float[Array, ""]]:
-    """A damped step of every separator, then embedded iterations of all points; the cost after them."""
+    """Every separator after its embedded iterations, or a damped step where there are none; the cost after that."""
     frames = slot_frames(layout, cameras)
-    if options.refine_points:
-        home = Home(points, in_front(residuals(layout, frames, points)[0]))
-        points, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home)
-        return points, total(costs)
     projection, residual = residuals(layout, frames, points)
+    if options.refine_points:
+        home = Home(points, in_front(projection))
+        refined, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home)
+        before = point_sum(layout, slot_costs(options.loss, residual)[None])[0]
+        costs = jnp.where(partition.separator, costs, before)
+        return jnp.where(partition.separator, refined, points), total(costs)
     entries = point_normal_equations(layout, frames, projection, residual, options.loss)
     sums = point_sum(layout, jnp.stack([*entries, slot_costs(options.loss, residual)]))
     matrix = [sums[k] for k in range(6)]

@@ -46,6 +46,7 @@ class StepInfo(NamedTuple):
     step_norm: Float[Array, ""]  # of the proposed step as long as it was tried, refined points included
     parameter_norm: Float[Array, ""]  # before the step
     cg_iterations: Int[Array, ""]
+    forcing: Float[Array, ""]  # term by which conjugate gradients ended; 0 where the step is not inexact by design
     share: Float[Array, ""]  # length of the candidate relative to the whole step, below 1 after further trials
     damping_share: Float[Array, ""]  # share of the step's curvature that is damping's, 0 (Gauss-Newton) to 1
     repairs: Int[Array, ""]  # camera rounds and further trials after the first candidate
@@ -106,6 +107,7 @@ def lm_step(
         damping,
         gradient_max=step.gradient_max,
         cg_iterations=step.cg_iterations,
+        forcing=step.forcing,
         share=trial.share,
         damping_share=jnp.clip(step.damped / step.slope, 0, 1),
         repairs=trial.repairs,
@@ -130,6 +132,7 @@ def _round(
         damping,
         gradient_max=found.gradient_max,
         cg_iterations=jnp.zeros((), jnp.int32),
+        forcing=jnp.zeros_like(state.cost),
         share=found.share,
         damping_share=jnp.clip(1 - found.curvature / found.slope, 0, 1),
         repairs=found.repairs,

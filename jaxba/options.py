@@ -129,9 +129,9 @@ class StepOptions:
         return self.linear_solver in ("clustered", "decomposed")
 
     @property
-    def inexactness(self) -> float:
-        """Forcing term of the solver, 0 if it does not end by one (inexact Newton)."""
-        return self.cg_forcing if self.linear_solver in ("sparse", "implicit", "normal") else 0.0
+    def inexact(self) -> bool:
+        """Whether conjugate gradients end by a forcing term (inexact Newton)."""
+        return self.linear_solver in ("sparse", "implicit", "normal")
 
     @property
     def leaves_rest(self) -> bool:

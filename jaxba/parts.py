@@ -130,7 +130,8 @@ class Clusters(NamedTuple):
 
     def sums(self, terms: Float[Array, " slots"]) -> Float[Array, " clusters"]:
         """See `Parts`."""
-        per_camera = tree_sum(terms[:, None], self.layout.camera_levels)[:, 0]
+        own_terms = jnp.where(self.layout.slot_mask, terms, 0)  # empty slots belong to some camera of another cluster
+        per_camera = tree_sum(own_terms[:, None], self.layout.camera_levels)[:, 0]
         members = self.partition.members
         own = per_camera.at[members].get(mode="clip")
         return jnp.sum(jnp.where(members < self.layout.num_cameras, own, 0), axis=1)

@@ -42,6 +42,7 @@ class Step(NamedTuple):
     damped: Float[Array, "*parts"]  # d.D d, pixels^2; of a step that solves no system, what -g.d exceeds d.H d by
     gradient_max: Float[Array, ""]  # largest entry of the gradient before the step
     cg_iterations: Int[Array, ""]  # 0 when the system was factored
+    forcing: Float[Array, ""]  # term by which they ended, 0 where that is not by one
 
     def predicted(self, share: Float[Array, "*parts"]) -> Float[Array, "*parts"]:
         """Decrease of the cost that the linear model promises at a share of the step, pixels^2."""
@@ -91,8 +92,7 @@ def solve_step(
     step = jnp.where(layout.camera_seen[:, None], step, jnp.zeros_like(step))
     if options.linear_solver != "normal":
         point_step = back_substitute(layout, linear, eliminated, step)
-    turned = jnp.einsum("cij,cj->ci", coordinates.inverse, step[:, :3])
-    camera_step = jnp.concatenate([turned, step[:, 3:]], axis=1)
+    camera_step = coordinates.given(step)
     slope, damped = _slope_and_damping(eliminated, system, step, camera_step, point_step)
     if options.leaves_rest:
         damped = slope - sum(jnp.sum(m * m) for m in image(layout, linear, step, jnp.stack(point_step)))
@@ -103,6 +103,7 @@ def solve_step(
         damped,
         largest_gradient(eliminated, system, coordinates),
         iterations,
+        jnp.asarray(forcing if options.inexact else 0.0, cameras.dtype),
     )
 
 

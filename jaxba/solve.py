@@ -244,7 +244,6 @@ def _info(layout: Layout, state: LMState, options: StepOptions, max_iterations: 
         unit=unit,
         focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
         max_iterations=count(max_iterations),
-        forcing=jnp.asarray(options.inexactness, state.cost.dtype),
     )
     return info
 

@@ -115,16 +115,17 @@ def best_trial(
         trial, left = turn
         return (left > 0) & (trial.gain < GOOD_GAIN) & (trial.cost < HOPELESS * cost) & matters
 
-    def attempt(share: Array, repairs: Array) -> Trial:
+    def attempt(wanted: Array, share: Array, repairs: Array) -> Trial:
         moved = move_cameras(cameras, parts.of_cameras(share) * step.cameras, options)
         trial = settle(moved, points + parts.of_points(share) * step.points, share, repairs)
         if not options.camera_rounds:
             return trial
         rounds = jnp.where(share == 1, options.camera_rounds, min(ROUNDS_OF_SHORTER, options.camera_rounds))
+        rounds = jnp.where(wanted, rounds, 0)
         return lax.while_loop(lambda turn: jnp.any(worth_it(turn)), repair, (trial, rounds))[0]
 
     if options.trials == 1:
-        return attempt(one, none)
+        return attempt(jnp.ones(cost.shape, bool), one, none)
     # the whole step is the first turn of the loop, so that the program has one copy of all this
     last = 1.5 * SHORTER ** (options.trials - 1)
 
@@ -132,7 +133,8 @@ def best_trial(
         return ~trial.accepted & (trial.share > last) & (matters | (trial.share > 1))
 
     def shorter(trial: Trial) -> Trial:
-        return _where(parts, refused(trial), attempt(SHORTER * trial.share, trial.repairs + 1), trial)
+        wanted = refused(trial)
+        return _where(parts, wanted, attempt(wanted, SHORTER * trial.share, trial.repairs + 1), trial)
 
     bad = jnp.full_like(cost, jnp.inf)
     nothing = Trial(cameras, points, bad, -one, -bad, jnp.zeros(cost.shape, bool), one / SHORTER, none - 1)

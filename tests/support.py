@@ -139,6 +139,7 @@ def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp
         "parameter_norm": 1.0,
         "share": 1.0,
         "damping_share": 0.0,
+        "forcing": 0.0,
         **changes,
     }
     return StepInfo(

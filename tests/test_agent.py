@@ -38,7 +38,7 @@ FREE = AgentConfig(guard="off", **RANGE)
 REJECTED, ACCEPTED = False, True
 
 
-def info(cost: float = 100.0, focal: float = 500.0, limit: int = 100, forcing: float = 0.0) -> ProblemInfo:
+def info(cost: float = 100.0, focal: float = 500.0, limit: int = 100) -> ProblemInfo:
     count = lambda n: jnp.asarray(n, jnp.int32)
     return ProblemInfo(
         cost=jnp.asarray(cost),
@@ -48,7 +48,6 @@ def info(cost: float = 100.0, focal: float = 500.0, limit: int = 100, forcing: f
         unit=jnp.asarray(1.0),
         focal=jnp.asarray(focal),
         max_iterations=count(limit),
-        forcing=jnp.asarray(forcing),
     )
 
 
@@ -218,10 +217,10 @@ def test_lambda_does_not_fall_after_an_inexact_step_that_it_hardly_changed():
     """Conjugate gradients left more open than lambda did; after an exact step it may fall."""
     config = AgentConfig(**{**RANGE, "descent": 1.5})
     for forcing, share, lowest in [(0.1, 0.9e-2, -5.0), (0.1, 1.1e-2, -6.5), (1e-3, 0.9e-2, -6.5), (0.0, 0.0, -6.5)]:
-        memory = after(config, _begin(config, info(forcing=forcing)), ACCEPTED, -5.0, damping_share=share)
+        memory = after(config, _begin(config, info()), ACCEPTED, -5.0, damping_share=share, forcing=forcing)
         np.testing.assert_allclose(decades(config, memory, -1), lowest, atol=1e-6)
         np.testing.assert_allclose(decades(config, memory, 1), config.high, atol=1e-6)
-    rejected = after(config, _begin(config, info(forcing=0.1)), REJECTED, -5.0, damping_share=0.0)
+    rejected = after(config, _begin(config, info()), REJECTED, -5.0, damping_share=0.0, forcing=0.1)
     assert not rejected.idle
 
 

@@ -27,7 +27,6 @@ def info(unit: float = 1.0, dtype=jnp.float64) -> ProblemInfo:
         unit=jnp.asarray(unit, dtype),
         focal=jnp.asarray(500.0, dtype),
         max_iterations=count(100),
-        forcing=jnp.asarray(0.0, dtype),
     )
 
 

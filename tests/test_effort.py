@@ -74,6 +74,7 @@ def test_a_step_with_another_forcing_term_is_that_of_options_with_it(solver):
         found, other = _step(layout, state, jnp.asarray(1e-6), options, effort=chosen)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
         assert int(one.cg_iterations) == int(other.cg_iterations)
+        np.testing.assert_allclose([one.forcing, other.forcing], forcing)
         iterations.append(int(other.cg_iterations))
     assert iterations[0] < iterations[2] < iterations[1]
 

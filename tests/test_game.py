@@ -26,8 +26,9 @@ from jaxba.game.evaluate import compare, evaluate, score
 from jaxba.game.play import Trajectories, play
 from jaxba.game.protocol import Environment
 from jaxba.game.scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
-from jaxba.game.slots import class_layout
+from jaxba.game.slots import class_layout, with_scene
 from jaxba.layout import partition_of
+from jaxba.lm import LMState, lm_step
 
 LIMIT = 25
 
@@ -92,7 +93,7 @@ def test_the_same_key_makes_the_same_scenes_and_another_one_others():
 def test_what_a_policy_is_told_of_a_scene_is_true():
     scenes = make_scenes(KIND, jax.random.key(1), 40)
     cost = initial_costs(KIND, scenes)
-    info = info_of(KIND, scenes, cost, 33, StepOptions())
+    info = info_of(KIND, scenes, cost, 33)
     for k, seen in enumerate(grid(KIND, scenes)):
         if not seen.any():
             continue
@@ -166,6 +167,24 @@ def test_scenes_of_a_class_share_random_clusters(method):
     assert (found.costs[:, 6] != played().costs[:, 6]).all()
 
 
+def test_scenes_whose_clusters_have_trials_and_rounds_are_played_as_each_alone():
+    """Loops with a verdict per cluster, scenes along another axis: as one scene after the other."""
+    bank, damping = tiny_bank(), 1e-6
+    options = StepOptions(linear_solver="decomposed", cluster_cameras=2, refine_points=2, trials=3, camera_rounds=2)
+    found = play(KIND, bank, make_policy(f"constant:{damping}"), options, 4)
+    layout = class_layout(KIND, options)
+    iterate = jax.jit(lambda own, state, turn: lm_step(own, state, damping, options, 0.0, turn))
+    repairs = 0
+    for k in range(6):
+        own = with_scene(layout, bank.scenes.pixels[k], bank.scenes.mask[k])
+        state = LMState(bank.scenes.cameras[k], bank.scenes.points[k], bank.initial_cost[k])
+        for turn in range(min(3, found.iterations[k])):
+            state, step = iterate(own, state, jnp.asarray(turn))
+            np.testing.assert_allclose(found.costs[k, turn + 1], state.cost, rtol=1e-5)
+            repairs += int(step.repairs)
+    assert repairs > 0
+
+
 def test_costs_start_at_the_start_never_rise_and_stay_after_the_end():
     bank, found = tiny_bank(), played()
     assert found.costs.shape == (len(bank.initial_cost), LIMIT + 1)
@@ -197,17 +216,19 @@ def test_lanes_do_not_mix_scenes(monkeypatch):
     np.testing.assert_array_equal(np.minimum(straight.iterations[order], LIMIT - 1), mixed.iterations)
 
 
-def test_a_network_meets_in_a_solve_what_it_meets_in_the_game():
+@pytest.mark.parametrize("method", ["lm", "deeplm"])
+def test_a_network_meets_in_a_solve_what_it_meets_in_the_game(method):
     """Each of its lambdas in a solve is the one it chose in the game, so its observations were the same."""
+    options = make_method(method).options(StepOptions())
     rng = np.random.default_rng(2)
     size = AGENT.observation_size
     draw = lambda *shape: rng.normal(size=shape).astype(np.float32)
     policy = Learned((Layer(draw(size, 8), draw(8)), Layer(draw(8, 2), draw(2))), AGENT)
     bank = tiny_bank()
-    found = play(KIND, bank, policy, StepOptions(), LIMIT)
+    found = play(KIND, bank, policy, options, LIMIT)
     limit = int(bank.info.max_iterations[0])
     for k in (0, 1, 5):
-        alone = solve(problem_of(KIND, bank.scenes, k), policy, StepOptions(), max_iterations=limit)
+        alone = solve(problem_of(KIND, bank.scenes, k), policy, options, max_iterations=limit)
         count = min(4, alone.iterations)
         np.testing.assert_allclose(found.dampings[k, :count], alone.history.damping[:count], rtol=1e-3)
 

@@ -188,17 +188,20 @@ def test_global_deeplm_run_to_convergence_is_the_exact_step(make, damping):
 # Domain decomposition
 
 
-def test_ddlm_with_one_block_is_plain_lm():
+@pytest.mark.parametrize("embedded", [{}, EMBEDDED])
+def test_ddlm_with_one_block_is_plain_lm(embedded):
     problem = support.tiny()
-    one = replace(DECOMPOSED, cluster_cameras=100)
+    one, whole = replace(DECOMPOSED, cluster_cameras=100, **embedded), StepOptions(**embedded)
     layout, state = start(problem, one)
-    plain, same = start(problem, StepOptions())
+    plain, _ = start(problem, whole)
     for turn, damping in enumerate([1e-4, 1e-2, 1e-6, 1.0]):
-        state, ours = step(layout, state, damping, one, turn=turn)
-        same, theirs = step(plain, same, damping, StepOptions())
+        before = state
+        state, ours = step(layout, before, damping, one, turn=turn)
+        same, theirs = step(plain, before, damping, whole)
         assert ours.accepted
         assert theirs.accepted
-        for name in ("cost", "predicted", "gain_ratio", "gradient_max", "step_norm", "damping_share"):
+        names = ("cost", "predicted", "gain_ratio", "gradient_max", "step_norm", "damping_share", "share", "repairs")
+        for name in names:
             np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-6, err_msg=name)
         np.testing.assert_allclose(state.cameras, same.cameras, rtol=1e-8, atol=1e-10)
 
@@ -280,6 +283,31 @@ def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
     small = [d for d in decreases if d <= 1e-6]
     assert decreases[0] > 1e-6
     assert small
+
+
+def test_a_cluster_of_ddlm_that_cannot_be_factored_leaves_the_others_alone(monkeypatch):
+    """Also that of camera 0, which owns the empty slots that padding reads."""
+    from jaxba import decompose
+
+    options = replace(DECOMPOSED, **EMBEDDED)
+    layout, state = start(support.tiny(), options)
+    part = partition_of(layout).at(0)
+    label = np.asarray(part.label)
+    expected = _round(layout, state, jnp.asarray(1e-3), part, options)
+    solve_all = decompose.solve_clusters
+
+    def fail(*arguments):
+        return jnp.where((label == label[0])[:, None], jnp.nan, solve_all(*arguments))
+
+    monkeypatch.setattr(decompose, "solve_clusters", fail)
+    found = jax.jit(lambda state: decomposed_round(layout, *state, jnp.asarray(1e-3), part, options, 0.0))(state)
+    mine, others = label == label[0], label != label[0]
+    assert others.any()
+    np.testing.assert_array_equal(np.asarray(found.cameras)[:, mine], np.asarray(state.cameras)[:, mine])
+    np.testing.assert_allclose(found.cameras[:, others], expected.cameras[:, others], rtol=1e-9, atol=1e-12)
+    assert (np.asarray(found.cameras)[:, others] != np.asarray(state.cameras)[:, others]).any()
+    assert found.accepted
+    assert found.share == LEAST_SHARE
 
 
 @functools.partial(jax.jit, static_argnames=("options",))

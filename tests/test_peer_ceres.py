@@ -302,13 +302,16 @@ def test_driven_by_its_own_rule_ceres_does_what_it_does_alone():
 
 def test_the_iterative_mode_counts_conjugate_gradients_and_the_direct_ones_have_none():
     for mode in ("dense", "sparse", "iterative"):
+        terms = []
+        note = lambda record, terms=terms: terms.append(float(record.step.forcing))
         for found in (
-            solve_by_ceres(support.tiny(), mode, max_iterations=3),
-            drive_ceres(support.tiny(), mode, SOME, max_iterations=3),
+            solve_by_ceres(support.tiny(), mode, max_iterations=3, callback=note),
+            drive_ceres(support.tiny(), mode, SOME, max_iterations=3, callback=note),
         ):
             assert found.linear_solver == mode
             assert (found.history.cg_iterations > 0).all() == (mode == "iterative")
             assert found.final_cost < found.initial_cost
+        assert set(terms) == {0.1 if mode == "iterative" else 0.0}  # Ceres' eta
 
 
 # Both

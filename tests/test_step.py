@@ -211,6 +211,25 @@ def test_a_start_that_is_not_finite_stays_as_it_is():
     assert same_bits(after, before)
 
 
+@pytest.mark.parametrize(
+    ("changes", "forcing"),
+    [
+        ({}, 0.0),
+        ({"algebra": "mixed"}, 0.0),  # conjugate gradients repair an exact solve
+        ({"linear_solver": "sparse"}, 0.1),
+        ({"linear_solver": "implicit", "cg_forcing": 0.02}, 0.02),
+        ({"linear_solver": "normal", "cg_forcing": 1e-3}, 1e-3),
+        ({"linear_solver": "power"}, 0.0),
+        ({"linear_solver": "clustered"}, 0.0),
+        ({"linear_solver": "decomposed"}, 0.0),
+    ],
+)
+def test_a_step_says_by_which_forcing_term_it_ended(changes, forcing):
+    options = StepOptions(**changes)
+    _, info = step(*start(support.tiny(), options), 1e-2, options)
+    assert float(info.forcing) == forcing
+
+
 def test_a_step_is_taken_only_if_its_gain_exceeds_the_threshold():
     layout, before = start(support.tiny())
     _, info = step(layout, before, 1e-2, EXACT, 0.0)

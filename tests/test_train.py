@@ -317,7 +317,7 @@ def test_banks_survive_their_file(tmp_path):
             jnp.ones((count, 9, 4)), jnp.ones((count, 3, 11)), jnp.ones((count, 2, 44)), jnp.ones((count, 44), bool)
         )
         whole = number.astype(jnp.int32)
-        info = ProblemInfo(number, whole, whole, whole, number, number, whole, number)
+        info = ProblemInfo(number, whole, whole, whole, number, number, whole)
         return Bank(scenes, number, 2 * number, info, number)
 
     splits = [Split(bank(5), bank(2)), Split(bank(3), bank(1))]
@@ -328,6 +328,11 @@ def test_banks_survive_their_file(tmp_path):
         assert a.dtype == b.dtype
         np.testing.assert_array_equal(a, b)
     assert [path.name for path in tmp_path.iterdir()] == ["bank.npz"]
+    with np.load(tmp_path / "bank.npz") as file:
+        older = {name: file[name] for name in file.files if not name.endswith("best_cost")}
+    np.savez(tmp_path / "older.npz", **older)
+    with pytest.raises(TrainError, match=r"^[^\n]*older.npz: written by another version \([^\n]*best_cost[^\n]*\); begin in a new folder$"):
+        task.read_banks(tmp_path / "older.npz")
 
 
 def test_the_log_is_json(whole):

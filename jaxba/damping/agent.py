@@ -342,12 +342,6 @@ def with_effort(config: AgentConfig, memory: Memory, action: Float[Array, " acti
     return memory._replace(effort=jax.tree.map(lambda all_, some: jnp.where(guarded, all_, some), full, chosen))
 
 
-def _forcing(memory: Memory) -> Float[Array, ""]:
-    """Forcing term of the last step."""
-    chosen = None if memory.effort is None else memory.effort.forcing
-    return memory.info.forcing if chosen is None else chosen
-
-
 def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     """After an iteration."""
     dtype = memory.cost.dtype
@@ -402,7 +396,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         shortened=shortened.astype(dtype),
         hand_over=memory.hand_over | over,
         effort=memory.effort,
-        idle=step.accepted & (step.damping_share < IDLE_SHARE * _forcing(memory)),
+        idle=step.accepted & (step.damping_share < IDLE_SHARE * step.forcing),
         capped=step.accepted & (step.share == 1) & (decrease < HEAVY_DECREASE) & (step.damping_share > HEAVY_SHARE),
     )
 

@@ -21,7 +21,6 @@ class ProblemInfo(NamedTuple):
     unit: Float[Array, ""]  # largest Hessian diagonal under identity scaling, 1 under diagonal scaling
     focal: Float[Array, ""]  # median focal length, pixels
     max_iterations: Int[Array, ""]
-    forcing: Float[Array, ""]  # term by which conjugate gradients end; 0 where steps are exact
 
 
 @runtime_checkable

@@ -64,9 +64,7 @@ class Bank(NamedTuple):
     ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule to 1e-3 of the best cost
 
 
-def info_of(
-    kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int, options: StepOptions
-) -> ProblemInfo:
+def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
     """What a policy may know of each scene before the first iteration."""
     count = len(scenes.mask)
     grid = scenes.mask.reshape(count, kind.cameras, kind.points + 1)
@@ -81,7 +79,6 @@ def info_of(
         unit=jnp.ones_like(initial),
         focal=focal,
         max_iterations=jnp.full((count,), limit, jnp.int32),
-        forcing=jnp.full((count,), options.inexactness, initial.dtype),
     )
 
 
@@ -166,13 +163,13 @@ def draft(
     """
     scenes = make_scenes(kind, key, count, dtype)
     initial = initial_costs(kind, scenes)
-    info = info_of(kind, scenes, initial, limit, options)
+    info = info_of(kind, scenes, initial, limit)
     error = jnp.sqrt(2 * initial / jnp.maximum(info.observations, 1))
     keep = np.flatnonzero((error < MAX_ERROR_ANGLE * info.focal) & (info.observations >= MIN_OBSERVATIONS))
     scenes, initial, info = jax.tree.map(lambda x: x[keep], (scenes, initial, info))
     if warm_share:
         scenes, initial = warm_starts(kind, scenes, initial, jax.random.fold_in(key, count), warm_share, options)
-        info = info_of(kind, scenes, initial, limit, options)
+        info = info_of(kind, scenes, initial, limit)
     bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
     runs = {}
     for rule in rules:

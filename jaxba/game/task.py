@@ -21,6 +21,7 @@ from jaxba.game.config import TrainConfig
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Score, compare, evaluate
 from jaxba.game.sac import Learner
+from jaxba.game.train import TrainError
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.options import StepOptions
 
@@ -147,10 +148,17 @@ def _write_banks(path: Path, splits: list[Split]) -> None:
 
 
 def read_banks(path: Path) -> list[Split]:
-    """The scenes of a run's folder."""
+    """The scenes of a run's folder.
+
+    Raises:
+        TrainError: another version wrote them.
+    """
     with np.load(path) as file:
         classes = sorted({int(name.split("/")[0]) for name in file.files})
-        return [_named_tuple(Split, f"{number}/", file) for number in classes]
+        try:
+            return [_named_tuple(Split, f"{number}/", file) for number in classes]
+        except KeyError as error:
+            raise TrainError(f"{path}: written by another version ({error.args[0]}); begin in a new folder") from None
 
 
 def _named_tuple(kind: Any, prefix: str, arrays: Mapping[str, np.ndarray]) -> Any:

@@ -26,6 +26,9 @@ _log = logging.getLogger(__name__)
 LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
 """Ceres' linear solvers by mode; the iterative one preconditions with SCHUR_JACOBI."""
 
+FORCING = 0.1
+"""Forcing term of the iterative mode. Source: Ceres eta."""
+
 ENDS = {
     "Function tolerance": Termination.COST,
     "Parameter tolerance": Termination.STEP,
@@ -46,6 +49,7 @@ def solver_options(mode: str, threads: int) -> Any:
     options = pyceres.SolverOptions()
     options.linear_solver_type = getattr(pyceres.LinearSolverType, LINEAR_SOLVERS[mode])
     options.preconditioner_type = pyceres.PreconditionerType.SCHUR_JACOBI
+    options.eta = FORCING
     options.num_threads = threads
     options.logging_type = pyceres.LoggingType.SILENT
     return options
@@ -137,6 +141,7 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
         "step_norm": np.nan,
         "parameter_norm": np.nan,
         "cg_iterations": 0,
+        "forcing": 0.0,
         "share": 1.0,
         "damping_share": np.nan,
         "repairs": 0,
@@ -160,6 +165,7 @@ def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: s
         "gradient_max": before.gradient_max_norm,
         "step_norm": now.step_norm,
         "cg_iterations": now.linear_solver_iterations if mode == "iterative" else 0,
+        "forcing": FORCING if mode == "iterative" else 0.0,
     }
     if now.step_is_valid:
         facts["accepted"] = bool(now.step_is_successful)

@@ -97,8 +97,7 @@ def drive_ceres(
     with jax.enable_x64(True), host.calm_blas(), CompileClock() as clock:
         started = time.perf_counter()
         constant = observed(problem, run.colmap.pixels)
-        forcing = options.eta if mode == "iterative" else 0.0
-        state, damping = _init(policy, _problem_info(problem, run.initial_cost, max_iterations, forcing))
+        state, damping = _init(policy, _problem_info(problem, run.initial_cost, max_iterations))
         # everything is compiled before the clock starts
         same = run.colmap.parameters()
         jax.block_until_ready(step_facts(constant, same, same))
@@ -162,7 +161,7 @@ def _answer(policy: DampingPolicy, state: Any, step: StepInfo, iteration: int, t
     return _after_step(policy, state, arrays, np.int32(iteration), limits, np.int32(limit))
 
 
-def _problem_info(problem: BundleProblem, cost: float, max_iterations: int, forcing: float) -> ProblemInfo:
+def _problem_info(problem: BundleProblem, cost: float, max_iterations: int) -> ProblemInfo:
     """As `solve` has it under diagonal damping."""
     cameras = np.unique(problem.camera_index)
     count = lambda n: jnp.asarray(n, jnp.int32)
@@ -174,5 +173,4 @@ def _problem_info(problem: BundleProblem, cost: float, max_iterations: int, forc
         unit=jnp.ones(()),
         focal=jnp.median(jnp.abs(jnp.asarray(problem.cameras)[cameras, 6])),
         max_iterations=count(max_iterations),
-        forcing=jnp.asarray(forcing),
     )
