@@ -331,7 +331,8 @@ def test_banks_survive_their_file(tmp_path):
     with np.load(tmp_path / "bank.npz") as file:
         older = {name: file[name] for name in file.files if not name.endswith("best_cost")}
     np.savez(tmp_path / "older.npz", **older)
-    with pytest.raises(TrainError, match=r"^[^\n]*older.npz: written by another version \([^\n]*best_cost[^\n]*\); begin in a new folder$"):
+    message = r"^[^\n]*older.npz: written by another version \([^\n]*best_cost[^\n]*\); begin in a new folder$"
+    with pytest.raises(TrainError, match=message):
         task.read_banks(tmp_path / "older.npz")
 
 
