@@ -173,7 +173,7 @@ def test_scenes_whose_clusters_have_trials_and_rounds_are_played_as_each_alone()
     options = StepOptions(linear_solver="decomposed", cluster_cameras=2, refine_points=2, trials=3, camera_rounds=2)
     found = play(KIND, bank, make_policy(f"constant:{damping}"), options, 4)
     layout = class_layout(KIND, options)
-    iterate = jax.jit(lambda own, state, turn: lm_step(own, state, damping, options, 0.0, turn))
+    iterate = jax.jit(lambda own, state, turn: lm_step(own, state, jnp.asarray(damping), options, 0.0, turn))
     repairs = 0
     for k in range(6):
         own = with_scene(layout, bank.scenes.pixels[k], bank.scenes.mask[k])
