@@ -113,7 +113,7 @@ def decomposed_round(
 
     def body(count: Array, carry: _Carry) -> _Carry:
         linear = linearize(layout, carry.cameras, carry.points, options.loss)
-        step, curvatures = _cluster_steps(parts, linear, carry.cameras, carry.dampings, options)
+        step = _cluster_steps(parts, linear, carry.cameras, carry.dampings, options)
         before = parts.sums(linear.costs)
         trial = best_trial(parts, carry.cameras, carry.points, before, linear, step, options, min_gain)
         good, whole = trial.accepted, step.predicted(jnp.ones_like(before))
@@ -130,7 +130,7 @@ def decomposed_round(
             carry.taken + sum_of(jnp.where(good, trial.share * whole, 0)),
             carry.repairs + trial.repairs,
             carry.slope + sum_of(step.slope),
-            carry.curvature + sum_of(curvatures),
+            carry.curvature + sum_of(step.slope - step.damped),
             jnp.where(count == 0, step.gradient_max, carry.gradient_max),
         )
 
@@ -163,8 +163,8 @@ def _cluster_steps(
     cameras: Array,
     dampings: Float[Array, " clusters"],
     options: StepOptions,
-) -> tuple[Step, Float[Array, " clusters"]]:
-    """Steps of all clusters, separators standing still, and their `d.H d`; the gradient is that of the whole problem.
+) -> Step:
+    """Steps of all clusters, separators standing still; the gradient is that of the whole problem.
 
     A cluster whose factorisation failed stands still, and its slope is nan.
     """
@@ -188,8 +188,7 @@ def _cluster_steps(
     curvatures = parts.sums(moved[0] * moved[0] + moved[1] * moved[1])
     gradient_max = largest_gradient(eliminated, system, coordinates)
     none = jnp.zeros((), jnp.int32), jnp.zeros_like(gradient_max)
-    step = Step(coordinates.given(moves).T, point_moves, slopes, slopes - curvatures, gradient_max, *none)
-    return step, curvatures
+    return Step(coordinates.given(moves).T, point_moves, slopes, slopes - curvatures, gradient_max, *none)
 
 
 def _separators(
