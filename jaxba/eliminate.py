@@ -105,7 +105,7 @@ def camera_system(
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
     )
-    extra = damping_diagonal(diagonal, damping, options)
+    extra = damping_diagonal(diagonal, options.camera_damping * damping, options)
     # a camera that nobody uses gets a unit block and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     turned = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)

@@ -65,10 +65,11 @@ class SolverName:
         plain = self.policy == LEARNED and self.refine_points == 0
         policy = make_policy(LEARNED_PLAIN if plain else self.policy)
         base = make_method(self.method).options(StepOptions())
-        if self.refine_points is not None:
-            return policy, replace(base, refine_points=self.refine_points)
         agent = policy.config if isinstance(policy, Learned) else AgentConfig()
-        return policy, agent.step_options(base)
+        if self.refine_points is None:
+            return policy, agent.step_options(base)
+        camera_damping = agent.camera_damping if isinstance(policy, Learned) else base.camera_damping
+        return policy, replace(base, refine_points=self.refine_points, camera_damping=camera_damping)
 
 
 def parse_solver(name: str) -> SolverName:

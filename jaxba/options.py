@@ -58,6 +58,10 @@ class StepOptions:
     """What lambda multiplies: `diagonal` the clamped diagonal of the Hessian (Ceres), `identity` the unit
     matrix (the paper's equation)."""
 
+    camera_damping: float = 1.0
+    """Damping of the cameras relative to that of the points, a factor on lambda. 1 is Levenberg-Marquardt as published.
+    Small ones leave it to the points to hold a step back (docs/game.md, "Cameras and points")."""
+
     rotation: Rotation = "angle-axis"
     """Coordinates of a rotation step: `angle-axis` adds to the three numbers of the file, as Ceres does with
     BAL cameras; `manifold` multiplies by exp(step). They differ in what diagonal damping damps."""
@@ -113,6 +117,8 @@ class StepOptions:
         for name in ("preconditioner_order", "power_order", "repairs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
+        if not 0 < self.camera_damping < float("inf"):
+            raise ValueError(f"camera_damping must be positive, is {self.camera_damping}")
         if self.intrinsics == "fixed" and self.linear_solver != "explicit":
             raise ValueError(f"fixed intrinsics need the explicit solver, not {self.linear_solver}")
         if self.cg_max_iterations < 1:

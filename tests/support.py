@@ -281,6 +281,7 @@ def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense
     diagonal = np.ones(jacobian.shape[1])
     if options.scaling == "diagonal":
         diagonal = np.clip(np.sum(jacobian**2, axis=0), 1e-6, 1e32)
+    diagonal[: problem.cameras.size] *= options.camera_damping
     stacked = np.vstack([jacobian, np.diag(np.sqrt(damping * diagonal))])
     free = np.ones(jacobian.shape[1], bool)
     if options.intrinsics == "fixed":

@@ -368,6 +368,7 @@ configs = st.builds(
     refine_points=st.integers(0, 5),
     trials=st.integers(1, 6),
     camera_rounds=st.integers(0, 4),
+    camera_damping=st.floats(1e-6, 1e6),
 )
 
 
@@ -375,10 +376,11 @@ configs = st.builds(
 def test_a_configuration_comes_back_from_its_numbers(config):
     assert config_from(asdict(config)) == config
     made = config.step_options(StepOptions(cg_forcing=0.2))
-    assert (made.refine_points, made.trials, made.camera_rounds) == (
+    assert (made.refine_points, made.trials, made.camera_rounds, made.camera_damping) == (
         config.refine_points,
         config.trials,
         config.camera_rounds,
+        config.camera_damping,
     )
     assert made.cg_forcing == 0.2
 
@@ -413,6 +415,8 @@ def test_a_configuration_comes_back_from_its_numbers(config):
         ({"refine_points": -1}, "refine_points"),
         ({"trials": 0}, "trials"),
         ({"camera_rounds": -1}, "camera_rounds"),
+        ({"camera_damping": 0.0}, "camera_damping"),
+        ({"camera_damping": float("inf")}, "camera_damping"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")

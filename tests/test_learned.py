@@ -20,7 +20,7 @@ from support import same_bits
 import jaxba
 from jaxba import StepOptions, like, make_policy, random_scene, solve, solve_loop
 from jaxba.damping import registry
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent import AgentConfig, config_from
 from jaxba.damping.learned import (
     FORMAT,
     LARGEST_FILE,
@@ -279,6 +279,21 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     assert options == StepOptions()
     assert parse_solver("learned+refine3").build()[1] == StepOptions(refine_points=3)
     assert parse_solver("ceres+embedded").build()[1] == AgentConfig().step_options(StepOptions())
+
+
+@pytest.mark.parametrize("refine", [None, 0, 4])
+def test_the_camera_damping_of_a_policys_training_goes_with_it_whatever_the_point_iterations(tmp_path, refine):
+    path = tmp_path / "mine.safetensors"
+    trained = random_policy(5)
+    save_policy(path, replace(trained, config=replace(trained.config, camera_damping=0.01)))
+    assert SolverName(str(path), refine).build()[1].camera_damping == 0.01
+    assert SolverName("ceres", refine).build()[1].camera_damping == 1
+
+
+def test_a_policy_file_from_before_camera_damping_damps_cameras_as_points():
+    values = asdict(AgentConfig())
+    del values["camera_damping"]
+    assert config_from(values).camera_damping == 1
 
 
 # Solves

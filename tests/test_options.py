@@ -17,6 +17,8 @@ from jaxba import Loss, StepOptions
         ({"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
         ({"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),
         ({"refine_points": -1}, "refine_points must be at least 0"),
+        ({"camera_damping": 0.0}, "camera_damping must be positive, is 0"),
+        ({"camera_damping": float("nan")}, "camera_damping must be positive, is nan"),
         ({"camera_rounds": -1}, "camera_rounds must be at least 0"),
         ({"trials": 0}, "trials must be at least 1"),
         ({"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
@@ -42,8 +44,9 @@ def test_equal_options_are_one_key_and_different_ones_are_not():
         StepOptions(loss=Loss("huber")),
         StepOptions(cg_forcing=0.5),
         StepOptions(intrinsics="fixed"),
+        StepOptions(camera_damping=0.01),
     }
-    assert len(different) == 8
+    assert len(different) == 9
 
 
 def test_options_cannot_change_under_a_compiled_program():

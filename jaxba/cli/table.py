@@ -23,6 +23,8 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         refine += f", up to {options.camera_rounds} camera rounds"
     if options.trials > 1:
         refine += f", up to {options.trials} trials"
+    if options.camera_damping != 1:
+        refine += f", cameras damped by {options.camera_damping:g} lambda"
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     sizes = f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations"
     return f"{name}: {sizes}\ndamping {args.damping}{refine}, {args.dtype}, {solver}"

@@ -107,6 +107,9 @@ class AgentConfig:
     camera_rounds: int = 3
     """Camera rounds of the step that it drives, see `StepOptions`."""
 
+    camera_damping: float = 1.0
+    """Damping of the cameras relative to that of the points in the step that it drives, see `StepOptions`."""
+
     effort: EffortMode = "fixed"
     """What an action decides beside lambda: nothing, or with a second number how many of the point iterations a step
     has, and with a third the forcing term of conjugate gradients. The guard's rule has all of them, and the smallest
@@ -138,8 +141,14 @@ class AgentConfig:
         self.step_options(StepOptions())
 
     def step_options(self, options: StepOptions) -> StepOptions:
-        """The options with the embedded iterations that the agent was trained with."""
-        return replace(options, refine_points=self.refine_points, trials=self.trials, camera_rounds=self.camera_rounds)
+        """The options with the embedded iterations and the camera damping that the agent was trained with."""
+        return replace(
+            options,
+            refine_points=self.refine_points,
+            trials=self.trials,
+            camera_rounds=self.camera_rounds,
+            camera_damping=self.camera_damping,
+        )
 
     @property
     def guarded(self) -> bool:
