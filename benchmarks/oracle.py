@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -56,7 +57,10 @@ def main() -> None:
         problem = read_problem(path)
         with host.calm_blas():
             runs = [search(problem, options, policy.min_gain, args.iterations, width) for width in (WIDTH, 1)]
-        runs += [_rule(problem, rule, options) for rule in (policy, make_policy("ceres"))]
+        runs += [
+            _rule(problem, policy, options),
+            _rule(problem, make_policy("ceres"), replace(options, camera_damping=1)),
+        ]
         name = path.name.removesuffix(".txt.bz2")
         best = min(float(known.get(name, np.inf)), *(run[-1] for run in runs))
         rows.append([[_reached(run, best * (1 + t)) for t in TOLERANCES] for run in runs])

@@ -33,7 +33,7 @@ class SolverName:
     """Damping policy, see `jaxba.damping.make_policy`."""
 
     refine_points: int | None = 0
-    """Embedded point iterations and nothing else. None: all embedded iterations; a learned policy brings those that it
+    """Embedded point iterations and no others. None: all embedded iterations; a learned policy brings those that it
     was trained with, a rule gets the default ones under the name `RULE+embedded`."""
 
     dtype: str = DTYPES[0]
@@ -68,8 +68,7 @@ class SolverName:
         agent = policy.config if isinstance(policy, Learned) else AgentConfig()
         if self.refine_points is None:
             return policy, agent.step_options(base)
-        camera_damping = agent.camera_damping if isinstance(policy, Learned) else base.camera_damping
-        return policy, replace(base, refine_points=self.refine_points, camera_damping=camera_damping)
+        return policy, replace(base, refine_points=self.refine_points, camera_damping=agent.camera_damping)
 
 
 def parse_solver(name: str) -> SolverName:

@@ -118,7 +118,7 @@ class StepOptions:
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
         if not 0 < self.camera_damping < float("inf"):
-            raise ValueError(f"camera_damping must be positive, is {self.camera_damping}")
+            raise ValueError(f"camera_damping must be positive and finite, is {self.camera_damping}")
         if self.intrinsics == "fixed" and self.linear_solver != "explicit":
             raise ValueError(f"fixed intrinsics need the explicit solver, not {self.linear_solver}")
         if self.cg_max_iterations < 1:

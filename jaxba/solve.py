@@ -133,7 +133,7 @@ def solve(
     Args:
         problem: start of the optimisation.
         damping: a policy, or the name of one (`jaxba.make_policy`).
-        options: how a step is made; if left out, with the embedded iterations that a learned policy was trained with.
+        options: how a step is made; if left out, as a learned policy was trained (`AgentConfig.step_options`).
         method: how a step is made (`jaxba.METHODS`); fixes the options that make it.
         linear_solver: overrides that of the options; `auto` asks the cost model in choose.py.
         max_iterations: limit of linear solves.

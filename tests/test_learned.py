@@ -287,13 +287,22 @@ def test_the_camera_damping_of_a_policys_training_goes_with_it_whatever_the_poin
     trained = random_policy(5)
     save_policy(path, replace(trained, config=replace(trained.config, camera_damping=0.01)))
     assert SolverName(str(path), refine).build()[1].camera_damping == 0.01
-    assert SolverName("ceres", refine).build()[1].camera_damping == 1
 
 
-def test_a_policy_file_from_before_camera_damping_damps_cameras_as_points():
+def test_an_agent_from_before_camera_damping_damps_cameras_as_points():
     values = asdict(AgentConfig())
     del values["camera_damping"]
     assert config_from(values).camera_damping == 1
+
+
+def test_a_solve_damps_cameras_as_the_policy_was_trained():
+    trained = random_policy(1)
+    light = replace(trained, config=replace(trained.config, camera_damping=0.01))
+    found = solve(scene(0), light, max_iterations=3)
+    asked = solve(scene(0), light, options=light.config.step_options(StepOptions()), max_iterations=3)
+    other = solve(scene(0), trained, max_iterations=3)
+    assert np.array_equal(found.history.cost, asked.history.cost)
+    assert not np.array_equal(found.history.cost, other.history.cost)
 
 
 # Solves

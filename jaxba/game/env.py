@@ -130,7 +130,7 @@ class Game:
     """Rules."""
 
     options: StepOptions = field(metadata={"static": True})
-    """Of the LM step, embedded iterations included."""
+    """Of the LM step, with what the agent's configuration says of it (`AgentConfig.step_options`)."""
 
     @property
     def num_envs(self) -> int:
@@ -277,7 +277,7 @@ def make_game(
         kinds: classes of the banks.
         banks: scenes.
         envs: environments of each class.
-        options: of the LM step; its embedded iterations are those of the agent.
+        options: of the LM step; the agent has the last word (`AgentConfig.step_options`).
     """
     options = config.agent.step_options(options or StepOptions())
     for kind in kinds:

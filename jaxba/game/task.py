@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -124,8 +124,9 @@ def _rules(
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
     names = tuple(dict.fromkeys((*own, *yardsticks)))
     policies: dict[str, tuple[DampingPolicy, StepOptions]] = {name: (make_policy(name), plain) for name in names}
-    if game.options != plain:
-        policies[yardsticks[0] + EMBEDDED] = make_policy(yardsticks[0]), game.options
+    embedded = replace(game.options, camera_damping=plain.camera_damping)
+    if embedded != plain:
+        policies[yardsticks[0] + EMBEDDED] = make_policy(yardsticks[0]), embedded
     scores = _compare(config, held_out, policies)
     part = path.with_suffix(".part")
     part.write_text(json.dumps({name: score._asdict() for name, score in scores.items()}, indent=1), encoding="utf-8")
