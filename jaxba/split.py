@@ -4,8 +4,8 @@ A point that several clusters see is split into a copy per cluster, and for this
 The reduced camera system is then block-diagonal, a small dense system per cluster. What the split lost is repaired by a
 few Richardson steps on the true reduced camera system, and the points follow the cameras unsplit.
 
-Lambda damps cameras (times `camera_damping`), points and copies. Large ones make the copies of a point disagree about a steepest-descent
-step; `agreed_gradient` mends that.
+Lambda damps cameras (times `camera_damping`), points and copies. Large ones make the copies of a point disagree about a
+steepest-descent step; `agreed_gradient` mends that.
 
 Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", sections 3 and 4,
 and the authors' code. Clusters: partition.py.

@@ -101,7 +101,8 @@ def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None
     """What an agent chooses must be something that the method has."""
     if effort != "fixed" and options.linear_solver == "decomposed":
         raise ValueError(
-            f"game.agent.effort: {effort!r} means nothing to method {method}, whose rounds always take all point iterations"
+            f"game.agent.effort: {effort!r} means nothing to method {method}, "
+            "whose rounds always take all point iterations"
         )
     if effort == "points+forcing" and options.linear_solver != "normal":
         raise ValueError("game.agent.effort: a forcing term needs conjugate gradients, as method deeplm has them")
