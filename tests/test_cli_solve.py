@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import support
 
-from jaxba import geometry, read_bal, write_bal
+from jaxba import StepOptions, geometry, read_bal, write_bal
 from jaxba.bench.records import record_from_json
 from jaxba.cli import table
 from jaxba.cli.solve import run
@@ -273,3 +274,10 @@ def test_what_the_parser_refuses_is_status_2_and_nothing_on_stdout(argv, capsys)
     printed = capsys.readouterr()
     assert printed.out == ""
     assert argv[0] in printed.err
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])
+def test_the_heading_says_where_cameras_are_damped_otherwise_than_points(factor, said):
+    args = SimpleNamespace(damping="mine.safetensors", dtype="float64", method="lm", linear_solver="auto")
+    text = table.heading("scene", support.tiny(), args, StepOptions(camera_damping=factor))
+    assert ("cameras damped by 0.01 lambda" in text) == said
