@@ -18,6 +18,7 @@ from jaxba.losses import Loss
 from jaxba.methods import METHODS, Method, make_method
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
+from jaxba.retriangulate import Retriangulation, retriangulate, solve_and_retriangulate
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
 from jaxba.solve import History, IterationRecord, Solution, solve, solve_loop
 from jaxba.termination import Termination, Tolerances
@@ -41,6 +42,7 @@ __all__ = [
     "Method",
     "ProblemError",
     "ProblemInfo",
+    "Retriangulation",
     "Safeguard",
     "SceneConfig",
     "Schedule",
@@ -64,7 +66,9 @@ __all__ = [
     "read_bal",
     "read_bundler",
     "read_problem",
+    "retriangulate",
     "solve",
+    "solve_and_retriangulate",
     "solve_loop",
     "write_bal",
     "write_ply",

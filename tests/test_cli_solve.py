@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import support
 
-from jaxba import StepOptions, geometry, read_bal, write_bal
+from jaxba import StepOptions, geometry, read_bal, solve, write_bal
 from jaxba.bench.records import record_from_json
 from jaxba.cli import table
 from jaxba.cli.solve import run
@@ -74,6 +75,26 @@ def test_without_a_problem_a_built_in_scene_is_solved(capsys):
     assert "30 cameras, 1500 points" in printed.out
     assert "\nconverged: " in printed.out
     assert printed.err == ""
+
+
+def test_a_search_for_points_is_told_and_rows_count_through(tmp_path, capsys):
+    """One point behind its cameras, with which the solve alone converges far above the minimum."""
+    problem, log = solve(support.tiny()).problem, tmp_path / "log.json"
+    points, center = np.array(problem.points), geometry.camera_centers(problem.cameras)[problem.camera_index[0]]
+    points[0] = center - 3 * (points[0] - center)
+    write_bal(problem.replace(points=points), tmp_path / "strayed.txt")
+    assert run([str(tmp_path / "strayed.txt"), "--retriangulate", "--log", str(log)]) == 0
+    printed, record = capsys.readouterr().out, json.loads(log.read_text())
+    searches = re.findall(
+        r"^   search for points at other depths: (\d+) of 40 points moved, cost (.*) -> (.*)$", printed, re.M
+    )
+    assert len(searches) >= 2
+    assert int(searches[0][0]) > 0
+    assert float(searches[0][2]) < float(searches[0][1])
+    assert searches[-1][1] == searches[-1][2]
+    assert [int(line[0]) for line in rows(printed)] == list(range(record["iterations"] + 1))
+    assert [point["iteration"] for point in record["trace"]] == list(range(record["iterations"] + 1))
+    np.testing.assert_allclose(record["final_cost"], geometry.cost(problem), rtol=1e-5)
 
 
 def test_padded_sizes_are_said_and_so_is_why_there_are_none(tiny, capsys):

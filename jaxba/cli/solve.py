@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -54,6 +54,10 @@ class Arguments:
     """Round sizes up to a coarse grid, so that problems of similar size share one compiled program, also from one call
     of this command to the next; auto then means explicit. For many small problems: large ones and those for other
     solvers are left as they are, and the summary says so."""
+
+    retriangulate: bool = False
+    """After convergence look for every point at other depths, go on from the cheapest places, and so on in turns while
+    that pays. Finds points that hang in the wrong place, and a lower cost, for more iterations."""
 
     max_iterations: int = 100
     """Linear solves before giving up."""
@@ -124,6 +128,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.io import read_problem, write_problem
     from jaxba.losses import Loss
     from jaxba.naming import SolverName
+    from jaxba.retriangulate import Retriangulation, solve_and_retriangulate
     from jaxba.solve import IterationRecord, Tolerances, solve
 
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
@@ -150,7 +155,11 @@ def _solve(args: Arguments) -> int:
             steps.append(record)
             return interrupt.asked
 
-        solution = solve(
+        def tell(found: Retriangulation) -> None:
+            print(table.retriangulated(found), flush=True)
+
+        search: dict[str, Any] = {"on_search": tell} if args.retriangulate else {}
+        solution = (solve_and_retriangulate if args.retriangulate else solve)(
             problem,
             policy,
             options,
@@ -160,6 +169,7 @@ def _solve(args: Arguments) -> int:
             dtype=args.dtype,
             callback=show,
             pad=args.pad,
+            **search,
         )
     print(table.summary(problem, solution))
     if args.pad:

@@ -11,6 +11,7 @@ from jaxba.methods import DEFAULT_METHOD
 from jaxba.options import StepOptions
 from jaxba.padding import capacity_of
 from jaxba.problem import BundleProblem
+from jaxba.retriangulate import Retriangulation
 from jaxba.solve import IterationRecord, Solution
 
 _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
@@ -44,6 +45,12 @@ def row(record: IterationRecord, time_before: float) -> str:
         f"{step.cg_iterations:7d}   {record.time_s - time_before:.2e}   {record.time_s:.2e}"
     )
     return cells if step.accepted else f"{cells}  rejected"
+
+
+def retriangulated(found: Retriangulation) -> str:
+    """What a search for points at other depths brought, between two rows."""
+    count = f"{found.moved} of {found.problem.num_points} points moved"
+    return f"   search for points at other depths: {count}, cost {found.cost_before:.6e} -> {found.cost_after:.6e}"
 
 
 def summary(problem: BundleProblem, solution: Solution) -> str:

@@ -1,0 +1,239 @@
+"""Points looked for elsewhere on their rays: what no small step finds.
+
+Bundle adjustment moves every point downhill from where it is. A point that a bold step, a bad start or a wrong depth
+took into a valley of its own stays there: behind its cameras, far beyond what it shows, or at a depth where two wrong
+rays nearly meet. After convergence such points are what is left of the cost that can still be had, and it can be had
+without another linear solve: given the cameras every point is a problem of three unknowns, which is solved from several
+depths. Then the adjustment goes on.
+
+Source of the alternation: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited",
+section 4.4), bundle adjustment and re-triangulation in turns. Measured: docs/game.md, "Cameras and points".
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Bool, Float
+
+from jaxba import camera, geometry, host
+from jaxba.blocks3 import cholesky3
+from jaxba.clock import CompileClock
+from jaxba.damping import DampingPolicy
+from jaxba.layout import Layout, build_layout
+from jaxba.linearize import behind, residuals, slot_costs, slot_frames
+from jaxba.lm import initial_state
+from jaxba.losses import Loss
+from jaxba.options import StepOptions
+from jaxba.problem import BundleProblem, ProblemError
+from jaxba.refine import refine_points
+from jaxba.solve import MAX_ITERATIONS, History, IterationRecord, Solution, explain_start, solve
+from jaxba.sums import point_sum
+from jaxba.termination import Tolerances
+
+PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
+"""Where to start from besides the midpoint of the rays: multiples of a point's distance from the first camera that sees
+it. The last is its mirror image, in front of the camera if the point lies behind it. Chosen once, not fitted."""
+
+UNDISTORTIONS = 10
+"""Fixed-point iterations that turn a pixel into a ray; what they leave open the point's own steps make good."""
+
+POINT_ITERATIONS = 6
+"""Steps of a point from each place."""
+
+LEAST_GAIN = 1e-3
+"""Share of its own cost that a point must gain to be moved ..."""
+
+NEGLIGIBLE = 1e-6
+"""... and share of an average point's cost, at the best places, that this gain must be worth."""
+
+MAX_ROUNDS = 5
+"""Searches at most. Source: COLMAP, ba_global_max_refinements."""
+
+
+@dataclass(frozen=True)
+class Retriangulation:
+    """Result of `retriangulate`."""
+
+    problem: BundleProblem
+    """The input with some points moved; cameras and all other points are unchanged, bit by bit."""
+
+    moved: int
+    """Points that were moved."""
+
+    cost_before: float
+    """Pixels squared."""
+
+    cost_after: float
+    """Pixels squared; never above the cost before."""
+
+
+class _Found(NamedTuple):
+    points: Float[Array, "3 points"]
+    moved: Bool[Array, " points"]
+    cost_before: Float[Array, ""]
+    cost_after: Float[Array, ""]
+
+
+def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangulation:
+    """Looks for a cheaper place for every point while the cameras stand still.
+
+    A point starts from the midpoint of the rays of its pixels and from several distances from the first camera that
+    sees it (`PLACES`), takes `POINT_ITERATIONS` Gauss-Newton steps from each, and moves to the cheapest place, if that
+    is worth it (`LEAST_GAIN`) and lies behind no more cameras than where it was.
+
+    Args:
+        problem: cameras and points, best at the end of a solve: at a bad start points are fitted to wrong cameras.
+        loss: robust loss of the squared whitened residual.
+
+    Returns:
+        The problem with the moved points, in float64.
+
+    Raises:
+        ProblemError: the cost is not finite.
+    """
+    with jax.enable_x64(True), host.calm_blas():
+        layout = build_layout(problem, pairs=False, grid=False)
+        order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+        real = order < problem.num_points  # the layout has an empty point besides
+        first = np.zeros(problem.num_points, np.int64)
+        first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
+        origin = np.zeros((3, len(order)))
+        origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
+        found = jax.device_get(_search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss()))
+    if not np.isfinite(found.cost_before):
+        raise ProblemError(explain_start(problem))
+    points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real
+    points[order[moved]] = np.asarray(found.points).T[moved]
+    return Retriangulation(
+        problem.replace(points=points), int(moved.sum()), float(found.cost_before), float(found.cost_after)
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("loss",))
+def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss) -> _Found:
+    """`retriangulate` in layout order; `origin` is where the rays start, in scene units."""
+    state = initial_state(layout, problem, StepOptions(loss=loss), jnp.float64)
+    frames, start = slot_frames(layout, state.cameras), state.points
+
+    def look(points: Float[Array, "3 points"]) -> tuple[Float[Array, " points"], Float[Array, " points"]]:
+        projection, residual = residuals(layout, frames, points)
+        costs, hidden = point_sum(
+            layout, jnp.stack([slot_costs(loss, residual), behind(projection).astype(points.dtype)])
+        )
+        return costs, hidden
+
+    own, hidden = look(start)
+
+    def visit(best: tuple[Array, Array], place: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
+        points, costs = best
+        trial, _ = refine_points(layout, frames, place, loss, POINT_ITERATIONS)
+        there, lost = look(trial)
+        better = (there < costs) & (lost <= hidden)
+        return (jnp.where(better, trial, points), jnp.where(better, there, costs)), None
+
+    places = [origin + factor * (start - origin) for factor in PLACES] + [_midpoints(layout, frames)]
+    (points, costs), _ = lax.scan(visit, (start, own), jnp.stack(places))
+    moved = own - costs > jnp.maximum(LEAST_GAIN * own, NEGLIGIBLE * jnp.mean(costs))
+    return _Found(points, moved, jnp.sum(own), jnp.sum(jnp.where(moved, costs, own)))
+
+
+def _midpoints(layout: Layout, frames: camera.Frames) -> Float[Array, "3 points"]:
+    """The point nearest to all rays of its pixels, in least squares; somewhere along them where they are parallel."""
+    pixel = layout.pixels.astype(frames.focal.dtype)
+    plane = pixel / frames.focal
+    for _ in range(UNDISTORTIONS):
+        squared = jnp.sum(plane * plane, axis=0)
+        plane = pixel / (frames.focal * (1 + squared * (frames.k1 + squared * frames.k2)))
+    ray = jnp.stack([plane[0], plane[1], -jnp.ones_like(plane[0])])
+    ray = jnp.einsum("jin,jn->in", frames.rotation, ray / jnp.sqrt(jnp.sum(ray * ray, axis=0)))
+    center = -jnp.einsum("jin,jn->in", frames.rotation, frames.translation)
+    # sum of (I - u u^T) X = sum of (I - u u^T) c
+    along = jnp.sum(ray * center, axis=0)
+    matrix = [(1.0 if i == j else 0.0) - ray[i] * ray[j] for i in range(3) for j in range(i + 1)]
+    right = [center[i] - ray[i] * along for i in range(3)]
+    sums = point_sum(layout, jnp.where(layout.slot_mask, jnp.stack([*matrix, *right]), 0))
+    factor = cholesky3([sums[k] for k in range(6)])
+    return jnp.stack(factor.backward(factor.forward([sums[k] for k in range(6, 9)])))
+
+
+def solve_and_retriangulate(
+    problem: BundleProblem,
+    damping: str | DampingPolicy = "ceres",
+    options: StepOptions | None = None,
+    *,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerances: Tolerances | None = None,
+    callback: Callable[[IterationRecord], bool | None] | None = None,
+    on_search: Callable[[Retriangulation], None] | None = None,
+    **more: Any,
+) -> Solution:
+    """`solve`, and where it converged `retriangulate`, in turns, until that no longer pays.
+
+    It pays as long as the cost falls by more than `ftol` of it, for `MAX_ROUNDS` searches at most. Every solve but the
+    first starts with the policy's first lambda.
+
+    Args:
+        problem: start of the optimisation.
+        damping: as for `solve`.
+        options: as for `solve`; their loss is that of the search.
+        max_iterations: limit of linear solves, all solves together.
+        tolerances: as for `solve`, for each of the solves.
+        callback: as for `solve`; iterations and seconds count through.
+        on_search: called after every search.
+        more: further arguments of `solve`.
+
+    Returns:
+        One solution for all of it. A search counts as no iteration, but takes time.
+
+    Raises:
+        ValueError, ProblemError: as `solve`.
+    """
+    tolerances = tolerances or Tolerances()
+    run = functools.partial(solve, damping=damping, options=options, tolerances=tolerances, **more)
+    whole = run(problem, max_iterations=max_iterations, callback=callback)
+    for _ in range(MAX_ROUNDS):
+        if not whole.converged or whole.iterations == max_iterations:
+            break
+        started = time.perf_counter()
+        with CompileClock() as clock:
+            found = retriangulate(whole.problem, options.loss if options else None)
+        seconds = time.perf_counter() - started - clock.seconds
+        whole = replace(whole, total_s=whole.total_s + seconds, compile_s=whole.compile_s + clock.seconds)
+        if on_search:
+            on_search(found)
+        if found.cost_before - found.cost_after <= tolerances.ftol * found.cost_before:
+            break
+        shown = callback and functools.partial(_shifted, callback, whole.iterations, whole.total_s)
+        left = max_iterations - whole.iterations
+        whole = _joined(whole, run(found.problem, max_iterations=left, callback=shown))
+    return whole
+
+
+def _shifted(
+    callback: Callable[[IterationRecord], bool | None], iterations: int, seconds: float, record: IterationRecord
+) -> bool | None:
+    """A callback that hears of all solves as of one."""
+    return callback(record._replace(iteration=record.iteration + iterations, time_s=record.time_s + seconds))
+
+
+def _joined(before: Solution, last: Solution) -> Solution:
+    """Two solves, the second of which goes on where the first ended, as one."""
+    return replace(
+        last,
+        initial_cost=before.initial_cost,
+        iterations=before.iterations + last.iterations,
+        accepted=before.accepted + last.accepted,
+        history=History(*(np.concatenate(pair) for pair in zip(before.history, last.history, strict=True))),
+        setup_s=before.setup_s + last.setup_s,
+        compile_s=before.compile_s + last.compile_s,
+        total_s=before.total_s + last.total_s,
+    )
