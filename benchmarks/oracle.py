@@ -28,6 +28,7 @@ from jaxba.cli.common import prepare_process
 from jaxba.damping.learned import Learned
 from jaxba.game.oracle import GRID, WIDTH
 from jaxba.layout import layout_for
+from jaxba.naming import parse_solver
 from jaxba.problem import BundleProblem
 
 TOLERANCES = (1e-3, 1e-4, 1e-6)
@@ -46,7 +47,7 @@ def main() -> None:
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     prepare_process()
-    policy = make_policy("learned+refine0" if args.plain else "learned")
+    policy = parse_solver("learned+refine0" if args.plain else "learned").build()[0]
     assert isinstance(policy, Learned)
     options = policy.config.step_options(StepOptions())
     known = dict(line.split() for line in args.best.read_text().splitlines()) if args.best else {}

@@ -39,6 +39,10 @@ class Method:
     fixes: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Fields of `StepOptions` that make the method."""
 
+    soft: bool = False
+    """Whether `learned` takes fewer iterations with cameras damped less than points, within the promise that the method
+    makes about its end (docs/methods.md)."""
+
     def options(self, base: StepOptions) -> StepOptions:
         """The options of a step of this method; what it does not fix is that of `base`."""
         return replace(base, **self.fixes)
@@ -57,6 +61,7 @@ METHODS: dict[str, Method] = {
             "stochastic bundle adjustment: random clusters of cameras solved apart, then four repairs",
             "stba",
             _fixed(linear_solver="clustered"),
+            soft=True,
         ),
         # 1e-3 and 150: DeepLM, authors' code
         Method(
@@ -64,12 +69,14 @@ METHODS: dict[str, Method] = {
             "DeepLM's global solver: conjugate gradients on cameras and points together",
             "ceres",
             _fixed(linear_solver="normal", cg_forcing=1e-3, cg_max_iterations=150),
+            soft=True,
         ),
         Method(
             "ddlm",
             "DeepLM's stochastic domain decomposition: clusters optimised beside each other, then the points between",
             "ceres",
             _fixed(linear_solver="decomposed"),
+            soft=True,
         ),
         Method(
             "poba",

@@ -8,9 +8,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 
-from jaxba.damping import LEARNED, LEARNED_PLAIN, DampingPolicy, Learned, is_learned, make_policy
+from jaxba.damping import DampingPolicy, Learned, is_learned, make_policy
 from jaxba.damping.agent import AgentConfig
-from jaxba.damping.registry import SUFFIX
+from jaxba.damping.registry import LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, LEARNED_SOFT, SUFFIX
 from jaxba.methods import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
 from jaxba.options import StepOptions
 
@@ -62,13 +62,31 @@ class SolverName:
         Raises:
             UnknownPolicyError, PolicyFileError, UnknownMethodError: as `make_policy`, `make_method`.
         """
-        plain = self.policy == LEARNED and self.refine_points == 0
-        policy = make_policy(LEARNED_PLAIN if plain else self.policy)
+        alone, peer = self.refine_points == 0, bool(self.peer)
+        policy = make_policy(fitting_policy(self.policy, self.method, alone=alone, peer=peer))
         base = make_method(self.method).options(StepOptions())
         agent = policy.config if isinstance(policy, Learned) else AgentConfig()
         if self.refine_points is None:
             return policy, agent.step_options(base)
         return policy, replace(base, refine_points=self.refine_points, camera_damping=agent.camera_damping)
+
+
+def fitting_policy(policy: str, method: str = DEFAULT_METHOD, *, alone: bool = False, peer: bool = False) -> str:
+    """The policy that a name means: `learned` is the shipped one that was found best for the step (docs/game.md).
+
+    Args:
+        policy: see `make_policy`.
+        method: how a step is made, see `jaxba.methods`.
+        alone: whether lambda is all that there is to choose, without embedded iterations.
+        peer: whether another library makes the step, which damps cameras as points.
+    """
+    if policy != LEARNED:
+        return policy
+    if peer:
+        return LEARNED_DRIVER
+    if alone:
+        return LEARNED_PLAIN
+    return LEARNED_SOFT if make_method(method).soft else LEARNED
 
 
 def parse_solver(name: str) -> SolverName:

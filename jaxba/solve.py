@@ -26,7 +26,7 @@ from jaxba.layout import Layout, layout_for
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.methods import DEFAULT_METHOD, make_method
-from jaxba.naming import DTYPES
+from jaxba.naming import DTYPES, fitting_policy
 from jaxba.options import StepOptions
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import AnyArray, BundleProblem, ProblemError
@@ -161,7 +161,7 @@ def solve(
         raise ValueError(f"dtype must be one of {', '.join(DTYPES)}, not {dtype!r}")
     if max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, is {max_iterations}")
-    policy = make_policy(damping) if isinstance(damping, str) else damping
+    policy = make_policy(fitting_policy(damping, method)) if isinstance(damping, str) else damping
     if options is None:
         options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
     options = make_method(method).options(options)

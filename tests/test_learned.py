@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
@@ -279,6 +280,34 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     assert options == StepOptions()
     assert parse_solver("learned+refine3").build()[1] == StepOptions(refine_points=3)
     assert parse_solver("ceres+embedded").build()[1] == AgentConfig().step_options(StepOptions())
+
+
+def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
+    """Each with the camera damping that it was trained with: another library has none."""
+    files = {"lm": "learned", "stba": "learned-soft", "deeplm": "learned-soft", "ddlm:3": "learned-soft"}
+    files |= {"poba": "learned"}
+    for method, file in files.items():
+        expected = load_policy(shipped[file]).layers
+        assert same_bits(parse_solver(f"{method}+learned").build()[0].layers, expected)
+        assert same_bits(parse_solver(f"{method}+learned+refine3").build()[0].layers, expected)
+        alone = parse_solver(f"{method}+learned+refine0").build()[0]
+        assert same_bits(alone.layers, load_policy(shipped["learned-plain"]).layers)
+    driver = parse_solver("pyceres:dense+learned").build()[0]
+    assert same_bits(driver.layers, load_policy(shipped["learned-driver"]).layers)
+
+
+def test_the_policy_that_drives_another_library_damps_cameras_as_points():
+    """Which is all that Ceres' one radius can do."""
+    policy, options = parse_solver("pyceres:dense+learned").build()
+    assert policy.config.camera_damping == options.camera_damping == 1
+
+
+def test_a_solve_takes_the_shipped_policy_that_fits_its_method(shipped):
+    problem = support.tiny()
+    for method, file in (("lm", "learned"), ("deeplm", "learned-soft")):
+        named = solve(problem, "learned", method=method, max_iterations=2)
+        given = solve(problem, load_policy(shipped[file]), method=method, max_iterations=2)
+        assert same_bits(named.history, given.history)
 
 
 @pytest.mark.parametrize("refine", [None, 0, 4])

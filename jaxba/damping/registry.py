@@ -23,14 +23,18 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
 }
 """Factory and one line of description by name."""
 
-LEARNED, LEARNED_PLAIN = "learned", "learned-plain"
-"""The shipped policies: for a step with embedded iterations, and for lambda alone (`learned+refine0`)."""
+LEARNED, LEARNED_SOFT, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-soft", "learned-plain", "learned-driver"
+"""The shipped policies, each where it is the best: for a step with embedded iterations; for the same of a method whose
+steps are not exact anyway, with cameras damped less; for lambda alone (`learned+refine0`); and for lambda alone where
+another library makes the step and damps all variables alike. `learned` means the one that fits (naming.py)."""
 
 SHIPPED = {
     LEARNED: "default.safetensors",
+    LEARNED_SOFT: "soft.safetensors",
     LEARNED_PLAIN: "plain.safetensors",
+    LEARNED_DRIVER: "driver.safetensors",
 }
-"""Their files in `jaxba/policies`, made by `jaxba-train --config default` and `plain`."""
+"""Their files in `jaxba/policies`, each made by the preset of `jaxba-train` that has its name."""
 
 SUFFIX = ".safetensors"
 """Ending by which a name is the path of a policy file."""

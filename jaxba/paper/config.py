@@ -106,7 +106,7 @@ class FigureConfig:
         "classic/implicit",
         "ceres/implicit",
         "learned/implicit",
-        "learned+refine0/implicit",
+        "learned-driver/implicit",
     )
     """`solver/linear solver` on the large scene."""
 

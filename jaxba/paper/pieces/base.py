@@ -13,7 +13,7 @@ from jaxba.paper.markdown import Line, Section, counted, lines_table
 from jaxba.paper.rows import Row
 from jaxba.paper.workshop import Method, Workshop, named
 
-CLASSIC, CERES, LEARNED, PLAIN = "classic", "ceres", "learned", "learned+refine0"
+CLASSIC, CERES, LEARNED, PLAIN = "classic", "ceres", "learned", "learned-driver"
 """Names of the rows that most tables have; `PLAIN` is lambda alone, the paper's own comparison."""
 
 NOT_YET = "Not run in this folder yet."

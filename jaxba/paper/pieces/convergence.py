@@ -10,7 +10,7 @@ from jaxba.paper.pieces.base import Piece
 from jaxba.paper.workshop import Workshop, named
 
 METHODS = tuple(
-    f"{policy}/{linear}" for policy in ("classic", "ceres", "learned+refine0") for linear in ("explicit", "implicit")
+    f"{policy}/{linear}" for policy in ("classic", "ceres", "learned-driver") for linear in ("explicit", "implicit")
 )
 
 

@@ -12,12 +12,12 @@ from jaxba.paper.pieces import base, figures
 from jaxba.paper.pieces.base import Piece
 from jaxba.paper.workshop import Method, Workshop, named
 
-PAPER = {"classic": 30, "schedule": 16, "learned+refine0": 8}
+PAPER = {"classic": 30, "schedule": 16, "learned-driver": 8}
 """Iterations on the paper's test case. Source: caption of the figure."""
 
 
 def _methods(shop: Workshop) -> list[Method]:
-    return [*map(named, ("classic", "schedule", "ceres", "learned+refine0")), shop.agent(agents.OURS)]
+    return [*map(named, ("classic", "schedule", "ceres", "learned-driver")), shop.agent(agents.OURS)]
 
 
 def _work(shop: Workshop) -> None:
@@ -35,7 +35,7 @@ def _section(shop: Workshop) -> Section:
         f"{name} {count}{'' if good else ' (not converged)'}{f' (paper {PAPER[name]})' if name in PAPER else ''}"
         for name, (count, good) in counts.items()
     ]
-    flat = next((r for r in records if r.solver == "learned+refine0"), None)
+    flat = next((r for r in records if r.solver == "learned-driver"), None)
     body = [figures.picture(shop, plot_lambda(records, problem.name), "lambda", caption)]
     body.append(f"Iterations on {problem.name}: {', '.join(said)}. The paper's test case is not named.")
     if flat is not None and len(flat.trace) > 2:

@@ -15,7 +15,7 @@ from jaxba.paper.pieces import base, figures
 from jaxba.paper.pieces.base import Piece
 from jaxba.paper.workshop import Workshop, named
 
-METHODS = ("classic", "ceres", "ceres+embedded", "learned+refine0", "learned")
+METHODS = ("classic", "ceres", "ceres+embedded", "learned-driver", "learned")
 TAUS = (0.1, 0.001)
 """Tolerances of the paper's figure."""
 
@@ -66,7 +66,7 @@ def _section(shop: Workshop) -> Section:
 def _speed_claim(records: list[Record], tau: float, text: str, faster: bool) -> claims.Claim:
     """Compares the geometric mean of the seconds of the two on the problems that both reach."""
     table = profile.reach_table(records, Target("tau", tau))
-    ours, classic = table.get("learned+refine0", {}), table.get("classic", {})
+    ours, classic = table.get("learned-driver", {}), table.get("classic", {})
     pairs = [(ours[name].seconds, classic[name].seconds) for name in ours if name in classic]
     logs = [math.log(max(a, 1e-6) / max(b, 1e-6)) for a, b in pairs if math.isfinite(a) and math.isfinite(b)]
     if not logs:

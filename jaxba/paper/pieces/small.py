@@ -65,7 +65,7 @@ def _methods(shop: Workshop, size: int) -> list[tuple[str, Method, float | None]
         ("classic", _known_lens(named("classic")), 5.0 if paper else None),
         ("Ceres' rule", _known_lens(named("ceres")), None),
         ("ours: agent of this run", _known_lens(shop.agent(agents.OURS)), 4.0 if paper else None),
-        ("ours: shipped policy, lambda alone", _known_lens(named("learned+refine0")), 4.0 if paper else None),
+        ("ours: shipped policy, lambda alone", _known_lens(named("learned-driver")), 4.0 if paper else None),
     ]
 
 

@@ -21,7 +21,7 @@ PAPER = {
 """Seconds of Ceres-CG, DeepLM, and DeepLM with the agent. Source: the paper, table "Acceleration of BAL's
 sub-problems"."""
 
-METHODS = ("ceres/implicit", "deeplm+ceres", "deeplm+learned+refine0", "learned+refine0")
+METHODS = ("ceres/implicit", "deeplm+ceres", "deeplm+learned-driver", "learned-driver")
 LABELS = ("Ceres-CG", "DeepLM", "DeepLM + ours", "ours, explicit")
 
 WHY = (

@@ -26,7 +26,7 @@ def _sets(shop: Workshop) -> list[tuple[str, tuple[Source, ...], str, list[real.
             ("classic", named("classic"), classic, None),
             ("Ceres' rule", named("ceres"), None, None),
             ("ours: agent of this run", shop.agent(agents.OURS), its[0], None),
-            ("ours: shipped policy, wide synthetic scenes", named("learned+refine0"), its[0], None),
+            ("ours: shipped policy, wide synthetic scenes", named("learned-driver"), its[0], None),
             (f"ours: trained on {count} scenes only", shop.agent(agents.FEW), its[0], None),
             (f"{label} + agent of this run", shop.agent(agents.OURS, outer), its[1], None),
         ]
