@@ -26,9 +26,9 @@ from jaxba import DampingPolicy, LMState, StepOptions, host, initial_state, lm_s
 from jaxba.choose import choose_linear_solver
 from jaxba.cli.common import prepare_process
 from jaxba.damping.learned import Learned
+from jaxba.damping.registry import LEARNED, LEARNED_DRIVER
 from jaxba.game.oracle import GRID, WIDTH
 from jaxba.layout import layout_for
-from jaxba.naming import parse_solver
 from jaxba.problem import BundleProblem
 
 TOLERANCES = (1e-3, 1e-4, 1e-6)
@@ -41,13 +41,13 @@ def main() -> None:
     """Prints one Markdown row a problem, and the geometric means."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("problems", type=Path, nargs="+", help="BAL files")
-    parser.add_argument("--plain", action="store_true", help="plain steps, lambda alone, as `learned+refine0`")
+    parser.add_argument("--plain", action="store_true", help="plain steps, lambda alone, as `learned-driver`")
     parser.add_argument("--iterations", type=int, default=40, help="of the search")
     parser.add_argument("--best", type=Path, help="best known costs, one `NAME COST` a line")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     prepare_process()
-    policy = parse_solver("learned+refine0" if args.plain else "learned").build()[0]
+    policy = make_policy(LEARNED_DRIVER if args.plain else LEARNED)
     assert isinstance(policy, Learned)
     options = policy.config.step_options(StepOptions())
     known = dict(line.split() for line in args.best.read_text().splitlines()) if args.best else {}

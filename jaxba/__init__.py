@@ -1,5 +1,6 @@
 """Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or written."""
 
+from jaxba.alternate import solve_and_retriangulate
 from jaxba.damping import (
     POLICIES,
     Ceres,
@@ -18,7 +19,7 @@ from jaxba.losses import Loss
 from jaxba.methods import METHODS, Method, make_method
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.retriangulate import Retriangulation, retriangulate, solve_and_retriangulate
+from jaxba.retriangulate import Retriangulation, retriangulate
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
 from jaxba.solve import History, IterationRecord, Solution, solve, solve_loop
 from jaxba.termination import Termination, Tolerances

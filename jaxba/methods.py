@@ -40,8 +40,8 @@ class Method:
     """Fields of `StepOptions` that make the method."""
 
     soft: bool = False
-    """Whether `learned` takes fewer iterations with cameras damped less than points, within the promise that the method
-    makes about its end (docs/methods.md)."""
+    """Whether `learned` was found to take fewer iterations with cameras damped less than points, at no worse an end
+    (docs/methods.md, "Which policy")."""
 
     def options(self, base: StepOptions) -> StepOptions:
         """The options of a step of this method; what it does not fix is that of `base`."""

@@ -79,6 +79,12 @@ def fitting_policy(policy: str, method: str = DEFAULT_METHOD, *, alone: bool = F
         method: how a step is made, see `jaxba.methods`.
         alone: whether lambda is all that there is to choose, without embedded iterations.
         peer: whether another library makes the step, which damps cameras as points.
+
+    Returns:
+        A name for `make_policy`; any but `learned` as it is.
+
+    Raises:
+        UnknownMethodError: as `make_method`.
     """
     if policy != LEARNED:
         return policy

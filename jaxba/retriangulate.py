@@ -4,7 +4,7 @@ Bundle adjustment moves every point downhill from where it is. A point that a bo
 took into a valley of its own stays there: behind its cameras, far beyond what it shows, or at a depth where two wrong
 rays nearly meet. After convergence such points are what is left of the cost that can still be had, and it can be had
 without another linear solve: given the cameras every point is a problem of three unknowns, which is solved from several
-depths. Then the adjustment goes on.
+depths. Then the adjustment goes on (alternate.py).
 
 Source of the alternation: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited",
 section 4.4), bundle adjustment and re-triangulation in turns. Measured: docs/game.md, "Cameras and points".
@@ -13,10 +13,8 @@ section 4.4), bundle adjustment and re-triangulation in turns. Measured: docs/ga
 from __future__ import annotations
 
 import functools
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +24,6 @@ from jaxtyping import Bool, Float
 
 from jaxba import camera, geometry, host
 from jaxba.blocks3 import cholesky3
-from jaxba.clock import CompileClock
-from jaxba.damping import DampingPolicy
 from jaxba.layout import Layout, build_layout
 from jaxba.linearize import behind, residuals, slot_costs, slot_frames
 from jaxba.lm import initial_state
@@ -35,9 +31,8 @@ from jaxba.losses import Loss
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.refine import refine_points
-from jaxba.solve import MAX_ITERATIONS, History, IterationRecord, Solution, explain_start, solve
+from jaxba.solve import explain_start
 from jaxba.sums import point_sum
-from jaxba.termination import Tolerances
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
 """Where to start from besides the midpoint of the rays: multiples of a point's distance from the first camera that sees
@@ -47,16 +42,13 @@ UNDISTORTIONS = 10
 """Fixed-point iterations that turn a pixel into a ray; what they leave open the point's own steps make good."""
 
 POINT_ITERATIONS = 6
-"""Steps of a point from each place."""
+"""Steps of a point from each place, twice what the learned policy has in an iteration. Chosen once, not fitted."""
 
 LEAST_GAIN = 1e-3
-"""Share of its own cost that a point must gain to be moved ..."""
+"""Share of its own cost that a point must gain to be moved: less is the same minimum. Chosen once, not fitted ..."""
 
 NEGLIGIBLE = 1e-6
 """... and share of an average point's cost, at the best places, that this gain must be worth."""
-
-MAX_ROUNDS = 5
-"""Searches at most. Source: COLMAP, ba_global_max_refinements."""
 
 
 @dataclass(frozen=True)
@@ -74,6 +66,10 @@ class Retriangulation:
 
     cost_after: float
     """Pixels squared; never above the cost before."""
+
+    def pays(self, ftol: float) -> bool:
+        """Whether the cost fell by more than `ftol` of it, so that it is worth going on from here."""
+        return self.cost_before - self.cost_after > ftol * self.cost_before
 
 
 class _Found(NamedTuple):
@@ -109,6 +105,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
         found = jax.device_get(_search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss()))
+        host.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem))
     points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real
@@ -163,77 +160,3 @@ def _midpoints(layout: Layout, frames: camera.Frames) -> Float[Array, "3 points"
     sums = point_sum(layout, jnp.where(layout.slot_mask, jnp.stack([*matrix, *right]), 0))
     factor = cholesky3([sums[k] for k in range(6)])
     return jnp.stack(factor.backward(factor.forward([sums[k] for k in range(6, 9)])))
-
-
-def solve_and_retriangulate(
-    problem: BundleProblem,
-    damping: str | DampingPolicy = "ceres",
-    options: StepOptions | None = None,
-    *,
-    max_iterations: int = MAX_ITERATIONS,
-    tolerances: Tolerances | None = None,
-    callback: Callable[[IterationRecord], bool | None] | None = None,
-    on_search: Callable[[Retriangulation], None] | None = None,
-    **more: Any,
-) -> Solution:
-    """`solve`, and where it converged `retriangulate`, in turns, until that no longer pays.
-
-    It pays as long as the cost falls by more than `ftol` of it, for `MAX_ROUNDS` searches at most. Every solve but the
-    first starts with the policy's first lambda.
-
-    Args:
-        problem: start of the optimisation.
-        damping: as for `solve`.
-        options: as for `solve`; their loss is that of the search.
-        max_iterations: limit of linear solves, all solves together.
-        tolerances: as for `solve`, for each of the solves.
-        callback: as for `solve`; iterations and seconds count through.
-        on_search: called after every search.
-        more: further arguments of `solve`.
-
-    Returns:
-        One solution for all of it. A search counts as no iteration, but takes time.
-
-    Raises:
-        ValueError, ProblemError: as `solve`.
-    """
-    tolerances = tolerances or Tolerances()
-    run = functools.partial(solve, damping=damping, options=options, tolerances=tolerances, **more)
-    whole = run(problem, max_iterations=max_iterations, callback=callback)
-    for _ in range(MAX_ROUNDS):
-        if not whole.converged or whole.iterations == max_iterations:
-            break
-        started = time.perf_counter()
-        with CompileClock() as clock:
-            found = retriangulate(whole.problem, options.loss if options else None)
-        seconds = time.perf_counter() - started - clock.seconds
-        whole = replace(whole, total_s=whole.total_s + seconds, compile_s=whole.compile_s + clock.seconds)
-        if on_search:
-            on_search(found)
-        if found.cost_before - found.cost_after <= tolerances.ftol * found.cost_before:
-            break
-        shown = callback and functools.partial(_shifted, callback, whole.iterations, whole.total_s)
-        left = max_iterations - whole.iterations
-        whole = _joined(whole, run(found.problem, max_iterations=left, callback=shown))
-    return whole
-
-
-def _shifted(
-    callback: Callable[[IterationRecord], bool | None], iterations: int, seconds: float, record: IterationRecord
-) -> bool | None:
-    """A callback that hears of all solves as of one."""
-    return callback(record._replace(iteration=record.iteration + iterations, time_s=record.time_s + seconds))
-
-
-def _joined(before: Solution, last: Solution) -> Solution:
-    """Two solves, the second of which goes on where the first ended, as one."""
-    return replace(
-        last,
-        initial_cost=before.initial_cost,
-        iterations=before.iterations + last.iterations,
-        accepted=before.accepted + last.accepted,
-        history=History(*(np.concatenate(pair) for pair in zip(before.history, last.history, strict=True))),
-        setup_s=before.setup_s + last.setup_s,
-        compile_s=before.compile_s + last.compile_s,
-        total_s=before.total_s + last.total_s,
-    )

@@ -96,7 +96,7 @@ class Solution:
     """Seconds for compilation; nearly zero when an executable was at hand."""
 
     total_s: float
-    """Seconds for the iterations."""
+    """Seconds for the iterations, and for searches between them (alternate.py)."""
 
     capacity: Capacity | None = None
     """Sizes to which the problem was padded; None where it was not."""
@@ -132,7 +132,8 @@ def solve(
 
     Args:
         problem: start of the optimisation.
-        damping: a policy, or the name of one (`jaxba.make_policy`).
+        damping: a policy, or the name of one (`jaxba.make_policy`). Without options `learned` is the shipped policy
+            that fits the method (`naming.fitting_policy`), with options the one for plain LM.
         options: how a step is made; if left out, as a learned policy was trained (`AgentConfig.step_options`).
         method: how a step is made (`jaxba.METHODS`); fixes the options that make it.
         linear_solver: overrides that of the options; `auto` asks the cost model in choose.py.
@@ -161,7 +162,10 @@ def solve(
         raise ValueError(f"dtype must be one of {', '.join(DTYPES)}, not {dtype!r}")
     if max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, is {max_iterations}")
-    policy = make_policy(fitting_policy(damping, method)) if isinstance(damping, str) else damping
+    if isinstance(damping, str):
+        policy = make_policy(damping if options is not None else fitting_policy(damping, method))
+    else:
+        policy = damping
     if options is None:
         options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
     options = make_method(method).options(options)

@@ -88,10 +88,10 @@ def test_a_search_for_points_is_told_and_rows_count_through(tmp_path, capsys):
     searches = re.findall(
         r"^   search for points at other depths: (\d+) of 40 points moved, cost (.*) -> (.*)$", printed, re.M
     )
-    assert len(searches) >= 2
+    assert len(searches) >= 1
     assert int(searches[0][0]) > 0
     assert float(searches[0][2]) < float(searches[0][1])
-    assert searches[-1][1] == searches[-1][2]
+    assert "   search for points at other depths: none found\nconverged" in printed
     assert [int(line[0]) for line in rows(printed)] == list(range(record["iterations"] + 1))
     assert [point["iteration"] for point in record["trace"]] == list(range(record["iterations"] + 1))
     np.testing.assert_allclose(record["final_cost"], geometry.cost(problem), rtol=1e-5)

@@ -33,6 +33,8 @@ from jaxba.damping.learned import (
     save_policy,
 )
 from jaxba.game import sac
+from jaxba.game.config import load
+from jaxba.methods import make_method
 from jaxba.naming import SolverName, parse_solver
 
 AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0)
@@ -294,6 +296,25 @@ def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
         assert same_bits(alone.layers, load_policy(shipped["learned-plain"]).layers)
     driver = parse_solver("pyceres:dense+learned").build()[0]
     assert same_bits(driver.layers, load_policy(shipped["learned-driver"]).layers)
+
+
+@pytest.mark.parametrize("name", registry.SHIPPED)
+def test_a_shipped_policy_is_wired_as_the_preset_of_its_files_name(name):
+    """So none can be taken for another: they differ in their camera damping or their embedded iterations."""
+    path = Path(jaxba.__file__).parent / "policies" / registry.SHIPPED[name]
+    assert load_policy(path).config == load(path.stem).game.agent
+    others = {load(Path(file).stem).game.agent for file in registry.SHIPPED.values()}
+    assert len(others) == len(set(registry.SHIPPED.values()))
+
+
+def test_options_that_are_given_are_met_by_the_policy_for_plain_lm(shipped):
+    """Cameras are then damped as the options say, so the policy must be the one that knows it so."""
+    options = make_method("stba").options(StepOptions(loss=jaxba.Loss("huber")))
+    named, given = (
+        solve(support.tiny(), policy, options, method="stba", max_iterations=2)
+        for policy in ("learned", load_policy(shipped["learned"]))
+    )
+    assert same_bits(named.history, given.history)
 
 
 def test_the_policy_that_drives_another_library_damps_cameras_as_points():

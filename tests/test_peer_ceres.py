@@ -251,7 +251,7 @@ def test_a_rejected_step_leaves_every_bit():
     assert same_bits(before, colmap.parameters())
 
 
-@pytest.mark.parametrize("name", ["learned-plain", "ceres", "classic"])
+@pytest.mark.parametrize("name", ["learned-driver", "ceres", "classic"])
 def test_a_policy_does_with_ceres_what_it_does_with_our_step(name):
     policy = make_policy(name)
     found = drive_ceres(support.tiny(), "dense", policy)
@@ -270,7 +270,7 @@ def test_a_policy_that_is_rejected_goes_on_from_the_same_state():
     np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["learned-plain", "ceres", "schedule"])
+@pytest.mark.parametrize("name", ["learned-driver", "ceres", "schedule"])
 def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
     jax.clear_caches()
     before = []
@@ -447,7 +447,7 @@ def test_real_costs_of_ceres_alone_are_ours_under_its_lambdas(name):
 @needs_data
 @pytest.mark.slow
 def test_the_learned_policy_drives_ladybug_as_with_our_step_also_where_points_pass_behind():
-    policy = make_policy("learned-plain")
+    policy = make_policy("learned-driver")
     found = drive_ceres(real(LADYBUG), "dense", policy, max_iterations=12)
     ours = solve(real(LADYBUG), policy, MANIFOLD, max_iterations=12)
     np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)

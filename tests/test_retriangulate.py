@@ -16,6 +16,7 @@ from jaxba import (
     BundleProblem,
     Loss,
     ProblemError,
+    StepOptions,
     Termination,
     Tolerances,
     geometry,
@@ -200,3 +201,29 @@ def test_a_stop_by_the_callback_ends_all_of_it():
     )
     assert stopped.termination == Termination.STOPPED
     assert stopped.iterations == 2
+    last = solve(one_astray(), "learned").iterations
+    converged = solve_and_retriangulate(
+        one_astray(),
+        "learned",
+        callback=lambda record: record.iteration == last,
+        on_search=lambda _: pytest.fail("a search"),
+    )
+    assert converged.termination == Termination.COST
+    assert converged.iterations == last
+
+
+def test_the_search_counts_the_loss_of_the_solve():
+    searches, options = [], StepOptions(loss=Loss("cauchy", 2.0))
+    found = solve_and_retriangulate(support.tiny(), "ceres", options, on_search=searches.append)
+    np.testing.assert_allclose(searches[0].cost_before, point_costs(found.problem, options.loss).sum(), rtol=1e-9)
+    assert searches[0].cost_before < 0.95 * geometry.cost(found.problem)
+
+
+def test_what_does_not_pay_is_dropped():
+    """With a tolerance so wide that no search pays, the solve alone is what comes back."""
+    searches, wide = [], Tolerances(ftol=0.5)
+    both = solve_and_retriangulate(one_astray(), "learned", tolerances=wide, on_search=searches.append)
+    (search,) = searches
+    assert search.moved > 0
+    assert not search.pays(0.5)
+    assert same_bits(both.problem, solve(one_astray(), "learned", tolerances=wide, callback=lambda _: None).problem)

@@ -28,8 +28,9 @@ class Arguments:
     ladybug-49 (see jaxba-data). Without it a built-in random scene is solved."""
 
     damping: str = "learned"
-    """Who chooses lambda: learned (the shipped policy), a .safetensors file of jaxba-train, ceres, classic, gtsam,
-    nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4; most take a first lambda, as in classic:0.03."""
+    """Who chooses lambda: learned (the shipped policy that fits the step), a .safetensors file of jaxba-train, ceres,
+    classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4; most take a first lambda, as in
+    classic:0.03."""
 
     method: str = DEFAULT_METHOD
     """How a step is made. lm: Levenberg-Marquardt. stba: random clusters of cameras, of at most 100 or, as stba:16, of
@@ -118,6 +119,7 @@ def _solve(args: Arguments) -> int:
     common.check_writable("--log", args.log)
     if args.output and args.log and Path(args.output).resolve() == Path(args.log).resolve():
         raise common.UsageError(f"--output and --log name the same file, {args.output}")
+    from jaxba.alternate import solve_and_retriangulate
     from jaxba.bench.records import record_to_json
     from jaxba.bench.run import record_of
     from jaxba.bench.sources import embedded_sources
@@ -128,7 +130,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.io import read_problem, write_problem
     from jaxba.losses import Loss
     from jaxba.naming import SolverName
-    from jaxba.retriangulate import Retriangulation, solve_and_retriangulate
+    from jaxba.retriangulate import Retriangulation
     from jaxba.solve import IterationRecord, Tolerances, solve
 
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
@@ -156,7 +158,7 @@ def _solve(args: Arguments) -> int:
             return interrupt.asked
 
         def tell(found: Retriangulation) -> None:
-            print(table.retriangulated(found), flush=True)
+            print(table.retriangulated(found, args.ftol), flush=True)
 
         search: dict[str, Any] = {"on_search": tell} if args.retriangulate else {}
         solution = (solve_and_retriangulate if args.retriangulate else solve)(

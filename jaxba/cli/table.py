@@ -47,10 +47,14 @@ def row(record: IterationRecord, time_before: float) -> str:
     return cells if step.accepted else f"{cells}  rejected"
 
 
-def retriangulated(found: Retriangulation) -> str:
+def retriangulated(found: Retriangulation, ftol: float) -> str:
     """What a search for points at other depths brought, between two rows."""
     count = f"{found.moved} of {found.problem.num_points} points moved"
-    return f"   search for points at other depths: {count}, cost {found.cost_before:.6e} -> {found.cost_after:.6e}"
+    costs = f"cost {found.cost_before:.6e} -> {found.cost_after:.6e}"
+    if not found.moved:
+        return "   search for points at other depths: none found"
+    dropped = "" if found.pays(ftol) else ": not worth going on, left as they were"
+    return f"   search for points at other depths: {count}, {costs}{dropped}"
 
 
 def summary(problem: BundleProblem, solution: Solution) -> str:

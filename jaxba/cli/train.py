@@ -27,7 +27,8 @@ class Arguments:
     """Options of `jaxba-train`."""
 
     config: str | None = None
-    """A preset (default, plain, fast, paper) or the path of a YAML file. A resumed run takes that of its folder."""
+    """A preset (default, soft, plain, driver, fast, paper) or the path of a YAML file. A resumed run takes that of its
+    folder."""
 
     overrides: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="KEY=VALUE ...")

@@ -24,17 +24,19 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
 """Factory and one line of description by name."""
 
 LEARNED, LEARNED_SOFT, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-soft", "learned-plain", "learned-driver"
-"""The shipped policies, each where it is the best: for a step with embedded iterations; for the same of a method whose
-steps are not exact anyway, with cameras damped less; for lambda alone (`learned+refine0`); and for lambda alone where
-another library makes the step and damps all variables alike. `learned` means the one that fits (naming.py)."""
+"""The shipped policies, each where it is the best: for a step with embedded iterations; for the same of methods that
+gain by cameras that are damped less; for lambda alone (`learned+refine0`); and for lambda alone where another library
+makes the step and damps all variables alike. In the name of a solver `learned` means the one that fits (naming.py)."""
 
 SHIPPED = {
     LEARNED: "default.safetensors",
+    "learned-default": "default.safetensors",
     LEARNED_SOFT: "soft.safetensors",
     LEARNED_PLAIN: "plain.safetensors",
     LEARNED_DRIVER: "driver.safetensors",
 }
-"""Their files in `jaxba/policies`, each made by the preset of `jaxba-train` that has its name."""
+"""Their files in `jaxba/policies`, each made by the preset of `jaxba-train` that has its name, `driver` before a rescue
+of the guard changed (docs/game.md)."""
 
 SUFFIX = ".safetensors"
 """Ending by which a name is the path of a policy file."""
@@ -51,8 +53,8 @@ def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
     Args:
-        name: `learned`, the path of a policy file, a key of `POLICIES`, optionally `name:FIRST_LAMBDA` for the rules
-            that have one, or `constant:LAMBDA`.
+        name: `learned`, here that for plain LM, another of `SHIPPED`, the path of a policy file, a key of `POLICIES`,
+            optionally `name:FIRST_LAMBDA` for the rules that have one, or `constant:LAMBDA`.
 
     Raises:
         UnknownPolicyError: no such policy, or a lambda that is not a positive number.

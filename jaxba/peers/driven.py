@@ -31,7 +31,7 @@ LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
 
 REJECTED_SHARE = 0.0
 """Stand-in for `damping_share` of a rejected step, which Ceres does not show. Steps are rejected for too little
-damping: of jaxba's own it was 0.0003 to 0.006 on Ladybug-49 and kittistereo00s under `learned-plain`."""
+damping: of jaxba's own it was 0.0003 to 0.006 on Ladybug-49 and kittistereo00s under `learned-driver`."""
 
 _after_step = jax.jit(after_step)
 _init = jax.jit(lambda policy, info: policy.init(info))
