@@ -111,4 +111,5 @@ def make_method(name: str) -> Method:
         raise UnknownMethodError(f"{name!r}: {base} has no clusters whose size could be set")
     if not (size.isdecimal() and int(size) > 0):
         raise UnknownMethodError(f"{name!r}: the cameras of a cluster must be a positive number, not {size!r}")
-    return replace(method, fixes=_fixed(**method.fixes, cluster_cameras=int(size)))
+    # what is known of `soft` was measured with clusters of the published size
+    return replace(method, fixes=_fixed(**method.fixes, cluster_cameras=int(size)), soft=False)

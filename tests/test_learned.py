@@ -286,8 +286,8 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
 
 def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
     """Each with the camera damping that it was trained with: another library has none."""
-    files = {"lm": "learned", "stba": "learned-soft", "deeplm": "learned-soft", "ddlm:3": "learned-soft"}
-    files |= {"poba": "learned"}
+    files = {"lm": "learned", "stba": "learned-soft", "deeplm": "learned-soft", "ddlm": "learned-soft"}
+    files |= {"poba": "learned", "ddlm:3": "learned"}
     for method, file in files.items():
         expected = load_policy(shipped[file]).layers
         assert same_bits(parse_solver(f"{method}+learned").build()[0].layers, expected)
