@@ -12,8 +12,18 @@ from jaxba.damping import (
     Schedule,
     make_policy,
 )
-from jaxba.io import read_bal, read_bundler, read_problem, write_bal, write_ply, write_problem
+from jaxba.io import (
+    read_bal,
+    read_bundler,
+    read_colmap,
+    read_problem,
+    write_bal,
+    write_colmap,
+    write_ply,
+    write_problem,
+)
 from jaxba.layout import Layout, build_layout
+from jaxba.lenses import Lenses
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.losses import Loss
 from jaxba.methods import METHODS, Method, make_method
@@ -39,6 +49,7 @@ __all__ = [
     "IterationRecord",
     "LMState",
     "Layout",
+    "Lenses",
     "Loss",
     "Method",
     "ProblemError",
@@ -66,12 +77,14 @@ __all__ = [
     "random_scene_with_truth",
     "read_bal",
     "read_bundler",
+    "read_colmap",
     "read_problem",
     "retriangulate",
     "solve",
     "solve_and_retriangulate",
     "solve_loop",
     "write_bal",
+    "write_colmap",
     "write_ply",
     "write_problem",
 ]

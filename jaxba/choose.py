@@ -14,7 +14,7 @@ import numpy as np
 from jaxba.density import has_small_capacitance
 from jaxba.options import REDUCED_SOLVERS, LinearSolver, StepOptions
 from jaxba.ordering import camera_order, is_banded
-from jaxba.problem import BundleProblem
+from jaxba.problem import BundleProblem, ProblemError
 
 SECONDS_PER_PAIR = 1e-7
 """Forming the blocks, per pair of observations of one point: 6e-8 on small problems, 1e-7 with 2.5 million pairs."""
@@ -157,7 +157,14 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_so
 
     Raises:
         ValueError: such a method, and another solver asked for by name.
+        ProblemError: cameras share a lens, or some of it stays, and it is not the explicit solver that was asked for.
     """
+    if problem.lenses is not None and options.intrinsics == "free":
+        wanted = options.linear_solver if linear_solver is None else linear_solver
+        if options.linear_solver not in REDUCED_SOLVERS or wanted not in ("auto", "explicit"):
+            refused = wanted if options.linear_solver in REDUCED_SOLVERS else options.linear_solver
+            raise ProblemError(f"shared or partly fixed lenses need plain LM, solved explicitly, not {refused}")
+        return replace(options, linear_solver="explicit")
     if linear_solver is None or linear_solver == options.linear_solver:
         return options
     if options.linear_solver not in REDUCED_SOLVERS:

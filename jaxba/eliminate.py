@@ -11,6 +11,7 @@ Source: Triggs et al. 2000, section 6; Agarwal et al. 2010, section 3.
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -24,6 +25,7 @@ from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.sums import outer_sum, point_sum, take, take_each, take_rows, tree_sum
+from jaxba.ties import LensTies
 
 
 class Coordinates(NamedTuple):
@@ -65,6 +67,7 @@ class CameraSystem(NamedTuple):
     gradient: Float[Array, "cameras 9"]  # g_c, manifold coordinates
     right: Float[Array, "cameras 9"]  # right-hand side of the reduced system
     damping: Float[Array, "cameras 9"]  # D_c, diagonal in the options' coordinates
+    ties: LensTies | None = None  # where cameras share a lens: the damping of its numbers is in equal parts theirs
 
 
 def eliminate_points(
@@ -105,13 +108,18 @@ def camera_system(
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
     )
-    extra = damping_diagonal(diagonal, options.camera_damping * damping, options)
+    factor = options.camera_damping * damping
+    extra = damping_diagonal(diagonal, factor, options)
+    ties = layout.lenses if layout.lenses is not None and layout.lenses.shared else None
+    if ties is not None:
+        whole = damping_diagonal(ties.total(diagonal[:, 6:]), factor, options)
+        extra = extra.at[:, 6:].set(ties.spread(whole / jnp.maximum(ties.counts(), 1)[:, None]))
     # a camera that nobody uses gets a unit block and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     turned = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
     added = extra[:, :, None] * jnp.eye(9, dtype=extra.dtype)
     added = added.at[:, :3, :3].set(turned)
-    return CameraSystem(blocks + added, added, gradient, right, extra)
+    return CameraSystem(blocks + added, added, gradient, right, extra, ties)
 
 
 def back_substitute(
@@ -155,8 +163,9 @@ def project_to_points(
 def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: Coordinates) -> Float[Array, ""]:
     """Largest entry of the gradient, in the options' coordinates."""
     turned = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
-    gradient = jnp.concatenate([turned, system.gradient[:, 3:]], axis=1)
-    return jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.max(jnp.abs(jnp.stack(points.gradient))))
+    lens = system.gradient[:, 6:] if system.ties is None else system.ties.total(system.gradient[:, 6:])
+    parts = turned, system.gradient[:, 3:6], lens, jnp.stack(points.gradient)
+    return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts])
 
 
 def damping_diagonal(diagonal: Array, damping: Float[Array, "..."], options: StepOptions) -> Array:

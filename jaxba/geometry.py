@@ -20,6 +20,9 @@ Array = np.ndarray | jax.Array
 CHUNK = 1 << 19
 """Observations handled at once: some 100 MB of temporaries, measured no slower than larger pieces."""
 
+COLMAP_FLIP = np.array([1.0, -1.0, -1.0])
+"""BAL's axes of a camera to COLMAP's, which looks down +z with y downwards; for pixels its first two."""
+
 
 def rotation_matrices(vectors: Float[Array, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
     """Rotation matrices of angle-axis vectors (radians), by Rodrigues' formula.
@@ -66,6 +69,23 @@ def _quaternions(r: np.ndarray) -> np.ndarray:
     largest = np.argmax(np.diagonal(outer, axis1=1, axis2=2), axis=1)
     rows = outer[np.arange(len(r)), largest]
     return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def colmap_quaternions(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
+    """Unit quaternions xyzw of `diag(1, -1, -1) R(w)` for angle-axis vectors w: `i q`, where i turns by pi about x."""
+    half = 0.5 * vectors
+    angle = np.linalg.norm(half, axis=1)
+    x, y, z = (np.sinc(angle / np.pi)[:, None] * half).T
+    return np.column_stack([np.cos(angle), -z, y, -x])
+
+
+def bal_rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
+    """Angle-axis vectors, of length pi at most: the inverse of `colmap_quaternions`."""
+    x, y, z, w = np.where(quaternions[:, :1] < 0, -1.0, 1.0).T * quaternions.T
+    vector = np.column_stack([-w, z, -y])
+    sine = np.linalg.norm(vector, axis=1)
+    scale = np.divide(2 * np.arctan2(sine, x), sine, out=np.full(len(sine), 2.0), where=sine > 0)  # 2: limit at zero
+    return scale[:, None] * vector
 
 
 def camera_centers(cameras: Float[Array, "cameras 9"]) -> Float[np.ndarray, "cameras 3"]:

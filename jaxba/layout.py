@@ -26,6 +26,7 @@ from jaxba.pairs import PairLayout, pair_layout
 from jaxba.partition import Partition, partition_layout
 from jaxba.problem import AnyArray, BundleProblem
 from jaxba.slots import bucket_slots, padded_slots
+from jaxba.ties import LensTies, lens_ties
 from jaxba.trees import sum_tree
 
 CAMERA_CHUNK = 8
@@ -74,6 +75,9 @@ class Layout:
 
     partitions: Partition | None
     """Random clusterings, one behind the other; None where no method asks for them."""
+
+    lenses: LensTies | None
+    """None where every camera has a lens of its own, all of it free."""
 
     buckets: tuple[tuple[int, int], ...] = field(metadata={"static": True})
     """(slots per point, points) of each bucket; none where sizes are padded."""
@@ -161,8 +165,12 @@ def build_layout(
         table = np.full((columns, cameras), empty, np.int32)
         table[slot_point[slot], camera] = slot
     listed = None
+    ties = None if problem.lenses is None else lens_ties(problem.lenses, seen > 0)
     if pairs and table is None:
-        listed = pair_layout(camera, slot, tracks, start, cameras, empty, factor=factor, capacity=capacity)
+        banded = ties is None or not ties.shared  # a shared lens couples cameras that have no point in common
+        listed = pair_layout(
+            camera, slot, tracks, start, cameras, empty, factor=factor, banded=banded, capacity=capacity
+        )
     drawn = None
     if partitions is not None:
         if listed is None:
@@ -184,6 +192,7 @@ def build_layout(
         grid=table,
         clusters=cluster_layout(camera, point, slot, cameras, len(tracks), slot_point, empty) if clusters else None,
         partitions=drawn,
+        lenses=ties,
         buckets=made.buckets,
     )
 

@@ -12,6 +12,7 @@ from jaxba import camera
 from jaxba.barrier import materialized
 from jaxba.layout import Layout
 from jaxba.losses import Loss
+from jaxba.options import Intrinsics
 from jaxba.sums import take, total
 
 
@@ -112,11 +113,27 @@ def linearize(
     return Linearization(residual, by_camera, by_point, costs, in_front(projection))
 
 
-def without_intrinsics(linear: Linearization) -> Linearization:
-    """The same where no residual depends on f, k1 and k2: their part of the damped system is the clamped damping alone,
-    their gradient zero, and so is their step."""
+def with_free_lenses(
+    layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False
+) -> Linearization:
+    """The same where no residual depends on what of f, k1 and k2 stays: its part of the damped system is the clamped
+    damping alone, its gradient zero, and so is its step.
+
+    Args:
+        layout: knows the lenses.
+        linear: all derivatives.
+        intrinsics: `fixed` is no lens's.
+        alone: whether every camera moves by itself, so that shared lenses must stay.
+    """
+    lenses = layout.lenses
     zero = jnp.zeros_like(linear.residual[0])
-    return linear._replace(camera_jacobian=[[*row[:6], zero, zero, zero] for row in linear.camera_jacobian])
+    if intrinsics == "fixed" or (alone and lenses is not None and lenses.shared):
+        return linear._replace(camera_jacobian=[[*row[:6], zero, zero, zero] for row in linear.camera_jacobian])
+    if lenses is None:
+        return linear
+    free = take(jnp.asarray(lenses.free), layout.slot_camera)
+    kept = lambda row: [jnp.where(free[k], column, zero) for k, column in enumerate(row[6:])]
+    return linear._replace(camera_jacobian=[[*row[:6], *kept(row)] for row in linear.camera_jacobian])
 
 
 def _whiten(layout: Layout, pair: list[Array]) -> list[Array]:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.decompose import Round, decomposed_round
 from jaxba.effort import Effort
 from jaxba.layout import Layout, partition_of
-from jaxba.linearize import cost, linearize, without_intrinsics
+from jaxba.linearize import cost, linearize, with_free_lenses
 from jaxba.options import StepOptions
 from jaxba.parts import Whole
 from jaxba.problem import BundleProblem
@@ -95,8 +95,7 @@ def lm_step(
     if options.linear_solver == "decomposed":
         return _round(layout, state, damping, options, min_gain, turn)
     linear = linearize(layout, state.cameras, state.points, options.loss)
-    if options.intrinsics == "fixed":
-        linear = without_intrinsics(linear)
+    linear = with_free_lenses(layout, linear, options.intrinsics)
     step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn, effort)
     trial = best_trial(Whole(layout), *state, linear, step, options, min_gain, effort)
     moved = [trial.share * step.cameras, trial.points - state.points]

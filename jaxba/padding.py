@@ -74,9 +74,12 @@ def capacity_of(problem: BundleProblem) -> Capacity | None:
     cells: 20 windows of 20 cameras of kitti00vo fall into 2 of them, with free points and pairs into 5.
 
     Returns:
-        None for problems with more than `MAX_CAMERAS`, `MAX_OBSERVATIONS` (points count too) or `MAX_PAIRS`.
+        None for problems with lenses (lenses.py), or with more than `MAX_CAMERAS`, `MAX_OBSERVATIONS` (points count
+        too) or `MAX_PAIRS`.
     """
-    if problem.num_cameras > MAX_CAMERAS or max(problem.num_points, problem.num_observations + 1) > MAX_OBSERVATIONS:
+    if problem.lenses is not None or problem.num_cameras > MAX_CAMERAS:
+        return None
+    if max(problem.num_points, problem.num_observations + 1) > MAX_OBSERVATIONS:
         return None
     camera, point = np.asarray(problem.camera_index, np.int64), np.asarray(problem.point_index)
     tracks = np.bincount(point).astype(np.int64)

@@ -13,8 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-AnyArray = np.ndarray | jax.Array
-"""An array on the host or on a device; tracers are of the second kind."""
+from jaxba.lenses import AnyArray, Lenses, checked_lenses
 
 CAMERA_SIZE = 9
 """Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""
@@ -54,6 +53,9 @@ class BundleProblem:
     whitening: Float[AnyArray, "observations 2 2"] | None = None
     """`Sigma^(-1/2)` of each observation; None stands for the identity (pixels)."""
 
+    lenses: Lenses | None = None
+    """Which cameras share a lens, and what of it stays; None: every camera has its own, all of it free (BAL)."""
+
     @classmethod
     def create(
         cls,
@@ -65,6 +67,7 @@ class BundleProblem:
         *,
         covariance: Any = None,
         weight: Any = None,
+        lenses: Lenses | None = None,
     ) -> BundleProblem:
         """Checks the arrays and makes a problem of float64 / int32 NumPy arrays.
 
@@ -78,10 +81,11 @@ class BundleProblem:
                 positive definite. The cost then uses `|Sigma^(-1/2) r|^2`.
             weight: optional, shape (observations,), non-negative; multiplies the squared
                 residual, so it stands for the covariance `I / weight`. Excludes `covariance`.
+            lenses: optional; which cameras share f, k1 and k2, and which of these are optimised.
 
         Raises:
             ProblemError: shapes differ, an index is out of range, a number is not finite, there
-                are no observations, or a covariance is not positive definite.
+                are no observations, a covariance is not positive definite, or cameras of one lens differ in it.
         """
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
@@ -99,7 +103,12 @@ class BundleProblem:
             if len(getattr(problem, name)) != count:
                 raise ProblemError(f"{name} has {len(getattr(problem, name))} entries for {count} observations")
         whitening = _whitening(covariance, weight, count)
-        return problem if whitening is None else replace(problem, whitening=whitening)
+        if lenses is not None:
+            try:
+                lenses = checked_lenses(lenses, np.asarray(problem.cameras))
+            except ValueError as error:
+                raise ProblemError(str(error)) from None
+        return replace(problem, whitening=whitening, lenses=lenses)
 
     @property
     def num_cameras(self) -> int:

@@ -32,6 +32,7 @@ from jaxba.options import StepOptions
 from jaxba.precondition import block_inverse, preconditioner, series
 from jaxba.problem import AnyArray
 from jaxba.sums import take_rows, tree_sum
+from jaxba.ties import solve_tied
 
 SINGLE_LIFT = 64.0
 """Rounding units added to the scaled diagonal of a system formed in float32, which may have lost its sign."""
@@ -63,6 +64,9 @@ def solve_reduced(
     if options.linear_solver == "power":
         return _power_series(product, system, options)
     explicit, grid = options.linear_solver == "explicit", layout.grid
+    if system.ties is not None:
+        formed = _dense(layout, linear, points, system)
+        return solve_tied(system.ties, formed, system.right), _no_iterations()
     # a small capacitance matrix is not worth rounding to float32
     if explicit and grid is not None and (options.algebra == "full" or has_few_points(*grid.shape)):
         return solve_dense(grid, linear, points, system), _no_iterations()
@@ -150,6 +154,13 @@ def dense_system(
     product = jnp.matmul(wide, wide.T, precision="highest")
     own = system.blocks[:, :, None, :] * jnp.eye(cameras, dtype=product.dtype)[:, None, :, None]
     return own.reshape(9 * cameras, 9 * cameras) - product
+
+
+def _dense(layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem) -> Float[Array, "n n"]:
+    """The reduced camera system as one matrix; only its lower triangle is filled."""
+    if layout.grid is not None:
+        return dense_system(layout.grid, linear, points, system)
+    return dense_blocks(_pairs(layout), reduced_blocks(layout, linear, points, system).reshape(-1, 81), 9)
 
 
 def factor_blocks(

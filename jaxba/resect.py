@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxba import camera
 from jaxba.layout import Layout
-from jaxba.linearize import linearize, residuals, slot_costs, slot_frames, without_intrinsics
+from jaxba.linearize import linearize, residuals, slot_costs, slot_frames, with_free_lenses
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.sums import outer_sum, take_rows, tree_sum
 
@@ -41,8 +41,7 @@ def refine_cameras(
         Cameras; the total cost is never larger than before.
     """
     linear = linearize(layout, cameras, points, options.loss)
-    if options.intrinsics == "fixed":
-        linear = without_intrinsics(linear)
+    linear = with_free_lenses(layout, linear, options.intrinsics, alone=True)
     rows = [entry for k in range(2) for entry in (*linear.camera_jacobian[k], linear.residual[k])]
     level, *levels = layout.camera_levels
     gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 10)

@@ -398,6 +398,11 @@ def _write_back(problem: BundleProblem, layout: Layout, state: LMState) -> Bundl
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
     seen = np.flatnonzero(layout.camera_seen)  # cameras of padding are not seen
     cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
+    if problem.lenses is not None:  # what nobody observes has the lens of the others
+        lens = np.asarray(problem.lenses.index)
+        used, first = np.unique(lens[seen], return_index=True)
+        follows = np.isin(lens, used)
+        cameras[follows, 6:] = cameras[seen[first[np.searchsorted(used, lens[follows])]], 6:]
     order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = order < problem.num_points
     points[order[real]] = np.asarray(state.points, np.float64).T[real]

@@ -1,4 +1,4 @@
-"""Where a benchmark's problems come from: files, downloaded problems by name, and random scenes by name."""
+"""Where a benchmark's problems come from: files, COLMAP models, downloaded problems and random scenes by name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jaxba.data.places import resolve
-from jaxba.io import read_problem
+from jaxba.io import is_colmap, read_problem
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, like, random_scene
 
@@ -71,8 +71,8 @@ def sources(locations: list[str]) -> list[Source]:
         else:
             name, location = location, resolve(location)
             path = Path(location)
-            if not path.is_file():
-                raise ProblemError(f"{location}: {'a directory, not a file' if path.is_dir() else 'no such file'}")
+            if not path.is_file() and not is_colmap(path):
+                raise ProblemError(f"{location}: {'no COLMAP model in it' if path.is_dir() else 'no such file'}")
             label = re.sub(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$", "", Path(name).name) or path.name
             family = path.resolve().parent.name
         taken = {source.name for source in found}

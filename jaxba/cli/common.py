@@ -100,6 +100,19 @@ def check_writable(option: str, path: str | None) -> None:
         raise UsageError(f"{option} {path}: folder {target.parent} cannot be written")
 
 
+def check_folder(option: str, path: str) -> None:
+    """Refuses a folder that could not be made or written to later, before any work is done.
+
+    Raises:
+        UsageError: it cannot be written, or the one that would hold it is missing or cannot.
+    """
+    target = Path(path).absolute()
+    if not target.is_dir():
+        return check_writable(option, path)
+    if not os.access(target, os.W_OK):
+        raise UsageError(f"{option} {path}: folder cannot be written")
+
+
 def check_positive(**values: Any) -> None:
     """Refuses numbers that are not positive (or, for tolerances, negative).
 

@@ -24,8 +24,8 @@ class Arguments:
     """Options of `jaxba-solve`."""
 
     problem: Annotated[str | None, tyro.conf.Positional] = None
-    """BAL file or Bundler .out file, plain or .bz2, .gz, .xz, or the name of a downloaded problem of BAL, such as
-    ladybug-49 (see jaxba-data). Without it a built-in random scene is solved."""
+    """BAL file or Bundler .out file, plain or .bz2, .gz, .xz; the folder of a COLMAP model (extra colmap); or the name
+    of a downloaded problem of BAL, such as ladybug-49 (see jaxba-data). Without it a built-in scene is solved."""
 
     damping: str = "learned"
     """Who chooses lambda: learned (the shipped policy that fits the step), a .safetensors file of jaxba-train, ceres,
@@ -79,8 +79,8 @@ class Arguments:
     """Coordinates of rotation steps: those of the file, as Ceres, or multiplication by exp(step)."""
 
     intrinsics: Intrinsics = "free"
-    """free: focal length and distortion of every camera are optimised, as in BAL. fixed: they stay, as they should with
-    calibrated cameras; the reduced camera system is then always formed and factored."""
+    """free: focal length and distortion of every camera are optimised, as in BAL, or of every lens, as in COLMAP.
+    fixed: they stay, as they should with calibrated cameras; the reduced camera system is then formed and factored."""
 
     loss: Literal["squared", "huber", "soft_l1", "cauchy", "tukey"] = "squared"
     """Robust loss of the squared residual."""
@@ -89,7 +89,8 @@ class Arguments:
     """Residual in pixels where the loss bends."""
 
     output: str | None = None
-    """Write the solution here: BAL format, compressed by its ending, or .ply for a viewer."""
+    """Write the solution here: BAL format, compressed by its ending, or .ply for a viewer; of a COLMAP model also a
+    COLMAP model, in a folder, which is what a name without an ending is then."""
 
     log: str | None = None
     """Write a JSON record of the solve here."""
@@ -115,7 +116,11 @@ def _solve(args: Arguments) -> int:
         raise common.UsageError(f"--linear-solver is for --method lm; {args.method} has its own")
     if args.intrinsics == "fixed" and (args.method != DEFAULT_METHOD or args.linear_solver not in ("auto", "explicit")):
         raise common.UsageError("--intrinsics fixed needs --method lm and the explicit linear solver")
-    common.check_writable("--output", args.output)
+    model = _output_model(args)
+    if model is None:
+        common.check_writable("--output", args.output)
+    else:
+        common.check_folder("--output", model)
     common.check_writable("--log", args.log)
     if args.output and args.log and Path(args.output).resolve() == Path(args.log).resolve():
         raise common.UsageError(f"--output and --log name the same file, {args.output}")
@@ -127,7 +132,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.cli import table
     from jaxba.damping import is_learned
     from jaxba.data.places import resolve
-    from jaxba.io import read_problem, write_problem
+    from jaxba.io import read_problem, write_colmap, write_problem
     from jaxba.losses import Loss
     from jaxba.naming import SolverName
     from jaxba.retriangulate import Retriangulation
@@ -178,7 +183,10 @@ def _solve(args: Arguments) -> int:
         print(table.padding(problem, solution))
     if args.output:
         try:
-            write_problem(solution.problem, args.output)
+            if model is None:
+                write_problem(solution.problem, args.output)
+            else:
+                write_colmap(solution.problem, model, like=str(args.problem))
         except OSError as error:
             raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
         print(f"wrote {args.output}")
@@ -190,3 +198,10 @@ def _solve(args: Arguments) -> int:
             raise common.UsageError(f"--log {args.log}: {error.strerror or error}") from None
         print(f"wrote {args.log}")
     return 0
+
+
+def _output_model(args: Arguments) -> str | None:
+    """The folder where a COLMAP model is to be written, if it is one."""
+    if not args.output or not args.problem or not Path(args.problem).is_dir():
+        return None
+    return args.output if Path(args.output).is_dir() or not Path(args.output).suffix else None

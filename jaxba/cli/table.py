@@ -28,6 +28,11 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         refine += f", cameras damped by {options.camera_damping:g} lambda"
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     sizes = f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations"
+    if problem.lenses is not None:
+        free = np.any(np.asarray(problem.lenses.free), axis=0) & (options.intrinsics == "free")
+        names = [one for k, one in enumerate(("f", "k1", "k2")) if free[k]]
+        count = len(problem.lenses.free)
+        sizes += f", {count} lens{'es' * (count > 1)} ({', '.join(names) or 'fixed'})"
     return f"{name}: {sizes}\ndamping {args.damping}{refine}, {args.dtype}, {solver}"
 
 

@@ -1,24 +1,39 @@
-"""Problems to and from files: BAL text, Bundler models, PLY point clouds."""
+"""Problems to and from files: BAL text, Bundler and COLMAP models, PLY point clouds."""
 
 from __future__ import annotations
 
+import os
 from pathlib import PurePath
 
 from jaxba.io.bal import read_bal, write_bal
 from jaxba.io.bundler import read_bundler
+from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
 from jaxba.io.files import StrPath, strip_compression
 from jaxba.io.ply import write_ply
 from jaxba.problem import BundleProblem
 
-__all__ = ["read_bal", "read_bundler", "read_problem", "write_bal", "write_ply", "write_problem"]
+__all__ = [
+    "is_colmap",
+    "read_bal",
+    "read_bundler",
+    "read_colmap",
+    "read_problem",
+    "write_bal",
+    "write_colmap",
+    "write_ply",
+    "write_problem",
+]
 
 
 def read_problem(path: StrPath) -> BundleProblem:
-    """Reads a problem: `.out` is a Bundler model, every other name a BAL file; each also compressed.
+    """Reads a problem: a folder is a COLMAP model, `.out` a Bundler model, every other name a BAL file, these two also
+    compressed.
 
     Raises:
-        ProblemError: as `read_bundler` and `read_bal` do.
+        ProblemError: as `read_colmap`, `read_bundler` and `read_bal` do.
     """
+    if os.path.isdir(path):
+        return read_colmap(path)
     return (read_bundler if _kind(path) == ".out" else read_bal)(path)
 
 

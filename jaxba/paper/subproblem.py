@@ -47,6 +47,7 @@ def sub_problem(
         camera_index=np.searchsorted(kept, camera_index[keep]).astype(np.int32),
         point_index=np.searchsorted(used, point_index[keep]).astype(np.int32),
         whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
+        lenses=None if problem.lenses is None else problem.lenses.of(kept),
     )
 
 

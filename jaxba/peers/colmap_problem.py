@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba import geometry
+from jaxba.geometry import COLMAP_FLIP as FLIP
+from jaxba.geometry import bal_rotations, colmap_quaternions
 from jaxba.peers.colmap import LENS_SIZE, PRINCIPAL_POINT, SMALLEST_DEPTH, AnySide, pose_manifold, pyceres, reprojection
 from jaxba.problem import BundleProblem, ProblemError
-
-FLIP = np.array([1.0, -1.0, -1.0])
-"""BAL's axes of a camera to COLMAP's; for pixels its first two."""
 
 
 class ColmapProblem:
@@ -30,10 +29,10 @@ class ColmapProblem:
         """Copies the parameters; the problem itself never changes.
 
         Raises:
-            ProblemError: the problem has covariances.
+            ProblemError: the problem has covariances or lenses.
         """
-        if problem.whitening is not None:
-            raise ProblemError("Ceres as a peer takes no covariances or weights")
+        if problem.whitening is not None or problem.lenses is not None:
+            raise ProblemError("Ceres as a peer takes no covariances or weights, and no shared or partly fixed lenses")
         cameras = np.asarray(problem.cameras, np.float64)
         self.start = problem
         self.poses = np.hstack([colmap_quaternions(cameras[:, :3]), cameras[:, 3:6] * FLIP])
@@ -89,20 +88,3 @@ class ColmapProblem:
         poses, lenses = self.poses[self.seen], self.lenses[self.seen]
         cameras[self.seen] = np.hstack([bal_rotations(poses[:, :4]), poses[:, 4:] * FLIP, lenses[:, [0, 3, 4]]])
         return self.start.replace(cameras=cameras, points=self.points.copy())
-
-
-def colmap_quaternions(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
-    """Unit quaternions xyzw of `diag(1, -1, -1) R(w)` for angle-axis vectors w: `i q`, where i turns by pi about x."""
-    half = 0.5 * vectors
-    angle = np.linalg.norm(half, axis=1)
-    x, y, z = (np.sinc(angle / np.pi)[:, None] * half).T
-    return np.column_stack([np.cos(angle), -z, y, -x])
-
-
-def bal_rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
-    """Angle-axis vectors, of length pi at most: the inverse of `colmap_quaternions`."""
-    x, y, z, w = np.where(quaternions[:, :1] < 0, -1.0, 1.0).T * quaternions.T
-    vector = np.column_stack([-w, z, -y])
-    sine = np.linalg.norm(vector, axis=1)
-    scale = np.divide(2 * np.arctan2(sine, x), sine, out=np.full(len(sine), 2.0), where=sine > 0)  # 2: limit at zero
-    return scale[:, None] * vector

@@ -1,0 +1,93 @@
+"""Lenses that several cameras share: the step in which they move alike.
+
+With T the matrix that gives every camera the numbers of its lens, tied unknowns y stand for the step T y, and the
+damped system `(H + D) d = -g` becomes `T^T (H + D) T y = -T^T g`. Points are eliminated as ever, since T leaves them
+alone: the reduced camera system of all cameras is formed, then rows and columns of a lens are added up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxba.dense import factor_and_solve
+from jaxba.lenses import LENS_SIZE, AnyArray, Lenses
+
+POSE_SIZE = 6
+"""Unknowns of a camera that are its own: rotation and translation. Those of the lens follow."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LensTies:
+    """What a layout knows of lenses."""
+
+    lens: Int[AnyArray, " cameras"]
+    """Lens of each camera."""
+
+    members: Bool[AnyArray, "cameras lenses"]
+    """Whether an observed camera has a lens."""
+
+    free: Bool[AnyArray, "3 cameras"]
+    """Which of f, k1 and k2 of a camera are optimised."""
+
+    shared: bool = field(metadata={"static": True})
+    """Whether two cameras have the same lens; without it nothing is tied, and some numbers may stay all the same."""
+
+    def total(self, values: Float[Array, "cameras 3"]) -> Float[Array, "lenses 3"]:
+        """Sums over the observed cameras of each lens: `T^T` of the lenses' unknowns."""
+        return jnp.matmul(self.members.T.astype(values.dtype), values, precision="highest")
+
+    def counts(self) -> Int[Array, " lenses"]:
+        """Observed cameras of each lens."""
+        return jnp.sum(self.members, axis=0, dtype=jnp.int32)
+
+    def spread(self, values: Float[Array, "lenses 3"]) -> Float[Array, "cameras 3"]:
+        """A lens's numbers for each of its cameras: T."""
+        return values[self.lens]
+
+
+def lens_ties(lenses: Lenses, seen: Bool[np.ndarray, " cameras"]) -> LensTies:
+    """The lenses of a problem, for its layout.
+
+    Args:
+        lenses: checked.
+        seen: cameras with at least one observation.
+    """
+    index = np.asarray(lenses.index)
+    members = (index[:, None] == np.arange(len(lenses.free))) & seen[:, None]
+    return LensTies(index, members, np.asarray(lenses.free)[index].T, lenses.shared)
+
+
+def solve_tied(
+    ties: LensTies, matrix: Float[Array, "unknowns unknowns"], right: Float[Array, "cameras 9"]
+) -> Float[Array, "cameras 9"]:
+    """Solves `T^T S T y = T^T b` by a dense Cholesky factorisation.
+
+    Args:
+        ties: T.
+        matrix: S, of which the lower triangle is read.
+        right: b.
+
+    Returns:
+        T y; not finite where the tied matrix is not positive definite.
+    """
+    cameras, lenses = ties.members.shape
+    lower = jnp.tril(matrix)
+    whole = (lower + jnp.tril(matrix, -1).T).reshape(cameras, 9, cameras, 9)
+    poses = whole[:, :POSE_SIZE, :, :POSE_SIZE].reshape(POSE_SIZE * cameras, -1)
+    own = ties.members.astype(matrix.dtype)
+    columns = jnp.einsum("cadk,dl->calk", whole[..., POSE_SIZE:], own, precision="highest")  # [c, 9, lens, 3]
+    both = columns[:, :POSE_SIZE].reshape(-1, LENS_SIZE * lenses)
+    alone = jnp.einsum("cl,cjmk->ljmk", own, columns[:, POSE_SIZE:], precision="highest")
+    unused = jnp.repeat(ties.counts() == 0, LENS_SIZE).astype(matrix.dtype)  # such a lens gets a zero step
+    alone = alone.reshape(LENS_SIZE * lenses, -1) + jnp.diag(unused)
+    tied = jnp.block([[poses, both], [both.T, alone]])
+    step = factor_and_solve(tied, jnp.concatenate([right[:, :POSE_SIZE].ravel(), ties.total(right[:, 6:]).ravel()]))
+    pose, lens = step[: POSE_SIZE * cameras], step[POSE_SIZE * cameras :]
+    return jnp.concatenate([pose.reshape(cameras, POSE_SIZE), ties.spread(lens.reshape(lenses, LENS_SIZE))], axis=1)

@@ -1,0 +1,306 @@
+"""COLMAP models: costs are COLMAP's, what is written is read back bit by bit, and what cannot be is refused.
+
+The truth is COLMAP itself: its projection, and its own bundle adjustment.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import support
+from support import DATA, needs_data
+
+from jaxba import BundleProblem, ProblemError, StepOptions, geometry, read_colmap, read_problem, solve, write_colmap
+from jaxba.bench.sources import sources
+from jaxba.cli.solve import run
+from jaxba.io.colmap import MODELS
+
+pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
+
+SIZE = 1280, 960
+LENSES = {
+    "SIMPLE_PINHOLE": [700, 640, 480],
+    "PINHOLE": [700, 721, 650, 470],
+    "SIMPLE_RADIAL": [700, 640, 480, -0.03],
+    "RADIAL": [700, 640, 480, -0.03, 0.002],
+    "OPENCV": [700, 712, 640, 480, -0.03, 0.002, 1e-3, -2e-3],
+    "OPENCV_FISHEYE": [700, 700, 640, 480, 0.01, 0, 0, 0],
+}
+REAL = ("bulani7", "yding", "ranjith")
+
+
+def model_of(kinds: list[str], seed: int = 0):
+    """The cameras and points of a random scene behind lenses in turn, seen with half a pixel of noise.
+
+    Ids have gaps and come in no order; one image is not registered, and one key-point of each belongs to no point.
+    """
+    scene = support.paper(seed)
+    model = pycolmap.Reconstruction()
+    for number, kind in enumerate(kinds):
+        lens = pycolmap.Camera(camera_id=9 - 3 * number, model=kind, width=SIZE[0], height=SIZE[1], params=LENSES[kind])
+        model.add_camera_with_trivial_rig(lens)
+    rng = np.random.default_rng(seed)
+    matrices = geometry.rotation_matrices(scene.cameras[:, :3])
+    flip = np.diag(geometry.COLMAP_FLIP)
+    ids = [40 - 3 * camera for camera in range(scene.num_cameras)]
+    for camera, identity in enumerate(ids):
+        lens_id = 9 - 3 * (camera % len(kinds))
+        rotation, shift = flip @ matrices[camera], flip @ scene.cameras[camera, 3:6]
+        keys = model.camera(lens_id).img_from_cam(scene.points @ rotation.T + shift)
+        keys = np.vstack([[[1.0, 2.0]], keys + rng.normal(scale=0.5, size=keys.shape)])
+        image = pycolmap.Image(name=f"{identity}.png", keypoints=keys, camera_id=lens_id, image_id=identity)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), shift))
+    absent = pycolmap.Image(name="absent.png", keypoints=np.zeros((3, 2)), camera_id=9, image_id=99)
+    model.add_image_with_trivial_frame(absent)
+    for point in range(scene.num_points):
+        track = pycolmap.Track([pycolmap.TrackElement(i, 1 + point) for i in ids[point % 3 :]])
+        model.add_point3D(scene.points[point] + rng.normal(scale=0.02, size=3), track)
+    return model
+
+
+def write(model, folder: Path, text: bool = False) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (model.write_text if text else model.write_binary)(str(folder))
+    return folder
+
+
+def colmap_cost(folder: Path | str) -> float:
+    """Half the squared errors of all observations, projected by COLMAP."""
+    model = pycolmap.Reconstruction(str(folder))
+    total = 0.0
+    for point in model.points3D.values():
+        for view in point.track.elements:
+            image = model.image(view.image_id)
+            error = image.project_point(point.xyz) - image.point2D(view.point2D_idx).xy
+            total += 0.5 * float(error @ error)
+    return total
+
+
+def adjusted_by_colmap(folder: Path | str, target: Path, lenses: bool) -> float:
+    """Cost after COLMAP's own bundle adjustment, squared loss, principal points constant."""
+    model = pycolmap.Reconstruction(str(folder))
+    options = pycolmap.BundleAdjustmentOptions(
+        print_summary=False, refine_focal_length=lenses, refine_extra_params=lenses, refine_principal_point=False
+    )
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
+    options.ceres.solver_options.max_num_iterations = 300
+    options.ceres.solver_options.function_tolerance = 1e-12
+    config = pycolmap.BundleAdjustmentConfig()
+    for identity in model.reg_image_ids():
+        config.add_image(identity)
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
+    return colmap_cost(write(model, target))
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+@pytest.mark.parametrize("kinds", [[kind] for kind in MODELS] + [list(MODELS)], ids=lambda kinds: "+".join(kinds))
+def test_the_cost_is_that_of_colmap(tmp_path, kinds, text):
+    folder = write(model_of(kinds), tmp_path / "model", text)
+    problem = read_problem(folder)
+    assert (problem.num_cameras, problem.num_points, problem.num_observations) == (10, 10, 10 * 10 - 9)
+    np.testing.assert_allclose(geometry.cost(problem), colmap_cost(folder), rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["OPENCV", "OPENCV_FISHEYE"])
+def test_a_lens_that_stays_weighs_errors_as_its_image_does_to_first_order(tmp_path, kind):
+    folder = write(model_of([kind]), tmp_path / "model")
+    problem = read_problem(folder)
+    assert problem.lenses is not None
+    assert not problem.lenses.free.any()
+    np.testing.assert_allclose(geometry.cost(problem), colmap_cost(folder), rtol=2e-2)
+    written = tmp_path / "out"
+    solution = solve(problem, "learned")
+    write_colmap(solution.problem, written, like=folder)
+    before, after = pycolmap.Reconstruction(str(folder)), pycolmap.Reconstruction(str(written))
+    assert (before.camera(9).params == after.camera(9).params).all()
+    truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=False)
+    np.testing.assert_allclose(colmap_cost(written), truth, rtol=1e-3)
+
+
+def test_images_of_one_camera_share_a_lens_whose_model_says_what_is_free(tmp_path):
+    problem = read_colmap(write(model_of(list(MODELS)), tmp_path))
+    assert problem.lenses is not None
+    # ids of images fall as those of lenses do: image 13 is the last one made
+    assert problem.lenses.index.tolist() == [2, 3, 0, 1, 2, 3, 0, 1, 2, 3]
+    by_id = [[1, 1, 1], [1, 1, 0], [1, 0, 0], [1, 0, 0]]  # ids 0, 3, 6, 9: RADIAL first
+    assert problem.lenses.free.astype(int).tolist() == by_id
+
+
+@pytest.mark.parametrize("kinds", [["RADIAL"], ["SIMPLE_RADIAL"], ["SIMPLE_PINHOLE", "RADIAL"]], ids="+".join)
+def test_a_solve_ends_where_colmaps_own_bundle_adjustment_does(tmp_path, kinds):
+    folder = write(model_of(kinds), tmp_path / "model")
+    solution = solve(read_problem(folder), "learned")
+    assert solution.converged
+    write_colmap(solution.problem, tmp_path / "out", like=folder)
+    truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=True)
+    np.testing.assert_allclose(solution.final_cost, truth, rtol=1e-5)
+    np.testing.assert_allclose(colmap_cost(tmp_path / "out"), solution.final_cost, rtol=1e-9)
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+def test_what_is_written_is_read_back_and_the_rest_is_as_it_was(tmp_path, text):
+    folder = write(model_of(["PINHOLE", "RADIAL", "OPENCV"]), tmp_path / "model", text)
+    problem = read_problem(folder)
+    rng = np.random.default_rng(1)
+    cameras = problem.cameras + 1e-3 * rng.normal(size=problem.cameras.shape)
+    first = np.array([np.flatnonzero(problem.lenses.index == lens)[0] for lens in problem.lenses.index])
+    held = ~problem.lenses.free[problem.lenses.index]
+    cameras[:, 6:] = np.where(held, problem.cameras[:, 6:], cameras[first, 6:])
+    changed = problem.replace(cameras=cameras, points=problem.points + 0.1)
+    write_colmap(changed, tmp_path / "out", like=folder)
+    assert (tmp_path / "out" / ("cameras.txt" if text else "cameras.bin")).is_file()
+    back = read_problem(tmp_path / "out")
+    np.testing.assert_allclose(back.cameras, changed.cameras, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(back.points, changed.points, rtol=1e-15)
+    # pixels behind a PINHOLE's or a constant lens are its numbers' to tell
+    np.testing.assert_allclose(back.observations, problem.observations, rtol=1e-12)
+    assert (back.camera_index == problem.camera_index).all()
+    assert (back.point_index == problem.point_index).all()
+    before, after = (pycolmap.Reconstruction(str(place)) for place in (folder, tmp_path / "out"))
+    assert {i: image.name for i, image in before.images.items()} == {i: image.name for i, image in after.images.items()}
+    assert after.num_reg_images() == 10
+    assert set(after.point3D_ids()) == set(before.point3D_ids())
+
+
+def test_a_model_may_be_written_in_its_own_folder(tmp_path):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    (folder / "notes.txt").write_text("mine")
+    assert run([str(folder), "--output", str(folder)]) == 0
+    assert sorted(path.name for path in folder.iterdir()) == [
+        *("cameras.bin", "frames.bin", "images.bin", "notes.txt", "points3D.bin", "rigs.bin")
+    ]
+    assert geometry.cost(read_problem(folder)) < 0.99 * geometry.cost(
+        read_problem(write(model_of(["RADIAL"]), tmp_path / "again"))
+    )
+
+
+def test_the_command_solves_a_model_and_writes_one_or_a_file(tmp_path, capsys):
+    folder = write(model_of(["SIMPLE_RADIAL"]), tmp_path / "model")
+    assert run([str(folder), "--output", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    assert "10 cameras, 10 points, 91 observations, 1 lens (f, k1)" in printed.out
+    assert f"wrote {tmp_path / 'out'}" in printed.out
+    solved = read_problem(tmp_path / "out")
+    assert geometry.cost(solved) < geometry.cost(read_problem(folder))
+    assert run([str(folder), "--intrinsics", "fixed", "--output", str(tmp_path / "out.txt")]) == 0
+    assert "1 lens (fixed)" in capsys.readouterr().out
+    flat = read_problem(tmp_path / "out.txt")
+    assert (flat.cameras[:, 6] == 700).all()
+
+
+def test_a_benchmark_takes_models(tmp_path):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    (source,) = sources([str(folder)])
+    assert source.name == "model"
+    assert source.read().num_cameras == 10
+
+
+def test_point_errors_in_the_written_model_are_those_of_the_solution(tmp_path):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    write_colmap(solve(read_problem(folder), "learned").problem, tmp_path / "out", like=folder)
+    model = pycolmap.Reconstruction(str(tmp_path / "out"))
+    point = model.point3D(1)
+    errors = []
+    for view in point.track.elements:
+        image = model.image(view.image_id)
+        errors.append(np.linalg.norm(image.project_point(point.xyz) - image.point2D(view.point2D_idx).xy))
+    np.testing.assert_allclose(point.error, np.mean(errors), rtol=1e-9)
+
+
+# What is refused, in one line that names the folder
+
+
+def refusal(folder: Path) -> str:
+    with pytest.raises(ProblemError) as caught:
+        read_problem(folder)
+    message = str(caught.value)
+    assert str(folder) in message
+    assert message.isprintable()
+    return message
+
+
+@pytest.mark.parametrize("file", ["images.bin", "points3D.bin"])
+def test_a_file_that_is_cut_short_is_refused(tmp_path, file):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    content = (folder / file).read_bytes()
+    (folder / file).write_bytes(content[: len(content) // 2])
+    assert "COLMAP says" in refusal(folder)
+
+
+def test_a_missing_file_is_refused(tmp_path):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    (folder / "images.bin").unlink()
+    assert "COLMAP says" in refusal(folder)
+
+
+def test_impossible_lenses_are_refused(tmp_path):
+    model = model_of(["RADIAL"])
+    model.camera(9).params = [-1.0, 0, 0, 0, 0]
+    assert "camera 9 has impossible parameters" in refusal(write(model, tmp_path / "model"))
+
+
+def test_a_model_without_points_is_refused(tmp_path):
+    model = model_of(["RADIAL"])
+    for identity in list(model.point3D_ids()):
+        model.delete_point3D(identity)
+    assert "no image sees a point" in refusal(write(model, tmp_path / "model"))
+
+
+def test_a_problem_of_another_model_is_not_written(tmp_path):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    with pytest.raises(ProblemError, match="the problem is not one of"):
+        write_colmap(support.tiny(), tmp_path / "out", like=folder)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_output_folder_that_cannot_be_made_is_refused_before_any_work(tmp_path, capsys):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    assert run([str(folder), "--output", str(tmp_path / "none" / "out")]) == 2
+    printed = capsys.readouterr()
+    assert printed.err == f"error: --output {tmp_path}/none/out: folder {tmp_path}/none does not exist\n"
+    assert printed.out == ""
+
+
+def test_without_pycolmap_one_line_says_how_to_get_it(tmp_path):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    program = "import sys; sys.modules['pycolmap'] = None; from jaxba.cli.solve import main; main()"
+    done = subprocess.run([sys.executable, "-c", program, str(folder)], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == f"error: {folder}: COLMAP models need pycolmap: pip install jaxba[colmap]\n"
+
+
+# Real models
+
+
+@needs_data
+@pytest.mark.parametrize("name", REAL)
+def test_real_models_have_colmaps_cost(name):
+    problem = read_problem(f"{DATA}/colmap/{name}")
+    rtol = 1e-4 if name == "ranjith" else 1e-9  # OPENCV: undistorted to first order
+    np.testing.assert_allclose(geometry.cost(problem), colmap_cost(f"{DATA}/colmap/{name}"), rtol=rtol)
+
+
+@needs_data
+@pytest.mark.parametrize("name", REAL)
+def test_real_models_end_no_higher_than_after_colmaps_own_bundle_adjustment(tmp_path, name):
+    folder = f"{DATA}/colmap/{name}"
+    solution = solve(read_problem(folder), "learned")
+    assert solution.converged
+    write_colmap(solution.problem, tmp_path / "out", like=folder)
+    truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=name != "ranjith")
+    assert colmap_cost(tmp_path / "out") <= (1 + 1e-5) * truth
+
+
+def test_a_start_far_from_the_end_is_solved_with_a_shared_lens(tmp_path):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    problem = read_problem(folder)
+    rng = np.random.default_rng(2)
+    far: BundleProblem = problem.replace(points=problem.points + rng.normal(scale=0.3, size=problem.points.shape))
+    near = solve(problem, "learned").final_cost
+    options = StepOptions(refine_points=3)
+    np.testing.assert_allclose(solve(far, "ceres", options).final_cost, near, rtol=1e-4)

@@ -1,0 +1,236 @@
+"""Cameras that share a lens, or keep some of it: steps, solves and refusals.
+
+The truth is the dense least squares problem in which a shared number is one unknown, and a held one none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import support
+from scipy.optimize import least_squares
+
+from jaxba import (
+    BundleProblem,
+    Lenses,
+    ProblemError,
+    SceneConfig,
+    StepOptions,
+    build_layout,
+    geometry,
+    random_scene,
+    solve,
+)
+from jaxba.cli.solve import run
+from jaxba.paper.subproblem import sub_problem
+
+INDEX = np.array([0, 1, 0, 2, 1, 0])
+FREE = np.array([[1, 1, 0], [1, 1, 1], [0, 0, 0]], bool)
+
+
+def with_lenses(problem: BundleProblem, index: np.ndarray, free: np.ndarray) -> BundleProblem:
+    """The problem with the numbers of each lens those of its first camera."""
+    cameras = np.array(problem.cameras)
+    first = np.array([np.flatnonzero(index == lens)[0] for lens in index])
+    cameras[:, 6:] = cameras[first, 6:]
+    parts = support.arrays(problem)[1:]
+    whole = BundleProblem.create(cameras, *parts, lenses=Lenses(index, free))
+    return whole.replace(whitening=problem.whitening)
+
+
+def shared() -> BundleProblem:
+    """Six cameras and three lenses: two of each kind of freedom and one that stays."""
+    return with_lenses(support.tiny(), INDEX, FREE)
+
+
+def unseen() -> BundleProblem:
+    """`shared` with two cameras that nobody observes, one of them with a lens of others."""
+    problem = shared()
+    cameras = np.vstack([problem.cameras, problem.cameras[:1], problem.cameras[:1]])
+    cameras[7, 6:] = 400, 0.1, 0.2
+    lenses = Lenses(np.append(INDEX, [0, 3]), np.vstack([FREE, [1, 1, 1]]).astype(bool))
+    return BundleProblem.create(cameras, *support.arrays(problem)[1:], lenses=lenses)
+
+
+def grid() -> BundleProblem:
+    """Ten cameras that see all points, so that the system is formed as one product."""
+    return with_lenses(support.paper(0), np.arange(10) % 2, np.array([[1, 1, 1], [1, 0, 0]], bool))
+
+
+def ties(problem: BundleProblem) -> np.ndarray:
+    """T: a column for every number that is optimised, with a one where a parameter is that number."""
+    assert problem.lenses is not None
+    columns, names = [], {}
+    for parameter in range(problem.cameras.size + problem.points.size):
+        camera, k = divmod(parameter, 9)
+        name: tuple = (parameter,)
+        if parameter < problem.cameras.size and k >= 6:
+            lens = int(problem.lenses.index[camera])
+            if not problem.lenses.free[lens, k - 6]:
+                continue
+            name = (lens, k)
+        if name not in names:
+            names[name] = len(columns)
+            columns.append(np.zeros(problem.cameras.size + problem.points.size))
+        columns[names[name]][parameter] = 1
+    return np.array(columns).T
+
+
+def dense_step(problem: BundleProblem, options: StepOptions, damping: float) -> np.ndarray:
+    """The damped step of the tied problem."""
+    residual, jacobian = support.linear(problem, options)
+    tied = ties(problem)
+    small = jacobian @ tied
+    diagonal = np.ones(small.shape[1])
+    if options.scaling == "diagonal":
+        diagonal = np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)
+    of_camera = tied[: problem.cameras.size].any(axis=0)
+    diagonal[of_camera] *= options.camera_damping
+    stacked = np.vstack([small, np.diag(np.sqrt(damping * diagonal))])
+    scale = 1 / np.linalg.norm(stacked, axis=0)
+    right = np.concatenate([-residual, np.zeros(len(diagonal))])
+    return tied @ (scale * np.linalg.lstsq(stacked * scale, right, rcond=None)[0])
+
+
+@pytest.mark.parametrize("make", [shared, unseen, grid])
+@pytest.mark.parametrize(
+    "options",
+    [
+        StepOptions(),
+        StepOptions(rotation="manifold", camera_damping=0.1),
+        StepOptions(scaling="identity"),
+    ],
+    ids=["diagonal", "manifold-soft", "identity"],
+)
+@pytest.mark.parametrize("damping", [1e-4, 1.0])
+def test_a_step_is_that_of_the_dense_tied_problem(make, options, damping):
+    problem = make()
+    layout, before = support.start(problem, options)
+    after, info = support.step(layout, before, damping, options, min_gain=-np.inf)
+    assert info.accepted
+    found = support.difference(problem, support.back(problem, before, after), options)
+    wanted = dense_step(problem, options, damping)
+    seen = np.ones(len(wanted), bool)  # the lens of a camera that nobody uses is set when a solve is over
+    observed = np.isin(np.arange(problem.num_cameras), problem.camera_index)
+    seen[: problem.cameras.size] = np.repeat(observed, 9)
+    np.testing.assert_allclose(found[seen], wanted[seen], rtol=0, atol=1e-8 * np.abs(wanted).max())
+
+
+def test_the_promised_decrease_and_the_gradient_are_those_of_the_tied_problem():
+    problem, options = shared(), StepOptions(rotation="manifold")
+    layout, before = support.start(problem, options)
+    _, info = support.step(layout, before, 1e-2, options)
+    residual, jacobian = support.linear(problem, options)
+    change = dense_step(problem, options, 1e-2)
+    model = 0.5 * np.sum(residual**2) - 0.5 * np.sum((residual + jacobian @ change) ** 2)
+    np.testing.assert_allclose(info.predicted, model, rtol=1e-9)
+    gradient = np.abs(ties(problem).T @ (jacobian.T @ residual)).max()
+    np.testing.assert_allclose(info.gradient_max, gradient, rtol=1e-10)
+
+
+@pytest.mark.parametrize("policy", ["ceres", "learned"])
+def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
+    problem = shared()
+    tied = ties(problem)
+    start = np.concatenate([problem.cameras.ravel(), problem.points.ravel()])
+
+    def residuals(unknowns):
+        every = start + tied @ unknowns
+        cameras, points = every[: problem.cameras.size].reshape(-1, 9), every[problem.cameras.size :].reshape(-1, 3)
+        return geometry.residuals(problem.replace(cameras=cameras, points=points)).ravel()
+
+    truth = least_squares(residuals, np.zeros(tied.shape[1]), x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12)
+    solution = solve(problem, policy)
+    assert solution.converged
+    np.testing.assert_allclose(solution.final_cost, truth.cost, rtol=2e-6)
+    np.testing.assert_allclose(solution.final_cost, geometry.cost(solution.problem), rtol=1e-10)
+
+
+@pytest.mark.parametrize("policy", ["ceres", "learned"])
+def test_cameras_of_one_lens_end_with_equal_numbers_and_what_stays_stays_bit_by_bit(policy):
+    problem = unseen()
+    after = solve(problem, policy).problem
+    lens = after.cameras[:, 6:]
+    for camera, other in ((2, 0), (5, 0), (6, 0), (4, 1)):
+        assert lens[camera].tobytes() == lens[other].tobytes()
+    assert lens[0, 0] != problem.cameras[0, 6]
+    held = ~FREE[problem.lenses.index[:6]]
+    assert (lens[:6][held] == problem.cameras[:6, 6:][held]).all()
+    assert (after.cameras[7] == problem.cameras[7]).all()
+    assert (after.cameras[6, :6] == problem.cameras[6, :6]).all()
+
+
+def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
+    problem = support.tiny()
+    own = with_lenses(problem, np.arange(6), np.ones((6, 3), bool))
+    plain, same = solve(problem, "learned"), solve(own, "learned")
+    np.testing.assert_allclose(same.history.cost, plain.history.cost, rtol=1e-12)
+
+
+def test_a_long_sequence_with_one_lens_is_solved():
+    # so long that its reduced camera system is factored as a band, which the lens breaks
+    scene = random_scene(SceneConfig(cameras=60, points=300, mean_track=4.0), seed=0)
+    layout = build_layout(scene)
+    assert layout.pairs is not None
+    assert layout.pairs.band is not None
+    one = with_lenses(scene, np.zeros(60, int), np.ones((1, 3), bool))
+    solution = solve(one, "learned", linear_solver="auto")
+    assert solution.converged
+    assert solution.linear_solver == "explicit"
+    assert np.ptp(solution.problem.cameras[:, 6:], axis=0).max() == 0
+    # nothing is left to win: the undamped tied model promises next to nothing
+    residual, jacobian = support.linear(solution.problem, StepOptions())
+    small = jacobian @ ties(solution.problem)
+    best = np.linalg.lstsq(small / np.linalg.norm(small, axis=0), -residual, rcond=1e-12)[0]
+    rest = residual + (small / np.linalg.norm(small, axis=0)) @ best
+    assert np.sum(residual**2) - np.sum(rest**2) < 1e-5 * np.sum(residual**2)
+
+
+def test_fixed_intrinsics_are_fixed_whoever_shares_them():
+    problem = shared()
+    after = solve(problem, "learned", StepOptions(intrinsics="fixed", refine_points=3)).problem
+    assert (after.cameras[:, 6:] == problem.cameras[:, 6:]).all()
+
+
+def test_a_part_of_a_problem_keeps_its_lenses():
+    part = sub_problem(shared(), np.array([0, 2, 3]))
+    assert part.lenses is not None
+    assert part.lenses.index.tolist() == [0, 0, 2]
+    assert solve(part, "ceres").final_cost > 0
+
+
+@pytest.mark.parametrize(
+    ("lenses", "message"),
+    [
+        (Lenses(np.zeros(5, int), FREE), "a lens for each of 6 cameras"),
+        (Lenses(np.array([0, 1, 2, 3, 0, 0]), FREE), "camera 3 has lens 3, outside 0..2"),
+        (Lenses(INDEX, FREE), "cameras 0 and 2 share lens 0, but differ in f, k1 or k2"),
+    ],
+)
+def test_lenses_that_make_no_sense_are_refused(lenses, message):
+    with pytest.raises(ProblemError, match=message):
+        BundleProblem.create(*support.arrays(support.tiny()), lenses=lenses)
+
+
+@pytest.mark.parametrize("method", ["stba", "deeplm", "ddlm", "poba"])
+def test_other_methods_refuse_lenses(method):
+    with pytest.raises(ProblemError, match="need plain LM, solved explicitly"):
+        solve(shared(), "ceres", method=method)
+
+
+@pytest.mark.parametrize("solver", ["sparse", "implicit", "power"])
+def test_other_linear_solvers_refuse_lenses(solver):
+    for options, name in ((StepOptions(), solver), (replace(StepOptions(), linear_solver=solver), None)):
+        with pytest.raises(ProblemError, match=f"solved explicitly, not {solver}"):
+            solve(shared(), "ceres", options, linear_solver=name)
+
+
+def test_padding_leaves_lenses_as_they_are():
+    assert solve(shared(), "ceres", pad=True).capacity is None
+
+
+def test_the_command_refuses_a_folder_without_a_model(tmp_path, capsys):
+    assert run([str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path}: no COLMAP model, which has cameras.bin or cameras.txt\n"
