@@ -74,6 +74,18 @@ def after(config: AgentConfig, memory: Memory, accepted: bool, log_damping: floa
 # Lambda
 
 
+@pytest.mark.parametrize(("dtype", "least"), [("float64", 1e-10), ("float32", float(np.finfo(np.float32).eps))])
+def test_no_lambda_is_below_what_its_type_can_add_to_one(dtype, least):
+    start = info()
+    start = start._replace(cost=start.cost.astype(dtype), unit=start.unit.astype(dtype))
+    for guard in ("off", "pause", "hand-over"):
+        memory = _begin(replace(FREE, guard=guard), start)
+        found = _damping(replace(FREE, guard=guard), memory, jnp.asarray(-1.0, jnp.float32))
+        assert found.dtype == dtype
+        np.testing.assert_allclose(float(found), least, rtol=1e-5)
+        assert float(found + jnp.ones((), found.dtype)) > 1 or dtype == "float64"
+
+
 @pytest.mark.parametrize(("low", "high"), [(-10.0, 2.0), (-6.0, 0.0)])
 def test_actions_are_decades_from_the_lowest_to_the_highest(low, high):
     for guard in ("off", "pause", "hand-over"):

@@ -224,12 +224,13 @@ def refusal(folder: Path) -> str:
     return message
 
 
-@pytest.mark.parametrize("file", ["images.bin", "points3D.bin"])
+@pytest.mark.parametrize("file", ["cameras.bin", "images.bin", "points3D.bin"])
 def test_a_file_that_is_cut_short_is_refused(tmp_path, file):
     folder = write(model_of(["RADIAL"]), tmp_path / "model")
     content = (folder / file).read_bytes()
     (folder / file).write_bytes(content[: len(content) // 2])
-    assert "COLMAP says" in refusal(folder)
+    message = refusal(folder)
+    assert "COLMAP says" in message or "impossible parameters" in message
 
 
 def test_a_missing_file_is_refused(tmp_path):

@@ -308,7 +308,8 @@ def action_of(config: AgentConfig, memory: Memory, decades: Float[Array, ""]) ->
 def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) -> Float[Array, ""]:
     """Lambda for an action in (-1, 1), the guard's word included."""
     middle, half = _scale(config, memory)
-    wanted = jnp.clip(middle + half * action.astype(memory.cost.dtype), config.low, config.high)
+    least = _least(config, memory.cost.dtype)
+    wanted = jnp.clip(middle + half * action.astype(memory.cost.dtype), least, config.high)
     if not config.guarded:
         return 10**wanted
     lowest = jnp.where(memory.iteration == 0, config.first_low, memory.damping - config.descent)
@@ -324,7 +325,16 @@ def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) ->
     # larger; so does a later one, when the rule in charge is refused as often in a row
     rescue = jnp.where(memory.worked > guard, memory.worked, FIRST_DAMPING)
     guard = jnp.where(memory.row == config.patience, jnp.maximum(guard, rescue), guard)
-    return jnp.clip(10 ** jnp.where(_guarding(config, memory), guard, wanted), 10**config.low, LARGEST)
+    return jnp.clip(10 ** jnp.where(_guarding(config, memory), guard, wanted), 10**least, LARGEST)
+
+
+def _least(config: AgentConfig, dtype: Any) -> float:
+    """log10 of the smallest lambda: what is below the rounding unit is lost when it is added to a diagonal.
+
+    In float64 that is beyond every agent's reach. In float32 `learned` went to 1e-9, where systems of real problems
+    have no digit left and steps are refused, or accepted a quarter as long (docs/performance.md).
+    """
+    return max(config.low, math.log10(float(jnp.finfo(dtype).eps)))
 
 
 def _guarding(config: AgentConfig, memory: Memory) -> Bool[Array, ""]:
