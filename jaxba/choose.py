@@ -6,6 +6,7 @@ matter for the choice, and those move little between machines.
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 from jaxba.density import has_small_capacitance
 from jaxba.options import REDUCED_SOLVERS, LinearSolver, StepOptions
 from jaxba.ordering import camera_order, is_banded
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem import CAMERA_SIZE, BundleProblem, ProblemError
 
 SECONDS_PER_PAIR = 1e-7
 """Forming the blocks, per pair of observations of one point: 6e-8 on small problems, 1e-7 with 2.5 million pairs."""
@@ -47,6 +48,9 @@ SHARED_SECONDS_PER_OBSERVATION = 2e-7
 INEXACT_ITERATIONS = 1.2
 """Iterations to convergence that truncated conjugate gradients take, relative to a factorisation: geometric mean over
 bulani1, bulani2, bulani4 and the rules ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
+
+TIED_COPIES = 5
+"""The reduced camera system, its mirror image, the tied one, that scaled, its factor (ties.py, dense.py)."""
 
 MAX_BYTES = 4e9
 """A solver that would need more memory than this is not chosen."""
@@ -164,6 +168,8 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_so
         if options.linear_solver not in REDUCED_SOLVERS or wanted not in ("auto", "explicit"):
             refused = wanted if options.linear_solver in REDUCED_SOLVERS else options.linear_solver
             raise ProblemError(f"shared or partly fixed lenses need plain LM, solved explicitly, not {refused}")
+        if problem.lenses.shared:
+            _check_memory(problem.num_cameras)
         return replace(options, linear_solver="explicit")
     if linear_solver is None or linear_solver == options.linear_solver:
         return options
@@ -174,6 +180,20 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_so
     if linear_solver == "auto":
         linear_solver = choose(problem) if options.intrinsics == "free" else "explicit"
     return replace(options, linear_solver=linear_solver)
+
+
+def _check_memory(cameras: int) -> None:
+    """Refuses what shared lenses would need more memory for than the machine has: they break bands and blocks."""
+    needed = TIED_COPIES * 8.0 * (CAMERA_SIZE * cameras) ** 2
+    try:
+        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return
+    if needed > there:
+        raise ProblemError(
+            f"{cameras} cameras with shared lenses take some {needed / 1e9:.0f} GB to solve, more than the "
+            f"{there / 1e9:.0f} GB of this machine; with fixed intrinsics they may take less"
+        )
 
 
 def _within(size: float, seconds: float) -> float:

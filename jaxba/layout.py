@@ -107,6 +107,7 @@ def build_layout(
     grid: bool = True,
     partitions: int | None = None,
     capacity: Capacity | None = None,
+    lenses: bool = True,
 ) -> Layout:
     """Sorts a problem's observations into slots.
 
@@ -121,6 +122,7 @@ def build_layout(
         partitions: cameras of a cluster at most, to draw random partitions of the cameras; needs pairs.
         capacity: pads all sizes, for a system that is factored: no clusters, no partitions. Where the system is a band,
             it is factored dense all the same.
+        lenses: whether the problem's lenses count; not where intrinsics are fixed.
 
     Returns:
         A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths. Those of a padded
@@ -165,7 +167,7 @@ def build_layout(
         table = np.full((columns, cameras), empty, np.int32)
         table[slot_point[slot], camera] = slot
     listed = None
-    ties = None if problem.lenses is None else lens_ties(problem.lenses, seen > 0)
+    ties = lens_ties(problem.lenses, seen > 0) if lenses and problem.lenses is not None else None
     if pairs and table is None:
         banded = ties is None or not ties.shared  # a shared lens couples cameras that have no point in common
         listed = pair_layout(
@@ -206,6 +208,7 @@ def layout_for(problem: BundleProblem, options: StepOptions, capacity: Capacity 
         clusters=options.uses_clusters,
         partitions=options.cluster_cameras if options.uses_partitions else None,
         capacity=capacity,
+        lenses=options.intrinsics == "free",
     )
 
 

@@ -122,7 +122,7 @@ def with_free_lenses(
     Args:
         layout: knows the lenses.
         linear: all derivatives.
-        intrinsics: `fixed` is no lens's.
+        intrinsics: `fixed` holds all lenses.
         alone: whether every camera moves by itself, so that shared lenses must stay.
     """
     lenses = layout.lenses

@@ -90,8 +90,13 @@ def lm_step(
 
     Returns:
         The next state (the same one after a rejection) and a record of what happened.
+
+    Raises:
+        ValueError: the layout has lenses, and the solver is not the explicit one.
     """
     damping = jnp.asarray(damping, state.cost.dtype)
+    if layout.lenses is not None and options.linear_solver != "explicit":
+        raise ValueError(f"shared or partly fixed lenses need the explicit solver, not {options.linear_solver}")
     if options.linear_solver == "decomposed":
         return _round(layout, state, damping, options, min_gain, turn)
     linear = linearize(layout, state.cameras, state.points, options.loss)

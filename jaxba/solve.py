@@ -23,7 +23,7 @@ from jaxba.choose import choose_linear_solver
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, Learned, ProblemInfo, effort_of, make_policy
 from jaxba.layout import Layout, layout_for
-from jaxba.linearize import linearize
+from jaxba.linearize import linearize, with_free_lenses
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES, fitting_policy
@@ -66,7 +66,7 @@ class Solution:
     """Result of `solve`."""
 
     problem: BundleProblem
-    """The input with optimised cameras and points; what nobody observes is unchanged."""
+    """The input with optimised cameras and points; what nobody observes is unchanged, but for a lens it shares."""
 
     initial_cost: float
     """Pixels squared."""
@@ -156,7 +156,7 @@ def solve(
 
     Raises:
         ValueError: unknown names, or limits that make no sense.
-        ProblemError: the cost at the start is not finite.
+        ProblemError: the cost at the start is not finite, or the step asked for cannot hold the problem's lenses.
     """
     if dtype not in DTYPES:
         raise ValueError(f"dtype must be one of {', '.join(DTYPES)}, not {dtype!r}")
@@ -193,7 +193,7 @@ def solve(
         count = int(final.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
         return Solution(
-            problem=_write_back(problem, layout, final.state),
+            problem=_write_back(problem, layout, final.state, options),
             initial_cost=float(state.cost),
             final_cost=float(final.state.cost),
             iterations=count,
@@ -238,7 +238,8 @@ def _info(layout: Layout, state: LMState, options: StepOptions, max_iterations: 
     """What a policy may know before the first iteration."""
     unit = jnp.ones_like(state.cost)
     if options.scaling == "identity":
-        unit = largest_diagonal(layout, linearize(layout, state.cameras, state.points, options.loss))
+        linear = linearize(layout, state.cameras, state.points, options.loss)
+        unit = largest_diagonal(layout, with_free_lenses(layout, linear, "free"))
     count = lambda n: jnp.asarray(n, jnp.int32)
     info = ProblemInfo(
         cost=state.cost,
@@ -393,16 +394,19 @@ def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *,
     return carry, history, clock.seconds, total_s
 
 
-def _write_back(problem: BundleProblem, layout: Layout, state: LMState) -> BundleProblem:
+def _write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:
     """Optimised parameters in the problem's own order; what was not optimised is copied bit by bit."""
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
     seen = np.flatnonzero(layout.camera_seen)  # cameras of padding are not seen
     cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
-    if problem.lenses is not None:  # what nobody observes has the lens of the others
+    if options.intrinsics == "fixed":
+        cameras[:, 6:] = problem.cameras[:, 6:]
+    elif problem.lenses is not None:  # what nobody observes has the lens of the others
         lens = np.asarray(problem.lenses.index)
         used, first = np.unique(lens[seen], return_index=True)
         follows = np.isin(lens, used)
         cameras[follows, 6:] = cameras[seen[first[np.searchsorted(used, lens[follows])]], 6:]
+        cameras[:, 6:] = np.where(np.asarray(problem.lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
     order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = order < problem.num_points
     points[order[real]] = np.asarray(state.points, np.float64).T[real]

@@ -31,7 +31,7 @@ class LensTies:
     """Lens of each camera."""
 
     members: Bool[AnyArray, "cameras lenses"]
-    """Whether an observed camera has a lens."""
+    """Whether an observed camera has a lens; no columns where no lens is shared."""
 
     free: Bool[AnyArray, "3 cameras"]
     """Which of f, k1 and k2 of a camera are optimised."""
@@ -60,7 +60,9 @@ def lens_ties(lenses: Lenses, seen: Bool[np.ndarray, " cameras"]) -> LensTies:
         seen: cameras with at least one observation.
     """
     index = np.asarray(lenses.index)
-    members = (index[:, None] == np.arange(len(lenses.free))) & seen[:, None]
+    members = np.zeros((len(index), 0), bool)
+    if lenses.shared:
+        members = (index[:, None] == np.arange(len(lenses.free))) & seen[:, None]
     return LensTies(index, members, np.asarray(lenses.free)[index].T, lenses.shared)
 
 

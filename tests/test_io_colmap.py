@@ -15,8 +15,11 @@ import support
 from support import DATA, needs_data
 
 from jaxba import BundleProblem, ProblemError, StepOptions, geometry, read_colmap, read_problem, solve, write_colmap
+from jaxba.bench.records import read_records
 from jaxba.bench.sources import sources
+from jaxba.cli.bench import run as run_bench
 from jaxba.cli.solve import run
+from jaxba.io import colmap
 from jaxba.io.colmap import MODELS
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
@@ -130,7 +133,9 @@ def test_images_of_one_camera_share_a_lens_whose_model_says_what_is_free(tmp_pat
     assert problem.lenses.free.astype(int).tolist() == by_id
 
 
-@pytest.mark.parametrize("kinds", [["RADIAL"], ["SIMPLE_RADIAL"], ["SIMPLE_PINHOLE", "RADIAL"]], ids="+".join)
+@pytest.mark.parametrize(
+    "kinds", [["RADIAL"], ["SIMPLE_RADIAL"], ["SIMPLE_PINHOLE"], ["SIMPLE_PINHOLE", "RADIAL"]], ids="+".join
+)
 def test_a_solve_ends_where_colmaps_own_bundle_adjustment_does(tmp_path, kinds):
     folder = write(model_of(kinds), tmp_path / "model")
     solution = solve(read_problem(folder), "learned")
@@ -193,11 +198,52 @@ def test_the_command_solves_a_model_and_writes_one_or_a_file(tmp_path, capsys):
     assert (flat.cameras[:, 6] == 700).all()
 
 
-def test_a_benchmark_takes_models(tmp_path):
-    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+def test_the_heading_counts_lenses_by_what_is_free(tmp_path, capsys):
+    folder = write(model_of(["RADIAL", "OPENCV", "SIMPLE_PINHOLE", "SIMPLE_PINHOLE"]), tmp_path / "model")
+    assert run([str(folder), "--max-iterations", "1"]) == 0
+    assert "2 lenses (f), 1 lens (fixed), 1 lens (f, k1, k2)" in capsys.readouterr().out
+
+
+def test_a_name_with_a_dot_is_a_folder_and_a_file_says_what_it_lacks(tmp_path, capsys):
+    folder = write(model_of(["PINHOLE"]), tmp_path / "model")
+    assert run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "refined.v2")]) == 0
+    assert (tmp_path / "refined.v2" / "cameras.bin").is_file()
+    assert "has no place" not in capsys.readouterr().out
+    assert run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "flat.txt.gz")]) == 0
+    assert "note: shared lenses and weights of observations are not in that file" in capsys.readouterr().out
+
+
+def test_robust_losses_and_the_search_for_points_work_with_shared_lenses(tmp_path, capsys):
+    folder = write(model_of(["PINHOLE", "RADIAL"]), tmp_path / "model")
+    out = tmp_path / "out"
+    assert run([str(folder), "--loss", "huber", "--retriangulate", "--output", str(out)]) == 0
+    assert "search for points at other depths" in capsys.readouterr().out
+    assert colmap_cost(out) < colmap_cost(folder)
+
+
+def test_fixed_lenses_stay_bit_by_bit_in_float32(tmp_path):
+    folder = write(model_of(["PINHOLE", "RADIAL"]), tmp_path / "model")
+    for arguments in (["--intrinsics", "fixed"], []):
+        assert run([str(folder), "--dtype", "float32", *arguments, "--output", str(tmp_path / "out")]) == 0
+        before, after = (pycolmap.Reconstruction(str(place)) for place in (folder, tmp_path / "out"))
+        for identity in (6, 9):
+            same = before.camera(identity).params == after.camera(identity).params
+            assert same.all() if arguments else same.tolist()[-2:] == [identity == 9, identity == 9]
+
+
+def test_a_benchmark_takes_models_and_skips_what_a_solver_refuses(tmp_path, capsys):
+    folder = write(model_of(["RADIAL"]), tmp_path / "garden" / "sparse" / "0")
     (source,) = sources([str(folder)])
-    assert source.name == "model"
-    assert source.read().num_cameras == 10
+    assert source.name == "garden-sparse-0"
+    out = tmp_path / "runs"
+    solvers = "stba+ceres,ceres,pyceres:dense"
+    assert run_bench([str(folder), "--solvers", solvers, "--repeats", "1", "--out", str(out)]) == 2
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 2
+    assert errors[0].startswith("error: garden-sparse-0, stba+ceres: shared or partly fixed lenses need plain LM")
+    assert errors[1].startswith("error: garden-sparse-0, pyceres:dense: Ceres as a peer takes no covariances")
+    assert [record.solver for record in read_records(out / "results.jsonl")] == ["ceres"]
+    assert (out / "report.html").is_file()
 
 
 def test_point_errors_in_the_written_model_are_those_of_the_solution(tmp_path):
@@ -254,9 +300,82 @@ def test_a_model_without_points_is_refused(tmp_path):
 
 def test_a_problem_of_another_model_is_not_written(tmp_path):
     folder = write(model_of(["RADIAL"]), tmp_path / "model")
-    with pytest.raises(ProblemError, match="the problem is not one of"):
-        write_colmap(support.tiny(), tmp_path / "out", like=folder)
+    problem = read_problem(folder)
+    fewer = problem.replace(
+        **{name: getattr(problem, name)[1:] for name in ("observations", "camera_index", "point_index")}
+    )
+    for other in (support.tiny(), fewer):
+        with pytest.raises(ProblemError, match="the problem is not one of"):
+            write_colmap(other, tmp_path / "out", like=folder)
+    apart = solve(problem.replace(lenses=None), "ceres", max_iterations=2).problem
+    with pytest.raises(ProblemError, match="images of camera 9 have different f, k1 or k2"):
+        write_colmap(apart, tmp_path / "out", like=folder)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_model_that_cannot_be_read_back_replaces_nothing(tmp_path, monkeypatch):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    problem = read_problem(folder)
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    counts = iter([problem.num_observations, problem.num_observations - 1])
+    monkeypatch.setattr(colmap, "_observations", lambda model: next(counts))
+    with pytest.raises(ProblemError, match="it cannot be read back"):
+        write_colmap(problem.replace(points=problem.points + 1), folder, like=folder)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
+def test_a_text_model_beside_a_binary_one_is_written_as_that(tmp_path):
+    text, binary = (
+        write(model_of(["RADIAL"]), tmp_path / "text", text=True),
+        write(model_of(["RADIAL"]), tmp_path / "b"),
+    )
+    problem = read_problem(text)
+    moved = problem.replace(points=problem.points + 1)
+    write_colmap(moved, binary, like=text)
+    np.testing.assert_allclose(read_problem(binary).points, moved.points, rtol=1e-15)
+
+
+def test_a_rig_of_two_cameras_is_refused(tmp_path):
+    model = model_of(["RADIAL"])
+    second = pycolmap.Camera(camera_id=50, model="RADIAL", width=SIZE[0], height=SIZE[1], params=LENSES["RADIAL"])
+    model.add_camera(second)
+    rig = pycolmap.Rig(rig_id=50)
+    rig.add_ref_sensor(model.camera(9).sensor_id)
+    rig.add_sensor(second.sensor_id, pycolmap.Rigid3d())
+    model.add_rig(rig)
+    frame = pycolmap.Frame(frame_id=500, rig_id=50)
+    images = []
+    for identity, camera in ((500, 9), (501, 50)):
+        images.append(
+            pycolmap.Image(name=f"{identity}", keypoints=np.ones((1, 2)), camera_id=camera, image_id=identity)
+        )
+        images[-1].frame_id = 500
+        frame.add_data_id(images[-1].data_id)
+    frame.rig_from_world = pycolmap.Rigid3d()
+    model.add_frame(frame)
+    for image in images:
+        model.add_image(image)
+    assert "image 500 is of a rig of several cameras" in refusal(write(model, tmp_path / "model"))
+
+
+def test_a_lens_without_a_focal_length_is_refused(tmp_path):
+    model = model_of(["RADIAL"])
+    lens = pycolmap.Camera(camera_id=80, model="EQUIRECTANGULAR", width=SIZE[0], height=SIZE[1], params=list(SIZE))
+    model.add_camera_with_trivial_rig(lens)
+    image = pycolmap.Image(name="sphere.png", keypoints=np.ones((1, 2)), camera_id=80, image_id=80)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    assert "camera 80: EQUIRECTANGULAR has no focal length" in refusal(write(model, tmp_path / "model"))
+
+
+@pytest.mark.parametrize("name", ["file", "file.v2"])
+def test_an_output_folder_that_is_a_file_is_refused_before_any_work(tmp_path, capsys, name):
+    folder = write(model_of(["RADIAL"]), tmp_path / "model")
+    (tmp_path / name).write_text("mine")
+    assert run([str(folder), "--output", str(tmp_path / name)]) == 2
+    printed = capsys.readouterr()
+    assert printed.err == f"error: --output {tmp_path / name}: is a file, not a folder\n"
+    assert printed.out == ""
 
 
 def test_an_output_folder_that_cannot_be_made_is_refused_before_any_work(tmp_path, capsys):

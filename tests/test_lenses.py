@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
@@ -18,12 +19,16 @@ from jaxba import (
     ProblemError,
     SceneConfig,
     StepOptions,
+    Tolerances,
     build_layout,
     geometry,
+    lm_step,
     random_scene,
     solve,
 )
+from jaxba.cli import table
 from jaxba.cli.solve import run
+from jaxba.layout import layout_for
 from jaxba.paper.subproblem import sub_problem
 
 INDEX = np.array([0, 1, 0, 2, 1, 0])
@@ -171,13 +176,12 @@ def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
 
 def test_a_long_sequence_with_one_lens_is_solved():
     # so long that its reduced camera system is factored as a band, which the lens breaks
-    scene = random_scene(SceneConfig(cameras=60, points=300, mean_track=4.0), seed=0)
+    scene = random_scene(SceneConfig(cameras=100, points=500, mean_track=4.0), seed=0)
     layout = build_layout(scene)
     assert layout.pairs is not None
     assert layout.pairs.band is not None
-    one = with_lenses(scene, np.zeros(60, int), np.ones((1, 3), bool))
-    solution = solve(one, "learned", linear_solver="auto")
-    assert solution.converged
+    one = with_lenses(scene, np.zeros(100, int), np.ones((1, 3), bool))
+    solution = solve(one, "learned", linear_solver="auto", tolerances=Tolerances(ftol=1e-9))
     assert solution.linear_solver == "explicit"
     assert np.ptp(solution.problem.cameras[:, 6:], axis=0).max() == 0
     # nothing is left to win: the undamped tied model promises next to nothing
@@ -228,7 +232,41 @@ def test_other_linear_solvers_refuse_lenses(solver):
 
 
 def test_padding_leaves_lenses_as_they_are():
-    assert solve(shared(), "ceres", pad=True).capacity is None
+    solution = solve(shared(), "ceres", pad=True)
+    assert solution.capacity is None
+    assert table.padding(shared(), solution) == "note: not padded: the problem has shared or partly fixed lenses"
+
+
+@pytest.mark.parametrize("solver", ["sparse", "implicit", "power", "normal"])
+def test_a_step_by_another_solver_is_refused_as_it_would_let_cameras_of_a_lens_part(solver):
+    layout, state = support.start(shared())
+    with pytest.raises(ValueError, match=f"need the explicit solver, not {solver}"):
+        lm_step(layout, state, jnp.asarray(1e-3), StepOptions(linear_solver=solver))
+
+
+def test_more_shared_lenses_than_memory_are_refused(monkeypatch):
+    monkeypatch.setattr("os.sysconf", lambda name: 1000 if name == "SC_PHYS_PAGES" else 1)
+    with pytest.raises(ProblemError, match="6 cameras with shared lenses take some 0 GB"):
+        solve(shared(), "ceres")
+
+
+@pytest.mark.parametrize("dtype", ["float32", "mixed"])
+def test_other_types_end_at_the_cost_of_float64_and_hold_what_is_held(dtype):
+    problem = shared()
+    exact, rough = solve(problem, "ceres"), solve(problem, "ceres", dtype=dtype)
+    np.testing.assert_allclose(geometry.cost(rough.problem), exact.final_cost, rtol=1e-5)
+    held = ~FREE[INDEX]
+    assert (rough.problem.cameras[:, 6:][held] == problem.cameras[:, 6:][held]).all()
+    assert np.ptp(rough.problem.cameras[INDEX == 0, 6:], axis=0).max() == 0
+
+
+def test_fixed_intrinsics_leave_a_band_a_band():
+    scene = random_scene(SceneConfig(cameras=100, points=500, mean_track=4.0), seed=0)
+    one = with_lenses(scene, np.zeros(100, int), np.ones((1, 3), bool))
+    layout = layout_for(one, StepOptions(intrinsics="fixed"))
+    assert layout.lenses is None
+    assert layout.pairs is not None
+    assert layout.pairs.band is not None
 
 
 def test_the_command_refuses_a_folder_without_a_model(tmp_path, capsys):

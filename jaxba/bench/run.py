@@ -223,7 +223,7 @@ def execute(
 ) -> Iterator[Record]:
     """Does the jobs that have no record yet, appending each result as soon as it is there.
 
-    A problem that cannot be read is reported once and skipped.
+    A problem that cannot be read is reported once and skipped, and so is a solver that refuses one.
     """
     finished = {(r.problem, r.solver, r.repeat) for r in done}
     problem, loaded, broken = None, None, set()
@@ -239,6 +239,10 @@ def execute(
                 on_error(job, error)
                 continue
         assert problem is not None
-        record = run_solver(problem, job.source, job.solver, job.repeat, settings, on_iteration)
+        try:
+            record = run_solver(problem, job.source, job.solver, job.repeat, settings, on_iteration)
+        except ProblemError as error:  # what this solver cannot do, others may
+            on_error(job, ProblemError(f"{job.source.name}, {job.solver}: {error}"))
+            continue
         append_record(folder / RESULTS, record)
         yield record

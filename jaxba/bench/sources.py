@@ -14,6 +14,8 @@ from jaxba.scenes import SceneConfig, like, random_scene
 SCENE_PREFIX = "scene:"
 """`scene:NAME` or `scene:NAME:SEED` stands for a random scene."""
 
+_SAYS_NOTHING = re.compile(r"sparse|model|\d+", re.IGNORECASE)
+
 EMBEDDED: dict[str, SceneConfig] = {
     "street-30": SceneConfig(cameras=30, points=1500, mean_track=4.5),
     "street-12-drift": SceneConfig(cameras=12, points=600, mean_track=4.5, start_drift=0.003),
@@ -74,6 +76,8 @@ def sources(locations: list[str]) -> list[Source]:
             if not path.is_file() and not is_colmap(path):
                 raise ProblemError(f"{location}: {'no COLMAP model in it' if path.is_dir() else 'no such file'}")
             label = re.sub(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$", "", Path(name).name) or path.name
+            if path.is_dir():
+                label = _model_name(path)
             family = path.resolve().parent.name
         taken = {source.name for source in found}
         if label in taken and f"{family}-{label}" not in taken:
@@ -84,6 +88,13 @@ def sources(locations: list[str]) -> list[Source]:
             unique = f"{label}-{count}"
         found.append(Source(unique, family, location))
     return found
+
+
+def _model_name(folder: Path) -> str:
+    """Name of a COLMAP model: its folder's, with those above it as long as that says nothing: `garden-sparse-0`."""
+    parts = list(folder.resolve().parts[1:]) or ["model"]
+    count = next((k for k, part in enumerate(reversed(parts), 1) if not _SAYS_NOTHING.fullmatch(part)), len(parts))
+    return "-".join(parts[-count:])
 
 
 def _scene(location: str) -> tuple[str, int]:

@@ -104,12 +104,14 @@ def check_folder(option: str, path: str) -> None:
     """Refuses a folder that could not be made or written to later, before any work is done.
 
     Raises:
-        UsageError: it cannot be written, or the one that would hold it is missing or cannot.
+        UsageError: it cannot be written or is a file, or the one that would hold it is missing or cannot be written.
     """
     target = Path(path).absolute()
-    if not target.is_dir():
-        return check_writable(option, path)
-    if not os.access(target, os.W_OK):
+    if target.exists() and not target.is_dir():
+        raise UsageError(f"{option} {path}: is a file, not a folder")
+    if not target.exists():
+        check_writable(option, path)
+    elif not os.access(target, os.W_OK):
         raise UsageError(f"{option} {path}: folder cannot be written")
 
 

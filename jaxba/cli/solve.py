@@ -18,6 +18,9 @@ from jaxba.options import Intrinsics, LinearSolverChoice, Preconditioner
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
 """What is solved where no problem is named."""
 
+FILE_ENDINGS = (".txt", ".bal", ".ply")
+"""Endings by which the output of a COLMAP model is a file and no model, besides those of compression."""
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -89,8 +92,8 @@ class Arguments:
     """Residual in pixels where the loss bends."""
 
     output: str | None = None
-    """Write the solution here: BAL format, compressed by its ending, or .ply for a viewer; of a COLMAP model also a
-    COLMAP model, in a folder, which is what a name without an ending is then."""
+    """Write the solution here: BAL format, compressed by its ending, or .ply for a viewer. Of a COLMAP model: a COLMAP
+    model, in a folder of this name, unless it ends in .txt, .bal, .ply, .bz2, .gz or .xz."""
 
     log: str | None = None
     """Write a JSON record of the solve here."""
@@ -190,6 +193,8 @@ def _solve(args: Arguments) -> int:
         except OSError as error:
             raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
         print(f"wrote {args.output}")
+        if model is None and not table.fits_bal(problem):
+            print("note: shared lenses and weights of observations are not in that file, which has no place for them")
     if args.log:
         record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
         try:
@@ -201,7 +206,11 @@ def _solve(args: Arguments) -> int:
 
 
 def _output_model(args: Arguments) -> str | None:
-    """The folder where a COLMAP model is to be written, if it is one."""
+    """The folder where a COLMAP model is to be written: what has no ending of a file, where the problem is a model."""
+    from jaxba.io.files import strip_compression
+
     if not args.output or not args.problem or not Path(args.problem).is_dir():
         return None
-    return args.output if Path(args.output).is_dir() or not Path(args.output).suffix else None
+    bare = strip_compression(args.output)
+    is_file = bare != args.output or Path(bare).suffix.lower() in FILE_ENDINGS
+    return args.output if Path(args.output).is_dir() or not is_file else None

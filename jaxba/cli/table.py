@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -29,10 +30,10 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     sizes = f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations"
     if problem.lenses is not None:
-        free = np.any(np.asarray(problem.lenses.free), axis=0) & (options.intrinsics == "free")
-        names = [one for k, one in enumerate(("f", "k1", "k2")) if free[k]]
-        count = len(problem.lenses.free)
-        sizes += f", {count} lens{'es' * (count > 1)} ({', '.join(names) or 'fixed'})"
+        free = np.asarray(problem.lenses.free) & (options.intrinsics == "free")
+        for kind, number in Counter(map(tuple, free.tolist())).most_common():
+            names = [one for one, used in zip(("f", "k1", "k2"), kind, strict=True) if used]
+            sizes += f", {number} lens{'es' * (number > 1)} ({', '.join(names) or 'fixed'})"
     return f"{name}: {sizes}\ndamping {args.damping}{refine}, {args.dtype}, {solver}"
 
 
@@ -77,11 +78,21 @@ def summary(problem: BundleProblem, solution: Solution) -> str:
     return "\n".join([*lines, *remarks(problem, solution)])
 
 
+def fits_bal(problem: BundleProblem) -> bool:
+    """Whether BAL can say all of a problem."""
+    return problem.lenses is None and problem.whitening is None
+
+
 def padding(problem: BundleProblem, solution: Solution) -> str:
     """Sizes of the program where they were asked to be rounded up, or why they were not."""
     if solution.capacity is not None:
         return f"padded to {solution.capacity}"
-    why = "the problem is too large" if capacity_of(problem) is None else "that is for the explicit linear solver"
+    if problem.lenses is not None:
+        why = "the problem has shared or partly fixed lenses"
+    elif capacity_of(problem) is None:
+        why = "the problem is too large"
+    else:
+        why = "that is for the explicit linear solver"
     return f"note: not padded: {why}"
 
 
@@ -91,7 +102,7 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
     before, after = (int(np.sum(geometry.depths(p) <= 0)) for p in (problem, solution.problem))
     found = [
-        (int(np.sum(cameras == 0)), "cameras without observations, kept as they are"),
+        (int(np.sum(cameras == 0)), "cameras without observations, whose poses stay"),
         (int(np.sum(points == 0)), "points without observations, kept as they are"),
         (int(np.sum(points == 1)), "points seen once; damping alone fixes their depth"),
     ]

@@ -45,8 +45,9 @@ def read_bal(path: StrPath) -> BundleProblem:
 def write_bal(problem: BundleProblem, path: StrPath) -> None:
     """Writes a BAL file that reads back bit by bit; compressed if the name ends in `.bz2`, `.gz` or `.xz`.
 
-    The file appears whole or not at all. BAL has no place for covariances or weights: `problem.whitening` is **not**
-    written, and the problem reads back with the identity.
+    The file appears whole or not at all. BAL has no place for covariances, weights or shared lenses:
+    `problem.whitening` and `problem.lenses` are **not** written, and the problem reads back with the identity and a
+    free lens for every camera.
 
     Args:
         problem: of NumPy or JAX arrays; float32 is written as the float64 of the same value.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +31,7 @@ MODELS = {
 
 _NUMBERS = ("f", "k1", "k2")
 _STEP = 1e-6  # of a direction, for the derivative of a lens that stays
+_LEAST_SPREAD = 1e-6  # determinant of that derivative below which an image folds
 
 
 class _Index(NamedTuple):
@@ -59,41 +61,40 @@ def read_colmap(folder: StrPath) -> BundleProblem:
     name = display_name(folder)
     model = _load(folder)
     index = _index(model, name)
-    image_of = {image: number for number, image in enumerate(index.images)}
-    lens_of = {lens: number for number, lens in enumerate(index.lenses)}
-    views = [
-        (number, image_of[view.image_id], view.image_id, view.point2D_idx)
-        for number, point in enumerate(index.points)
-        for view in model.point3D(point).track.elements
-        if view.image_id in image_of
-    ]
-    if not views:
+    number_of = {identity: number for number, identity in enumerate(index.images)}
+    tracks = [model.point3D(identity).track.elements for identity in index.points]
+    views = np.array([(view.image_id, view.point2D_idx) for track in tracks for view in track]).reshape(-1, 2)
+    point_index = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
+    here = np.isin(views[:, 0], index.images)
+    views, point_index = views[here], point_index[here]
+    if not len(views):
         raise ProblemError(f"{name}: no image sees a point")
-    point_index, camera_index, image, key = np.array(views).T
-    seen_by = {number: model.image(number).points2D for number in index.images}
-    pixels = np.array([seen_by[i][k].xy for i, k in zip(image.tolist(), key.tolist(), strict=True)])
-    lens = np.array([lens_of[model.image(number).camera_id] for number in index.images])
-    poses = [model.image(number).cam_from_world() for number in index.images]
+    camera_index = np.array([number_of[identity] for identity in views[:, 0].tolist()])
+    pixels = np.empty((len(views), 2))
+    for number, seen in _groups(camera_index, len(index.images)):
+        keys = model.image(index.images[number]).points2D
+        pixels[seen] = np.array([keys[key].xy for key in views[seen, 1].tolist()]).reshape(-1, 2)
+    lens = np.searchsorted(index.lenses, [model.image(identity).camera_id for identity in index.images])
+    poses = [model.image(identity).cam_from_world() for identity in index.images]
     quaternions = np.array([pose.rotation.quat for pose in poses])  # xyzw
     shifts = np.array([pose.translation for pose in poses]) * COLMAP_FLIP
     numbers, free = np.zeros((len(index.lenses), LENS_SIZE)), np.zeros((len(index.lenses), LENS_SIZE), bool)
     observations, whitening = np.empty_like(pixels), np.tile(np.eye(2), (len(pixels), 1, 1))
-    for number, identity in enumerate(index.lenses):
-        here = lens[camera_index] == number
-        camera = model.camera(identity)
-        if not (np.isfinite(camera.params).all() and camera.mean_focal_length() > 0):
-            raise ProblemError(f"{name}: camera {identity} has impossible parameters: {camera.params_to_string()}")
+    for number, seen in _groups(lens[camera_index], len(index.lenses)):
+        camera = model.camera(index.lenses[number])
+        label = f"{name}: camera {index.lenses[number]}"
+        _check(camera, label)
         parameters = MODELS.get(camera.model.name)
         if parameters:
             named = dict(zip(parameters, camera.params, strict=True))
             numbers[number] = [named.get(one, 0.0) for one in _NUMBERS]
             free[number] = [one in named for one in _NUMBERS]
             ratio = named.get("fy", named["f"]) / named["f"]
-            observations[here] = (pixels[here] - [named["cx"], named["cy"]]) / [1.0, ratio]
-            whitening[here, 1, 1] = ratio
+            observations[seen] = (pixels[seen] - [named["cx"], named["cy"]]) / [1.0, ratio]
+            whitening[seen, 1, 1] = ratio
         else:
             numbers[number, 0] = camera.mean_focal_length()
-            observations[here], whitening[here] = _undistorted(camera, pixels[here], f"{name}: camera {identity}")
+            observations[seen], whitening[seen] = _undistorted(camera, pixels[seen], label)
     covariance = None
     if (whitening != np.eye(2)).any():
         root = np.linalg.inv(whitening)
@@ -117,7 +118,8 @@ def read_colmap(folder: StrPath) -> BundleProblem:
 def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath) -> None:
     """Writes a model with the poses, points and lenses of a problem, and everything else as in another model.
 
-    Its files appear whole, one after the other: binary ones, or text where the other model is text.
+    Its files appear whole, one after the other, when all have been written elsewhere and read back: binary ones, or
+    text where the other model is text and no binary one is there.
 
     Args:
         problem: what `read_colmap` made of the other model, with other cameras and points.
@@ -125,42 +127,83 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath) -> None
         like: the other model.
 
     Raises:
-        ProblemError: the problem is not one of that model, the folder cannot be written, or pycolmap is not installed.
+        ProblemError: the problem is not one of that model, images of one camera have different lenses, the folder
+            cannot be written, or pycolmap is not installed.
     """
+    model = _load(like)
     import pycolmap
 
-    model = _load(like)
     index = _index(model, display_name(like))
-    if (problem.num_cameras, problem.num_points) != (len(index.images), len(index.points)):
+    counts = len(index.images), len(index.points), _observations(model)
+    if (problem.num_cameras, problem.num_points, problem.num_observations) != counts:
         raise ProblemError(f"cannot write {display_name(folder)}: the problem is not one of {display_name(like)}")
     cameras = np.asarray(problem.cameras, np.float64)
     quaternions, shifts = colmap_quaternions(cameras[:, :3]), cameras[:, 3:6] * COLMAP_FLIP
+    named: dict[int, np.ndarray] = {}
     for number, identity in enumerate(index.images):
         image: Any = model.image(identity)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quaternions[number]), shifts[number])
         image.frame.set_cam_from_world(image.camera_id, pose)
-        lens = model.camera(image.camera_id)
-        parameters = MODELS.get(lens.model.name)
-        if parameters:
-            values = dict(zip(parameters, lens.params, strict=True))
-            ratio = values.get("fy", values["f"]) / values["f"]
-            values |= {one: cameras[number, 6 + k] for k, one in enumerate(_NUMBERS) if one in values}
-            if "fy" in values:
-                values["fy"] = ratio * values["f"]
-            lens.params = [values[one] for one in parameters]
+        lens = named.setdefault(image.camera_id, cameras[number, 6:])
+        if (lens != cameras[number, 6:]).any():
+            raise ProblemError(
+                f"cannot write {display_name(folder)}: images of camera {image.camera_id} have different f, k1 or k2"
+            )
+    for identity, lens in named.items():
+        _set_lens(model.camera(identity), dict(zip(_NUMBERS, lens, strict=True)))
     for identity, position in zip(index.points, np.asarray(problem.points, np.float64), strict=True):
         model.point3D(identity).xyz = position
     model.update_point_3d_errors()
-    text = not (Path(like) / "cameras.bin").is_file()
+    target = Path(folder)
+    text = not _is_binary(like) and not _is_binary(target)  # COLMAP would not look at text beside a binary model
     try:
-        target = Path(folder)
-        target.mkdir(exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target, prefix=".jaxba-") as temporary:
+        with tempfile.TemporaryDirectory(dir=target.absolute().parent, prefix=".jaxba-") as temporary:
             (model.write_text if text else model.write_binary)(temporary)
+            written = pycolmap.Reconstruction(temporary)  # a full disk may have cut it short
+            if _observations(written) != counts[2] or written.num_points3D() != counts[1]:
+                raise OSError("it cannot be read back")
+            target.mkdir(exist_ok=True)
             for file in sorted(Path(temporary).iterdir()):
                 os.replace(file, target / file.name)
-    except OSError as error:
+    except Exception as error:  # what C++ throws comes as any of Python's
         raise ProblemError(f"cannot write {display_name(folder)}: {reason(error)}") from error
+
+
+def _set_lens(camera: Any, numbers: dict[str, float]) -> None:
+    """Gives a lens new numbers, as far as its model has and knows them; the others stay bit by bit."""
+    parameters = MODELS.get(camera.model.name)
+    if parameters is None:
+        return
+    values = dict(zip(parameters, camera.params, strict=True))
+    if "fy" in values and values["f"] != numbers["f"]:
+        values["fy"] *= numbers["f"] / values["f"]
+    camera.params = [numbers.get(one, values[one]) for one in parameters]
+
+
+def _observations(model: Any) -> int:
+    """How many observations of a model are of registered images."""
+    registered = set(model.reg_image_ids())
+    return sum(view.image_id in registered for p in model.points3D.values() for view in p.track.elements)
+
+
+def _groups(numbers: np.ndarray, count: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Every number below `count`, and where it stands."""
+    order = np.argsort(numbers, kind="stable")
+    return enumerate(np.split(order, np.searchsorted(numbers[order], np.arange(1, count))))
+
+
+def _is_binary(folder: StrPath) -> bool:
+    """Whether COLMAP would read the binary files of a folder."""
+    return all((Path(folder) / f"{part}.bin").is_file() for part in ("cameras", "images", "points3D"))
+
+
+def _check(camera: Any, name: str) -> None:
+    """Refuses a lens that is none."""
+    if camera.is_spherical():
+        raise ProblemError(f"{name}: {camera.model.name} has no focal length and cannot be used")
+    focal = np.asarray(camera.params)[list(camera.focal_length_idxs())]
+    if not (np.isfinite(camera.params).all() and (focal > 0).all()):
+        raise ProblemError(f"{name} has impossible parameters: {camera.params_to_string()}")
 
 
 def _load(folder: StrPath) -> Any:
@@ -169,7 +212,7 @@ def _load(folder: StrPath) -> Any:
         raise ProblemError(f"{name}: no COLMAP model, which has cameras.bin or cameras.txt")
     try:
         import pycolmap
-    except ModuleNotFoundError:
+    except (ImportError, RuntimeError):
         raise ProblemError(f"{name}: COLMAP models need pycolmap: pip install jaxba[colmap]") from None
     try:
         return pycolmap.Reconstruction(os.fspath(folder))
@@ -197,6 +240,10 @@ def _undistorted(
     image = lambda p: np.asarray(camera.img_from_cam(np.column_stack([p, np.ones(len(p))])))
     steps = _STEP * np.eye(2)
     rates = np.stack([(image(plane + step) - image(plane - step)) / (2 * _STEP * focal) for step in steps], axis=2)
-    if not (np.isfinite(plane).all() and np.isfinite(rates).all()):
-        raise ProblemError(f"{name} ({camera.model.name}) cannot tell the direction of all its pixels")
+    finite = np.isfinite(np.column_stack([plane, rates.reshape(-1, 4)])).all(axis=1)
+    spread = np.abs(np.linalg.det(np.where(finite.reshape(-1, 1, 1), rates, 0.0)))
+    bad = spread < _LEAST_SPREAD
+    if bad.any():
+        shown = ", ".join(f"{x:g}" for x in pixels[bad][0])
+        raise ProblemError(f"{name} ({camera.model.name}) has no direction for pixel {shown}")
     return focal * plane, rates @ np.diag(COLMAP_FLIP[:2])
