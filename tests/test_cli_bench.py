@@ -234,7 +234,7 @@ BAD = {
     "unknown method": (["scene:tiny", "--solvers", "sgd+ceres"], "unknown method 'sgd'"),
     "no solver": (["scene:tiny", "--solvers", ","], "--solvers names no solver"),
     "missing file": (["no-such-file.txt"], "no-such-file.txt: no such file"),
-    "directory": (["."], "a directory, not a file"),
+    "directory": (["."], "a directory without a COLMAP model"),
     "unknown scene": (["scene:none"], "no scene is called 'none'"),
     "bad seed": (["scene:tiny:x"], "the seed must be a whole number"),
     "no repeats": (["scene:tiny", "--repeats", "0"], "--repeats must be positive"),

@@ -171,7 +171,7 @@ def test_what_is_odd_about_the_data_is_counted(tmp_path, capsys):
     assert once >= 2
     after = int(np.sum(geometry.depths(read_bal(output)) <= 0))
     assert notes == [
-        "note: 1 cameras without observations, kept as they are",
+        "note: 1 cameras without observations, whose poses stay",
         "note: 2 points without observations, kept as they are",
         f"note: {once} points seen once; damping alone fixes their depth",
         f"note: observations behind their camera: 1 at the start, {after} at the end",

@@ -276,4 +276,6 @@ def test_fixed_intrinsics_leave_a_band_a_band():
 
 def test_the_command_refuses_a_folder_without_a_model(tmp_path, capsys):
     assert run([str(tmp_path)]) == 2
-    assert capsys.readouterr().err == f"error: {tmp_path}: no COLMAP model, which has cameras.bin or cameras.txt\n"
+    assert (
+        capsys.readouterr().err == f"error: {tmp_path}: no directory with a COLMAP model (cameras.bin or cameras.txt)\n"
+    )

@@ -74,7 +74,9 @@ def sources(locations: list[str]) -> list[Source]:
             name, location = location, resolve(location)
             path = Path(location)
             if not path.is_file() and not is_colmap(path):
-                raise ProblemError(f"{location}: {'no COLMAP model in it' if path.is_dir() else 'no such file'}")
+                raise ProblemError(
+                    f"{location}: {'a directory without a COLMAP model' if path.is_dir() else 'no such file'}"
+                )
             label = re.sub(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$", "", Path(name).name) or path.name
             if path.is_dir():
                 label = _model_name(path)

@@ -155,9 +155,10 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath) -> None
         model.point3D(identity).xyz = position
     model.update_point_3d_errors()
     target = Path(folder)
+    beside = target if target.is_dir() else target.absolute().parent  # a folder that may be written, on the same disk
     text = not _is_binary(like) and not _is_binary(target)  # COLMAP would not look at text beside a binary model
     try:
-        with tempfile.TemporaryDirectory(dir=target.absolute().parent, prefix=".jaxba-") as temporary:
+        with tempfile.TemporaryDirectory(dir=beside, prefix=".jaxba-") as temporary:
             (model.write_text if text else model.write_binary)(temporary)
             written = pycolmap.Reconstruction(temporary)  # a full disk may have cut it short
             if _observations(written) != counts[2] or written.num_points3D() != counts[1]:
@@ -209,7 +210,7 @@ def _check(camera: Any, name: str) -> None:
 def _load(folder: StrPath) -> Any:
     name = display_name(folder)
     if not is_colmap(folder):
-        raise ProblemError(f"{name}: no COLMAP model, which has cameras.bin or cameras.txt")
+        raise ProblemError(f"{name}: no directory with a COLMAP model (cameras.bin or cameras.txt)")
     try:
         import pycolmap
     except (ImportError, RuntimeError):
