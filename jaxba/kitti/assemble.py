@@ -7,14 +7,14 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.geometry import angle_axis, camera_centers, rotation_matrices
+from jaxba.geometry import COLMAP_FLIP, angle_axis, camera_centers, rotation_matrices
 from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.tracks import Tracks
 from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate_robustly
 from jaxba.problem import BundleProblem, ProblemError
 
-FLIP = np.diag([1.0, -1.0, -1.0])
-"""From axes x right, y down, z forward (KITTI) to x right, y up, z backward (BAL)."""
+FLIP = np.diag(COLMAP_FLIP)
+"""From axes x right, y down, z forward (KITTI, as COLMAP) to x right, y up, z backward (BAL)."""
 
 MIN_SIGHTINGS = 10
 """Sightings that a camera needs: twice as many numbers as its 9 parameters, and a little more."""
