@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.lm import StepInfo
 
@@ -17,6 +17,11 @@ DAMPING_LIMIT = 1e32
 HIDDEN_DECREASE = 100.0
 """A small decrease ends a solve only if, without damping, it would be estimated at no more than this times as large. A
 step that lambda made short says nothing about how far the minimum is."""
+
+
+COST_ROUNDING = 8.0
+"""Rounding units of a cost that a change must exceed to be judged: 1e-6 in float32, where costs of real problems have
+errors of that size (docs/performance.md), 2e-15 in float64."""
 
 
 class Termination(enum.IntEnum):
@@ -31,11 +36,12 @@ class Termination(enum.IntEnum):
     DAMPING_LIMIT = 6
     STOPPED = 7
     TARGET = 8
+    ROUNDING = 9
 
     @property
     def converged(self) -> bool:
-        """Whether one of the three convergence tests ended the solve."""
-        return self in (Termination.COST, Termination.STEP, Termination.GRADIENT)
+        """Whether a convergence test ended the solve."""
+        return self in (Termination.COST, Termination.STEP, Termination.GRADIENT, Termination.ROUNDING)
 
     @property
     def reason(self) -> str:
@@ -48,6 +54,7 @@ _REASONS = {
     Termination.COST: "relative decrease of an accepted step within ftol",
     Termination.STEP: "accepted step within xtol",
     Termination.GRADIENT: "gradient within gtol",
+    Termination.ROUNDING: "promised decrease of a refused step within the rounding of the cost",
     Termination.MAX_ITERATIONS: "iteration limit",
     Termination.STALLED: "a rejected step would be repeated unchanged",
     Termination.STOPPED: "stopped by the caller",
@@ -57,7 +64,10 @@ _REASONS = {
 
 
 class Tolerances(NamedTuple):
-    """Convergence tests, on accepted steps only (design, section 2), and a cost that is good enough."""
+    """Convergence tests, on accepted steps only (design, section 2), and a cost that is good enough.
+
+    A refused step ends a solve where nothing can be told any more (`lost_in_rounding`).
+    """
 
     ftol: float = 1e-6
     """`|f - f'| <= ftol f`, by a step that is not short for its damping (`converged_in_cost`)."""
@@ -79,16 +89,32 @@ def converged_in_cost(step: StepInfo, ftol: Any) -> Bool[Array, ""]:
     `s = lambda / (h + lambda)`, and the undamped model would promise `1 / (1 - s^2)` times the decrease. That may not
     exceed `HIDDEN_DECREASE` times the tolerance.
     """
-    decrease, share = step.previous_cost - step.cost, step.damping_share
-    hidden = decrease > HIDDEN_DECREASE * (1 - share) * (1 + share) * ftol * step.previous_cost
+    return step.accepted & _is_little(step.previous_cost - step.cost, step, ftol)
+
+
+def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
+    """A step was refused that promised less than what its cost is rounded by, and not because damping made it short.
+
+    Whether such a step is any good cannot be seen, and the next ones, damped more, promise less still. In float64 that
+    is beyond all tolerances; in float32 it comes before `ftol` is met, which then needs a step accepted by luck.
+    """
+    rounding = COST_ROUNDING * float(jnp.finfo(step.cost.dtype).eps)
+    return ~step.accepted & (step.predicted > 0) & _is_little(step.predicted, step, rounding)
+
+
+def _is_little(decrease: Float[Array, ""], step: StepInfo, tolerance: Any) -> Bool[Array, ""]:
+    """Whether a decrease is within a tolerance relative to the cost, also as it would be without damping."""
+    share = step.damping_share
+    hidden = decrease > HIDDEN_DECREASE * (1 - share) * (1 + share) * tolerance * step.previous_cost
     whole = ~(step.share < 1)  # a step that had to be shortened says nothing either
-    return step.accepted & (decrease <= ftol * step.previous_cost) & ~hidden & whole
+    return (decrease <= tolerance * step.previous_cost) & ~hidden & whole
 
 
 def termination_of(
     step: StepInfo, stuck: Bool[Array, ""], iteration: Int[Array, ""], tolerances: Tolerances, max_iterations: Any
 ) -> Int[Array, ""]:
-    """First stop rule that applies. Only an accepted step, or a zero gradient, ends a solve as converged."""
+    """First stop rule that applies. Only an accepted step, a zero gradient, or a promise that drowns in rounding ends a
+    solve as converged."""
     by_cost = converged_in_cost(step, tolerances.ftol)
     bound = tolerances.xtol * (step.parameter_norm + tolerances.xtol)
     hidden = step.step_norm > HIDDEN_DECREASE * (1 - step.damping_share) * bound
@@ -100,6 +126,7 @@ def termination_of(
         (by_cost, Termination.COST),
         (by_step, Termination.STEP),
         (by_gradient, Termination.GRADIENT),
+        (lost_in_rounding(step), Termination.ROUNDING),
         (limit, Termination.DAMPING_LIMIT),
         (stalled, Termination.STALLED),
         ((step.cost <= tolerances.target) & (tolerances.target > 0), Termination.TARGET),

@@ -234,7 +234,8 @@ def test_convergence_comes_before_the_wish_to_stop():
 def test_every_end_has_a_reason_for_a_person():
     reasons = [end.reason for end in Termination]
     assert len(set(reasons)) == len(reasons)
-    assert {end for end in Termination if end.converged} == {Termination.COST, Termination.STEP, Termination.GRADIENT}
+    tests = {Termination.COST, Termination.STEP, Termination.GRADIENT, Termination.ROUNDING}
+    assert {end for end in Termination if end.converged} == tests
 
 
 # What a solution promises

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import step_info
 
-from jaxba import Termination, Tolerances, solve
-from jaxba.termination import HIDDEN_DECREASE, converged_in_cost, termination_of
+from jaxba import Termination, Tolerances, geometry, solve
+from jaxba.termination import HIDDEN_DECREASE, converged_in_cost, lost_in_rounding, termination_of
 
 LIMIT = 30
 
@@ -67,6 +68,56 @@ def test_the_same_small_decrease_ends_a_solve_or_not_by_what_made_it_small(share
 def test_no_decrease_at_all_is_convergence_whatever_lambda_was():
     """Then the undamped step promises nothing either; without this a solve at the exact minimum would never end."""
     assert converged_in_cost(step_info(True, cost=1.0, previous_cost=1.0, damping_share=0.999), 1e-6)
+
+
+def single(**fields):
+    """A refused step in float32."""
+    info = step_info(False, **{"cost": 1.0, "previous_cost": 1.0, "predicted": 5e-7, "damping_share": 0.0} | fields)
+    return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, info)
+
+
+def test_a_refused_step_ends_a_solve_in_float32_where_its_promise_drowns_in_the_rounding_of_the_cost():
+    info = single()
+    assert lost_in_rounding(info)
+    code = termination_of(info, jnp.asarray(False), jnp.asarray(3, jnp.int32), Tolerances(ftol=1e-12), 100)
+    assert int(code) == Termination.ROUNDING
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"predicted": 5e-6},  # more than rounding
+        {"damping_share": 1 - 1e-6},  # little only for its damping
+        {"share": 0.25},  # or for having been shortened
+        {"predicted": np.nan},  # a factorisation failed
+        {"predicted": -1.0},  # or was of no use
+        {"accepted": True},  # then `ftol` decides
+    ],
+)
+def test_no_other_step_in_float32_ends_a_solve_by_that_rule(fields):
+    info = single(**{k: v for k, v in fields.items() if k != "accepted"})
+    if "accepted" in fields:
+        info = info._replace(accepted=jnp.asarray(True))
+    assert not lost_in_rounding(info)
+
+
+def test_in_float64_the_same_promise_can_be_judged():
+    info = step_info(False, cost=1.0, previous_cost=1.0, predicted=5e-7, damping_share=0.0)
+    assert not lost_in_rounding(info)
+    assert lost_in_rounding(info._replace(predicted=jnp.asarray(1e-15)))
+
+
+def test_a_solve_in_float32_asked_for_more_digits_than_it_has_ends_as_converged_at_the_minimum():
+    exact = solve(support.tiny(), "ceres", tolerances=Tolerances(ftol=1e-12))
+    rough = solve(
+        support.tiny(),
+        "ceres",
+        dtype="float32",
+        max_iterations=100,
+        tolerances=Tolerances(ftol=1e-30, xtol=0.0, gtol=0.0),
+    )
+    assert rough.termination == Termination.ROUNDING
+    assert geometry.cost(rough.problem) == pytest.approx(exact.final_cost, rel=1e-5)
 
 
 def test_a_huge_lambda_does_not_feign_convergence_and_ceres_rule_converges():
