@@ -8,7 +8,8 @@ what they see. Repairing that locally is cheap beside a linear solve, and lets b
 2. `camera_rounds`: where the step did less than half of what the model promised and is not hopeless, cameras alone,
    then points alone again, a few times over. A step along a curved valley comes back to its floor.
 3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 and at most one round
-   of 2.
+   of 2. A camera whose focal length would change its sign stays where it was: an image seen in a mirror fits for a
+   while, and there is no way back.
 
 None of it takes another linear solve, so it is all one iteration (design, section 2). Where a problem falls into parts
 that are judged by themselves (`parts.py`), each has its own share, rounds and verdict. Source: 1 is Jeong et al. 2012,
@@ -117,6 +118,8 @@ def best_trial(
 
     def attempt(wanted: Array, share: Array, repairs: Array) -> Trial:
         moved = move_cameras(cameras, parts.of_cameras(share) * step.cameras, options)
+        if options.trials > 1:
+            moved = jnp.where(moved[6] * cameras[6] < 0, cameras, moved)
         trial = settle(moved, points + parts.of_points(share) * step.points, share, repairs)
         if not options.camera_rounds:
             return trial

@@ -18,7 +18,7 @@ from support import bal_file, needs_data, published_loss, same_bits, start, step
 
 from jaxba import BundleProblem, Loss, StepOptions, geometry, read_bal, solve
 from jaxba.linearize import in_front, residuals, slot_frames
-from jaxba.refine import Home, refine_points
+from jaxba.refine import FARTHEST, Home, refine_points
 
 STILL = 1e30
 """A lambda under which the linear solve moves nothing."""
@@ -189,6 +189,69 @@ def test_points_that_the_step_left_in_front_do_not_start_from_home():
     real = [(point == problem.points).all(axis=1).any() for point in np.asarray(state.points).T]
     assert (came_back ^ stayed)[real].all()
     assert came_back[real].sum() == len(lost)
+
+
+# Far away
+
+
+def nearness(problem: BundleProblem) -> np.ndarray:
+    """Sum of inverse depths of every point."""
+    return np.bincount(problem.point_index, 1 / depths(problem), problem.num_points)
+
+
+def parallel(seed: int) -> BundleProblem:
+    """Points in pictures from two cameras a hundredth of their distance apart, noisy enough that half of the rays meet
+    nowhere: the cheapest places are at infinity and beyond."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-2, 2, (60, 2)), rng.uniform(-12, -8, 60)])
+    cameras = [[0, 0, 0, shift, 0, 0, 500.0, 0, 0] for shift in (0.0, 0.1)]
+    camera, point = np.tile([0, 1], 60), np.repeat(np.arange(60), 2)
+    local = points[point] + np.array(cameras)[camera, 3:6]
+    pixels = -500 * local[:, :2] / local[:, 2:] + rng.normal(scale=5, size=(120, 2))
+    return BundleProblem.create(cameras, points, pixels, camera, point)
+
+
+def settled(problem: BundleProblem, iterations: int) -> BundleProblem:
+    """The problem with its points after point iterations alone."""
+    layout, state = start(problem)
+    found, _ = _at_home(layout, state, state.points, Loss(), iterations)
+    order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    points = np.array(problem.points)
+    real = order < problem.num_points
+    points[order[real]] = np.asarray(found).T[real]
+    return problem.replace(points=points)
+
+
+@pytest.mark.parametrize("iterations", [1, 3, 10])
+def test_no_point_goes_a_hundred_times_as_far_in_one_go_nor_beyond_infinity(iterations):
+    problem = parallel(0)
+    before, after = nearness(problem), nearness(settled(problem, iterations))
+    assert (after >= before / FARTHEST * (1 - 1e-9)).all()
+
+
+def test_points_whose_rays_meet_far_away_come_near_to_them_iteration_by_iteration():
+    """What stops a point is no wall: the next iteration goes on."""
+    problem, distance = parallel(0), []
+    for _ in range(4):
+        distance.append(np.max(1 / nearness(problem)))
+        problem = settled(problem, 10)
+    assert (np.diff(distance) > 0).all()
+    assert distance[-1] > 2 * FARTHEST * distance[0]
+
+
+def test_a_point_that_the_step_took_far_away_starts_again_from_home():
+    problem = support.tiny()
+    layout, state = start(problem)
+    centre = np.mean([-Rotation.from_rotvec(c[:3]).inv().apply(c[3:6]) for c in problem.cameras], axis=0)
+    at_home, _ = _at_home(layout, state, state.points, Loss(), 1)
+    real = [(point == problem.points).all(axis=1).any() for point in np.asarray(state.points).T]
+    for times, came_back in ((3e3, True), (3.0, False)):
+        points = centre + times * (np.asarray(problem.points) - centre)
+        moved = problem.replace(points=points)
+        assert ((nearness(moved) < nearness(problem) / FARTHEST) == came_back).all()
+        _, there = start(moved)
+        found, _ = _at_home(layout, state, there.points, Loss(), 1)
+        assert ((np.asarray(found) == np.asarray(at_home)).all(axis=0)[real] == came_back).all()
 
 
 @needs_data

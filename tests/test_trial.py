@@ -19,9 +19,10 @@ from jaxba.game.bank import initial_costs
 from jaxba.game.scenes import SceneClass, make_scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.linearize import cost, linearize
+from jaxba.parts import Whole
 from jaxba.resect import DAMPINGS, refine_cameras, solve_positive
 from jaxba.schur import solve_step
-from jaxba.trial import GOOD_GAIN, HOPELESS, NEGLIGIBLE, ROUNDS_OF_SHORTER, SHORTER
+from jaxba.trial import GOOD_GAIN, HOPELESS, NEGLIGIBLE, ROUNDS_OF_SHORTER, SHORTER, best_trial
 
 PLAIN = StepOptions()
 SHORTER_ONLY = StepOptions(trials=4)
@@ -225,6 +226,22 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         np.testing.assert_allclose(info.cost, costs[-1], rtol=1e-6)
         assert after.cost < before.cost
     assert saved >= 3
+
+
+_best_trial = jax.jit(best_trial, static_argnames=("options", "min_gain"))
+
+
+def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
+    layout, before = start(support.tiny())
+    linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
+    whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(1e-3), PLAIN)
+    mirrored = whole._replace(cameras=whole.cameras.at[6, 0].set(-1.5 * before.cameras[6, 0]))
+    found = lambda options: _best_trial(Whole(layout), *before, linear, mirrored, options, 0.0)
+    plain, kept = found(PLAIN), found(SHORTER_ONLY)
+    assert plain.cameras[6, 0] < 0
+    assert kept.share == 1
+    assert np.array_equal(kept.cameras[:, 0], before.cameras[:, 0])
+    np.testing.assert_allclose(kept.cameras[:, 1:], plain.cameras[:, 1:], rtol=1e-12)
 
 
 @pytest.mark.parametrize("options", [PLAIN, SHORTER_ONLY, EVERYTHING], ids=["plain", "trials", "everything"])
