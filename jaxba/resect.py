@@ -58,7 +58,8 @@ def refine_cameras(
         # on the manifold, in which the Jacobian is written
         moved = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
         costs = slot_costs(options.loss, residuals(layout, slot_frames(layout, moved), points)[1])
-        better = (own_cost(costs) < before) & ~done
+        upright = moved[6] * cameras[6] >= 0  # as in trial.py
+        better = (own_cost(costs) < before) & ~done & upright
         return (jnp.where(better, moved, best), done | better), None
 
     # a scan and not two copies: half of it to compile

@@ -20,8 +20,8 @@ step that lambda made short says nothing about how far the minimum is."""
 
 
 COST_ROUNDING = 8.0
-"""Rounding units of a cost that a change must exceed to be judged: 1e-6 in float32, where costs of real problems have
-errors of that size (docs/performance.md), 2e-15 in float64."""
+"""Rounding units of a cost within which the promise of a refused step tells nothing: 1e-6 in float32, where costs of
+real problems have errors of that size (docs/performance.md), 2e-15 in float64."""
 
 
 class Termination(enum.IntEnum):
@@ -64,9 +64,10 @@ _REASONS = {
 
 
 class Tolerances(NamedTuple):
-    """Convergence tests, on accepted steps only (design, section 2), and a cost that is good enough.
+    """Convergence tests (design, section 2), and a cost that is good enough.
 
-    A refused step ends a solve where nothing can be told any more (`lost_in_rounding`).
+    The first two are for accepted steps. A refused one ends a solve where nothing can be told any more
+    (`lost_in_rounding`).
     """
 
     ftol: float = 1e-6
@@ -96,10 +97,11 @@ def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
     """A step was refused that promised less than what its cost is rounded by, and not because damping made it short.
 
     Whether such a step is any good cannot be seen, and the next ones, damped more, promise less still. In float64 that
-    is beyond all tolerances; in float32 it comes before `ftol` is met, which then needs a step accepted by luck.
+    is beyond all useful tolerances; in float32 it comes before `ftol` is met, which then needs a step accepted by luck.
     """
     rounding = COST_ROUNDING * float(jnp.finfo(step.cost.dtype).eps)
-    return ~step.accepted & (step.predicted > 0) & _is_little(step.predicted, step, rounding)
+    told = (step.predicted > 0) & jnp.isfinite(step.step_norm)  # peers do not tell what they refused (peers/driven.py)
+    return ~step.accepted & told & _is_little(step.predicted, step, rounding)
 
 
 def _is_little(decrease: Float[Array, ""], step: StepInfo, tolerance: Any) -> Bool[Array, ""]:

@@ -4,12 +4,12 @@ The linear model is wrong far from where it was made, and mostly wrong locally: 
 what they see. Repairing that locally is cheap beside a linear solve, and lets bolder steps pass:
 
 1. `refine_points`: every point re-optimised alone at the new cameras; one that the step sent behind a camera starts
-   from where it was.
+   from where it was, and so does one that it sent far away.
 2. `camera_rounds`: where the step did less than half of what the model promised and is not hopeless, cameras alone,
    then points alone again, a few times over. A step along a curved valley comes back to its floor.
 3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 and at most one round
-   of 2. A camera whose focal length would change its sign stays where it was: an image seen in a mirror fits for a
-   while, and there is no way back.
+   of 2. Where steps are tried again, a camera whose focal length would change its sign stays where it was: an image
+   seen in a mirror fits for a while, and there is no way back.
 
 None of it takes another linear solve, so it is all one iteration (design, section 2). Where a problem falls into parts
 that are judged by themselves (`parts.py`), each has its own share, rounds and verdict. Source: 1 is Jeong et al. 2012,

@@ -239,6 +239,17 @@ def test_points_whose_rays_meet_far_away_come_near_to_them_iteration_by_iteratio
     assert distance[-1] > 2 * FARTHEST * distance[0]
 
 
+def test_points_that_the_step_brought_from_behind_to_the_front_stay_there():
+    problem = support.tiny()
+    layout, there = start(problem)
+    _, state = start(mirrored(problem, np.arange(problem.num_points)))
+    points = np.asarray(state.points).T
+    alone = _at_home(layout, there, there.points, Loss(), 2)[0]
+    came = _at_home(layout, there._replace(points=state.points), there.points, Loss(), 2)[0]
+    assert not np.allclose(points.T, there.points)
+    np.testing.assert_array_equal(came, alone)
+
+
 def test_a_point_that_the_step_took_far_away_starts_again_from_home():
     problem = support.tiny()
     layout, state = start(problem)

@@ -91,6 +91,7 @@ def test_a_refused_step_ends_a_solve_in_float32_where_its_promise_drowns_in_the_
         {"share": 0.25},  # or for having been shortened
         {"predicted": np.nan},  # a factorisation failed
         {"predicted": -1.0},  # or was of no use
+        {"step_norm": np.nan},  # a peer refused it, and does not tell more
         {"accepted": True},  # then `ftol` decides
     ],
 )

@@ -38,8 +38,8 @@ COST_DEFINITION_TOLERANCE = 1e-5
 """Relative difference of initial costs that rounding does not explain: COLMAP's zeroing of the 31 points behind
 cameras of Ladybug-49 makes 1.3e-4, float32 about 1e-6."""
 
-CONVERGED = frozenset({"cost", "step", "gradient", "converged", "convergence", "ftol", "xtol", "gtol"})
-"""Words in `Record.termination` that mean converged, in lower case; every other word is a failure. The first three
+CONVERGED = frozenset({"cost", "step", "gradient", "rounding", "converged", "convergence", "ftol", "xtol", "gtol"})
+"""Words in `Record.termination` that mean converged, in lower case; every other word is a failure. The first four
 are the names of `jaxba.solve.Termination`; peers write "converged" or Ceres' "CONVERGENCE"."""
 
 

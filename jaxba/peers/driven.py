@@ -66,7 +66,7 @@ def drive_ceres(
 
     The policy sees what it sees of `lm_step`: costs, gain ratio, predicted decrease and gradient as Ceres reports them
     (the gradient by a quaternion's three tangent coordinates, twice that by angles), the rest by `step_facts`. Of a
-    rejected step the length stays unknown (NaN, no test asks for it) and the share of damping is `REJECTED_SHARE`.
+    rejected step the length stays unknown (NaN, by which stop rules know it), the share of damping is `REJECTED_SHARE`.
     Where an accepted step takes points behind their camera, which COLMAP rewards with a residual of zero, the whole
     cost decides once more.
 
