@@ -104,6 +104,8 @@ def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
         ours, linear_solver = _our_iteration(problem, repeats)
         label = f"iteration/{source.name}"
         yield Metric(f"{label}/jaxba ({linear_solver})", ours, "s", "lower")
+        host = _layout_seconds(problem, repeats)
+        yield Metric(f"{label}/layout over an iteration", host / ours, "ratio", "lower", GATE_TOLERANCE, target=1.0)
         if binary is None:
             continue
         with tempfile.TemporaryDirectory() as folder:
@@ -139,6 +141,21 @@ def _our_iteration(problem, repeats: int) -> tuple[float, str]:
         solver = solution.linear_solver
         times += [after - before for before, after in itertools.pairwise(stamps)]
     return statistics.median(times), solver
+
+
+def _layout_seconds(problem: BundleProblem, repeats: int) -> float:
+    """Median time on the host to sort the observations for the solver that `auto` takes."""
+    from jaxba import StepOptions
+    from jaxba.choose import choose_linear_solver
+    from jaxba.layout import layout_for
+
+    options = choose_linear_solver(problem, StepOptions(), "auto")
+    times = []
+    for _ in range(max(repeats, 3)):
+        started = time.perf_counter()
+        layout_for(problem, options)
+        times.append(time.perf_counter() - started)
+    return statistics.median(times)
 
 
 def time_to_tolerance(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Int
+from scipy.sparse import csr_matrix
 
 from jaxba.ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.padding import Capacity, room_for
@@ -84,48 +86,56 @@ def pair_layout(
         banded: whether it may be factored as a band, where that is cheaper.
         capacity: makes all shapes follow from it: every block of the lower triangle is there, and no band.
     """
+    camera, slot = camera.astype(np.int32), slot.astype(np.int32)
     lefts, rights = [], []
     for length in np.unique(tracks[tracks > 0]):
-        first = start[np.flatnonzero(tracks == length)]
-        a, b = np.tril_indices(length)
+        first = start[np.flatnonzero(tracks == length)].astype(np.int32)
+        a, b = (side.astype(np.int32) for side in np.tril_indices(length))
         lefts.append((first[:, None] + a).ravel())
         rights.append((first[:, None] + b).ravel())
     left, right = np.concatenate(lefts), np.concatenate(rights)
+    rows, columns = camera[left], camera[right]
     # a camera that sees a point twice: both orders add to the same diagonal block
-    twice = (camera[left] == camera[right]) & (left != right)
-    left, right = np.concatenate([left, right[twice]]), np.concatenate([right, left[twice]])
-    diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
-    block = camera[left].astype(np.int64) * cameras + camera[right]
-    names = np.union1d(block, diagonal)
-    if capacity is not None:
-        names, banded = np.ravel_multi_index(np.tril_indices(cameras), (cameras, cameras)), False
+    twice = np.flatnonzero(rows == columns)
+    twice = twice[left[twice] != right[twice]]
+    if twice.size:
+        left, right = np.concatenate([left, right[twice]]), np.concatenate([right, left[twice]])
+        rows, columns = np.concatenate([rows, columns[twice]]), np.concatenate([columns, rows[twice]])
     rank, reach = np.arange(cameras), cameras
-    if factor and banded and cameras >= MIN_BAND_CAMERAS:
-        rank, reach = camera_order(*np.divmod(names, cameras), cameras)
+    if capacity is None and factor and banded and cameras >= MIN_BAND_CAMERAS:
+        there = np.zeros((cameras, cameras), bool)
+        there[rows, columns] = True
+        row, column = np.nonzero(there)
+        rank, reach = camera_order(row, column, cameras)
     banded = banded and is_banded(cameras, reach)
     if banded:  # from here on cameras go by their rank, and the lower triangle is that of the ranks
-        swap = rank[camera[left]] < rank[camera[right]]
+        place = rank.astype(np.int32)
+        rows, columns = place[rows], place[columns]
+        swap = rows < columns
         left, right = np.where(swap, right, left), np.where(swap, left, right)
-        block = rank[camera[left]] * cameras + rank[camera[right]]
-        names = np.union1d(block, diagonal)
+        rows, columns = np.maximum(rows, columns), np.minimum(rows, columns)
     else:
         rank = np.arange(cameras)
-    order = np.argsort(block, kind="stable")
-    counts = np.bincount(np.searchsorted(names, block), minlength=len(names))
+    blocks = _Blocks.of(rows, columns, cameras)
+    if capacity is not None:
+        blocks = blocks.with_all(cameras)
+    names, counts, order = blocks
+    diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
     room = None if capacity is None else room_for(counts, capacity.pairs, capacity.points)
     number_of = lambda w: int((-(-counts // w)).sum()) if room is None else chunks_at_most(room.items, len(names), w)
     width = min(PAIR_CHUNKS, key=lambda w: number_of(w) * (w + PAIR_ITEM_COST))
     width = max(1, min(width, int(counts.max()) if room is None else room.most))
     chunks = -(-counts // width)
-    row = np.repeat(np.cumsum(chunks) - chunks, counts)
-    position = np.arange(len(left)) - np.repeat(np.cumsum(counts) - counts, counts)
+    # where each pair goes, in the order of the blocks: those of a block stand together, and begin a row
+    shift = width * (np.cumsum(chunks) - chunks) - (np.cumsum(counts) - counts)
+    position = np.repeat(shift.astype(np.int32), counts) + np.arange(len(left), dtype=np.int32)
     used, total = int(chunks.sum()), number_of(width) + 1  # at least one chunk is all padding
     batches = -(-total // PAIR_BATCH)
     batch = -(-total // batches)
     padded = []
     for side in (left, right):
-        array = np.full((batches * batch, width), empty, np.int32)
-        array[row + position // width, position % width] = slot[side[order]]
+        array = np.full(batches * batch * width, empty, np.int32)
+        array[position] = slot[side[order]]
         padded.append(array.reshape(batches, batch, width))
     table = None
     if factor and not banded:
@@ -159,3 +169,46 @@ def pair_layout(
         table=table,
         band=band_of(names, rank, reach) if banded else None,
     )
+
+
+class _Blocks(NamedTuple):
+    """Which blocks of the lower triangle there are, and which pairs add to them."""
+
+    names: Int[np.ndarray, " blocks"]
+    """`row * cameras + column`, sorted; all on the diagonal are there."""
+
+    counts: Int[np.ndarray, " blocks"]
+    """Pairs of each."""
+
+    order: Int[np.ndarray, " pairs"]
+    """Pairs in the order of their blocks, and as they were given within one."""
+
+    @classmethod
+    def of(cls, rows: Int[np.ndarray, " pairs"], columns: Int[np.ndarray, " pairs"], cameras: int) -> _Blocks:
+        """Sorts pairs by the block of each."""
+        # by column, then by row: two sorts by counting, which is what the transposition of a sparse matrix is
+        order = _sorted_by(columns, cameras)
+        order = order[_sorted_by(rows[order], cameras)]
+        names = rows[order].astype(np.int64) * cameras + columns[order]
+        first = np.flatnonzero(np.diff(names, prepend=-1))
+        counts = np.diff(first, append=len(names))
+        diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
+        return cls(names[first], counts, order).with_these(diagonal)
+
+    def with_these(self, wanted: Int[np.ndarray, " more"]) -> _Blocks:
+        """The same with further blocks, to which no pair adds."""
+        names = np.union1d(self.names, wanted)
+        counts = np.zeros(len(names), np.int64)
+        counts[np.searchsorted(names, self.names)] = self.counts
+        return self._replace(names=names, counts=counts)
+
+    def with_all(self, cameras: int) -> _Blocks:
+        """The same with every block of the lower triangle."""
+        return self.with_these(np.ravel_multi_index(np.tril_indices(cameras), (cameras, cameras)))
+
+
+def _sorted_by(keys: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " n"]:
+    """A stable `argsort` of numbers below `most`, in linear time."""
+    ones = np.ones(len(keys), np.int8)
+    rows = csr_matrix((ones, keys, np.arange(len(keys) + 1, dtype=np.int32)), shape=(len(keys), most))
+    return rows.tocsc().indices
