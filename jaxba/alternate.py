@@ -97,4 +97,5 @@ def _joined(before: Solution, last: Solution) -> Solution:
         setup_s=before.setup_s + last.setup_s,
         compile_s=before.compile_s + last.compile_s,
         total_s=before.total_s + last.total_s,
+        quick_iterations=before.quick_iterations + last.quick_iterations,
     )

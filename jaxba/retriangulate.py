@@ -12,7 +12,6 @@ section 4.4), bundle adjustment and re-triangulation in turns. Measured: docs/ga
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -30,6 +29,7 @@ from jaxba.lm import initial_state
 from jaxba.losses import Loss
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
+from jaxba.programs import program, quick_iterations
 from jaxba.refine import refine_points
 from jaxba.solve import explain_start
 from jaxba.sums import point_sum
@@ -104,7 +104,8 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
-        found = jax.device_get(_search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss()))
+        search = program(_search, "loss", quick=quick_iterations(problem.num_observations) > 0)
+        found = jax.device_get(search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss()))
         host.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem))
@@ -115,7 +116,6 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     )
 
 
-@functools.partial(jax.jit, static_argnames=("loss",))
 def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss) -> _Found:
     """`retriangulate` in layout order; `origin` is where the rays start, in scene units."""
     state = initial_state(layout, problem, StepOptions(loss=loss), jnp.float64)

@@ -1,7 +1,8 @@
 """The whole solve: iterate the step under a damping policy until it converges.
 
 Without a callback the loop is one compiled program. With one, the same iteration runs step by step
-from Python and every record carries the wall-clock time at which it was finished.
+from Python and every record carries the wall-clock time at which it was finished; so it does where a quickly
+compiled program may give way to an optimised one (programs.py).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import functools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -30,11 +31,10 @@ from jaxba.naming import DTYPES, fitting_policy
 from jaxba.options import StepOptions
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import AnyArray, BundleProblem, ProblemError
+from jaxba.programs import Compilation, program, quick_iterations, quick_options
 from jaxba.schur import largest_diagonal
 from jaxba.sums import point_sum
 from jaxba.termination import Termination, Tolerances, termination_of
-
-T = TypeVar("T")
 
 MAX_ITERATIONS = 100
 """Iterations after which a solve has failed. Source: the paper."""
@@ -101,6 +101,9 @@ class Solution:
     capacity: Capacity | None = None
     """Sizes to which the problem was padded; None where it was not."""
 
+    quick_iterations: int = 0
+    """Iterations, of a solve the first ones, that a quickly compiled program computed; they are slower."""
+
     @property
     def converged(self) -> bool:
         """Whether a convergence test ended the solve."""
@@ -127,6 +130,7 @@ def solve(
     dtype: str = "float64",
     callback: Callable[[IterationRecord], bool | None] | None = None,
     pad: bool = False,
+    compilation: Compilation = "full",
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
 
@@ -147,6 +151,10 @@ def solve(
             persistent compilation cache; results differ by rounding alone. For many small problems with the explicit
             solver, which `auto` then means. Other solvers and larger problems are left as they are:
             `Solution.capacity` is None then. See padding.py.
+        compilation: `full`: all optimisation, for many solves of a shape and for whoever takes the time of iterations.
+            `quick`: compiled in a third of the time, iterations take three to six times as long. `auto`: quick, and
+            optimised after as many iterations as pay for it; the end of one small solve comes soonest. They differ by
+            rounding. On a GPU all are `full`. See programs.py.
 
     Many problems of many shapes may be solved in one process: before their programs exceed what Linux lets a process
     map, all compiled programs of JAX are dropped (`host.release_programs`), and compiled anew where they are needed.
@@ -160,6 +168,8 @@ def solve(
     """
     if dtype not in DTYPES:
         raise ValueError(f"dtype must be one of {', '.join(DTYPES)}, not {dtype!r}")
+    if compilation not in get_args(Compilation):
+        raise ValueError(f"compilation must be one of {', '.join(get_args(Compilation))}, not {compilation!r}")
     if max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, is {max_iterations}")
     if isinstance(damping, str):
@@ -180,13 +190,16 @@ def solve(
         started = time.perf_counter()
         with CompileClock() as clock:
             layout = jax.device_put(layout_for(problem, options, capacity))
-            initial = _small(initial_state, "options", "dtype")
+            initial = program(initial_state, "options", "dtype", quick=True)
             begin = problem if capacity is None else padded_parameters(problem, capacity)
             state = jax.block_until_ready(initial(layout, begin, options, jnp.dtype(dtype)))
         setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))
-        run = _run_compiled if callback is None else functools.partial(_run_stepwise, callback=callback)
+        quick = _quick_part(compilation, problem, max_iterations)
+        run = functools.partial(_run_stepwise, callback=callback or (lambda _: None), quick=quick)
+        if callback is None and not quick:
+            run = _run_compiled
         final, history, compile_s, total_s = run(layout, state, policy, tolerances, options, max_iterations)
         if clock.seconds + compile_s > 0:
             host.release_programs()  # many problems in one process would end it
@@ -205,6 +218,7 @@ def solve(
             compile_s=compile_s + clock.seconds,
             total_s=total_s,
             capacity=capacity,
+            quick_iterations=min(quick, count),
         )
 
 
@@ -222,16 +236,11 @@ def explain_start(problem: BundleProblem) -> str:
     )
 
 
-@functools.cache
-def _small(function: Callable[..., T], *static: str) -> Callable[..., T]:
-    """A program that runs in microseconds, or once, beside the iterations: on a CPU compiled in half the time.
-
-    Args:
-        function: what it computes.
-        static: names of its static arguments.
-    """
-    hasty = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else None
-    return jax.jit(function, static_argnames=static, compiler_options=hasty)
+def _quick_part(compilation: str, problem: BundleProblem, max_iterations: int) -> int:
+    """How many of the first iterations are a quickly compiled program's."""
+    if compilation == "full" or quick_options() is None:
+        return 0
+    return max_iterations if compilation == "quick" else quick_iterations(problem.num_observations)
 
 
 def _info(layout: Layout, state: LMState, options: StepOptions, max_iterations: int) -> ProblemInfo:
@@ -258,9 +267,6 @@ def _begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> _Carry:
     policy_state, damping = policy.init(info)
     count = lambda n: jnp.asarray(n, jnp.int32)
     return _Carry(state, policy_state, damping, count(0), count(Termination.RUNNING))
-
-
-_step = jax.jit(lm_step, static_argnames=("options",))
 
 
 def after_step(
@@ -358,8 +364,9 @@ def _run_compiled(layout, state, policy, tolerances, options, max_iterations):
     return carry, history, clock.seconds, time.perf_counter() - started - clock.seconds
 
 
-def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *, callback):
-    inform, begin, advance = _small(_info, "options", "max_iterations"), _small(_begin), _small(_advance_and_tell)
+def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *, callback, quick):
+    inform = program(_info, "options", "max_iterations", quick=True)
+    begin, advance = program(_begin, quick=True), program(_advance_and_tell, quick=True)
     with CompileClock() as clock:
         # without the parameters what is the policy's compiles once for all problems
         carry = begin(inform(layout, state, options, max_iterations), policy, None)
@@ -367,29 +374,34 @@ def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *,
         min_gain = jnp.asarray(policy.min_gain, state.cost.dtype)
         limit = jnp.asarray(max_iterations, jnp.int32)
 
-        def iterate(carry: _Carry) -> tuple[_Carry, StepInfo, Termination]:
+        def iterate(carry: _Carry, done: int) -> tuple[_Carry, StepInfo, Termination]:
             effort = effort_of(policy, carry.policy)
-            state, step = _step(layout, carry.state, carry.damping, options, min_gain, carry.iteration, effort)
+            take_step = program(lm_step, "options", quick=done < quick)
+            state, step = take_step(layout, carry.state, carry.damping, options, min_gain, carry.iteration, effort)
             carry, facts = advance(carry._replace(state=None), step, policy, tolerances, limit)
             return carry._replace(state=state), *_told(facts, step)
 
-        before, started = clock.seconds, time.perf_counter()
-        after, step, end = iterate(carry)
-        if clock.seconds > before:  # compiled just now: the iteration is pure, so do it again with the clock running
-            started = time.perf_counter()
-            after, step, end = iterate(carry)
+        started, compiling = time.perf_counter(), 0.0
         records = []
         while True:
+            began, before = time.perf_counter(), clock.seconds
+            after, step, end = iterate(carry, len(records))
+            if clock.seconds > before:  # compiled just now
+                spent = time.perf_counter() - began
+                if len(records) < quick:  # who is in a hurry takes what the clock says
+                    compiling += min(spent, clock.seconds - before)
+                else:  # the iteration is pure, so do it again
+                    compiling += spent
+                    after, step, end = iterate(carry, len(records))
             carry = after
             records.append(step)
-            wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started, step))
+            wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - compiling, step))
             if end != Termination.RUNNING:
                 break
             if wants_stop:
                 carry = carry._replace(termination=jnp.asarray(int(Termination.STOPPED), jnp.int32))
                 break
-            after, step, end = iterate(carry)
-        total_s = time.perf_counter() - started
+        total_s = time.perf_counter() - started - compiling
     history = jax.tree.map(lambda *values: np.array(values), *map(_history, records))
     return carry, history, clock.seconds, total_s
 

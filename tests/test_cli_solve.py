@@ -115,7 +115,7 @@ def test_the_iteration_limit_is_no_error_and_is_said(tiny, tmp_path, capsys):
 
 
 def test_a_rejected_step_is_marked(tiny, capsys):
-    assert run([str(tiny), "--damping", "constant:1e30"]) == 0
+    assert run([str(tiny), "--damping", "constant:1e30", "--compilation", "full"]) == 0
     printed = capsys.readouterr().out
     assert rows(printed)[1][-1] == "rejected"
     assert "not converged: " in printed

@@ -14,6 +14,7 @@ from jaxba.cli import common
 from jaxba.cli.interrupt import Interrupt
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.options import Intrinsics, LinearSolverChoice, Preconditioner
+from jaxba.programs import Compilation
 
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
 """What is solved where no problem is named."""
@@ -58,6 +59,10 @@ class Arguments:
     """Round sizes up to a coarse grid, so that problems of similar size share one compiled program, also from one call
     of this command to the next; auto then means explicit. For many small problems: large ones and those for other
     solvers are left as they are, and the summary says so."""
+
+    compilation: Compilation = "auto"
+    """quick: compiled in a third of the time, but iterations take three to six times as long. full: all optimisation.
+    auto: quick, and optimised after as many iterations as pay for it; large problems at once. On a GPU always full."""
 
     retriangulate: bool = False
     """After convergence look for every point at other depths, go on from the cheapest places, and so on in turns while
@@ -179,6 +184,7 @@ def _solve(args: Arguments) -> int:
             dtype=args.dtype,
             callback=show,
             pad=args.pad,
+            compilation=args.compilation,
             **search,
         )
     print(table.summary(problem, solution))

@@ -73,9 +73,18 @@ def summary(problem: BundleProblem, solution: Solution) -> str:
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e} (rms {rms[0]:.4g} -> {rms[1]:.4g} px)",
         f"{solution.iterations} iterations, {solution.accepted} accepted; linear solver {solution.linear_solver}",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
-        f"iterations {solution.total_s:.2f} s",
+        f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
     ]
     return "\n".join([*lines, *remarks(problem, solution)])
+
+
+def _how_compiled(solution: Solution) -> str:
+    """That iterations were slow by design."""
+    quick = solution.quick_iterations
+    if not quick:
+        return ""
+    which = f"{quick} of them" if quick < solution.iterations else "all"
+    return f" ({which} by a quickly compiled program, see --compilation)"
 
 
 def fits_bal(problem: BundleProblem) -> bool:

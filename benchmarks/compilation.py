@@ -1,0 +1,90 @@
+"""Seconds to compile a step and seconds that it takes, with all optimisation and quickly compiled.
+
+    python -m benchmarks.compilation PROBLEM ... [--solver learned] [--linear-solver auto] [--repeats 15]
+
+PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The constants of
+`jaxba/programs.py` follow from the last two columns: `saved s` is what compiling quickly saves, `slower us` what an
+observation takes longer in an iteration. Both ways in turns, in one process, without a compilation cache.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxba import host, lm
+from jaxba.bench.sources import sources
+from jaxba.choose import choose_linear_solver
+from jaxba.layout import layout_for
+from jaxba.methods import DEFAULT_METHOD
+from jaxba.naming import parse_solver
+from jaxba.programs import quick_options
+
+LONGEST = 10.0
+"""Seconds of repeats of one program."""
+
+HEADING = (
+    f"{'problem':28s} {'linear solver':13s} {'full: compile s':>15s} {'step ms':>8s} {'quick: compile s':>16s} "
+    f"{'step ms':>8s} {'saved s':>8s} {'slower us':>9s}"
+)
+
+
+def measure(step: Any, arguments: tuple[Any, ...], options: dict[str, Any] | None, repeats: int) -> tuple[float, float]:
+    """Seconds of compilation, tracing included, and median seconds of a step."""
+    started = time.perf_counter()
+    compiled = jax.jit(lambda *given: step(*given)).lower(*arguments).compile(options)
+    compile_s = time.perf_counter() - started
+    jax.block_until_ready(compiled(*arguments))
+    times: list[float] = []
+    while len(times) < 3 or (len(times) < repeats and sum(times) < LONGEST):
+        started = time.perf_counter()
+        jax.block_until_ready(compiled(*arguments))
+        times.append(time.perf_counter() - started)
+    return compile_s, float(np.median(times))
+
+
+def row(location: str, solver: str, linear_solver: str, repeats: int) -> str:
+    """Both ways for one problem, as a line of the table."""
+    source = sources([location])[0]
+    problem, name = source.read(), parse_solver(solver)
+    _, options = name.build()
+    options = choose_linear_solver(problem, options, linear_solver if name.method == DEFAULT_METHOD else None)
+    with jax.enable_x64(name.dtype == "float64"):
+        dtype = jnp.dtype(name.dtype)
+        layout = jax.device_put(layout_for(problem, options))
+        state = jax.jit(lm.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
+        arguments = (layout, state, jnp.asarray(1e-4, dtype))
+        step = lambda la, s, d: lm.lm_step(la, s, d, options)
+        (full_s, step_s), (quick_s, slow_s) = (
+            measure(step, arguments, how, repeats) for how in (None, quick_options())
+        )
+    slower = 1e6 * (slow_s - step_s) / problem.num_observations
+    return (
+        f"{source.name[:28]:28s} {options.linear_solver:13s} {full_s:15.2f} {1e3 * step_s:8.1f} {quick_s:16.2f} "
+        f"{1e3 * slow_s:8.1f} {full_s - quick_s:8.2f} {slower:9.2f}"
+    )
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("problem", nargs="+")
+    parser.add_argument("--solver", default="learned")
+    parser.add_argument("--linear-solver", default="auto")
+    parser.add_argument("--repeats", type=int, default=15)
+    args = parser.parse_args()
+    host.keep_memory()
+    print(HEADING)
+    with host.calm_blas():
+        for location in args.problem:
+            print(row(location, args.solver, args.linear_solver, args.repeats), flush=True)
+            host.release_programs()
+
+
+if __name__ == "__main__":
+    main()
