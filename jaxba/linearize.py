@@ -13,6 +13,7 @@ from jaxba.barrier import materialized
 from jaxba.layout import Layout
 from jaxba.losses import Loss
 from jaxba.options import Intrinsics
+from jaxba.programs import traced_once
 from jaxba.sums import take, total
 
 
@@ -29,11 +30,13 @@ class Linearization(NamedTuple):
     front: Bool[Array, " slots"]  # whether the point lies in front of its camera
 
 
+@traced_once()
 def slot_frames(layout: Layout, cameras: Float[Array, "9 cameras"]) -> camera.Frames:
     """The camera of every slot; rotation matrices are made once per camera."""
     return camera.frames(cameras).at(layout.slot_camera)
 
 
+@traced_once()
 def residuals(
     layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"]
 ) -> tuple[camera.Projection, list[Array]]:
@@ -71,6 +74,7 @@ def cost(
     return total(slot_costs(loss, residuals(layout, slot_frames(layout, cameras), points)[1]))
 
 
+@traced_once("loss")
 def point_normal_equations(
     layout: Layout, frames: camera.Frames, projection: camera.Projection, residual: list[Array], loss: Loss
 ) -> list[Array]:
@@ -92,6 +96,7 @@ def normal_entries(by_point: list[list[Array]], residual: list[Array]) -> list[A
     return matrix + [first[i] * residual[0] + second[i] * residual[1] for i in range(3)]
 
 
+@traced_once("loss")
 def linearize(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Linearization:

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, TypeVar, cast, get_args
 
 import jax
 
+Function = TypeVar("Function", bound=Callable[..., Any])
 Result = TypeVar("Result")
 
 Compilation = Literal["full", "quick", "auto"]
@@ -65,3 +66,14 @@ def program(function: Callable[..., Result], *static: str, quick: bool = False) 
     """
     options: Any = quick_options() if quick else None
     return jax.jit(function, static_argnames=static, compiler_options=options)
+
+
+def traced_once(*static: str) -> Callable[[Function], Function]:
+    """Decorates what a program contains several times: traced once for arguments of equal types, and called.
+
+    XLA inlines the calls, so that the program is the same; half of the time to trace a step went into copies.
+
+    Args:
+        static: names of its static arguments.
+    """
+    return lambda function: cast(Function, jax.jit(function, static_argnames=static))
