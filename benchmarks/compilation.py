@@ -1,16 +1,24 @@
 """Seconds to compile a step and seconds that it takes, with all optimisation and quickly compiled.
 
     python -m benchmarks.compilation PROBLEM ... [--solver learned] [--linear-solver auto] [--repeats 15]
+    python -m benchmarks.compilation PROBLEM ... --whole
 
 PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The constants of
 `jaxba/programs.py` follow from the last two columns: `saved s` is what compiling quickly saves, `slower us` what an
-observation takes longer in an iteration. Both ways in turns, in one process, without a compilation cache.
+observation takes longer in an iteration. Both ways in turns, in one process, without a compilation cache. `--whole`
+takes the time of `jaxba-solve FILE` from start to end, with `--compilation auto` and `full` in turns.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
 import time
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -70,6 +78,30 @@ def row(location: str, solver: str, linear_solver: str, repeats: int) -> str:
     )
 
 
+WHOLE = (
+    f"{'problem':28s} {'auto: whole s':>13s} {'compile s':>9s} {'iter':>4s} {'full: whole s':>13s} {'compile s':>9s} "
+    f"{'iter':>4s} {'auto/full':>9s} {'ends differ':>11s}"
+)
+
+
+def whole(location: str) -> tuple[str, float]:
+    """One call of `jaxba-solve` each way, nothing cached, as a line of the table; and the ratio of their times."""
+    cells, costs, seconds = f"{Path(location).name[:28]:28s}", [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for way in ("auto", "full"):
+            log = Path(folder) / f"{way}.json"
+            command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", location]
+            command += ["--compilation", way, "--log", str(log)]
+            started = time.perf_counter()
+            subprocess.run(command, env={**os.environ, "JAXBA_CACHE": "off"}, check=True, capture_output=True)
+            seconds.append(time.perf_counter() - started)
+            record = json.loads(log.read_text())
+            costs.append(record["final_cost"])
+            cells += f" {seconds[-1]:13.2f} {record['compile_s']:9.2f} {record['iterations']:4d}"
+    ratio = seconds[0] / seconds[1]
+    return f"{cells} {ratio:9.2f} {abs(costs[0] / costs[1] - 1):11.1e}", ratio
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
@@ -77,7 +109,17 @@ def main() -> None:
     parser.add_argument("--solver", default="learned")
     parser.add_argument("--linear-solver", default="auto")
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--whole", action="store_true", help="whole calls of jaxba-solve")
     args = parser.parse_args()
+    if args.whole:
+        print(WHOLE)
+        ratios = []
+        for location in args.problem:
+            line, ratio = whole(location)
+            ratios.append(ratio)
+            print(line, flush=True)
+        print(f"geometric mean of auto/full {np.exp(np.mean(np.log(ratios))):.2f}")
+        return
     host.keep_memory()
     print(HEADING)
     with host.calm_blas():
