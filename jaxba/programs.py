@@ -1,7 +1,7 @@
 """How XLA compiles programs on a CPU: with all optimisation, or in a third of the time.
 
 Compiling takes longer than most solves. A program made without LLVM's optimisation, and without XLA's newer kernel
-emitters, whose kernels LLVM takes longest for, computes the same to rounding, but three to six times as slowly
+emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly
 (`python -m benchmarks.compilation`, docs/performance.md). So who has one problem to solve starts with it, and pays for
 the optimised program only where so many iterations come that it would have been cheaper from the start: as with skis
 that may be rented or bought, that is never much dearer than the better of the two.

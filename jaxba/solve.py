@@ -152,7 +152,7 @@ def solve(
             solver, which `auto` then means. Other solvers and larger problems are left as they are:
             `Solution.capacity` is None then. See padding.py.
         compilation: `full`: all optimisation, for many solves of a shape and for whoever takes the time of iterations.
-            `quick`: compiled in a third of the time, iterations take three to six times as long. `auto`: quick, and
+            `quick`: compiled in a third of the time, iterations take two to six times as long. `auto`: quick, and
             optimised after as many iterations as pay for it; the end of one small solve comes soonest. They differ by
             rounding. On a GPU all are `full`. See programs.py.
 

@@ -61,7 +61,7 @@ class Arguments:
     solvers are left as they are, and the summary says so."""
 
     compilation: Compilation = "auto"
-    """quick: compiled in a third of the time, but iterations take three to six times as long. full: all optimisation.
+    """quick: compiled in a third of the time, but iterations take two to six times as long. full: all optimisation.
     auto: quick, and optimised after as many iterations as pay for it; large problems at once. On a GPU always full."""
 
     retriangulate: bool = False
