@@ -1,12 +1,13 @@
-"""Seconds to compile a step and seconds that it takes, with all optimisation and quickly compiled.
+"""Seconds to compile the parts of a step and seconds that they take, with all optimisation and quickly compiled.
 
     python -m benchmarks.compilation PROBLEM ... [--solver learned] [--linear-solver auto] [--repeats 15]
     python -m benchmarks.compilation PROBLEM ... --whole
 
 PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The constants of
-`jaxba/programs.py` follow from the last two columns: `saved s` is what compiling quickly saves, `slower us` what an
-observation takes longer in an iteration. Both ways in turns, in one process, without a compilation cache. `--whole`
-takes the time of `jaxba-solve FILE` from start to end, with `--compilation auto` and `full` in turns.
+`jaxba/programs.py` follow from the last three columns: `saved s` is what compiling quickly saves, `slower us` what an
+observation takes longer in an iteration, `repaid` their quotient: observations times iterations, in millions. Both ways
+in turns, in one process, without a compilation cache, at the start with lambda 1e-4. `--whole` takes the time of
+`jaxba-solve FILE` from start to end, with `--compilation auto` and `full` in turns.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +39,8 @@ LONGEST = 10.0
 """Seconds of repeats of one program."""
 
 HEADING = (
-    f"{'problem':28s} {'linear solver':13s} {'full: compile s':>15s} {'step ms':>8s} {'quick: compile s':>16s} "
-    f"{'step ms':>8s} {'saved s':>8s} {'slower us':>9s}"
+    f"{'problem':28s} {'linear solver':13s} {'part':7s} {'full: compile s':>15s} {'run ms':>8s} "
+    f"{'quick: compile s':>16s} {'run ms':>8s} {'saved s':>8s} {'slower us':>9s} {'repaid':>7s}"
 )
 
 
@@ -56,8 +58,8 @@ def measure(step: Any, arguments: tuple[Any, ...], options: dict[str, Any] | Non
     return compile_s, float(np.median(times))
 
 
-def row(location: str, solver: str, linear_solver: str, repeats: int) -> str:
-    """Both ways for one problem, as a line of the table."""
+def rows(location: str, solver: str, linear_solver: str, repeats: int) -> Iterator[str]:
+    """Both ways for every part of a problem's step, as lines of the table."""
     source = sources([location])[0]
     problem, name = source.read(), parse_solver(solver)
     _, options = name.build()
@@ -66,16 +68,26 @@ def row(location: str, solver: str, linear_solver: str, repeats: int) -> str:
         dtype = jnp.dtype(name.dtype)
         layout = jax.device_put(layout_for(problem, options))
         state = jax.jit(lm.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
-        arguments = (layout, state, jnp.asarray(1e-4, dtype))
-        step = lambda la, s, d: lm.lm_step(la, s, d, options)
-        (full_s, step_s), (quick_s, slow_s) = (
-            measure(step, arguments, how, repeats) for how in (None, quick_options())
-        )
-    slower = 1e6 * (slow_s - step_s) / problem.num_observations
-    return (
-        f"{source.name[:28]:28s} {options.linear_solver:13s} {full_s:15.2f} {1e3 * step_s:8.1f} {quick_s:16.2f} "
-        f"{1e3 * slow_s:8.1f} {full_s - quick_s:8.2f} {slower:9.2f}"
-    )
+        given = (layout, state, jnp.asarray(1e-4, dtype))
+        parts: dict[str, tuple[Any, tuple[Any, ...]]] = {
+            "round": (lambda la, s, d: lm.lm_step(la, s, d, options), given)
+        }
+        if options.in_two:
+            propose = lambda la, s, d: lm.propose(la, s, d, options)
+            proposal = jax.jit(propose)(*given)
+            parts = {
+                "propose": (propose, given),
+                "judge": (lambda la, s, d, p: lm.judge(la, s, d, p, options), (*given, proposal)),
+            }
+        for part, (function, arguments) in parts.items():
+            (full_s, step_s), (quick_s, slow_s) = (
+                measure(function, arguments, how, repeats) for how in (None, quick_options())
+            )
+            saved, slower = full_s - quick_s, 1e6 * (slow_s - step_s) / problem.num_observations
+            yield (
+                f"{source.name[:28]:28s} {options.linear_solver:13s} {part:7s} {full_s:15.2f} {1e3 * step_s:8.1f} "
+                f"{quick_s:16.2f} {1e3 * slow_s:8.1f} {saved:8.2f} {slower:9.2f} {saved / slower:7.1f}"
+            )
 
 
 WHOLE = (
@@ -124,7 +136,8 @@ def main() -> None:
     print(HEADING)
     with host.calm_blas():
         for location in args.problem:
-            print(row(location, args.solver, args.linear_solver, args.repeats), flush=True)
+            for line in rows(location, args.solver, args.linear_solver, args.repeats):
+                print(line, flush=True)
             host.release_programs()
 
 

@@ -15,10 +15,12 @@ import numpy as np
 
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy
+from jaxba.loop import History
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.retriangulate import Retriangulation, retriangulate
-from jaxba.solve import MAX_ITERATIONS, History, IterationRecord, Solution, solve
+from jaxba.solve import MAX_ITERATIONS, Solution, solve
+from jaxba.stepwise import IterationRecord
 from jaxba.termination import Tolerances
 
 MAX_ROUNDS = 5

@@ -115,7 +115,7 @@ def decomposed_round(
         linear = linearize(layout, carry.cameras, carry.points, options.loss)
         step = _cluster_steps(parts, linear, carry.cameras, carry.dampings, options)
         before = parts.sums(linear.costs)
-        trial = best_trial(parts, carry.cameras, carry.points, before, linear, step, options, min_gain)
+        trial = best_trial(parts, carry.cameras, carry.points, before, linear.present, step, options, min_gain)
         good, whole = trial.accepted, step.predicted(jnp.ones_like(before))
         possible = jnp.isfinite(whole)
         sum_of = lambda values: jnp.sum(jnp.where(possible, values, 0))

@@ -17,6 +17,13 @@ from jaxba.programs import traced_once
 from jaxba.sums import take, total
 
 
+class Present(NamedTuple):
+    """What a candidate is compared with, slot by slot."""
+
+    costs: Array  # (slots,), pixels squared
+    front: Bool[Array, " slots"]  # whether the point lies in front of its camera
+
+
 class Linearization(NamedTuple):
     """Whitened, loss-weighted residuals and Jacobians; everything is zero in empty slots.
 
@@ -28,6 +35,11 @@ class Linearization(NamedTuple):
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
     costs: Array  # (slots,), pixels squared
     front: Bool[Array, " slots"]  # whether the point lies in front of its camera
+
+    @property
+    def present(self) -> Present:
+        """What there is to know without derivatives."""
+        return Present(self.costs, self.front)
 
 
 @traced_once()

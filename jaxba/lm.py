@@ -1,8 +1,8 @@
 """The Levenberg-Marquardt step: the one piece that solver, game and benchmark share.
 
-`lm_step` is pure. It compiles once per problem shape and `StepOptions`, runs under `vmap`, and never
-branches in Python on a value: a failed factorisation or an overflow is a candidate with a non-finite cost,
-and that is a rejected step.
+`lm_step` is pure: `propose`, a linear solve, and `judge`, the verdict on what it proposes (stepwise.py compiles them as
+two programs). It compiles once per problem shape and `StepOptions`, runs under `vmap`, and never branches in Python on
+a value: a failed factorisation or an overflow is a candidate with a non-finite cost, and that is a rejected step.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from jaxtyping import Bool, Float, Int
 from jaxba.decompose import Round, decomposed_round
 from jaxba.effort import Effort
 from jaxba.layout import Layout, partition_of
-from jaxba.linearize import cost, linearize, with_free_lenses
+from jaxba.linearize import Present, cost, linearize, with_free_lenses
 from jaxba.options import StepOptions
 from jaxba.parts import Whole
 from jaxba.problem import BundleProblem
-from jaxba.schur import solve_step
+from jaxba.schur import Step, solve_step
 from jaxba.trial import Trial, best_trial
 
 
@@ -50,6 +50,13 @@ class StepInfo(NamedTuple):
     share: Float[Array, ""]  # length of the candidate relative to the whole step, below 1 after further trials
     damping_share: Float[Array, ""]  # share of the step's curvature that is damping's, 0 (Gauss-Newton) to 1
     repairs: Int[Array, ""]  # camera rounds and further trials after the first candidate
+
+
+class Proposal(NamedTuple):
+    """What the linear model proposes, and what candidates are compared with."""
+
+    step: Step
+    present: Present
 
 
 def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
@@ -94,15 +101,42 @@ def lm_step(
     Raises:
         ValueError: the layout has lenses, and the solver is not the explicit one.
     """
+    if not options.in_two:
+        return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, turn)
+    proposal = propose(layout, state, damping, options, turn, effort)
+    return judge(layout, state, damping, proposal, options, min_gain, effort)
+
+
+def propose(
+    layout: Layout,
+    state: LMState,
+    damping: Float[Array, ""],
+    options: StepOptions,
+    turn: int | Int[Array, ""] = 0,
+    effort: Effort | None = None,
+) -> Proposal:
+    """The first part of `lm_step`: the linear model and its damped solution. Arguments are those of `lm_step`."""
+    _check_lenses(layout, options)
     damping = jnp.asarray(damping, state.cost.dtype)
-    if layout.lenses is not None and options.linear_solver != "explicit":
-        raise ValueError(f"shared or partly fixed lenses need the explicit solver, not {options.linear_solver}")
-    if options.linear_solver == "decomposed":
-        return _round(layout, state, damping, options, min_gain, turn)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = with_free_lenses(layout, linear, options.intrinsics)
     step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn, effort)
-    trial = best_trial(Whole(layout), *state, linear, step, options, min_gain, effort)
+    return Proposal(step, linear.present)
+
+
+def judge(
+    layout: Layout,
+    state: LMState,
+    damping: Float[Array, ""],
+    proposal: Proposal,
+    options: StepOptions,
+    min_gain: float | Float[Array, ""] = 0.0,
+    effort: Effort | None = None,
+) -> tuple[LMState, StepInfo]:
+    """The second part of `lm_step`: candidates along a step, and whether one is accepted."""
+    damping = jnp.asarray(damping, state.cost.dtype)
+    step = proposal.step
+    trial = best_trial(Whole(layout), *state, proposal.present, step, options, min_gain, effort)
     moved = [trial.share * step.cameras, trial.points - state.points]
     return _verdict(
         state,
@@ -118,6 +152,11 @@ def lm_step(
     )
 
 
+def _check_lenses(layout: Layout, options: StepOptions) -> None:
+    if layout.lenses is not None and options.linear_solver != "explicit":
+        raise ValueError(f"shared or partly fixed lenses need the explicit solver, not {options.linear_solver}")
+
+
 def _round(
     layout: Layout,
     state: LMState,
@@ -127,6 +166,7 @@ def _round(
     turn: int | Int[Array, ""],
 ) -> tuple[LMState, StepInfo]:
     """A round of domain decomposition in the place of a step: parts of it are accepted, each by itself."""
+    _check_lenses(layout, options)
     partition = partition_of(layout).at(turn)
     found = decomposed_round(layout, *state, damping, partition, options, min_gain)
     return _verdict(

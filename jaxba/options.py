@@ -140,6 +140,16 @@ class StepOptions:
         return self.linear_solver in ("sparse", "implicit", "normal")
 
     @property
+    def factors(self) -> bool:
+        """Whether linear systems are factored, not iterated upon."""
+        return self.linear_solver in ("explicit", "clustered", "decomposed")
+
+    @property
+    def in_two(self) -> bool:
+        """Whether a step is one linear solve and then the verdict on it, not a round of many."""
+        return self.linear_solver != "decomposed"
+
+    @property
     def leaves_rest(self) -> bool:
         """Whether a step leaves a residual of the linear system that is not orthogonal to it."""
         return self.linear_solver in ("clustered", "power")

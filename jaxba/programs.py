@@ -4,13 +4,18 @@ Compiling takes longer than most solves. A program made without LLVM's optimisat
 emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly
 (`python -m benchmarks.compilation`, docs/performance.md). So who has one problem to solve starts with it, and pays for
 the optimised program only where so many iterations come that it would have been cheaper from the start: as with skis
-that may be rented or bought, that is never much dearer than the better of the two.
+that may be rented or bought, that is never much dearer than the better of the two. The parts of a step are programs of
+their own, since they gain differently, and are compiled beside each other.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import os
+from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Literal, TypeVar, cast, get_args
 
 import jax
@@ -26,19 +31,24 @@ COMPILATIONS: tuple[str, ...] = get_args(Compilation)
 QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 """XLA's options for a quick compilation. Level 0 alone saves half as much and makes loops twice as slow."""
 
-REPAID = 2_000_000
-"""Observations times iterations after which the optimised program has paid for its compilation: it took 4 to 8 s longer
-to compile and 1.1e-6 to 4.4e-6 s less for an observation in an iteration, on nine problems, all on the same machine
-(`python -m benchmarks.compilation`)."""
+Part = Literal["factored", "iterated", "judge", "round"]
+"""What is compiled by itself: a linear solve by factorisation or by an iteration, the verdict on its step, or a round
+of domain decomposition."""
 
-FEWEST = 20
-"""Where the optimised program pays within so few iterations it is compiled at once, since many solves take as many:
-`learned` converges within 3 to 98 on the fifteen real problems, within fewer than 20 on eleven of them."""
+REPAID: dict[Part, int] = {"factored": 1_000_000, "iterated": 2_000_000, "judge": 15_000_000, "round": 2_000_000}
+"""Observations times runs after which the optimised program has paid for its compilation: it takes 1 to 5 s
+longer to compile, and what an iteration of the quick one takes longer is mostly in the linear solve
+(`python -m benchmarks.compilation`, docs/performance.md, on thirteen problems). A verdict counts once more for every
+camera round and further trial that it takes."""
+
+FEWEST = 10
+"""Where the optimised program pays within so few runs it is compiled at once, since many solves take as many:
+`learned` converges within 3 to 98 on the fifteen real problems, within 6 on most of them."""
 
 
-def quick_iterations(observations: int) -> int:
-    """How many iterations of a problem are computed by a quickly compiled program before the optimised one is made."""
-    count = REPAID // max(1, observations)
+def quick_runs(part: Part, observations: int) -> int:
+    """How often a quickly compiled program does a part for so many observations, before the optimised one is made."""
+    count = REPAID[part] // max(1, observations)
     return count if count >= FEWEST else 0
 
 
@@ -66,6 +76,50 @@ def program(function: Callable[..., Result], *static: str, quick: bool = False) 
     """
     options: Any = quick_options() if quick else None
     return jax.jit(function, static_argnames=static, compiler_options=options)
+
+
+class CompiledTogether:
+    """A context in which programs are compiled beside each other, and not run; calling them later compiles nothing.
+
+    XLA compiles one program on little more than one core. Who leaves the context compiles what is still waiting, in the
+    thread that will run it: the memory that this takes is then there for running (`host.keep_memory`).
+    """
+
+    def __enter__(self) -> CompiledTogether:
+        self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
+        self._waiting: deque[Any] = deque()
+        self._jobs: list[Future[None]] = []
+        return self
+
+    def __call__(self, function: Any, *arguments: Any) -> Any:
+        """Has a `program` compiled for such arguments.
+
+        Args:
+            function: what `program` returned.
+            arguments: arrays, or their shapes and types, and static arguments.
+
+        Returns:
+            Shapes and types of its results, to be arguments of the next.
+        """
+        traced = function.trace(*arguments)
+        self._waiting.append(traced.lower())
+        self._jobs.append(self._pool.submit(self._compile_next))
+        return traced.out_info
+
+    def _compile_next(self) -> None:
+        with contextlib.suppress(IndexError):  # another thread was faster
+            self._waiting.popleft().compile()
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            while self._waiting and kind is None:
+                self._compile_next()
+        finally:
+            self._waiting.clear()
+            self._pool.shutdown()
+        if kind is None:
+            for job in self._jobs:
+                job.result()
 
 
 def traced_once(*static: str) -> Callable[[Function], Function]:

@@ -29,7 +29,7 @@ from jaxba.lm import initial_state
 from jaxba.losses import Loss
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.programs import program, quick_iterations
+from jaxba.programs import program, quick_runs
 from jaxba.refine import refine_points
 from jaxba.solve import explain_start
 from jaxba.sums import point_sum
@@ -104,7 +104,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
-        search = program(_search, "loss", quick=quick_iterations(problem.num_observations) > 0)
+        search = program(_search, "loss", quick=quick_runs("judge", problem.num_observations) > 0)
         found = jax.device_get(search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss()))
         host.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):

@@ -1,64 +1,40 @@
 """The whole solve: iterate the step under a damping policy until it converges.
 
-Without a callback the loop is one compiled program. With one, the same iteration runs step by step
-from Python and every record carries the wall-clock time at which it was finished; so it does where a quickly
-compiled program may give way to an optimised one (programs.py).
+Without a callback the loop is one compiled program (loop.py). With one, or where compilation is in a hurry, the same
+iteration runs step by step from Python (stepwise.py).
 """
 
 from __future__ import annotations
 
 import functools
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
-from jaxtyping import Float, Int
 
 from jaxba import geometry, host
 from jaxba.choose import choose_linear_solver
 from jaxba.clock import CompileClock
-from jaxba.damping import DampingPolicy, Learned, ProblemInfo, effort_of, make_policy
+from jaxba.damping import DampingPolicy, Learned, make_policy
 from jaxba.layout import Layout, layout_for
-from jaxba.linearize import linearize, with_free_lenses
-from jaxba.lm import LMState, StepInfo, initial_state, lm_step
+from jaxba.lm import LMState, initial_state
+from jaxba.loop import Carry, History, solve_loop
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES, fitting_policy
 from jaxba.options import StepOptions
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
-from jaxba.problem import AnyArray, BundleProblem, ProblemError
-from jaxba.programs import Compilation, program, quick_iterations, quick_options
-from jaxba.schur import largest_diagonal
-from jaxba.sums import point_sum
-from jaxba.termination import Termination, Tolerances, termination_of
+from jaxba.problem import BundleProblem, ProblemError
+from jaxba.programs import Compilation, Part, program, quick_options, quick_runs
+from jaxba.stepwise import IterationRecord, run_stepwise
+from jaxba.termination import Termination, Tolerances
 
 MAX_ITERATIONS = 100
 """Iterations after which a solve has failed. Source: the paper."""
-
-
-class History(NamedTuple):
-    """One entry an iteration; NumPy arrays of equal length in a `Solution`."""
-
-    cost: AnyArray  # accepted cost after the iteration, pixels^2
-    candidate_cost: AnyArray  # cost of the proposed step
-    damping: AnyArray  # lambda that was used
-    gain_ratio: AnyArray
-    accepted: AnyArray
-    cg_iterations: AnyArray
-    gradient_max: AnyArray  # largest gradient entry before the step
-    step_norm: AnyArray
-
-
-class IterationRecord(NamedTuple):
-    """What a callback sees."""
-
-    iteration: int  # from 1
-    time_s: float  # seconds since the first iteration started, compilation excluded
-    step: StepInfo  # Python and NumPy scalars
 
 
 @dataclass(frozen=True)
@@ -102,20 +78,12 @@ class Solution:
     """Sizes to which the problem was padded; None where it was not."""
 
     quick_iterations: int = 0
-    """Iterations, of a solve the first ones, that a quickly compiled program computed; they are slower."""
+    """Iterations, a solve's first ones, that quickly compiled programs computed, at least in part; they are slower."""
 
     @property
     def converged(self) -> bool:
         """Whether a convergence test ended the solve."""
         return self.termination.converged
-
-
-class _Carry(NamedTuple):
-    state: Any  # LMState, or None where only the policy's part is wanted
-    policy: Any
-    damping: Float[Array, ""]
-    iteration: Int[Array, ""]
-    termination: Int[Array, ""]
 
 
 def solve(
@@ -196,11 +164,13 @@ def solve(
         setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))
-        quick = _quick_part(compilation, problem, max_iterations)
-        run = functools.partial(_run_stepwise, callback=callback or (lambda _: None), quick=quick)
-        if callback is None and not quick:
+        quick = _quick_parts(compilation, problem, options)
+        run = functools.partial(run_stepwise, callback=callback or (lambda _: None), quick=quick)
+        if callback is None and not any(quick.values()):
             run = _run_compiled
-        final, history, compile_s, total_s = run(layout, state, policy, tolerances, options, max_iterations)
+        final, history, quick_count, compile_s, total_s = run(
+            layout, state, policy, tolerances, options, max_iterations
+        )
         if clock.seconds + compile_s > 0:
             host.release_programs()  # many problems in one process would end it
         count = int(final.iteration)
@@ -218,7 +188,7 @@ def solve(
             compile_s=compile_s + clock.seconds,
             total_s=total_s,
             capacity=capacity,
-            quick_iterations=min(quick, count),
+            quick_iterations=quick_count,
         )
 
 
@@ -236,174 +206,31 @@ def explain_start(problem: BundleProblem) -> str:
     )
 
 
-def _quick_part(compilation: str, problem: BundleProblem, max_iterations: int) -> int:
-    """How many of the first iterations are a quickly compiled program's."""
+def _quick_parts(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, int]:
+    """How often a quickly compiled program is run before the optimised one is made, for each part of a step."""
+    parts: dict[str, Part] = {"round": "round"}
+    if options.in_two:
+        parts = {"propose": "factored" if options.factors else "iterated", "judge": "judge"}
     if compilation == "full" or quick_options() is None:
-        return 0
-    return max_iterations if compilation == "quick" else quick_iterations(problem.num_observations)
+        return dict.fromkeys(parts, 0)
+    if compilation == "quick":
+        return dict.fromkeys(parts, sys.maxsize)
+    return {name: quick_runs(part, problem.num_observations) for name, part in parts.items()}
 
 
-def _info(layout: Layout, state: LMState, options: StepOptions, max_iterations: int) -> ProblemInfo:
-    """What a policy may know before the first iteration."""
-    unit = jnp.ones_like(state.cost)
-    if options.scaling == "identity":
-        linear = linearize(layout, state.cameras, state.points, options.loss)
-        unit = largest_diagonal(layout, with_free_lenses(layout, linear, "free"))
-    count = lambda n: jnp.asarray(n, jnp.int32)
-    info = ProblemInfo(
-        cost=state.cost,
-        observations=count(jnp.sum(layout.slot_mask)),
-        cameras=count(jnp.sum(layout.camera_seen)),
-        points=count(jnp.sum(point_sum(layout, jnp.asarray(layout.slot_mask, state.cost.dtype)[None]) > 0)),
-        unit=unit,
-        focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
-        max_iterations=count(max_iterations),
-    )
-    return info
-
-
-def _begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> _Carry:
-    """Carry before the first iteration."""
-    policy_state, damping = policy.init(info)
-    count = lambda n: jnp.asarray(n, jnp.int32)
-    return _Carry(state, policy_state, damping, count(0), count(Termination.RUNNING))
-
-
-def after_step(
-    policy: DampingPolicy,
-    policy_state: Any,
-    step: StepInfo,
-    iteration: Int[Array, ""],
-    tolerances: Tolerances,
-    max_iterations: Any,
-) -> tuple[Any, Float[Array, ""], Int[Array, ""]]:
-    """The policy's answer to a step, and the stop rules: its next state, the next lambda, a `Termination`."""
-    after, damping = policy.propose(policy_state, step)
-    # the same state and lambda after a rejection: the policy would ask for the same step for ever
-    same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (policy_state, after)), strict=True)]
-    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping)
-    return after, damping, termination_of(step, stuck, iteration, tolerances, max_iterations)
-
-
-def _advance(
-    carry: _Carry, state: Any, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
-) -> _Carry:
-    """Everything of an iteration that follows the step.
-
-    The parameters are handed on and not looked at; None leaves them out.
-    """
-    iteration = carry.iteration + 1
-    policy_state, damping, end = after_step(policy, carry.policy, step, iteration, tolerances, max_iterations)
-    return _Carry(state, policy_state, damping, iteration, end)
-
-
-def _advance_and_tell(
-    carry: _Carry, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
-) -> tuple[_Carry, Float[Array, " facts"]]:
-    """`_advance` without the parameters, and for the host the step and the end, as one array: one transfer, not 15."""
-    after = _advance(carry, None, step, policy, tolerances, max_iterations)
-    return after, jnp.stack([x.astype(step.cost.dtype) for x in (*step, after.termination)])
-
-
-def _told(facts: Float[Array, " facts"], shapes: StepInfo) -> tuple[StepInfo, Termination]:
-    """The other end of `_advance_and_tell`: Python numbers of the types that `shapes` has."""
-    *values, end = np.asarray(facts).tolist()
-    kinds = {"b": bool, "i": int, "f": float}
-    return StepInfo(*(kinds[x.dtype.kind](v) for v, x in zip(values, shapes, strict=True))), Termination(int(end))
-
-
-def _history(step: StepInfo) -> History:
-    return History(
-        cost=step.cost,
-        candidate_cost=step.candidate_cost,
-        damping=step.damping,
-        gain_ratio=step.gain_ratio,
-        accepted=step.accepted,
-        cg_iterations=step.cg_iterations,
-        gradient_max=step.gradient_max,
-        step_norm=step.step_norm,
-    )
-
-
-@functools.partial(jax.jit, static_argnames=("options", "max_iterations"))
-def solve_loop(
+def _run_compiled(
     layout: Layout,
     state: LMState,
     policy: DampingPolicy,
     tolerances: Tolerances,
     options: StepOptions,
     max_iterations: int,
-) -> tuple[_Carry, History]:
-    """The loop as one program; vmappable over layouts and states of equal shape.
-
-    Returns:
-        Final carry, and histories of length `max_iterations`, zero past the last iteration.
-    """
-    carry = _begin(_info(layout, state, options, max_iterations), policy, state)
-
-    def step_of(c: _Carry) -> tuple[LMState, StepInfo]:
-        effort = effort_of(policy, c.policy)
-        return lm_step(layout, c.state, c.damping, options, policy.min_gain, c.iteration, effort)
-
-    shapes = jax.eval_shape(lambda c: _history(step_of(c)[1]), carry)
-    empty = jax.tree.map(lambda s: jnp.zeros((max_iterations, *s.shape), s.dtype), shapes)
-
-    def body(loop: tuple[_Carry, History]) -> tuple[_Carry, History]:
-        carry, history = loop
-        state, step = step_of(carry)
-        history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, _history(step))
-        return _advance(carry, state, step, policy, tolerances, max_iterations), history
-
-    return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))
-
-
-def _run_compiled(layout, state, policy, tolerances, options, max_iterations):
+) -> tuple[Carry, History, int, float, float]:
+    """The loop as one optimised program; returns what `run_stepwise` does."""
     started = time.perf_counter()
     with CompileClock() as clock:
         carry, history = jax.block_until_ready(solve_loop(layout, state, policy, tolerances, options, max_iterations))
-    return carry, history, clock.seconds, time.perf_counter() - started - clock.seconds
-
-
-def _run_stepwise(layout, state, policy, tolerances, options, max_iterations, *, callback, quick):
-    inform = program(_info, "options", "max_iterations", quick=True)
-    begin, advance = program(_begin, quick=True), program(_advance_and_tell, quick=True)
-    with CompileClock() as clock:
-        # without the parameters what is the policy's compiles once for all problems
-        carry = begin(inform(layout, state, options, max_iterations), policy, None)
-        carry = jax.block_until_ready(carry._replace(state=state))
-        min_gain = jnp.asarray(policy.min_gain, state.cost.dtype)
-        limit = jnp.asarray(max_iterations, jnp.int32)
-
-        def iterate(carry: _Carry, done: int) -> tuple[_Carry, StepInfo, Termination]:
-            effort = effort_of(policy, carry.policy)
-            take_step = program(lm_step, "options", quick=done < quick)
-            state, step = take_step(layout, carry.state, carry.damping, options, min_gain, carry.iteration, effort)
-            carry, facts = advance(carry._replace(state=None), step, policy, tolerances, limit)
-            return carry._replace(state=state), *_told(facts, step)
-
-        started, compiling = time.perf_counter(), 0.0
-        records = []
-        while True:
-            began, before = time.perf_counter(), clock.seconds
-            after, step, end = iterate(carry, len(records))
-            if clock.seconds > before:  # compiled just now
-                spent = time.perf_counter() - began
-                if len(records) < quick:  # who is in a hurry takes what the clock says
-                    compiling += min(spent, clock.seconds - before)
-                else:  # the iteration is pure, so do it again
-                    compiling += spent
-                    after, step, end = iterate(carry, len(records))
-            carry = after
-            records.append(step)
-            wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - compiling, step))
-            if end != Termination.RUNNING:
-                break
-            if wants_stop:
-                carry = carry._replace(termination=jnp.asarray(int(Termination.STOPPED), jnp.int32))
-                break
-        total_s = time.perf_counter() - started - compiling
-    history = jax.tree.map(lambda *values: np.array(values), *map(_history, records))
-    return carry, history, clock.seconds, total_s
+    return carry, history, 0, clock.seconds, time.perf_counter() - started - clock.seconds
 
 
 def _write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:

@@ -26,7 +26,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.effort import Effort
-from jaxba.linearize import Linearization
+from jaxba.linearize import Present
 from jaxba.options import StepOptions
 from jaxba.parts import Parts
 from jaxba.refine import Home
@@ -71,7 +71,7 @@ def best_trial(
     cameras: Float[Array, "9 cameras"],
     points: Float[Array, "3 points"],
     cost: Float[Array, "*parts"],
-    linear: Linearization,
+    present: Present,
     step: Step,
     options: StepOptions,
     min_gain: float | Float[Array, ""],
@@ -84,7 +84,7 @@ def best_trial(
         cameras: present cameras.
         points: present points.
         cost: their cost, pixels squared.
-        linear: what was known there; only its costs and what lay in front of its camera are used.
+        present: costs of the slots there, and what lay in front of its camera.
         step: the solution of the damped system; its slope and damped part are those of the parts.
         options: static.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
@@ -94,8 +94,8 @@ def best_trial(
     if effort is not None:
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     # costs are compared term by term: two sums would cancel in float32
-    before = parts.terms(linear.costs, options)
-    home = Home(points, linear.front)
+    before = parts.terms(present.costs, options)
+    home = Home(points, present.front)
     one, none = jnp.ones_like(cost), jnp.zeros(cost.shape, jnp.int32)
     matters = step.predicted(one) > NEGLIGIBLE * cost
 

@@ -20,7 +20,9 @@ from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 from jaxba.peers import require
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.solve import MAX_ITERATIONS, IterationRecord, Solution, Tolerances, solve
+from jaxba.solve import MAX_ITERATIONS, Solution, solve
+from jaxba.stepwise import IterationRecord
+from jaxba.termination import Tolerances
 
 RESULTS = "results.jsonl"
 """One line a run."""

@@ -144,7 +144,9 @@ def _solve(args: Arguments) -> int:
     from jaxba.losses import Loss
     from jaxba.naming import SolverName
     from jaxba.retriangulate import Retriangulation
-    from jaxba.solve import IterationRecord, Tolerances, solve
+    from jaxba.solve import solve
+    from jaxba.stepwise import IterationRecord
+    from jaxba.termination import Tolerances
 
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
     name = SolverName(args.damping, refine, args.dtype, args.method)

@@ -13,7 +13,8 @@ from jaxba.options import StepOptions
 from jaxba.padding import capacity_of
 from jaxba.problem import BundleProblem
 from jaxba.retriangulate import Retriangulation
-from jaxba.solve import IterationRecord, Solution
+from jaxba.solve import Solution
+from jaxba.stepwise import IterationRecord
 
 _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
 
@@ -84,7 +85,7 @@ def _how_compiled(solution: Solution) -> str:
     if not quick:
         return ""
     which = f"{quick} of them" if quick < solution.iterations else "all"
-    return f" ({which} by a quickly compiled program, see --compilation)"
+    return f" ({which} with quickly compiled programs, see --compilation)"
 
 
 def fits_bal(problem: BundleProblem) -> bool:

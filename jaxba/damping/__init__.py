@@ -1,7 +1,7 @@
 """Damping policies: who chooses lambda."""
 
 from jaxba.damping.learned import Learned, PolicyFileError, load_policy, save_policy
-from jaxba.damping.policy import DampingPolicy, ProblemInfo, effort_of
+from jaxba.damping.policy import DampingPolicy, ProblemInfo, decides_effort, effort_of
 from jaxba.damping.registry import LEARNED, LEARNED_PLAIN, POLICIES, UnknownPolicyError, is_learned, make_policy
 from jaxba.damping.rules import Ceres, Classic, Geometric, Schedule
 from jaxba.damping.safeguard import Safeguard
@@ -20,6 +20,7 @@ __all__ = [
     "Safeguard",
     "Schedule",
     "UnknownPolicyError",
+    "decides_effort",
     "effort_of",
     "is_learned",
     "load_policy",

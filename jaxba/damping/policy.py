@@ -46,7 +46,11 @@ class DampingPolicy(Protocol):
         ...
 
 
+def decides_effort(policy: DampingPolicy) -> bool:
+    """Whether the policy says what an iteration may cost; otherwise `StepOptions` do."""
+    return getattr(policy, "effort", None) is not None
+
+
 def effort_of(policy: DampingPolicy, state: Any) -> Effort | None:
     """What the iteration that follows may cost, if the policy decides that; None where `StepOptions` do."""
-    decide = getattr(policy, "effort", None)
-    return None if decide is None else decide(state)
+    return policy.effort(state) if decides_effort(policy) else None  # pyright: ignore[reportAttributeAccessIssue]

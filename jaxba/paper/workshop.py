@@ -29,7 +29,8 @@ from jaxba.paper.rows import NEAR, Row
 from jaxba.paper.schedule import LENGTH
 from jaxba.paper.store import Play, Store
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.solve import IterationRecord, solve
+from jaxba.solve import solve
+from jaxba.stepwise import IterationRecord
 
 LIMIT = profile.ITERATION_LIMIT
 

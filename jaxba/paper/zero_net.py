@@ -30,8 +30,7 @@ from jaxba.game.env import Episode, Game
 from jaxba.game.play import step_groups
 from jaxba.lm import StepInfo
 from jaxba.paper.config import ZeroNetConfig
-from jaxba.solve import Tolerances
-from jaxba.termination import converged_in_cost
+from jaxba.termination import Tolerances, converged_in_cost
 
 STEEPEST = 1.0
 """Largest slope of a cost's decimal logarithm in the action that a scene may contribute, so that one diverging step

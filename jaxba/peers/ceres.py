@@ -15,10 +15,12 @@ from jaxtyping import Bool
 
 from jaxba import geometry
 from jaxba.lm import StepInfo
+from jaxba.loop import History
 from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
 from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.solve import MAX_ITERATIONS, History, IterationRecord, Solution, explain_start
+from jaxba.solve import MAX_ITERATIONS, Solution, explain_start
+from jaxba.stepwise import IterationRecord
 from jaxba.termination import Termination, Tolerances
 
 _log = logging.getLogger(__name__)

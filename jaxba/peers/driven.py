@@ -19,11 +19,12 @@ from jaxba import host
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm import StepInfo
+from jaxba.loop import after_step
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import Observed, observed, step_facts
 from jaxba.problem import BundleProblem
-from jaxba.solve import MAX_ITERATIONS, Solution, after_step
+from jaxba.solve import MAX_ITERATIONS, Solution
 from jaxba.termination import Termination, Tolerances
 
 LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300

@@ -1,0 +1,143 @@
+"""The loop of a solve: what an iteration does after its step, and all iterations as one compiled program."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Float, Int
+
+from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
+from jaxba.layout import Layout
+from jaxba.linearize import linearize, with_free_lenses
+from jaxba.lm import LMState, StepInfo, lm_step
+from jaxba.options import StepOptions
+from jaxba.problem import AnyArray
+from jaxba.schur import largest_diagonal
+from jaxba.sums import point_sum
+from jaxba.termination import Termination, Tolerances, termination_of
+
+
+class History(NamedTuple):
+    """One entry an iteration; NumPy arrays of equal length in a `Solution`."""
+
+    cost: AnyArray  # accepted cost after the iteration, pixels^2
+    candidate_cost: AnyArray  # cost of the proposed step
+    damping: AnyArray  # lambda that was used
+    gain_ratio: AnyArray
+    accepted: AnyArray
+    cg_iterations: AnyArray
+    gradient_max: AnyArray  # largest gradient entry before the step
+    step_norm: AnyArray
+
+
+class Carry(NamedTuple):
+    """What goes from one iteration to the next."""
+
+    state: Any  # LMState, or None where only the policy's part is wanted
+    policy: Any
+    damping: Float[Array, ""]
+    iteration: Int[Array, ""]
+    termination: Int[Array, ""]
+
+
+def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: int) -> ProblemInfo:
+    """What a policy may know before the first iteration."""
+    unit = jnp.ones_like(state.cost)
+    if options.scaling == "identity":
+        linear = linearize(layout, state.cameras, state.points, options.loss)
+        unit = largest_diagonal(layout, with_free_lenses(layout, linear, "free"))
+    count = lambda n: jnp.asarray(n, jnp.int32)
+    info = ProblemInfo(
+        cost=state.cost,
+        observations=count(jnp.sum(layout.slot_mask)),
+        cameras=count(jnp.sum(layout.camera_seen)),
+        points=count(jnp.sum(point_sum(layout, jnp.asarray(layout.slot_mask, state.cost.dtype)[None]) > 0)),
+        unit=unit,
+        focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
+        max_iterations=count(max_iterations),
+    )
+    return info
+
+
+def begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> Carry:
+    """Carry before the first iteration."""
+    policy_state, damping = policy.init(info)
+    count = lambda n: jnp.asarray(n, jnp.int32)
+    return Carry(state, policy_state, damping, count(0), count(Termination.RUNNING))
+
+
+def after_step(
+    policy: DampingPolicy,
+    policy_state: Any,
+    step: StepInfo,
+    iteration: Int[Array, ""],
+    tolerances: Tolerances,
+    max_iterations: Any,
+) -> tuple[Any, Float[Array, ""], Int[Array, ""]]:
+    """The policy's answer to a step, and the stop rules: its next state, the next lambda, a `Termination`."""
+    after, damping = policy.propose(policy_state, step)
+    # the same state and lambda after a rejection: the policy would ask for the same step for ever
+    same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (policy_state, after)), strict=True)]
+    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping)
+    return after, damping, termination_of(step, stuck, iteration, tolerances, max_iterations)
+
+
+def advance(
+    carry: Carry, state: Any, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
+) -> Carry:
+    """Everything of an iteration that follows the step.
+
+    The parameters are handed on and not looked at; None leaves them out.
+    """
+    iteration = carry.iteration + 1
+    policy_state, damping, end = after_step(policy, carry.policy, step, iteration, tolerances, max_iterations)
+    return Carry(state, policy_state, damping, iteration, end)
+
+
+def history_of(step: StepInfo) -> History:
+    return History(
+        cost=step.cost,
+        candidate_cost=step.candidate_cost,
+        damping=step.damping,
+        gain_ratio=step.gain_ratio,
+        accepted=step.accepted,
+        cg_iterations=step.cg_iterations,
+        gradient_max=step.gradient_max,
+        step_norm=step.step_norm,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("options", "max_iterations"))
+def solve_loop(
+    layout: Layout,
+    state: LMState,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    options: StepOptions,
+    max_iterations: int,
+) -> tuple[Carry, History]:
+    """The loop as one program; vmappable over layouts and states of equal shape.
+
+    Returns:
+        Final carry, and histories of length `max_iterations`, zero past the last iteration.
+    """
+    carry = begin(problem_info(layout, state, options, max_iterations), policy, state)
+
+    def step_of(c: Carry) -> tuple[LMState, StepInfo]:
+        effort = effort_of(policy, c.policy)
+        return lm_step(layout, c.state, c.damping, options, policy.min_gain, c.iteration, effort)
+
+    shapes = jax.eval_shape(lambda c: history_of(step_of(c)[1]), carry)
+    empty = jax.tree.map(lambda s: jnp.zeros((max_iterations, *s.shape), s.dtype), shapes)
+
+    def body(loop: tuple[Carry, History]) -> tuple[Carry, History]:
+        carry, history = loop
+        state, step = step_of(carry)
+        history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, history_of(step))
+        return advance(carry, state, step, policy, tolerances, max_iterations), history
+
+    return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))
