@@ -35,21 +35,28 @@ Part = Literal["factored", "iterated", "judge", "round"]
 """What is compiled by itself: a linear solve by factorisation or by an iteration, the verdict on its step, or a round
 of domain decomposition."""
 
-REPAID: dict[Part, int] = {"factored": 1_000_000, "iterated": 2_000_000, "judge": 15_000_000, "round": 2_000_000}
+REPAID: dict[Part, int] = {"factored": 1_000_000, "iterated": 2_000_000, "judge": 12_000_000, "round": 2_000_000}
 """Observations times runs after which the optimised program has paid for its compilation: it takes 1 to 5 s
 longer to compile, and what an iteration of the quick one takes longer is mostly in the linear solve
-(`python -m benchmarks.compilation`, docs/performance.md, on thirteen problems). A verdict counts once more for every
-camera round and further trial that it takes."""
+(`python -m benchmarks.compilation`, docs/performance.md, on thirteen problems)."""
 
-FEWEST = 10
-"""Where the optimised program pays within so few runs it is compiled at once, since many solves take as many:
-`learned` converges within 3 to 98 on the fifteen real problems, within 6 on most of them."""
+REPAIR = 2
+"""How often a verdict counts for each camera round or further trial that it takes: a quick one takes 0.6 us longer
+for an observation, the verdict without any 0.1 to 0.5 (on the two sequences of KITTI)."""
+
+FEWEST: dict[Part, int] = {"factored": 10, "iterated": 10, "judge": 150, "round": 10}
+"""Where the optimised program pays within so few runs, the quick one gets no more than these:"""
+
+AT_STAKE: dict[Part, int] = {"factored": 0, "iterated": 0, "judge": 12, "round": 0}
+"""Runs of the quick program of a large problem, where much is at stake. Of the fifteen real problems nine converge in 3
+to 9 iterations with 0 to 2 repairs, the others take 15 to 98 iterations with one to three repairs each, soon after the
+start: 12 runs tell them apart."""
 
 
 def quick_runs(part: Part, observations: int) -> int:
     """How often a quickly compiled program does a part for so many observations, before the optimised one is made."""
     count = REPAID[part] // max(1, observations)
-    return count if count >= FEWEST else 0
+    return count if count >= FEWEST[part] else AT_STAKE[part]
 
 
 @functools.cache

