@@ -10,7 +10,6 @@ their own, since they gain differently, and are compiled beside each other.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import os
 from collections import deque
@@ -114,8 +113,11 @@ class CompiledTogether:
         return traced.out_info
 
     def _compile_next(self) -> None:
-        with contextlib.suppress(IndexError):  # another thread was faster
-            self._waiting.popleft().compile()
+        try:
+            lowered = self._waiting.popleft()
+        except IndexError:  # another thread was faster
+            return
+        lowered.compile()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:

@@ -44,6 +44,9 @@ UNDISTORTIONS = 10
 POINT_ITERATIONS = 6
 """Steps of a point from each place, twice what the learned policy has in an iteration. Chosen once, not fitted."""
 
+VERDICTS = (1 + len(PLACES)) * POINT_ITERATIONS // 3
+"""Verdicts on a step, of three point iterations each, that take as long as a search."""
+
 LEAST_GAIN = 1e-3
 """Share of its own cost that a point must gain to be moved: less is the same minimum. Chosen once, not fitted ..."""
 
@@ -104,7 +107,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
-        search = program(_search, "loss", quick=quick_runs("judge", problem.num_observations) > 0)
+        search = program(_search, "loss", quick=quick_runs("judge", problem.num_observations) > VERDICTS)
         found = jax.device_get(search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss()))
         host.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):
