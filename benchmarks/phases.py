@@ -23,7 +23,7 @@ from jaxba.bench.sources import sources
 from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.dense import factor_and_solve
 from jaxba.layout import Layout, layout_for
-from jaxba.linearize import cost, linearize, slot_frames
+from jaxba.linearize import cost, linearize
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.refine import refine_points
@@ -114,7 +114,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
         product = lambda li, po, sy, x: eliminate.apply_reduced(layout, li, po, sy, x)
         yield phase("one product", product, linear, points, system, system.right)
     frames = camera.frames(state.cameras)
-    anchor = Anchor(frames.rotation, frames.translation, state.points)
+    anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), state.points)
     if plain.uses_clusters:
         coarse = lambda li, po, sy, x: coarse_preconditioner(layout, li, po, sy, anchor)(x)
         yield phase("coarse system", coarse, linear, points, system, system.right)
@@ -125,7 +125,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     yield phase("cost", lambda s: cost(layout, s.cameras, s.points, plain.loss), state)
     count = options.refine_points
     if count:
-        refine = lambda s: refine_points(layout, slot_frames(layout, s.cameras), s.points, plain.loss, count)
+        refine = lambda s: refine_points(layout, camera.frames(s.cameras), s.points, plain.loss, count)
         yield phase(f"refine {count}", refine, state)
     yield phase("whole step", lambda la, s: lm.lm_step(la, s, damping, plain), layout, state)
     if count:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxba.barrier import materialized
 from jaxba.problem import AnyArray
@@ -26,31 +26,48 @@ SMALL_ANGLE_SQUARED = 1e-6
 class Frames(NamedTuple):
     """What an observation needs to know of its camera."""
 
-    rotation: Float[Array, "3 3 cameras"]  # R, world to camera
-    translation: Float[Array, "3 cameras"]  # t, scene units
-    focal: Float[Array, " cameras"]  # pixels
-    k1: Float[Array, " cameras"]
-    k2: Float[Array, " cameras"]
+    rotation: Float[Array, "3 3 ..."] | list[list[Array]]  # R, world to camera
+    translation: Float[Array, "3 ..."] | list[Array]  # t, scene units
+    focal: Float[Array, "..."]  # pixels
+    k1: Float[Array, "..."]
+    k2: Float[Array, "..."]
 
-    def at(self, index: AnyArray) -> Frames:
-        """The frames of the cameras in `index`, one column an entry."""
-        rows = [*self.rotation.reshape(9, -1), *self.translation, self.focal, self.k1, self.k2]
-        # one gather a component, from a table that exists: see `materialized`
-        table = materialized(jnp.stack(rows))
-        at = [row.at[index].get(mode="promise_in_bounds") for row in table]
-        rotation = jnp.stack([jnp.stack(at[k : k + 3]) for k in (0, 3, 6)])
-        return Frames(rotation, jnp.stack(at[9:12]), *at[12:])
+    def stored(self) -> Frames:
+        """The same, made once for all that read it; of arrays."""
+        rotation, translation = jnp.asarray(self.rotation), jnp.asarray(self.translation)
+        table = materialized(jnp.stack([*rotation.reshape(9, -1), *translation, self.focal, self.k1, self.k2]))
+        return Frames(table[:9].reshape(rotation.shape), table[9:12], *table[12:])
+
+    def at(self, index: Int[AnyArray, "..."]) -> Frames:
+        """The frames of the cameras in `index`, in lists: vectors that are not stored but looked up by who reads them.
+
+        To be called on what is `stored`, lest a camera's sine be taken once an observation.
+        """
+        look = lambda row: row.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        rotation = [[look(entry) for entry in row] for row in self.rotation]
+        return Frames(rotation, [look(row) for row in self.translation], *map(look, self[2:]))
+
+    def stacked(self) -> Frames:
+        """Lists made arrays, which are stored."""
+        rotation = jnp.stack([jnp.stack(list(row)) for row in self.rotation])
+        return self._replace(rotation=rotation, translation=jnp.stack(list(self.translation)))
 
 
 class Projection(NamedTuple):
-    """A projected point with the intermediate values that derivatives share."""
+    """A projected point with the intermediate values that derivatives share, vectors in lists or arrays of them."""
 
-    pixel: Float[Array, "2 n"]  # f d p
-    direction: Float[Array, "2 n"]  # p = -P.xy / P.z
-    inverse_depth: Float[Array, " n"]  # 1 / P.z; zero where masked
-    radius: Float[Array, " n"]  # |p|^2
-    distortion: Float[Array, " n"]  # d = 1 + k1 |p|^2 + k2 |p|^4
-    rotated: Float[Array, "3 n"]  # R X
+    pixel: Float[Array, "2 ..."] | list[Array]  # f d p
+    direction: Float[Array, "2 ..."] | list[Array]  # p = -P.xy / P.z
+    inverse_depth: Float[Array, "..."]  # 1 / P.z; zero where masked
+    radius: Float[Array, "..."]  # |p|^2
+    distortion: Float[Array, "..."]  # d = 1 + k1 |p|^2 + k2 |p|^4
+    rotated: Float[Array, "3 ..."] | list[Array]  # R X
+
+    def stacked(self) -> Projection:
+        """Lists made arrays, which are stored."""
+        stack = lambda rows: jnp.stack(list(rows))
+        pixel, direction, rotated = stack(self.pixel), stack(self.direction), stack(self.rotated)
+        return self._replace(pixel=pixel, direction=direction, rotated=rotated)
 
 
 def _coefficients(squared: Array) -> tuple[Array, Array, Array]:
@@ -134,7 +151,9 @@ def frames(cameras: Float[Array, "9 cameras"]) -> Frames:
     return Frames(rotation_matrix(cameras[:3]), cameras[3:6], cameras[6], cameras[7], cameras[8])
 
 
-def project(frame: Frames, points: Float[Array, "3 n"], mask: Bool[AnyArray, " n"] | None = None) -> Projection:
+def project(
+    frame: Frames, points: Float[Array, "3 ..."] | list[Array], mask: Bool[AnyArray, "..."] | None = None
+) -> Projection:
     """Projects one point through one camera per column.
 
     Args:
@@ -143,11 +162,11 @@ def project(frame: Frames, points: Float[Array, "3 n"], mask: Bool[AnyArray, " n
         mask: where false, the projection and everything derived from it is exactly zero.
 
     Returns:
-        Pixels (BAL axes) and shared terms. A point on the camera plane gives non-finite pixels; a point
+        Pixels (BAL axes) and shared terms, in lists. A point on the camera plane gives non-finite pixels; a point
         behind the camera is projected like any other, as BAL does.
     """
     rotation = frame.rotation
-    rotated = [rotation[k, 0] * points[0] + rotation[k, 1] * points[1] + rotation[k, 2] * points[2] for k in range(3)]
+    rotated = [row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in rotation]
     x, y, z = (rotated[k] + frame.translation[k] for k in range(3))
     inverse = 1 / z
     if mask is not None:
@@ -156,9 +175,7 @@ def project(frame: Frames, points: Float[Array, "3 n"], mask: Bool[AnyArray, " n
     radius = u * u + v * v
     distortion = 1 + radius * (frame.k1 + frame.k2 * radius)
     scale = frame.focal * distortion
-    return Projection(
-        jnp.stack([scale * u, scale * v]), jnp.stack([u, v]), inverse, radius, distortion, jnp.stack(rotated)
-    )
+    return Projection([scale * u, scale * v], [u, v], inverse, radius, distortion, rotated)
 
 
 class Derivatives(NamedTuple):
@@ -192,5 +209,5 @@ def derivatives(frame: Frames, projection: Projection) -> Derivatives:
         turn = [qy * c - qz * b, qz * a - qx * c, qx * b - qy * a]
         lens = [distortion * direction, frame.focal * radius * direction, frame.focal * radius * radius * direction]
         camera.append([*turn, *row, *lens])
-        point.append([a * rotation[0, k] + b * rotation[1, k] + c * rotation[2, k] for k in range(3)])
+        point.append([a * rotation[0][k] + b * rotation[1][k] + c * rotation[2][k] for k in range(3)])
     return Derivatives(camera, point)

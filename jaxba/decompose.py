@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
+from jaxba import camera
 from jaxba.blocks3 import cholesky3
 from jaxba.eliminate import (
     Coordinates,
@@ -33,11 +34,9 @@ from jaxba.eliminate import (
 from jaxba.layout import Layout
 from jaxba.linearize import (
     Linearization,
-    in_front,
     linearize,
-    point_normal_equations,
+    point_terms,
     residuals,
-    slot_costs,
     slot_frames,
 )
 from jaxba.normal import image
@@ -47,8 +46,9 @@ from jaxba.parts import Clusters
 from jaxba.refine import Home, refine_points
 from jaxba.schur import Step
 from jaxba.split import solve_clusters
-from jaxba.sums import point_sum, take, total
+from jaxba.sums import take, total
 from jaxba.trial import NEGLIGIBLE, best_trial
+from jaxba.views import point_passes
 
 LOCAL_FACTOR = 4.0
 """Factor on a cluster's own lambda after its step failed."""
@@ -195,22 +195,22 @@ def _separators(
     layout: Layout, cameras: Array, points: Array, damping: Array, partition: Partition, options: StepOptions
 ) -> tuple[Float[Array, "3 points"], Float[Array, ""]]:
     """Every separator after its embedded iterations, or a damped step where there are none; the cost after that."""
-    frames = slot_frames(layout, cameras)
-    projection, residual = residuals(layout, frames, points)
+    frames, fused = camera.frames(cameras), options.fused_passes
+    one_pass = point_passes(layout, frames, fused=fused)
+    terms = lambda views: point_terms(views, options.loss)[:10]
+    *entries, before = one_pass(points, terms)
     if options.refine_points:
-        home = Home(points, in_front(projection))
-        refined, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home)
-        before = point_sum(layout, slot_costs(options.loss, residual)[None])[0]
+        there = residuals(layout, slot_frames(layout, cameras), points)[0]
+        home = Home.of(layout, points, there.inverse_depth)
+        refined, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home, fused=fused)
         costs = jnp.where(partition.separator, costs, before)
         return jnp.where(partition.separator, refined, points), total(costs)
-    entries = point_normal_equations(layout, frames, projection, residual, options.loss)
-    sums = point_sum(layout, jnp.stack([*entries, slot_costs(options.loss, residual)]))
-    matrix = [sums[k] for k in range(6)]
+    matrix = entries[:6]
     for place in (0, 2, 5):
         matrix[place] = matrix[place] + damping_diagonal(matrix[place], damping, options)
     factor = cholesky3(matrix)
-    step = jnp.stack(factor.backward(factor.forward([sums[k] for k in range(6, 9)])))
+    step = jnp.stack(factor.backward(factor.forward(entries[6:])))
     trial = points - jnp.where(partition.separator, step, 0)
-    costs = point_sum(layout, slot_costs(options.loss, residuals(layout, frames, trial)[1])[None])[0]
-    better = costs < sums[9]
-    return jnp.where(better, trial, points), total(jnp.where(better, costs, sums[9]))
+    costs = one_pass(trial, terms)[9]
+    better = costs < before
+    return jnp.where(better, trial, points), total(jnp.where(better, costs, before))

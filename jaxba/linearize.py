@@ -9,19 +9,19 @@ from jax import Array, lax
 from jaxtyping import Bool, Float
 
 from jaxba import camera
-from jaxba.barrier import materialized
 from jaxba.layout import Layout
 from jaxba.losses import Loss
 from jaxba.options import Intrinsics
 from jaxba.programs import traced_once
 from jaxba.sums import take, total
+from jaxba.views import Views, all_views
 
 
 class Present(NamedTuple):
     """What a candidate is compared with, slot by slot."""
 
     costs: Array  # (slots,), pixels squared
-    front: Bool[Array, " slots"]  # whether the point lies in front of its camera
+    inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
 
 
 class Linearization(NamedTuple):
@@ -34,18 +34,18 @@ class Linearization(NamedTuple):
     camera_jacobian: list[list[Array]]  # [2][9] of (slots,)
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
     costs: Array  # (slots,), pixels squared
-    front: Bool[Array, " slots"]  # whether the point lies in front of its camera
+    inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
 
     @property
     def present(self) -> Present:
         """What there is to know without derivatives."""
-        return Present(self.costs, self.front)
+        return Present(self.costs, self.inverse_depth)
 
 
 @traced_once()
 def slot_frames(layout: Layout, cameras: Float[Array, "9 cameras"]) -> camera.Frames:
-    """The camera of every slot; rotation matrices are made once per camera."""
-    return camera.frames(cameras).at(layout.slot_camera)
+    """The camera of every slot, stored; rotation matrices are made once per camera."""
+    return camera.frames(cameras).stored().at(layout.slot_camera).stacked()
 
 
 @traced_once()
@@ -55,25 +55,25 @@ def residuals(
     """Projects every slot through its frame (`slot_frames`).
 
     Returns:
-        The projection and the whitened residual `Sigma^(-1/2) (predicted - observed)`, pixels, as two
-        vectors over slots; zero in empty slots.
+        The projection, stored, and the whitened residual, pixels, as two vectors over slots; zero in empty slots.
     """
-    projection = camera.project(frames, take(points, layout.slot_point), layout.slot_mask)
-    difference = projection.pixel - layout.pixels.astype(projection.pixel.dtype)
-    return projection, _whiten(layout, [difference[0], difference[1]])
+    views = all_views(layout, frames, points)
+    projection = views.projected()
+    return projection, view_residuals(views, projection)
 
 
-def in_front(projection: camera.Projection) -> Bool[Array, " slots"]:
-    """Whether the point of a slot lies in front of its camera, which looks down -z; false in empty slots."""
-    return projection.inverse_depth < 0
+def view_residuals(views: Views, projection: camera.Projection) -> list[Array]:
+    """The whitened residual `Sigma^(-1/2) (predicted - observed)`, pixels; zero where there is no observation."""
+    measured = [row.astype(projection.radius.dtype) for row in views.pixels]
+    return _whiten(views, [predicted - pixel for predicted, pixel in zip(projection.pixel, measured, strict=True)])
 
 
-def behind(projection: camera.Projection) -> Bool[Array, " slots"]:
-    """Whether it lies behind; false in empty slots."""
+def behind(projection: camera.Projection) -> Bool[Array, "*slots"]:
+    """Whether the point lies behind its camera, which looks down -z; false in empty slots."""
     return projection.inverse_depth > 0
 
 
-def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, " slots"]:
+def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, "*slots"]:
     """`rho(|r|^2) / 2` of every slot, pixels squared."""
     squared = residual[0] * residual[0] + residual[1] * residual[1]
     return 0.5 * (squared if loss.trivial else loss(squared)[0])
@@ -86,19 +86,19 @@ def cost(
     return total(slot_costs(loss, residuals(layout, slot_frames(layout, cameras), points)[1]))
 
 
-@traced_once("loss")
-def point_normal_equations(
-    layout: Layout, frames: camera.Frames, projection: camera.Projection, residual: list[Array], loss: Loss
-) -> list[Array]:
-    """Per slot: the six lower entries of `J_p^T J_p` (row by row), then the three of `J_p^T r`."""
-    by_point = _whiten_columns(layout, camera.derivatives(frames, projection).point)
-    rows = list(materialized(jnp.stack([*by_point[0], *by_point[1], *residual])))
-    by_point, residual = [rows[:3], rows[3:6]], rows[6:]
-    entries = normal_entries(by_point, residual)
-    if loss.trivial:
-        return entries
-    slope = loss(residual[0] * residual[0] + residual[1] * residual[1])[1]
-    return [slope * entry for entry in entries]
+def point_terms(views: Views, loss: Loss) -> list[Array]:
+    """Of every observation the six lower entries of `J_p^T J_p` (row by row), the three of `J_p^T r`, its cost (pixels
+    squared), and the inverse depth."""
+    projection = views.projected()
+    residual = view_residuals(views, projection)
+    by_point = _whiten_columns(views, camera.derivatives(views.frames, projection).point)
+    rows = views.kept([*by_point[0], *by_point[1], *residual])
+    residual = rows[6:]
+    entries = normal_entries([rows[:3], rows[3:6]], residual)
+    if not loss.trivial:
+        slope = loss(residual[0] * residual[0] + residual[1] * residual[1])[1]
+        entries = [slope * entry for entry in entries]
+    return [*entries, slot_costs(loss, residual), projection.inverse_depth]
 
 
 def normal_entries(by_point: list[list[Array]], residual: list[Array]) -> list[Array]:
@@ -127,7 +127,7 @@ def linearize(
         residual = [root * r for r in residual]
         by_camera = [[root * column for column in row] for row in by_camera]
         by_point = [[root * column for column in row] for row in by_point]
-    return Linearization(residual, by_camera, by_point, costs, in_front(projection))
+    return Linearization(residual, by_camera, by_point, costs, projection.inverse_depth)
 
 
 def with_free_lenses(
@@ -153,13 +153,13 @@ def with_free_lenses(
     return linear._replace(camera_jacobian=[[*row[:6], *kept(row)] for row in linear.camera_jacobian])
 
 
-def _whiten(layout: Layout, pair: list[Array]) -> list[Array]:
-    if layout.whitening is None:
+def _whiten(slots: Layout | Views, pair: list[Array]) -> list[Array]:
+    if slots.whitening is None:
         return pair
-    factor = layout.whitening.astype(pair[0].dtype)
+    factor = slots.whitening.astype(pair[0].dtype)
     return [factor[k, 0] * pair[0] + factor[k, 1] * pair[1] for k in range(2)]
 
 
-def _whiten_columns(layout: Layout, rows: list[list[Array]]) -> list[list[Array]]:
-    columns = [_whiten(layout, [first, second]) for first, second in zip(*rows, strict=True)]
+def _whiten_columns(slots: Layout | Views, rows: list[list[Array]]) -> list[list[Array]]:
+    columns = [_whiten(slots, [first, second]) for first, second in zip(*rows, strict=True)]
     return [list(row) for row in zip(*columns, strict=True)]

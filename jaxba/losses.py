@@ -76,7 +76,7 @@ class Loss:
         """Whether the weight is one everywhere."""
         return self.name == "squared"
 
-    def __call__(self, squared: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    def __call__(self, squared: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """`rho(s)` and `rho'(s)` at squared residual norms, pixels squared."""
         area = self.scale * self.scale
         value, slope = _SHAPES[self.name](squared / area)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxba.camera import frames
 from jaxba.layout import Layout
 from jaxba.linearize import residuals, slot_costs, slot_frames
 from jaxba.options import StepOptions
@@ -75,10 +76,9 @@ class Whole(NamedTuple):
         iterations: int | Int[Array, ""],
     ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
         """See `Parts`."""
-        frames = slot_frames(self.layout, cameras)
         if options.refine_points:
-            return refine_points(self.layout, frames, points, options.loss, iterations, home)
-        return points, slot_costs(options.loss, residuals(self.layout, frames, points)[1])
+            return _refined(self.layout, cameras, points, home, options, iterations)
+        return points, _costs(self.layout, cameras, points, options)
 
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
         """See `Parts`."""
@@ -122,11 +122,10 @@ class Clusters(NamedTuple):
         iterations: int | Int[Array, ""],
     ) -> tuple[Float[Array, "3 points"], Float[Array, " slots"]]:
         """See `Parts`."""
-        frames = slot_frames(self.layout, cameras)
         if options.refine_points:
-            points = refine_points(self.layout, frames, points, options.loss, iterations, home)[0]
+            points, _ = _refined(self.layout, cameras, points, home, options, iterations)
             points = jnp.where(self.partition.separator, home.points, points)
-        return points, slot_costs(options.loss, residuals(self.layout, frames, points)[1])
+        return points, _costs(self.layout, cameras, points, options)
 
     def sums(self, terms: Float[Array, " slots"]) -> Float[Array, " clusters"]:
         """See `Parts`."""
@@ -143,3 +142,14 @@ class Clusters(NamedTuple):
     def of_points(self, values: Array) -> Array:
         """See `Parts`."""
         return take(values, self.owner)
+
+
+def _refined(
+    layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, iterations: int | Int[Array, ""]
+) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
+    fused = options.fused_passes
+    return refine_points(layout, frames(cameras), points, options.loss, iterations, home, fused=fused)
+
+
+def _costs(layout: Layout, cameras: Array, points: Array, options: StepOptions) -> Float[Array, " slots"]:
+    return slot_costs(options.loss, residuals(layout, slot_frames(layout, cameras), points)[1])

@@ -28,9 +28,10 @@ from jaxtyping import Bool, Float, Int
 from jaxba import camera
 from jaxba.blocks3 import cholesky3
 from jaxba.layout import Layout
-from jaxba.linearize import behind, point_normal_equations, residuals, slot_costs
+from jaxba.linearize import point_terms
 from jaxba.losses import Loss
 from jaxba.sums import point_sum
+from jaxba.views import Views, point_passes
 
 INITIAL_DAMPING = 1e-6
 """Relative damping of a point's first step: plain Gauss-Newton but for parallel rays."""
@@ -50,10 +51,16 @@ cameras has no limit. The depths of a scene span two decades.
 
 
 class Home(NamedTuple):
-    """Where points were before the step, and the slots from whose camera they were visible there."""
+    """Where points were before the step, and what was visible there."""
 
     points: Float[Array, "3 points"]
-    front: Bool[Array, " slots"]
+    front: Bool[Array, " slots"]  # whether the point lay in front of the camera
+    nearness: Float[Array, " points"]  # see `_gone`
+
+    @classmethod
+    def of(cls, layout: Layout, points: Float[Array, "3 points"], inverse_depth: Float[Array, " slots"]) -> Home:
+        """Where points are, with `Projection.inverse_depth` of every slot there."""
+        return cls(points, inverse_depth < 0, point_sum(layout, inverse_depth[None])[0])
 
 
 class _Carry(NamedTuple):
@@ -63,6 +70,8 @@ class _Carry(NamedTuple):
     damping: Float[Array, " points"]
     trial: Float[Array, "3 points"]  # where to look next
     nearness: Float[Array, " points"]  # of the start, see `_gone`
+    late: Bool[Array, " points"]  # whether it was taken home, and so is a pass behind the others
+    passes: Int[Array, ""]
 
 
 def refine_points(
@@ -72,72 +81,78 @@ def refine_points(
     loss: Loss,
     iterations: int | Int[Array, ""],
     home: Home | None = None,
+    *,
+    fused: bool = True,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """Improves every point by `iterations` steps of its own.
 
     Args:
         layout: slots.
-        frames: camera of every slot (`linearize.slot_frames`).
+        frames: of every camera (`camera.frames`).
         points: where to start.
         loss: robust loss.
-        iterations: steps per point, none or more; each costs one pass over the observations, a home two.
+        iterations: steps per point, none or more; each costs one pass over the observations, and so does the end, and
+            one more where points are taken home.
         home: a point that lies behind a camera in front of which it was at home, or `FARTHEST` times as far from its
             cameras, starts from there.
+        fused: see `views.point_passes`.
 
     Returns:
         Points, and the cost of each point's observations there (pixels squared), never larger than where it
         started, which is its home for a point that was taken there.
     """
+    one_pass = point_passes(layout, frames, fused=fused)
+    fronts = () if home is None else (home.front,)
 
-    if home is not None:
-        points = _brought_home(layout, frames, points, home)
+    def terms(views: Views, *front: Array) -> list[Array]:
+        found = point_terms(views, loss)
+        return [*found, *((seen & (found[-1] > 0)).astype(points.dtype) for seen in front)]
 
-    def propose(best: _Carry) -> _Carry:
+    def propose(best: _Carry) -> Float[Array, "3 points"]:
         matrix = [best.system[k] for k in range(6)]
         for k in (0, 2, 5):
             matrix[k] = matrix[k] * (1 + best.damping)
         factor = cholesky3(matrix)
         step = factor.backward(factor.forward([best.system[k] for k in range(6, 9)]))
-        return best._replace(trial=best.points - jnp.stack(step))
+        return best.points - jnp.stack(step)
 
-    def body(_: Array, carry: _Carry) -> _Carry:
-        projection, residual = residuals(layout, frames, carry.trial)
-        entries = point_normal_equations(layout, frames, projection, residual, loss)
-        sums = point_sum(layout, jnp.stack([*entries, slot_costs(loss, residual), projection.inverse_depth]))
-        nearness = jnp.where(jnp.isinf(carry.costs), sums[10], carry.nearness)
-        better = (sums[9] < carry.costs) & ~_gone(sums[10], nearness)
+    def body(carry: _Carry) -> _Carry:
+        *system, costs, nearness = (found := one_pass(carry.trial, terms, *fronts))[:11]
+        astray, late = jnp.zeros_like(carry.late), carry.late
+        if home is not None:
+            astray = (carry.passes == 0) & ((found[11] > 0) | _gone(nearness, home.nearness))
+            late = late | astray
+        start = jnp.where(jnp.isinf(carry.costs), nearness, carry.nearness)
+        going_on = ~astray & (late | (carry.passes <= iterations))
+        better = (costs < carry.costs) & ~_gone(nearness, start) & going_on
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
+        damping = jnp.where(better, carry.damping / DAMPING_FACTOR, grown)
         best = _Carry(
             points=jnp.where(better, carry.trial, carry.points),
-            costs=jnp.where(better, sums[9], carry.costs),
-            system=jnp.where(better, sums[:9], carry.system),
-            damping=jnp.where(better, carry.damping / DAMPING_FACTOR, grown),
+            costs=jnp.where(better, costs, carry.costs),
+            system=jnp.where(better, jnp.stack(system), carry.system),
+            damping=jnp.where(astray, carry.damping, damping),
             trial=carry.trial,
-            nearness=nearness,
+            nearness=start,
+            late=late,
+            passes=carry.passes + 1,
         )
-        return propose(best)
+        best = best._replace(trial=propose(best))
+        if home is None:
+            return best
+        return best._replace(
+            points=jnp.where(astray, home.points, best.points), trial=jnp.where(astray, home.points, best.trial)
+        )
 
-    # the start is a trial better than nothing: one copy of the body in the program, and less to compile
+    # the start is a trial better than nothing, and the end one like the others: the program has one copy of a pass
     nothing = jnp.full_like(points[0], jnp.inf)
     first = jnp.full_like(nothing, DAMPING_FACTOR * INITIAL_DAMPING)
-    zero = jnp.zeros_like(nothing)
-    carry = _Carry(points, nothing, jnp.zeros((9, nothing.shape[0]), points.dtype), first, points, zero)
-    carry = lax.fori_loop(0, iterations, body, carry)
-    # nothing follows the last step, so that its cost and where it led are all there is to know
-    projection, residual = residuals(layout, frames, carry.trial)
-    costs, nearness = point_sum(layout, jnp.stack([slot_costs(loss, residual), projection.inverse_depth]))
-    better = (costs < carry.costs) & ~_gone(nearness, carry.nearness)
-    return jnp.where(better, carry.trial, carry.points), jnp.where(better, costs, carry.costs)
-
-
-def _brought_home(
-    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], home: Home
-) -> Float[Array, "3 points"]:
-    """Points, but those behind a camera in front of which they were at home, or gone far away, which are taken back."""
-    projection, before = (residuals(layout, frames, place)[0] for place in (points, home.points))
-    lost = (home.front & behind(projection)).astype(points.dtype)
-    lost, *nearness = point_sum(layout, jnp.stack([lost, projection.inverse_depth, before.inverse_depth]))
-    return jnp.where((lost > 0) | _gone(*nearness), home.points, points)
+    none, zero = jnp.zeros(nothing.shape, bool), jnp.zeros_like(nothing)
+    system = jnp.zeros((9, *nothing.shape), points.dtype)
+    carry = _Carry(points, nothing, system, first, points, zero, none, jnp.zeros((), jnp.int32))
+    more = lambda c: c.passes <= iterations + jnp.any(c.late)
+    carry = lax.while_loop(more, body, carry)
+    return carry.points, carry.costs
 
 
 def _gone(nearness: Float[Array, " points"], before: Float[Array, " points"]) -> Bool[Array, " points"]:

@@ -107,8 +107,9 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
-        search = program(_search, "loss", quick=quick_runs("judge", problem.num_observations) > VERDICTS)
-        found = jax.device_get(search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss()))
+        quick = quick_runs("judge", problem.num_observations) > VERDICTS
+        search = program(_search, "loss", "fused", quick=quick)
+        found = jax.device_get(search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss(), not quick))
         host.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem))
@@ -119,10 +120,13 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     )
 
 
-def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss) -> _Found:
+def _search(
+    layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss, fused: bool
+) -> _Found:
     """`retriangulate` in layout order; `origin` is where the rays start, in scene units."""
     state = initial_state(layout, problem, StepOptions(loss=loss), jnp.float64)
     frames, start = slot_frames(layout, state.cameras), state.points
+    of_cameras = camera.frames(state.cameras)
 
     def look(points: Float[Array, "3 points"]) -> tuple[Float[Array, " points"], Float[Array, " points"]]:
         projection, residual = residuals(layout, frames, points)
@@ -135,7 +139,7 @@ def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 poin
 
     def visit(best: tuple[Array, Array], place: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
         points, costs = best
-        trial, _ = refine_points(layout, frames, place, loss, POINT_ITERATIONS)
+        trial, _ = refine_points(layout, of_cameras, place, loss, POINT_ITERATIONS, fused=fused)
         there, lost = look(trial)
         better = (there < costs) & (lost <= hidden)
         return (jnp.where(better, trial, points), jnp.where(better, there, costs)), None

@@ -77,7 +77,7 @@ def solve_step(
     forcing = options.cg_forcing if effort is None or effort.forcing is None else effort.forcing
     coordinates = Coordinates.of(cameras, options)
     frames = camera.frames(cameras)
-    anchor = Anchor(frames.rotation, frames.translation, points)
+    anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
     eliminated = eliminate_points(layout, linear, damping, options)
     system = camera_system(layout, linear, eliminated, coordinates, damping, options)
     if options.linear_solver == "normal":

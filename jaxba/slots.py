@@ -13,6 +13,9 @@ from jaxba.trees import TREE_WIDTH, sum_tree
 MAX_PADDING = 0.10
 """Largest share of slots that may be empty because track lengths share a bucket (design, section 3)."""
 
+CHEAPER = 0.8
+"""Factor on the price of a bucket while more than that is empty."""
+
 
 class Slots(NamedTuple):
     """Where the observations of a layout are; they are sorted by point."""
@@ -107,13 +110,13 @@ def _first_width(most: int) -> int:
 def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
     """Largest track length of each bucket: few buckets with little padding.
 
-    Dynamic programme over the distinct lengths; a bucket costs as many slots as `MAX_PADDING / 10` of
-    all observations, halved until padding stays below `MAX_PADDING`.
+    Dynamic programme over the distinct lengths. A bucket has a price, in slots, which is lowered until padding stays
+    below `MAX_PADDING`: every bucket is a part of the program, and costs time to compile.
     """
     values, counts = np.unique(tracks[tracks > 0], return_counts=True)
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
-    price = total * MAX_PADDING / 10
+    price = total * MAX_PADDING
     while True:
         best = np.zeros(len(values) + 1)
         cut = np.zeros(len(values) + 1, int)
@@ -127,4 +130,4 @@ def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
             end = cut[end]
         if best[-1] - price * len(ends) <= (1 + MAX_PADDING) * total:
             return values[ends[::-1]]
-        price /= 2
+        price *= CHEAPER

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Set
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -62,13 +63,16 @@ class _Loop(NamedTuple):
         if decides_effort(self.policy):
             effort = call(program(effort_of, quick=True), self.policy, carry.policy)
         part = lambda name, function: program(function, "options", quick=name in quick)
+        # what is compiled in a hurry should be small
+        small = replace(options, fused_passes=False)
+        how = lambda name: small if name in quick else options
         min_gain = jnp.asarray(self.policy.min_gain, state.cost.dtype)
         if options.in_two:
             given = (self.layout, state, carry.damping)
-            proposal = call(part("propose", propose), *given, options, carry.iteration, effort)
-            state, step = call(part("judge", judge), *given, proposal, options, min_gain, effort)
+            proposal = call(part("propose", propose), *given, how("propose"), carry.iteration, effort)
+            state, step = call(part("judge", judge), *given, proposal, how("judge"), min_gain, effort)
         else:
-            given = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
+            given = (self.layout, state, carry.damping, how("round"), min_gain, carry.iteration, effort)
             state, step = call(part("round", lm_step), *given)
         limit = jnp.asarray(self.max_iterations, jnp.int32)
         own = (carry._replace(state=None), step, self.policy, self.tolerances, limit)

@@ -84,7 +84,7 @@ def best_trial(
         cameras: present cameras.
         points: present points.
         cost: their cost, pixels squared.
-        present: costs of the slots there, and what lay in front of its camera.
+        present: costs of the slots there, and depths.
         step: the solution of the damped system; its slope and damped part are those of the parts.
         options: static.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
@@ -95,7 +95,7 @@ def best_trial(
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     # costs are compared term by term: two sums would cancel in float32
     before = parts.terms(present.costs, options)
-    home = Home(points, present.front)
+    home = Home.of(parts.layout, points, present.inverse_depth)
     one, none = jnp.ones_like(cost), jnp.zeros(cost.shape, jnp.int32)
     matters = step.predicted(one) > NEGLIGIBLE * cost
 
