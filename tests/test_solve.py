@@ -214,7 +214,8 @@ def test_a_solve_ends_at_the_first_cost_that_is_good_enough(callback, monkeypatc
     """And another target compiles nothing."""
     monkeypatch.setattr("jaxba.host.release_programs", lambda: False)
     costs = stepwise(support.tiny()).history.cost
-    targets = (0.5 * (costs[0] + costs[1]), costs[2])
+    # other programs sum in another order
+    targets = (0.5 * (costs[0] + costs[1]), costs[2] * (1 + 1e-12))
     for target, iterations in zip(targets, (2, 3), strict=True):
         solution = solve(support.tiny(), tolerances=Tolerances(target=float(target)), callback=callback)
         assert solution.termination == Termination.TARGET

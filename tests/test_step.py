@@ -185,13 +185,15 @@ def test_a_damping_without_meaning_is_a_rejected_step_that_changes_no_bit(option
 
 @pytest.mark.parametrize("damping", [0.0, 1e-300, 1e-18, 1e-14, 1e-10, 1e-6, 1e-2, 1e2, 1e6, 1e20, 1e300])
 def test_no_damping_lets_the_cost_rise_or_a_nan_in(damping):
-    """At zero the seven gauge freedoms leave the system singular: whatever the factorisation makes of it."""
+    """At zero the seven gauge freedoms leave the system singular: whatever the factorisation makes of it. At 1e20 a
+    step is so short that costs fall by less than what their sum is rounded by."""
     for problem in (support.tiny(), support.odd(), support.single(), support.whitened()):
         layout, before = start(problem)
         after, info = step(layout, before, damping, EXACT)
         assert all(np.isfinite(leaf).all() for leaf in after)
         if info.accepted:
-            assert after.cost < before.cost
+            assert after.cost < before.cost if damping <= 1e6 else after.cost <= before.cost
+            assert info.gain_ratio > 0
             assert info.cost == after.cost == info.candidate_cost
         else:
             assert same_bits(after, before)

@@ -140,7 +140,7 @@ def test_nor_does_it_by_the_length_of_its_steps():
 
 
 def test_near_the_minimum_a_small_undamped_step_ends_a_solve():
-    problem = solve(support.tiny(), "ceres", max_iterations=LIMIT, tolerances=Tolerances(ftol=1e-9)).problem
+    problem = solve(support.tiny(), "ceres", max_iterations=LIMIT).problem
     again = solve(problem, "constant:1e-6", max_iterations=LIMIT)
     assert again.termination == Termination.COST
     assert again.iterations <= 2
