@@ -1,9 +1,14 @@
-"""Numbers are float64, types are checked where people call, and what was compiled once is kept for the next session."""
+"""Numbers are float64, types are checked where people call, and what was compiled once is kept for the next session.
+
+Programs are compiled without LLVM's optimisations, unless `--compilation full` is given: they compute the same, and
+most of the time of all these tests is compilation. `.ci/run` has the slow ones, and those of the step, compiled fully.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
+import os
 import platform
 import tempfile
 from pathlib import Path
@@ -12,8 +17,23 @@ import jax
 import jaxtyping
 import pytest
 
+QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""What `jaxba.programs.QUICK` says, for all programs of a process and its children; not imported from there, because it
+has to be said before jaxba is."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--compilation",
+        choices=("quick", "full"),
+        default="quick",
+        help="how XLA compiles all programs (on a GPU: full)",
+    )
+
 
 def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("compilation") == "quick":
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}".strip()
     jax.config.update("jax_enable_x64", True)
     jax.tree_util.register_dataclass = _register_dataclass
     cache = getattr(config, "cache", None)
@@ -24,6 +44,14 @@ def pytest_configure(config: pytest.Config) -> None:
         folder = Path(config.stash[_TEMPORARY].name)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("compilation") == "full":
+        return
+    for item in items:
+        if item.get_closest_marker("fully_compiled"):
+            item.add_marker(pytest.mark.skip(reason="needs --compilation full"))
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:

@@ -132,6 +132,7 @@ def test_the_point_cloud_has_every_point_and_camera(tiny, tmp_path, capsys):
     assert len(body) == 46 * (3 * 8 + 3)
 
 
+@pytest.mark.slow
 def test_options_reach_the_solver(tiny, tmp_path, capsys):
     log = tmp_path / "log.json"
     options = ["--damping", "classic:0.03", "--refine-points", "3", "--max-iterations", "3", "--log", str(log)]

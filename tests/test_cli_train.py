@@ -87,6 +87,7 @@ def error_of(capsys, *argv: str) -> str:
 # Results
 
 
+@pytest.mark.slow
 def test_a_run_leaves_policy_curve_log_and_configuration(finished):
     names = {path.name for path in finished.iterdir()}
     assert names == {
@@ -174,6 +175,7 @@ def test_errors_of_the_configuration_are_one_line(capsys, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_resumed_run_of_other_settings_is_refused(folder, capsys):
     error = error_of(capsys, "--out", str(folder), "--resume", "--set", "sac.width=9")
     assert "begun with another sac.width" in error

@@ -152,6 +152,7 @@ def case(request) -> Case:
     return make(request.param)
 
 
+@pytest.mark.slow
 def test_the_cases_have_the_clusters_that_they_are_named_after():
     count = lambda name: make(name).found.label.max() + 1
     names = ("three-clusters", "unseen-camera", "two-cameras", "single")

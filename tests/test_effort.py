@@ -60,6 +60,7 @@ def test_a_step_with_fewer_point_iterations_is_that_of_options_with_fewer_and_co
     assert none.cost > costs[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["implicit", "normal"])
 def test_a_step_with_another_forcing_term_is_that_of_options_with_it(solver):
     options = StepOptions(linear_solver=solver, refine_points=1, cg_forcing=1e-3)
@@ -160,6 +161,7 @@ def test_a_file_with_too_few_numbers_for_its_effort_is_refused(tmp_path):
 # The game
 
 
+@pytest.mark.slow
 def test_an_iteration_is_paid_by_the_point_iterations_that_the_action_chose():
     game = tiny_game(replace(RULES, agent=replace(POINTS, guard="off")), 6)
     assert game.action_size == 2

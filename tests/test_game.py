@@ -145,6 +145,7 @@ def test_a_scene_is_played_as_it_is_solved():
             np.testing.assert_allclose(found.costs[k, -1], alone.final_cost, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["stba", "deeplm", "ddlm", "poba"])
 def test_a_scene_is_played_as_it_is_solved_by_every_method(method):
     bank, options = tiny_bank(), make_method(method).options(StepOptions())
@@ -167,6 +168,7 @@ def test_scenes_of_a_class_share_random_clusters(method):
     assert (found.costs[:, 6] != played().costs[:, 6]).all()
 
 
+@pytest.mark.slow
 def test_scenes_whose_clusters_have_trials_and_rounds_are_played_as_each_alone():
     """Loops with a verdict per cluster, scenes along another axis: as one scene after the other."""
     bank, damping = tiny_bank(), 1e-6
@@ -216,6 +218,7 @@ def test_lanes_do_not_mix_scenes(monkeypatch):
     np.testing.assert_array_equal(np.minimum(straight.iterations[order], LIMIT - 1), mixed.iterations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["lm", "deeplm"])
 def test_a_network_meets_in_a_solve_what_it_meets_in_the_game(method):
     """Each of its lambdas in a solve is the one it chose in the game, so its observations were the same."""

@@ -405,6 +405,7 @@ def test_real_models_have_colmaps_cost(name):
     np.testing.assert_allclose(geometry.cost(problem), colmap_cost(f"{DATA}/colmap/{name}"), rtol=rtol)
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.parametrize("name", REAL)
 def test_real_models_end_no_higher_than_after_colmaps_own_bundle_adjustment(tmp_path, name):

@@ -323,6 +323,7 @@ def test_the_policy_that_drives_another_library_damps_cameras_as_points():
     assert policy.config.camera_damping == options.camera_damping == 1
 
 
+@pytest.mark.slow
 def test_a_solve_takes_the_shipped_policy_that_fits_its_method(shipped):
     problem = support.tiny()
     for method, file in (("lm", "learned"), ("deeplm", "learned-soft")):
@@ -345,6 +346,7 @@ def test_an_agent_from_before_camera_damping_damps_cameras_as_points():
     assert config_from(values).camera_damping == 1
 
 
+@pytest.mark.slow
 def test_a_solve_damps_cameras_as_the_policy_was_trained():
     trained = random_policy(1)
     light = replace(trained, config=replace(trained.config, camera_damping=0.01))

@@ -167,6 +167,7 @@ def test_cameras_of_one_lens_end_with_equal_numbers_and_what_stays_stays_bit_by_
     assert (after.cameras[6, :6] == problem.cameras[6, :6]).all()
 
 
+@pytest.mark.slow
 def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
     problem = support.tiny()
     own = with_lenses(problem, np.arange(6), np.ones((6, 3), bool))
@@ -174,6 +175,7 @@ def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
     np.testing.assert_allclose(same.history.cost, plain.history.cost, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_long_sequence_with_one_lens_is_solved():
     # so long that its reduced camera system is factored as a band, which the lens breaks
     scene, truth = random_scene_with_truth(SceneConfig(cameras=100, points=500, mean_track=4.0), seed=0)

@@ -220,6 +220,7 @@ def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, chan
         np.testing.assert_allclose(state.cost, support.cost(support.back(problem, first, state), options), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_clusters_of_ddlm_have_shares_and_repairs_of_their_own():
     """Three scenes in one problem: one step passes, one is shortened, one repaired, as each would be alone."""
     scenes, damping = [paper(2), turned(paper(1)), turned(paper(3))], 1e-3
@@ -285,6 +286,7 @@ def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
     assert small
 
 
+@pytest.mark.slow
 def test_a_cluster_of_ddlm_that_cannot_be_factored_leaves_the_others_alone(monkeypatch):
     """Also that of camera 0, which owns the empty slots that padding reads."""
     from jaxba import decompose
@@ -350,6 +352,7 @@ def test_clusters_of_ddlm_share_no_variable():
 # Power series
 
 
+@pytest.mark.slow
 def test_the_power_series_comes_closer_with_every_order():
     problem, damping = support.tiny(), 1e-1
     truth = support.dense(problem, StepOptions(), damping)
@@ -420,6 +423,7 @@ def test_random_clusters_are_one_program_for_all_turns(method):
     assert clock.seconds == 0
 
 
+@pytest.mark.slow
 def test_many_clusters_and_camera_blocks_factored_in_one_program_do_not_wait_for_each_other_for_ever():
     """Two batched factorisations side by side stood still on two threads. In a process of its own, to be killed."""
     script = """

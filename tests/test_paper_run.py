@@ -78,6 +78,7 @@ def runs(capsys) -> int:
     return int(found[0])
 
 
+@pytest.mark.slow
 def test_one_table_is_made_from_nothing(finished):
     plays = [json.loads(line) for line in (finished / PLAYS).read_text().splitlines()]
     assert [(p["method"], p["seed"]) for p in plays] == [("classic", 0), ("ceres", 0), ("agent", 0)]

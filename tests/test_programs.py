@@ -19,6 +19,8 @@ from jaxba.lm import judge, lm_step, propose
 from jaxba.options import StepOptions
 from jaxba.programs import FEWEST, REPAID, CompiledTogether, Part, program, quick_options, quick_runs
 
+pytestmark = pytest.mark.step
+
 PROGRAM = "/jax/core/compile/backend_compile_duration"
 """What JAX calls the compilation of a program by XLA."""
 
@@ -41,6 +43,7 @@ def test_this_jaxlib_knows_the_quick_way():
     assert quick_options() == programs.QUICK
 
 
+@pytest.mark.fully_compiled
 @pytest.mark.parametrize(
     "how",
     [
@@ -101,6 +104,7 @@ def test_every_program_is_compiled_once_before_the_first_iteration(how):
     assert seen.names.count("_advance_and_tell") == 1
 
 
+@pytest.mark.fully_compiled
 def test_the_two_parts_are_the_step():
     layout, state = support.start(support.tiny())
     options = StepOptions(refine_points=3, camera_rounds=3, trials=4)
@@ -154,6 +158,7 @@ def test_nothing_more_is_compiled_after_an_error():
     assert len(compiled) < 50
 
 
+@pytest.mark.fully_compiled
 @on_a_cpu
 @pytest.mark.parametrize("watched", [True, False])
 def test_the_optimised_program_takes_over_without_a_trace(watched, monkeypatch):

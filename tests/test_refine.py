@@ -20,6 +20,8 @@ from jaxba import BundleProblem, Loss, StepOptions, camera, geometry, read_bal, 
 from jaxba.linearize import residuals, slot_frames
 from jaxba.refine import FARTHEST, Home, refine_points
 
+pytestmark = pytest.mark.step
+
 STILL = 1e30
 """A lambda under which the linear solve moves nothing."""
 
@@ -97,6 +99,7 @@ def test_every_point_ends_where_scipy_ends_on_that_point_alone(loss):
         np.testing.assert_allclose(point_costs(found, loss)[point], best.cost, rtol=1e-9)
 
 
+@pytest.mark.fully_compiled
 @pytest.mark.parametrize("damping", [1e-12, 1e-6, 1e-2, 1.0])
 def test_refinement_never_makes_the_candidate_of_a_step_worse(damping):
     for seed, size in ((0, 0.0), (1, 0.3), (2, 2.0)):

@@ -29,6 +29,8 @@ from jaxba import (
     solve_loop,
 )
 
+pytestmark = pytest.mark.step
+
 NEVER = Tolerances(ftol=0.0, xtol=0.0, gtol=0.0)
 """No convergence test can apply."""
 
@@ -41,6 +43,7 @@ def stepwise(problem, damping="ceres", options=None, **settings):
 # One solve, run in many ways
 
 
+@pytest.mark.fully_compiled
 @pytest.mark.parametrize("damping", ["ceres", "classic"])
 def test_the_compiled_loop_and_the_stepwise_one_are_the_same_solve(damping):
     records = []

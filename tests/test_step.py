@@ -13,6 +13,8 @@ from support import MINIATURES, bal_file, needs_data, same_bits, start, step
 
 from jaxba import BundleProblem, Loss, StepOptions, lm_step, read_bal
 
+pytestmark = pytest.mark.step
+
 DAMPINGS = (1e-8, 1e-4, 1e-2, 1.0, 100.0)
 EXACT = StepOptions()
 TO_THE_END = StepOptions(linear_solver="implicit", cg_forcing=0.0, cg_tolerance=1e-14, cg_max_iterations=5000)

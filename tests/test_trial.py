@@ -24,6 +24,8 @@ from jaxba.resect import DAMPINGS, refine_cameras, solve_positive
 from jaxba.schur import solve_step
 from jaxba.trial import GOOD_GAIN, HOPELESS, NEGLIGIBLE, ROUNDS_OF_SHORTER, SHORTER, best_trial
 
+pytestmark = pytest.mark.step
+
 PLAIN = StepOptions()
 SHORTER_ONLY = StepOptions(trials=4)
 EVERYTHING = StepOptions(refine_points=3, trials=4, camera_rounds=3)
@@ -194,6 +196,7 @@ def wide() -> list[tuple[Layout, LMState]]:
 _cost = jax.jit(cost, static_argnames=("loss",))
 
 
+@pytest.mark.fully_compiled
 def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
     saved = 0
     for layout, before in wide():
@@ -268,6 +271,7 @@ def test_a_refused_step_leaves_every_bit_alone(options):
         assert info.cost == info.previous_cost
 
 
+@pytest.mark.fully_compiled
 def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
     rounds = StepOptions(camera_rounds=3)
     better = trusted = 0
@@ -287,6 +291,7 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
     assert trusted >= 5
 
 
+@pytest.mark.fully_compiled
 def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
     with_rounds = StepOptions(trials=4, camera_rounds=3)
     better = 0

@@ -18,6 +18,8 @@ from jaxba.padding import capacity_of
 from jaxba.refine import refine_points
 from jaxba.views import Views, point_passes
 
+pytestmark = pytest.mark.step
+
 
 def two_tracks() -> BundleProblem:
     """`tiny` cut down to tracks of different lengths, so that its layout has several buckets."""

@@ -57,6 +57,7 @@ def test_a_share_that_is_none_is_refused(share):
         BankConfig(warm_share=share)
 
 
+@pytest.mark.slow
 def test_the_share_of_the_settings_reaches_the_bank(monkeypatch):
     monkeypatch.setattr("jaxba.game.bank.PORTFOLIO", ("ceres",))
     banks = [BankConfig((KIND,), (60,), 0, share) for share in (0.0, 1.0)]
