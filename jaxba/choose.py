@@ -33,7 +33,7 @@ SECONDS_PER_CUBE = 4.5e-12
 """Dense Cholesky factorisation, per cube of the number of unknowns."""
 
 SECONDS_PER_PRODUCT = 1.2e-11
-"""A multiplication and addition in a dense product: 170 GFLOP/s (docs/performance.md)."""
+"""A multiplication and addition in a dense product: 170 GFLOP/s (docs/optimisations.md)."""
 
 SECONDS_PER_BAND = 3.3e-11
 """Band factorisation, per unknown times the square of the band's unknowns."""

@@ -30,7 +30,7 @@ def keep_memory() -> bool:
     """Tells glibc to keep freed memory instead of handing it back to the system.
 
     XLA allocates the temporaries of a program anew at every call. Above 32 MiB glibc maps fresh pages for them each
-    time, and touching those costs more than the arithmetic (measured: docs/performance.md). Memory then stays with
+    time, and touching those costs more than the arithmetic (measured: docs/optimisations.md). Memory then stays with
     the process until it ends.
 
     That holds for glibc's main arena, the one of the process's first thread; another thread's holds 64 MiB and is given

@@ -11,16 +11,19 @@ their own, since they gain differently, and are compiled beside each other.
 from __future__ import annotations
 
 import functools
+import inspect
 import os
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args
 
 import jax
 
+from jaxba.stored import Store
+
 Function = TypeVar("Function", bound=Callable[..., Any])
-Result = TypeVar("Result")
 
 Compilation = Literal["full", "quick", "auto"]
 """`full`: all optimisation. `quick`: hardly any. `auto`: quick, and full after as many iterations as pay for it."""
@@ -71,8 +74,26 @@ def quick_options() -> dict[str, bool | int] | None:
     return options
 
 
+class Program:
+    """A function compiled by `jax.jit` for every shape of its arguments, which are given by position."""
+
+    def __init__(self, function: Callable[..., Any], static: tuple[str, ...], quick: bool) -> None:
+        self.function = function
+        self.options: Any = quick_options() if quick else None
+        self.jitted = jax.jit(function, static_argnames=static, compiler_options=self.options)
+        self._static = [name if name in static else None for name in inspect.signature(function).parameters]
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.jitted(*arguments)
+
+    def parted(self, arguments: tuple[Any, ...]) -> tuple[dict[str, Any], tuple[Any, ...]]:
+        """Static arguments by name, and the others."""
+        named = list(zip(self._static, arguments, strict=False))
+        return {name: x for name, x in named if name}, tuple(x for name, x in named if not name)
+
+
 @functools.cache
-def program(function: Callable[..., Result], *static: str, quick: bool = False) -> Callable[..., Result]:
+def program(function: Callable[..., Any], *static: str, quick: bool = False) -> Program:
     """The function compiled, one program for each way of compiling.
 
     Args:
@@ -80,25 +101,44 @@ def program(function: Callable[..., Result], *static: str, quick: bool = False) 
         static: names of its static arguments.
         quick: hardly optimised, if that can be had.
     """
-    options: Any = quick_options() if quick else None
-    return jax.jit(function, static_argnames=static, compiler_options=options)
+    return Program(function, static, quick)
+
+
+_store: Store | None = None
+
+
+def keep_in(folder: Path | None) -> None:
+    """Has `CompiledTogether` look for programs in a folder, and leave them there for later processes.
+
+    Not beside JAX's own compilation cache, which then is the only one: what JAX has read from there cannot be written.
+
+    Args:
+        folder: exists and can be written, by nobody else; None keeps nothing.
+    """
+    global _store
+    _store = None if folder is None else Store(folder)
 
 
 class CompiledTogether:
-    """A context in which programs are compiled beside each other, and not run; calling them later compiles nothing.
+    """A context in which programs are compiled beside each other, and not run; `run` compiles nothing then.
 
     XLA compiles one program on little more than one core. Who leaves the context compiles what is still waiting, in the
-    thread that will run it: the memory that this takes is then there for running (`host.keep_memory`).
+    thread that will run it: the memory that this takes is then there for running (`host.keep_memory`). It may be
+    entered again for more.
     """
+
+    def __init__(self) -> None:
+        self.loaded: dict[Any, Callable[..., Any]] = {}
+        """What was on disk (stored.py)."""
 
     def __enter__(self) -> CompiledTogether:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
-        self._waiting: deque[Any] = deque()
+        self._waiting: deque[Callable[[], None]] = deque()
         self._jobs: list[Future[None]] = []
         return self
 
-    def __call__(self, function: Any, *arguments: Any) -> Any:
-        """Has a `program` compiled for such arguments.
+    def __call__(self, function: Program, *arguments: Any) -> Any:
+        """Has a program compiled for such arguments.
 
         Args:
             function: what `program` returned.
@@ -107,17 +147,36 @@ class CompiledTogether:
         Returns:
             Shapes and types of its results, to be arguments of the next.
         """
-        traced = function.trace(*arguments)
-        self._waiting.append(traced.lower())
+        store, place = None if jax.config.values.get("jax_compilation_cache_dir") else _store, None
+        if store is not None:
+            static, given = function.parted(arguments)
+            place = store.place(function.function, static, given, function.options)
+            if (stored := store.load(place, given)) is not None:
+                self.loaded[function] = stored.run
+                return stored.out
+        traced = function.jitted.trace(*arguments)
+        lowered = traced.lower()
+
+        def compile_and_keep() -> None:
+            compiled = lowered.compile()
+            if store is not None:
+                store.save(place, compiled, traced.out_info)
+
+        self._waiting.append(compile_and_keep)
         self._jobs.append(self._pool.submit(self._compile_next))
         return traced.out_info
 
+    def run(self, function: Program, *arguments: Any) -> Any:
+        """What the program computes."""
+        loaded = self.loaded.get(function)
+        return function(*arguments) if loaded is None else loaded(*function.parted(arguments)[1])
+
     def _compile_next(self) -> None:
         try:
-            lowered = self._waiting.popleft()
+            compile_one = self._waiting.popleft()
         except IndexError:  # another thread was faster
             return
-        lowered.compile()
+        compile_one()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
@@ -129,6 +188,13 @@ class CompiledTogether:
         if kind is None:
             for job in self._jobs:
                 job.result()
+
+
+def run_alone(function: Program, *arguments: Any) -> Any:
+    """What a program computes, for one that is needed once; as `CompiledTogether` it looks for it on disk."""
+    with CompiledTogether() as together:
+        together(function, *arguments)
+    return together.run(function, *arguments)
 
 
 def traced_once(*static: str) -> Callable[[Function], Function]:

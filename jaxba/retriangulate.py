@@ -29,7 +29,7 @@ from jaxba.lm import initial_state
 from jaxba.losses import Loss
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.programs import program, quick_runs
+from jaxba.programs import program, quick_runs, run_alone
 from jaxba.refine import refine_points
 from jaxba.solve import explain_start
 from jaxba.sums import point_sum
@@ -109,7 +109,8 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
         quick = quick_runs("judge", problem.num_observations) > VERDICTS
         search = program(_search, "loss", "fused", quick=quick)
-        found = jax.device_get(search(jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss(), not quick))
+        given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss(), not quick)
+        found = jax.device_get(run_alone(search, *given))
         host.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem))

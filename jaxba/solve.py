@@ -29,7 +29,7 @@ from jaxba.naming import DTYPES, fitting_policy
 from jaxba.options import StepOptions
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.programs import Compilation, Part, program, quick_options, quick_runs
+from jaxba.programs import Compilation, Part, program, quick_options, quick_runs, run_alone
 from jaxba.stepwise import IterationRecord, run_stepwise
 from jaxba.termination import Termination, Tolerances
 
@@ -160,7 +160,7 @@ def solve(
             layout = jax.device_put(layout_for(problem, options, capacity))
             initial = program(initial_state, "options", "dtype", quick=True)
             begin = problem if capacity is None else padded_parameters(problem, capacity)
-            state = jax.block_until_ready(initial(layout, begin, options, jnp.dtype(dtype)))
+            state = jax.block_until_ready(run_alone(initial, layout, begin, options, jnp.dtype(dtype)))
         setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))

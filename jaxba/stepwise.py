@@ -36,12 +36,8 @@ class IterationRecord(NamedTuple):
     step: StepInfo  # Python and NumPy scalars
 
 
-def _run(function: Any, *arguments: Any) -> Any:
-    return function(*arguments)
-
-
 class _Loop(NamedTuple):
-    """What stays from one iteration to the next. `call` runs programs (`_run`), or has them compiled."""
+    """What stays from one iteration to the next. `call` runs programs, or has them compiled."""
 
     layout: Layout
     policy: DampingPolicy
@@ -114,21 +110,22 @@ def run_stepwise(
     started = time.perf_counter()
     with CompileClock() as clock, CompiledTogether() as together:
         loop.iterate(together, loop.start(together, state), hurried)
-    carry = jax.block_until_ready(loop.start(_run, state))
+    run = together.run
+    carry = jax.block_until_ready(loop.start(run, state))
     compile_s = 0.0
-    if clock.seconds > 0:
+    if clock.seconds > 0 or together.loaded:
         if not hurried:  # a program's first run touches its memory for the first time; the time of others is wanted
-            jax.block_until_ready(loop.iterate(_run, carry, hurried)[2])
+            jax.block_until_ready(loop.iterate(run, carry, hurried)[2])
         compile_s = time.perf_counter() - started
     records, quick_iterations = [], 0
     started, waited = time.perf_counter(), 0.0
     while True:
         if hurried != (left := {name for name in quick if runs[name] < quick[name]}):
             hurried, began = left, time.perf_counter()
-            with CompiledTogether() as together:
+            with together:
                 loop.iterate(together, carry, hurried)
             waited += time.perf_counter() - began
-        carry, step, facts = loop.iterate(_run, carry, hurried)
+        carry, step, facts = loop.iterate(run, carry, hurried)
         step, end = _told(facts, step)
         records.append(step)
         quick_iterations += bool(hurried)

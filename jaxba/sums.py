@@ -33,7 +33,7 @@ def outer_sum(left: Float[Array, "n terms a"], right: Float[Array, "n terms b"])
     """`sum_k left[:, k]^T right[:, k]` for many small items, written out term by term.
 
     One fused loop whose inner dimension is vectorised and whose outer one is shared by threads. XLA's batched matrix
-    product does neither for blocks of this size on a CPU: it took four times as long (docs/performance.md).
+    product does neither for blocks of this size on a CPU: it took four times as long (docs/optimisations.md).
     """
     total = left[:, 0, :, None] * right[:, 0, None, :]
     for k in range(1, left.shape[1]):

@@ -3,7 +3,7 @@
 XLA on a CPU makes every vector of a program in a loop of its own, which computes anew, or reads anew from memory, what
 vectors share. One reduction of many operands is one loop: it looks up an observation's camera, projects its point, and
 adds all that is asked of it to that point's sums, and nothing is stored in between. That took a pass of
-point iterations over 347,173 observations from 36 to 6 ms (docs/performance.md).
+point iterations over 347,173 observations from 36 to 6 ms (docs/optimisations.md).
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from jaxba.cli.solve import run
 from jaxba.io import write_problem
 from jaxba.lm import judge, lm_step, propose
 from jaxba.options import StepOptions
-from jaxba.programs import FEWEST, REPAID, CompiledTogether, Part, program, quick_options, quick_runs
+from jaxba.programs import FEWEST, REPAID, CompiledTogether, Part, Program, program, quick_options, quick_runs
 
 pytestmark = pytest.mark.step
 
@@ -117,10 +117,13 @@ def test_the_two_parts_are_the_step():
         np.testing.assert_allclose(part, one, rtol=1e-9, atol=1e-12)
 
 
-class Failing:
+class Failing(Program):
     """A program that cannot be compiled."""
 
     out_info = None
+
+    def __init__(self):
+        self.jitted = self
 
     def trace(self):
         return self

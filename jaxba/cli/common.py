@@ -57,18 +57,27 @@ def exit_with(status: int) -> NoReturn:
     sys.exit(status)
 
 
-def prepare_process() -> None:
-    """Settings for speed: memory is kept, compiled programs are cached."""
+def prepare_process(*, untraced: bool = False) -> None:
+    """Settings for speed: memory is kept, compiled programs are cached.
+
+    Args:
+        untraced: whether programs are found without tracing them (`jaxba/stored.py`), for a command that runs few
+            programs, all of them through `programs.CompiledTogether`; else by their text, in JAX's cache.
+    """
     from jaxba import host
 
     host.keep_memory()
-    use_compilation_cache()
+    use_compilation_cache(untraced)
 
 
-def use_compilation_cache() -> None:
-    """Keeps compiled programs in the user's cache folder, so that the next run starts at once."""
+def use_compilation_cache(untraced: bool = False) -> None:
+    """Keeps compiled programs in the user's cache folder, so that the next run starts at once.
+
+    One way or the other: what JAX has read from its cache cannot be written again.
+    """
     import jax
 
+    from jaxba import programs
     from jaxba.data.places import user_cache
 
     choice = os.environ.get(CACHE_VARIABLE, "")
@@ -79,6 +88,9 @@ def use_compilation_cache() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return  # a home that cannot be written costs time, nothing else
+    if untraced:
+        programs.keep_in(folder)
+        return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 

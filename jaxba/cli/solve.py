@@ -152,7 +152,7 @@ def _solve(args: Arguments) -> int:
     name = SolverName(args.damping, refine, args.dtype, args.method)
     policy, options = name.build()
     problem = read_problem(resolve(args.problem)) if args.problem else embedded_sources()[0].read()
-    common.prepare_process()
+    common.prepare_process(untraced=True)
     options = replace(
         options,
         scaling=args.scaling,

@@ -37,7 +37,7 @@ Reward = Literal["duration", "constant", "reduction", "reversed"]
 
 POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
-Ladybug-49: three take 3.9 of 12.6 ms (docs/performance.md)."""
+Ladybug-49: three take 3.9 of 12.6 ms (docs/optimisations.md)."""
 
 CG_ITERATION_COST = 0.06
 """The same for an iteration of conjugate gradients, charged where the agent chooses their number. An estimate: one
