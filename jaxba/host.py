@@ -94,8 +94,7 @@ def calm_blas() -> Iterator[None]:
     """One BLAS thread for as long as the context is open.
 
     XLA on a CPU factors matrices with SciPy's OpenBLAS, whose threads keep spinning after each call. XLA's own threads
-    then share the processor with them; beside another busy process an iteration became ten times slower
-    (docs/performance.md).
+    then share the processor with them; beside another busy process an iteration became ten times slower.
     """
     import scipy.linalg.cython_lapack  # noqa: F401  # loads the library whose threads are limited
 

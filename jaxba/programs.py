@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeVar, cast, get_args
 
 import jax
 
-from jaxba.stored import Store
+from jaxba.stored import Store, Stored, compiled_here
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -110,7 +110,8 @@ _store: Store | None = None
 def keep_in(folder: Path | None) -> None:
     """Has `CompiledTogether` look for programs in a folder, and leave them there for later processes.
 
-    Not beside JAX's own compilation cache, which then is the only one: what JAX has read from there cannot be written.
+    For solves with a callback or compiled quickly (`solve(compilation="auto")`): the loop as one program has JAX's own
+    compilation cache. Where that is switched on it is the only one.
 
     Args:
         folder: exists and can be written, by nobody else; None keeps nothing.
@@ -128,8 +129,9 @@ class CompiledTogether:
     """
 
     def __init__(self) -> None:
-        self.loaded: dict[Any, Callable[..., Any]] = {}
-        """What was on disk (stored.py)."""
+        self.loaded: dict[Program, Stored] = {}
+        """What was on disk."""
+        self._proven: set[Program] = set()
 
     def __enter__(self) -> CompiledTogether:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
@@ -151,15 +153,21 @@ class CompiledTogether:
         if store is not None:
             static, given = function.parted(arguments)
             place = store.place(function.function, static, given, function.options)
+            self.loaded.pop(function, None)
             if (stored := store.load(place, given)) is not None:
-                self.loaded[function] = stored.run
+                self.loaded[function] = stored
+                self._proven.discard(function)
                 return stored.out
         traced = function.jitted.trace(*arguments)
         lowered = traced.lower()
 
         def compile_and_keep() -> None:
-            compiled = lowered.compile()
-            if store is not None:
+            if store is None:
+                lowered.compile()
+                return
+            with compiled_here() as is_new:
+                compiled = lowered.compile()
+            if is_new():
                 store.save(place, compiled, traced.out_info)
 
         self._waiting.append(compile_and_keep)
@@ -168,8 +176,21 @@ class CompiledTogether:
 
     def run(self, function: Program, *arguments: Any) -> Any:
         """What the program computes."""
-        loaded = self.loaded.get(function)
-        return function(*arguments) if loaded is None else loaded(*function.parted(arguments)[1])
+        stored = self.loaded.get(function)
+        if stored is None:
+            return function(*arguments)
+        given = function.parted(arguments)[1]
+        if function in self._proven:
+            return stored.run(*given)
+        try:
+            result = jax.block_until_ready(stored.run(*given))
+        except Exception:  # XLA finds some damage only when it runs a program
+            del self.loaded[function]
+            if _store is not None:
+                _store.drop(stored)
+            return function(*arguments)
+        self._proven.add(function)
+        return result
 
     def _compile_next(self) -> None:
         try:

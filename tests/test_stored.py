@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import importlib
 import os
 import subprocess
 import sys
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
+from jax.experimental.compilation_cache import compilation_cache
 from test_programs import Compilations
 
-from jaxba import programs, solve, stored
+from jaxba import make_policy, programs, solve, stored
 from jaxba.io import write_problem
+from jaxba.lm import judge
 from jaxba.options import StepOptions
 from jaxba.programs import CompiledTogether, program, run_alone
 from jaxba.retriangulate import retriangulate
@@ -26,13 +31,18 @@ pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="tried on
 @pytest.fixture(autouse=True)
 def folder(tmp_path):
     """Where programs are kept, and not in JAX's cache."""
-    cache = jax.config.jax_compilation_cache_dir
-    jax.config.update("jax_compilation_cache_dir", None)
-    jax.clear_caches()  # what came from JAX's cache cannot be written
+    cache = jax.config.values["jax_compilation_cache_dir"]
+    use_cache_of_jax(None)
     programs.keep_in(tmp_path)
     yield tmp_path
     programs.keep_in(None)
-    jax.config.update("jax_compilation_cache_dir", cache)
+    use_cache_of_jax(cache)
+
+
+def use_cache_of_jax(folder):
+    jax.config.update("jax_compilation_cache_dir", folder)
+    compilation_cache.reset_cache()  # it keeps the folder that it has opened
+    jax.clear_caches()
 
 
 def forget():
@@ -47,6 +57,20 @@ def kept(folder):
 
 def double(x, power):
     return 2 * x**power
+
+
+double.__module__ = "jaxba.somewhere"  # others' functions are not kept
+
+
+class Rule(NamedTuple):
+    """As somebody might write one."""
+
+    value: jax.Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    number: int = 1
 
 
 def call(x, power=1):
@@ -144,8 +168,13 @@ def test_another_question_is_another_program(folder, monkeypatch):
     store = stored.Store(folder)
     x = jnp.arange(3.0)
     place = functools.partial(store.place, double, {"power": 1}, (x,))
+    layout, _ = support.start(support.tiny())
+    fewer = dataclasses.replace(layout, buckets=layout.buckets[1:])
+    learned = make_policy("learned")
+    stricter = dataclasses.replace(learned, config=dataclasses.replace(learned.config, min_gain=0.2))
     others = [
-        store.place(call, {"power": 1}, (x,)),
+        store.place(judge, {"power": 1}, (x,)),
+        *(store.place(double, {}, (tree,)) for tree in (layout, fewer, learned, stricter)),
         store.place(double, {"power": 2}, (x,)),
         store.place(double, {"power": StepOptions()}, (x,)),
         store.place(double, {"power": StepOptions(trials=2)}, (x,)),
@@ -162,7 +191,7 @@ def test_another_question_is_another_program(folder, monkeypatch):
         others.append(place())
     with monkeypatch.context() as patch:
         patch.setattr(stored, "_source", lambda: "another version of this package")
-        others.append(place())
+        others.append(stored.Store(folder).place(double, {"power": 1}, (x,)))
     with monkeypatch.context() as patch:
         patch.setattr(stored, "_machine", lambda: "another machine")
         others.append(place())
@@ -170,10 +199,86 @@ def test_another_question_is_another_program(folder, monkeypatch):
     assert place() == store.place(double, {"power": 1}, (jax.ShapeDtypeStruct((3,), x.dtype),))
 
 
-def test_what_has_no_lasting_name_is_not_kept(folder):
-    assert stored.Store(folder).place(double, {"power": lambda: 0}, (jnp.arange(3.0),)) is None
-    assert run_alone(program(lambda x: x + 1), 1) == 2
-    assert not kept(folder)
+@pytest.mark.parametrize(
+    ("function", "static", "argument"),
+    [
+        (double, {"power": abs}, 1.0),
+        (double, {"power": lambda: 0}, 1.0),
+        (double, {"power": Choice()}, 1.0),
+        (double, {"power": (1, Choice())}, 1.0),
+        (double, {"power": 1}, Rule(1.0)),
+        (double, {"power": 1}, [Rule(1.0)]),
+        (call, {"power": 1}, 1.0),
+        (lambda x: x, {}, 1.0),
+    ],
+    ids=["builtin", "lambda", "class", "inside", "tree", "in a tree", "function", "nameless"],
+)
+def test_what_is_somebody_elses_is_not_kept(function, static, argument, folder):
+    assert stored.Store(folder).place(function, static, (argument,)) is None
+
+
+def test_two_rules_of_a_user_are_not_mistaken_for_each_other(folder):
+    def rule(factor):
+        @jax.tree_util.register_dataclass
+        @dataclasses.dataclass(frozen=True)
+        class Constant(type(make_policy("constant:1e-3"))):
+            def propose(self, state, step):
+                return state, factor * step.damping
+
+        base = make_policy("constant:1e-3")
+        return Constant(**{field.name: getattr(base, field.name) for field in dataclasses.fields(base)})
+
+    for factor in (0.5, 2.0):
+        forget()
+        solved = solve(support.tiny(), rule(factor), max_iterations=3, callback=lambda record: None)
+        np.testing.assert_allclose(solved.history.damping[1:] / solved.history.damping[:-1], factor, rtol=1e-12)
+    names = {file.name.partition("-")[0] for file in kept(folder)}
+    assert {"propose", "judge"} <= names
+    assert not {"begin", "_advance_and_tell"} & names
+
+
+def test_what_cannot_be_run_is_compiled_anew_and_mended(folder):
+    call(jnp.arange(4.0))
+    (other,) = kept(folder)
+    content = other.read_bytes()
+    expected = np.asarray(call(jnp.arange(3.0)))
+    (file,) = set(kept(folder)) - {other}
+    file.write_bytes(content)  # can be read, but is for four numbers
+    forget()
+    np.testing.assert_array_equal(call(jnp.arange(3.0)), expected)
+    assert not file.exists()
+    forget()
+    np.testing.assert_array_equal(call(jnp.arange(3.0)), expected)
+    assert file.exists()
+
+
+def test_what_jax_has_read_from_its_cache_is_not_written(folder, tmp_path):
+    use_cache_of_jax(str(tmp_path / "of-jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    try:
+        call(jnp.arange(3.0))
+        jax.config.update("jax_compilation_cache_dir", None)  # what it has opened stays open
+        for count in (1, 0):  # the folder's name is part of the question, so that the first is compiled
+            forget()
+            np.testing.assert_array_equal(call(jnp.arange(3.0)), [0, 2, 4])
+            assert len(kept(folder)) == count
+            for file in kept(folder):
+                file.unlink()
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def test_both_ways_of_compiling_are_kept(folder, monkeypatch):
+    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "quick_runs", lambda part, observations: 1)
+    once = lambda: solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
+    first = once()
+    assert first.quick_iterations == 1
+    assert sum(file.name.startswith(("propose", "judge")) for file in kept(folder)) == 4
+    forget()
+    with Compilations() as seen:
+        again = once()
+    assert not {"propose", "judge"} & set(seen.names)
+    assert support.same_bits(first.history, again.history)
 
 
 def test_a_folder_that_is_gone_costs_time_and_nothing_else(tmp_path):
@@ -182,7 +287,7 @@ def test_a_folder_that_is_gone_costs_time_and_nothing_else(tmp_path):
 
 
 def test_beside_the_cache_of_jax_nothing_is_kept(folder, tmp_path):
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "of-jax"))
+    use_cache_of_jax(str(tmp_path / "of-jax"))
     np.testing.assert_array_equal(call(jnp.arange(3.0)), [0, 2, 4])
     assert not kept(folder)
 
@@ -207,7 +312,7 @@ def test_a_program_is_run_with_any_static_argument_in_any_place(folder):
     def third(x, power, y):
         return x**power + y
 
-    third.__qualname__ = "third"
+    third.__qualname__, third.__module__ = "third", "jaxba.somewhere"
     function = program(third, "power")
     for _ in range(2):
         with CompiledTogether() as together:
