@@ -1,13 +1,13 @@
-"""Seconds to compile the parts of a step and seconds that they take, with all optimisation and quickly compiled.
+"""Seconds to compile the parts of a step and seconds that they take, in each way of compiling.
 
     python -m benchmarks.compilation PROBLEM ... [--solver learned] [--linear-solver auto] [--repeats 15]
     python -m benchmarks.compilation PROBLEM ... --whole
 
 PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The constants of
-`jaxba/programs.py` follow from the last three columns: `saved s` is what compiling quickly saves, `slower us` what an
-observation takes longer in an iteration, `repaid` their quotient: observations times iterations, in millions. Both ways
-in turns, in one process, without a compilation cache, at the start with lambda 1e-4. `--whole` takes the time of
-`jaxba-solve FILE` from start to end, with `--compilation auto` and `full` in turns.
+`jaxba/programs.py` follow from the last columns: after how many observations times iterations, in millions, what the
+better way takes longer to compile has paid. All ways in turns, in one process, without a compilation cache, at the
+start with lambda 1e-4. `--whole` takes the time of `jaxba-solve FILE` from start to end, with `--compilation auto` and
+`full` in turns.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,21 +34,27 @@ from jaxba.choose import choose_linear_solver
 from jaxba.layout import layout_for
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import parse_solver
-from jaxba.programs import quick_options
+from jaxba.programs import Way, options_of
 
 LONGEST = 10.0
 """Seconds of repeats of one program."""
 
+WAYS: tuple[Way, ...] = ("quick", "brisk", "full")
+
+REPAID = (("quick", "brisk"), ("quick", "full"), ("brisk", "full"))
+
 HEADING = (
-    f"{'problem':28s} {'linear solver':13s} {'part':7s} {'full: compile s':>15s} {'run ms':>8s} "
-    f"{'quick: compile s':>16s} {'run ms':>8s} {'saved s':>8s} {'slower us':>9s} {'repaid':>7s}"
+    f"{'problem':28s} {'linear solver':13s} {'part':7s}"
+    + "".join(f" {way + ': compile s':>16s} {'run ms':>8s}" for way in WAYS)
+    + "".join(f" {worse + '->' + better:>12s}" for worse, better in REPAID)
 )
 
 
-def measure(step: Any, arguments: tuple[Any, ...], options: dict[str, Any] | None, repeats: int) -> tuple[float, float]:
+def measure(step: Any, arguments: tuple[Any, ...], way: Way, repeats: int) -> tuple[float, float]:
     """Seconds of compilation, tracing included, and median seconds of a step."""
+    options: Any = options_of(way)
     started = time.perf_counter()
-    compiled = jax.jit(lambda *given: step(*given)).lower(*arguments).compile(options)
+    compiled = jax.jit(lambda *given: step(way, *given)).lower(*arguments).compile(options)
     compile_s = time.perf_counter() - started
     jax.block_until_ready(compiled(*arguments))
     times: list[float] = []
@@ -59,7 +66,7 @@ def measure(step: Any, arguments: tuple[Any, ...], options: dict[str, Any] | Non
 
 
 def rows(location: str, solver: str, linear_solver: str, repeats: int) -> Iterator[str]:
-    """Both ways for every part of a problem's step, as lines of the table."""
+    """All ways for every part of a problem's step, as lines of the table."""
     source = sources([location])[0]
     problem, name = source.read(), parse_solver(solver)
     _, options = name.build()
@@ -69,25 +76,28 @@ def rows(location: str, solver: str, linear_solver: str, repeats: int) -> Iterat
         layout = jax.device_put(layout_for(problem, options))
         state = jax.jit(lm.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
         given = (layout, state, jnp.asarray(1e-4, dtype))
+        # as in stepwise.py: what is compiled in a hurry should be small
+        how = lambda way: options if way == "full" else replace(options, fused_passes=False)
         parts: dict[str, tuple[Any, tuple[Any, ...]]] = {
-            "round": (lambda la, s, d: lm.lm_step(la, s, d, options), given)
+            "round": (lambda way, la, s, d: lm.lm_step(la, s, d, how(way)), given)
         }
         if options.in_two:
-            propose = lambda la, s, d: lm.propose(la, s, d, options)
-            proposal = jax.jit(propose)(*given)
+            propose = lambda way, la, s, d: lm.propose(la, s, d, how(way))
+            proposal = jax.jit(lambda *given: propose("full", *given))(*given)
             parts = {
                 "propose": (propose, given),
-                "judge": (lambda la, s, d, p: lm.judge(la, s, d, p, options), (*given, proposal)),
+                "judge": (lambda way, la, s, d, p: lm.judge(la, s, d, p, how(way)), (*given, proposal)),
             }
         for part, (function, arguments) in parts.items():
-            (full_s, step_s), (quick_s, slow_s) = (
-                measure(function, arguments, how, repeats) for how in (None, quick_options())
-            )
-            saved, slower = full_s - quick_s, 1e6 * (slow_s - step_s) / problem.num_observations
-            yield (
-                f"{source.name[:28]:28s} {options.linear_solver:13s} {part:7s} {full_s:15.2f} {1e3 * step_s:8.1f} "
-                f"{quick_s:16.2f} {1e3 * slow_s:8.1f} {saved:8.2f} {slower:9.2f} {saved / slower:7.1f}"
-            )
+            measured = {way: measure(function, arguments, way, repeats) for way in WAYS}
+            line = f"{source.name[:28]:28s} {options.linear_solver:13s} {part:7s}"
+            for compile_s, run_s in measured.values():
+                line += f" {compile_s:16.2f} {1e3 * run_s:8.1f}"
+            for worse, better in REPAID:
+                longer = measured[better][0] - measured[worse][0]
+                faster = 1e6 * (measured[worse][1] - measured[better][1]) / problem.num_observations
+                line += f" {longer / faster if faster > 0 else np.inf:12.1f}"
+            yield line
 
 
 WHOLE = (

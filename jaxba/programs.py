@@ -1,11 +1,12 @@
-"""How XLA compiles programs on a CPU: with all optimisation, or in a third of the time.
+"""How XLA compiles programs on a CPU: with all optimisation, or in a third to half of the time.
 
 Compiling takes longer than most solves. A program made without LLVM's optimisation, and without XLA's newer kernel
-emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly
-(`python -m benchmarks.compilation`, docs/performance.md). So who has one problem to solve starts with it, and pays for
-the optimised program only where so many iterations come that it would have been cheaper from the start: as with skis
-that may be rented or bought, that is never much dearer than the better of the two. The parts of a step are programs of
-their own, since they gain differently, and are compiled beside each other.
+emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly; with
+LLVM's first level alone, in half of the time, it is nearly as fast as with all (`python -m benchmarks.compilation`,
+docs/performance.md). So who has one problem to solve starts with one of these, and pays for a better program only where
+so many iterations come that it would have been cheaper from the start: as with skis that may be rented or bought, that
+is never much dearer than the better of the two. The parts of a step are programs of their own, since they gain
+differently, and are compiled beside each other.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
 
 import jax
 
@@ -26,47 +27,81 @@ from jaxba.stored import Store, Stored, compiled_here
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 Compilation = Literal["full", "quick", "auto"]
-"""`full`: all optimisation. `quick`: hardly any. `auto`: quick, and full after as many iterations as pay for it."""
+"""`full`: all optimisation. `quick`: hardly any. `auto`: by the number of observations hardly any or little, and all
+after as many iterations as pay for it."""
 
 COMPILATIONS: tuple[str, ...] = get_args(Compilation)
 
-QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""XLA's options for a quick compilation. Level 0 alone saves half as much and makes loops twice as slow."""
+Way = Literal["full", "brisk", "quick"]
+"""How one program is compiled."""
+
+HASTE: dict[Way, dict[str, bool | int]] = {
+    "brisk": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
+    "quick": {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
+}
+"""XLA's options. Without the older emitters a level alone saves half as much."""
 
 Part = Literal["factored", "iterated", "judge", "round"]
 """What is compiled by itself: a linear solve by factorisation or by an iteration, the verdict on its step, or a round
 of domain decomposition."""
 
-REPAID: dict[Part, int] = {"factored": 1_000_000, "iterated": 2_000_000, "judge": 12_000_000, "round": 2_000_000}
-"""Observations times runs after which the optimised program has paid for its compilation: it takes 1 to 5 s
-longer to compile, and what an iteration of the quick one takes longer is mostly in the linear solve
-(`python -m benchmarks.compilation`, docs/performance.md, on thirteen problems)."""
+
+class Stage(NamedTuple):
+    """A way of compiling, and how often a program is run so before the next better one is made."""
+
+    way: Way
+    runs: int
+
+
+class Pays(NamedTuple):
+    """When a better program pays for its compilation (`python -m benchmarks.compilation`, docs/performance.md)."""
+
+    typical: int
+    """Runs that a solve may well take. A program that would not last so long is left out. Of the fifteen real problems
+    nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one to three repairs each."""
+
+    quick: int
+    """Observations times runs of a quick program after which the brisk one has paid for its compilation."""
+
+    brisk: int
+    """The same of a brisk program, after which the optimised one has."""
+
+
+PAYS: dict[Part, Pays] = {
+    "factored": Pays(typical=5, quick=220_000, brisk=4_000_000),
+    "iterated": Pays(typical=8, quick=1_000_000, brisk=15_000_000),
+    "judge": Pays(typical=80, quick=7_000_000, brisk=30_000_000),
+    "round": Pays(typical=8, quick=1_600_000, brisk=8_000_000),
+}
 
 REPAIR = 2
 """How often a verdict counts for each camera round or further trial that it takes: a quick one takes 0.6 us longer
 for an observation, the verdict without any 0.1 to 0.5 (on the two sequences of KITTI)."""
 
-FEWEST: dict[Part, int] = {"factored": 10, "iterated": 10, "judge": 150, "round": 10}
-"""Where the optimised program pays within so few runs, the quick one gets no more than these:"""
 
-AT_STAKE: dict[Part, int] = {"factored": 0, "iterated": 0, "judge": 12, "round": 0}
-"""Runs of the quick program of a large problem, where much is at stake. Of the fifteen real problems nine converge in 3
-to 9 iterations with 0 to 2 repairs, the others take 15 to 98 iterations with one to three repairs each, soon after the
-start: 12 runs tell them apart."""
+def stages(part: Part, observations: int) -> tuple[Stage, ...]:
+    """How a part of a step for so many observations is compiled, one way after the other, before the optimised one."""
+    typical, *repaid = PAYS[part]
+    ways: tuple[Way, ...] = ("quick", "brisk")
+    found = [Stage(way, count // max(1, observations)) for way, count in zip(ways, repaid, strict=True)]
+    return tuple(stage for stage in found if stage.runs >= typical)
 
 
-def quick_runs(part: Part, observations: int) -> int:
-    """How often a quickly compiled program does a part for so many observations, before the optimised one is made."""
-    count = REPAID[part] // max(1, observations)
-    return count if count >= FEWEST[part] else AT_STAKE[part]
+def way_after(runs: int, stages: tuple[Stage, ...]) -> Way:
+    """How a program is compiled that was run so often."""
+    for way, count in stages:
+        if runs < count:
+            return way
+        runs -= count
+    return "full"
 
 
 @functools.cache
-def quick_options() -> dict[str, bool | int] | None:
-    """XLA's options for a quick compilation; None where there is no such thing, on a GPU or in another jaxlib."""
-    if jax.default_backend() != "cpu":
+def options_of(way: Way) -> dict[str, bool | int] | None:
+    """XLA's options; None where there is no such way, on a GPU or in another jaxlib, and for `full`."""
+    if way not in HASTE or jax.default_backend() != "cpu":
         return None
-    options: dict[str, bool | int] = dict(QUICK)
+    options = dict(HASTE[way])
     try:
         jax.jit(lambda: 0, compiler_options=options).lower().compile()
     except jax.errors.JaxRuntimeError:  # an option that it does not know
@@ -77,9 +112,9 @@ def quick_options() -> dict[str, bool | int] | None:
 class Program:
     """A function compiled by `jax.jit` for every shape of its arguments, which are given by position."""
 
-    def __init__(self, function: Callable[..., Any], static: tuple[str, ...], quick: bool) -> None:
+    def __init__(self, function: Callable[..., Any], static: tuple[str, ...], way: Way) -> None:
         self.function = function
-        self.options: Any = quick_options() if quick else None
+        self.options: Any = options_of(way)
         self.jitted = jax.jit(function, static_argnames=static, compiler_options=self.options)
         self._static = [name if name in static else None for name in inspect.signature(function).parameters]
 
@@ -93,15 +128,15 @@ class Program:
 
 
 @functools.cache
-def program(function: Callable[..., Any], *static: str, quick: bool = False) -> Program:
+def program(function: Callable[..., Any], *static: str, way: Way = "full") -> Program:
     """The function compiled, one program for each way of compiling.
 
     Args:
         function: what it computes.
         static: names of its static arguments.
-        quick: hardly optimised, if that can be had.
+        way: optimised or hardly, if that can be had.
     """
-    return Program(function, static, quick)
+    return Program(function, static, way)
 
 
 _store: Store | None = None
@@ -125,13 +160,14 @@ class CompiledTogether:
 
     XLA compiles one program on little more than one core. Who leaves the context compiles what is still waiting, in the
     thread that will run it: the memory that this takes is then there for running (`host.keep_memory`). It may be
-    entered again for more.
+    entered again for more; a program is compiled once, for the arguments that it was given first.
     """
 
     def __init__(self) -> None:
         self.loaded: dict[Program, Stored] = {}
         """What was on disk."""
         self._proven: set[Program] = set()
+        self._known: dict[Program, Any] = {}  # shapes and types of results
 
     def __enter__(self) -> CompiledTogether:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
@@ -149,14 +185,17 @@ class CompiledTogether:
         Returns:
             Shapes and types of its results, to be arguments of the next.
         """
+        if function not in self._known:
+            self._known[function] = self._begin(function, *arguments)
+        return self._known[function]
+
+    def _begin(self, function: Program, *arguments: Any) -> Any:
         store, place = None if jax.config.values.get("jax_compilation_cache_dir") else _store, None
         if store is not None:
             static, given = function.parted(arguments)
             place = store.place(function.function, static, given, function.options)
-            self.loaded.pop(function, None)
             if (stored := store.load(place, given)) is not None:
                 self.loaded[function] = stored
-                self._proven.discard(function)
                 return stored.out
         traced = function.jitted.trace(*arguments)
         lowered = traced.lower()

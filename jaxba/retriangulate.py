@@ -29,7 +29,7 @@ from jaxba.lm import initial_state
 from jaxba.losses import Loss
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.programs import program, quick_runs, run_alone
+from jaxba.programs import program, run_alone, stages, way_after
 from jaxba.refine import refine_points
 from jaxba.solve import explain_start
 from jaxba.sums import point_sum
@@ -107,9 +107,9 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
-        quick = quick_runs("judge", problem.num_observations) > VERDICTS
-        search = program(_search, "loss", "fused", quick=quick)
-        given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss(), not quick)
+        way = way_after(VERDICTS, stages("judge", problem.num_observations))
+        search = program(_search, "loss", "fused", way=way)
+        given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss(), way == "full")
         found = jax.device_get(run_alone(search, *given))
         host.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):

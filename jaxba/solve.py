@@ -29,7 +29,7 @@ from jaxba.naming import DTYPES, fitting_policy
 from jaxba.options import StepOptions
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.programs import Compilation, Part, program, quick_options, quick_runs, run_alone
+from jaxba.programs import Compilation, Part, Stage, options_of, program, run_alone, stages
 from jaxba.stepwise import IterationRecord, run_stepwise
 from jaxba.termination import Termination, Tolerances
 
@@ -78,7 +78,7 @@ class Solution:
     """Sizes to which the problem was padded; None where it was not."""
 
     quick_iterations: int = 0
-    """Iterations, a solve's first ones, that quickly compiled programs computed, at least in part; they are slower."""
+    """Iterations, a solve's first ones, that were computed, at least in part, by programs not fully optimised."""
 
     @property
     def converged(self) -> bool:
@@ -120,9 +120,10 @@ def solve(
             solver, which `auto` then means. Other solvers and larger problems are left as they are:
             `Solution.capacity` is None then. See padding.py.
         compilation: `full`: all optimisation, for many solves of a shape and for whoever takes the time of iterations.
-            `quick`: compiled in a third of the time, iterations take two to six times as long. `auto`: quick, and
-            optimised after as many iterations as pay for it; the end of one small solve comes soonest. They differ by
-            rounding. On a GPU all are `full`. See programs.py.
+            `quick`: compiled in a third of the time, iterations take two to six times as long. `auto`: quick or, with
+            more observations, in half of the time and nearly as fast, and optimised after as many iterations as pay
+            for it; the end of one solve comes soonest. They differ by rounding. On a GPU all are `full`. See
+            programs.py.
 
     Many problems of many shapes may be solved in one process: before their programs exceed what Linux lets a process
     map, all compiled programs of JAX are dropped (`host.release_programs`), and compiled anew where they are needed.
@@ -158,15 +159,15 @@ def solve(
         started = time.perf_counter()
         with CompileClock() as clock:
             layout = jax.device_put(layout_for(problem, options, capacity))
-            initial = program(initial_state, "options", "dtype", quick=True)
+            initial = program(initial_state, "options", "dtype", way="quick")
             begin = problem if capacity is None else padded_parameters(problem, capacity)
             state = jax.block_until_ready(run_alone(initial, layout, begin, options, jnp.dtype(dtype)))
         setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))
-        quick = _quick_parts(compilation, problem, options)
-        run = functools.partial(run_stepwise, callback=callback or (lambda _: None), quick=quick)
-        if callback is None and not any(quick.values()):
+        before = _stages(compilation, problem, options)
+        run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=before)
+        if callback is None and not any(before.values()):
             run = _run_compiled
         final, history, quick_count, compile_s, total_s = run(
             layout, state, policy, tolerances, options, max_iterations
@@ -206,16 +207,16 @@ def explain_start(problem: BundleProblem) -> str:
     )
 
 
-def _quick_parts(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, int]:
-    """How often a quickly compiled program is run before the optimised one is made, for each part of a step."""
+def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
+    """How each part of a step is compiled before it is optimised."""
     parts: dict[str, Part] = {"round": "round"}
     if options.in_two:
         parts = {"propose": "factored" if options.factors else "iterated", "judge": "judge"}
-    if compilation == "full" or quick_options() is None:
-        return dict.fromkeys(parts, 0)
+    if compilation == "full" or options_of("quick") is None:
+        return dict.fromkeys(parts, ())
     if compilation == "quick":
-        return dict.fromkeys(parts, sys.maxsize)
-    return {name: quick_runs(part, problem.num_observations) for name, part in parts.items()}
+        return dict.fromkeys(parts, (Stage("quick", sys.maxsize),))
+    return {name: stages(part, problem.num_observations) for name, part in parts.items()}
 
 
 def _run_compiled(

@@ -8,7 +8,7 @@ solve, the verdict on the step, the policy), so that they compile beside each ot
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from jaxba.layout import Layout
 from jaxba.lm import LMState, StepInfo, judge, lm_step, propose
 from jaxba.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.options import StepOptions
-from jaxba.programs import REPAIR, CompiledTogether, program
+from jaxba.programs import REPAIR, CompiledTogether, Stage, Way, program, way_after
 from jaxba.termination import Termination, Tolerances
 
 
@@ -47,21 +47,21 @@ class _Loop(NamedTuple):
 
     def start(self, call: Callable[..., Any], state: LMState) -> Carry:
         """The carry before the first iteration."""
-        inform = program(problem_info, "options", "max_iterations", quick=True)
+        inform = program(problem_info, "options", "max_iterations", way="quick")
         info = call(inform, self.layout, state, self.options, self.max_iterations)
         # without the parameters what is the policy's compiles once for all problems
-        return call(program(begin, quick=True), info, self.policy, None)._replace(state=state)
+        return call(program(begin, way="quick"), info, self.policy, None)._replace(state=state)
 
-    def iterate(self, call: Callable[..., Any], carry: Carry, quick: Set[str]) -> tuple[Carry, StepInfo, Any]:
-        """One iteration, some parts of it quickly compiled: the carry after it, its record, and that for the host."""
+    def iterate(self, call: Callable[..., Any], carry: Carry, ways: Mapping[str, Way]) -> tuple[Carry, StepInfo, Any]:
+        """One iteration, its parts compiled in these ways: the carry after it, its record, and that for the host."""
         state, options = carry.state, self.options
         effort = None
         if decides_effort(self.policy):
-            effort = call(program(effort_of, quick=True), self.policy, carry.policy)
-        part = lambda name, function: program(function, "options", quick=name in quick)
+            effort = call(program(effort_of, way="quick"), self.policy, carry.policy)
+        part = lambda name, function: program(function, "options", way=ways[name])
         # what is compiled in a hurry should be small
         small = replace(options, fused_passes=False)
-        how = lambda name: small if name in quick else options
+        how = lambda name: options if ways[name] == "full" else small
         min_gain = jnp.asarray(self.policy.min_gain, state.cost.dtype)
         if options.in_two:
             given = (self.layout, state, carry.damping)
@@ -72,7 +72,7 @@ class _Loop(NamedTuple):
             state, step = call(part("round", lm_step), *given)
         limit = jnp.asarray(self.max_iterations, jnp.int32)
         own = (carry._replace(state=None), step, self.policy, self.tolerances, limit)
-        carry, facts = call(program(_advance_and_tell, quick=True), *own)
+        carry, facts = call(program(_advance_and_tell, way="quick"), *own)
         return carry._replace(state=state), step, facts
 
 
@@ -85,7 +85,7 @@ def run_stepwise(
     max_iterations: int,
     *,
     callback: Callable[[IterationRecord], bool | None],
-    quick: Mapping[str, int],
+    stages: Mapping[str, tuple[Stage, ...]],
 ) -> tuple[Carry, History, int, float, float]:
     """Iterates until a stop rule or the callback ends it.
 
@@ -97,38 +97,44 @@ def run_stepwise(
         options: static.
         max_iterations: limit of linear solves.
         callback: sees every record; a true answer ends the solve.
-        quick: how often a quickly compiled program is run before the optimised one is made, for each part of a step,
-            `propose` and `judge`, or `round`. A camera round or a further trial counts `programs.REPAIR` times more.
+        stages: how each part of a step is compiled before it is optimised, `propose` and `judge`, or `round`. A camera
+            round or a further trial counts `programs.REPAIR` times more than a run.
 
     Returns:
         Final carry, histories of as many entries as there were iterations, how many of these had a quickly compiled
         part, seconds of compilation and seconds of everything else.
     """
     loop = _Loop(layout, policy, tolerances, options, max_iterations)
-    runs = dict.fromkeys(quick, 0)
-    hurried = {name for name in quick if runs[name] < quick[name]}
+    runs = dict.fromkeys(stages, 0)
+
+    def ways_now() -> dict[str, Way]:
+        return {name: way_after(runs[name], of_part) for name, of_part in stages.items()}
+
+    ways = ways_now()
     started = time.perf_counter()
     with CompileClock() as clock, CompiledTogether() as together:
-        loop.iterate(together, loop.start(together, state), hurried)
+        loop.iterate(together, loop.start(together, state), ways)
     run = together.run
     carry = jax.block_until_ready(loop.start(run, state))
     compile_s = 0.0
     if clock.seconds > 0 or together.loaded:
-        if not hurried:  # a program's first run touches its memory for the first time; the time of others is wanted
-            jax.block_until_ready(loop.iterate(run, carry, hurried)[2])
+        if set(ways.values()) == {
+            "full"
+        }:  # a program's first run touches its memory for the first time; the time of others is wanted
+            jax.block_until_ready(loop.iterate(run, carry, ways)[2])
         compile_s = time.perf_counter() - started
     records, quick_iterations = [], 0
     started, waited = time.perf_counter(), 0.0
     while True:
-        if hurried != (left := {name for name in quick if runs[name] < quick[name]}):
-            hurried, began = left, time.perf_counter()
+        if ways != (now := ways_now()):
+            ways, began = now, time.perf_counter()
             with together:
-                loop.iterate(together, carry, hurried)
+                loop.iterate(together, carry, ways)
             waited += time.perf_counter() - began
-        carry, step, facts = loop.iterate(run, carry, hurried)
+        carry, step, facts = loop.iterate(run, carry, ways)
         step, end = _told(facts, step)
         records.append(step)
-        quick_iterations += bool(hurried)
+        quick_iterations += set(ways.values()) != {"full"}
         for name in runs:
             runs[name] += 1 + REPAIR * int(step.repairs) if name == "judge" else 1
         wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - waited, step))

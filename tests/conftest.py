@@ -18,8 +18,8 @@ import jaxtyping
 import pytest
 
 QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-"""What `jaxba.programs.QUICK` says, for all programs of a process and its children; not imported from there, because it
-has to be said before jaxba is."""
+"""What `jaxba.programs.HASTE["quick"]` says, for all programs of a process and its children; not imported from there,
+because it has to be said before jaxba is."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -17,7 +17,7 @@ from jaxba.cli.solve import run
 from jaxba.io import write_problem
 from jaxba.lm import judge, lm_step, propose
 from jaxba.options import StepOptions
-from jaxba.programs import FEWEST, REPAID, CompiledTogether, Part, Program, program, quick_options, quick_runs
+from jaxba.programs import PAYS, CompiledTogether, Part, Program, Stage, Way, options_of, program, stages, way_after
 
 pytestmark = pytest.mark.step
 
@@ -28,19 +28,27 @@ on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU
 
 
 @pytest.mark.parametrize("part", get_args(Part))
-def test_many_observations_are_compiled_with_all_optimisation_at_once(part):
-    edge = REPAID[part] // FEWEST[part]
-    sizes = [1, 100, 31_843, edge, edge + 1, 10**7]
-    counts = [quick_runs(part, size) for size in sizes]
-    assert counts == sorted(counts, reverse=True)
-    assert counts[:4] == [REPAID[part] // size for size in sizes[:4]]
-    assert counts[-2:] == [12 if part == "judge" else 0] * 2
-    assert counts[2] > 20, "Ladybug-49 converges before that"
+def test_the_more_observations_the_better_programs_are_compiled_and_the_sooner(part):
+    typical, quick, brisk = PAYS[part]
+    assert stages(part, 1) == (("quick", quick), ("brisk", brisk))
+    assert stages(part, 100) == (("quick", quick // 100), ("brisk", brisk // 100))
+    assert stages(part, quick // typical) == (("quick", typical), ("brisk", brisk // (quick // typical)))
+    assert [way for way, _ in stages(part, quick // (typical - 1))] == ["brisk"]
+    assert stages(part, brisk // typical) == (("brisk", typical),)
+    assert stages(part, brisk // (typical - 1)) == stages(part, 10**9) == ()
+    assert sum(runs for _, runs in stages(part, 31_843)) > 100, "Ladybug-49 converges before that"
+
+
+def test_a_program_gives_way_to_a_better_one_when_it_was_run_often_enough():
+    both = (Stage("quick", 2), Stage("brisk", 3))
+    assert [way_after(runs, both) for runs in range(7)] == ["quick"] * 2 + ["brisk"] * 3 + ["full"] * 2
+    assert way_after(0, ()) == "full"
 
 
 @on_a_cpu
-def test_this_jaxlib_knows_the_quick_way():
-    assert quick_options() == programs.QUICK
+def test_this_jaxlib_knows_both_hasty_ways():
+    assert {way: options_of(way) for way in ("quick", "brisk")} == programs.HASTE
+    assert options_of("full") is None
 
 
 @pytest.mark.fully_compiled
@@ -63,11 +71,23 @@ def test_a_quickly_compiled_solve_is_the_same_solve(how):
     full = solve(support.tiny(), **how, max_iterations=8, callback=lambda record: None)
     quick = solve(support.tiny(), **how, max_iterations=8, compilation="quick")
     assert full.quick_iterations == 0
-    assert quick.quick_iterations == (quick.iterations if quick_options() else 0)
+    assert quick.quick_iterations == (quick.iterations if options_of("quick") else 0)
     assert (quick.iterations, quick.accepted, quick.termination) == (full.iterations, full.accepted, full.termination)
     np.testing.assert_allclose(quick.history.cost, full.history.cost, rtol=1e-8)
     # a network of, among others, the last digits of a decrease
     np.testing.assert_allclose(quick.history.damping, full.history.damping, rtol=1e-4)
+
+
+@pytest.mark.fully_compiled
+@on_a_cpu
+@pytest.mark.parametrize("how", [{}, {"linear_solver": "implicit"}, {"method": "ddlm"}, {"method": "stba"}], ids=str)
+def test_a_briskly_compiled_solve_is_the_same_solve(how, monkeypatch):
+    full = solve(support.tiny(), "learned", **how, max_iterations=8, callback=lambda record: None)
+    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "stages", lambda part, _: (Stage("brisk", 100),))
+    brisk = solve(support.tiny(), "learned", **how, max_iterations=8, compilation="auto")
+    assert (full.quick_iterations, brisk.quick_iterations) == (0, brisk.iterations)
+    assert (brisk.iterations, brisk.accepted, brisk.termination) == (full.iterations, full.accepted, full.termination)
+    np.testing.assert_allclose(brisk.history.cost, full.history.cost, rtol=1e-8)
 
 
 class Compilations:
@@ -167,8 +187,8 @@ def test_nothing_more_is_compiled_after_an_error():
 def test_the_optimised_program_takes_over_without_a_trace(watched, monkeypatch):
     full = solve(support.tiny(), "ceres")
     assert full.iterations > 2
-    quick = {"factored": 1, "judge": 2}
-    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "quick_runs", lambda part, _: quick[part])
+    before = {"factored": (Stage("quick", 1),), "judge": (Stage("quick", 1), Stage("brisk", 1))}
+    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "stages", lambda part, _: before[part])
     records = []
     callback = records.append if watched else None
     mixed = solve(support.tiny(), "ceres", compilation="auto", callback=callback)
@@ -184,7 +204,7 @@ def test_the_optimised_program_takes_over_without_a_trace(watched, monkeypatch):
 
 @on_a_cpu
 def test_a_second_quick_solve_compiles_nothing_and_each_way_has_its_program():
-    assert program(propose, "options", quick=True) is not program(propose, "options")
+    assert len({program(propose, "options", way=way) for way in get_args(Way)}) == 3
     solve(support.paper(0), "ceres", max_iterations=3, compilation="quick")
     with Compilations() as seen:
         again = solve(support.paper(1), "ceres", max_iterations=3, compilation="quick")
@@ -205,8 +225,8 @@ def test_iterations_of_solves_in_turns_are_added():
 
 
 def test_where_the_options_are_unknown_programs_are_optimised(monkeypatch):
-    monkeypatch.setattr(programs, "QUICK", {"xla_no_such_option": True})
-    assert quick_options.__wrapped__() is None
+    monkeypatch.setitem(programs.HASTE, "quick", {"xla_no_such_option": True})
+    assert options_of.__wrapped__("quick") is None
 
 
 def test_an_unknown_way_is_refused_in_one_line(unchecked):
@@ -223,6 +243,6 @@ def test_the_command_says_where_iterations_were_slow_by_design(tmp_path, capsys,
     assert " (all with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out
     assert run([*fast, "--compilation", "full"]) == 0
     assert "quickly" not in capsys.readouterr().out
-    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "quick_runs", lambda part, observations: 1)
+    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "stages", lambda part, _: (Stage("quick", 1),))
     assert run(fast) == 0
     assert " (1 of them with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out

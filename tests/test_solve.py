@@ -51,12 +51,15 @@ def test_the_compiled_loop_and_the_stepwise_one_are_the_same_solve(damping):
     watched = solve(support.tiny(), damping, callback=records.append)
     assert compiled.termination == watched.termination == Termination.COST
     assert (compiled.iterations, compiled.accepted) == (watched.iterations, watched.accepted)
+    costs = np.append(compiled.initial_cost, compiled.history.cost)
+    assert compiled.history.accepted.all()
+    # two programs round costs differently, in the last three digits; a small decrease has as many fewer that are right
+    wanted = {"gradient_max": 1e-6, "gain_ratio": 1e-6 + 1e-13 * costs[1:] / -np.diff(costs)}
     for name in compiled.history._fields:
         one, other = getattr(compiled.history, name), getattr(watched.history, name)
         assert len(one) == len(other) == compiled.iterations
-        np.testing.assert_allclose(
-            one, other, rtol=1e-6 if name in ("gradient_max", "gain_ratio") else 1e-8, err_msg=name
-        )
+        bound = wanted.get(name, 1e-8) * np.abs(other)
+        assert (np.abs(one.astype(float) - other) <= bound).all(), name
     np.testing.assert_allclose(compiled.problem.points, watched.problem.points, rtol=1e-6, atol=1e-8)
     assert [r.iteration for r in records] == list(range(1, watched.iterations + 1))
     assert [r.step.cost for r in records] == list(watched.history.cost)

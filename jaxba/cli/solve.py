@@ -62,7 +62,8 @@ class Arguments:
 
     compilation: Compilation = "auto"
     """quick: compiled in a third of the time, but iterations take two to six times as long. full: all optimisation.
-    auto: quick, and optimised after as many iterations as pay for it; large problems at once. On a GPU always full."""
+    auto: quick, or in half of the time and nearly as fast, by the number of observations, and optimised after as many
+    iterations as pay for it. On a GPU always full."""
 
     retriangulate: bool = False
     """After convergence look for every point at other depths, go on from the cheapest places, and so on in turns while
