@@ -110,6 +110,7 @@ def run_stepwise(
     def ways_now() -> dict[str, Way]:
         return {name: way_after(runs[name], of_part) for name, of_part in stages.items()}
 
+    optimised = lambda ways: set(ways.values()) == {"full"}
     ways = ways_now()
     started = time.perf_counter()
     with CompileClock() as clock, CompiledTogether() as together:
@@ -118,9 +119,7 @@ def run_stepwise(
     carry = jax.block_until_ready(loop.start(run, state))
     compile_s = 0.0
     if clock.seconds > 0 or together.loaded:
-        if set(ways.values()) == {
-            "full"
-        }:  # a program's first run touches its memory for the first time; the time of others is wanted
+        if optimised(ways):  # a program's first run touches its memory for the first time; the time of others is wanted
             jax.block_until_ready(loop.iterate(run, carry, ways)[2])
         compile_s = time.perf_counter() - started
     records, quick_iterations = [], 0
@@ -134,7 +133,7 @@ def run_stepwise(
         carry, step, facts = loop.iterate(run, carry, ways)
         step, end = _told(facts, step)
         records.append(step)
-        quick_iterations += set(ways.values()) != {"full"}
+        quick_iterations += not optimised(ways)
         for name in runs:
             runs[name] += 1 + REPAIR * int(step.repairs) if name == "judge" else 1
         wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - waited, step))
