@@ -283,9 +283,7 @@ def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense
         diagonal = np.clip(np.sum(jacobian**2, axis=0), 1e-6, 1e32)
     diagonal[: problem.cameras.size] *= options.camera_damping
     stacked = np.vstack([jacobian, np.diag(np.sqrt(damping * diagonal))])
-    free = jacobian.any(
-        axis=0
-    )  # what no residual depends on does not move; a factorisation finds that to rounding only
+    free = jacobian.any(axis=0)  # what no residual depends on stays; a factorisation finds that to rounding only
     stacked = stacked[:, free]
     scale = 1 / np.linalg.norm(stacked, axis=0)
     q, r = np.linalg.qr(stacked * scale)
