@@ -57,8 +57,9 @@ class Pays(NamedTuple):
     """When a better program pays for its compilation (`python -m benchmarks.compilation`, docs/performance.md)."""
 
     typical: int
-    """Runs that a solve may well take. A program that would not last so long is left out. Of the fifteen real problems
-    nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one to three repairs each."""
+    """Runs, counted as `REPAIR` says, that a solve may well take: a program that would not last so long is left out. Of
+    the fifteen real problems nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one
+    to three repairs each. Chosen with whole calls of eight problems in sight (docs/performance.md)."""
 
     quick: int
     """Observations times runs of a quick program after which the brisk one has paid for its compilation."""
@@ -87,9 +88,9 @@ def stages(part: Part, observations: int) -> tuple[Stage, ...]:
     return tuple(stage for stage in found if stage.runs >= typical)
 
 
-def way_after(runs: int, stages: tuple[Stage, ...]) -> Way:
-    """How a program is compiled that was run so often."""
-    for way, count in stages:
+def way_after(runs: int, before: tuple[Stage, ...]) -> Way:
+    """How a program is compiled that was run so often; after its stages it is optimised."""
+    for way, count in before:
         if runs < count:
             return way
         runs -= count

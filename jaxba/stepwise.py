@@ -101,8 +101,8 @@ def run_stepwise(
             round or a further trial counts `programs.REPAIR` times more than a run.
 
     Returns:
-        Final carry, histories of as many entries as there were iterations, how many of these had a quickly compiled
-        part, seconds of compilation and seconds of everything else.
+        Final carry, histories of as many entries as there were iterations, how many of these had a part
+        that was not optimised, seconds of compilation and seconds of everything else.
     """
     loop = _Loop(layout, policy, tolerances, options, max_iterations)
     runs = dict.fromkeys(stages, 0)

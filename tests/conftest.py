@@ -51,7 +51,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
     for item in items:
         if item.get_closest_marker("fully_compiled"):
-            item.add_marker(pytest.mark.skip(reason="needs --compilation full"))
+            item.add_marker(pytest.mark.skip(reason="needs --compilation full, as in .ci/run"))
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
