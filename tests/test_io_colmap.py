@@ -24,6 +24,8 @@ from jaxba.io.colmap import MODELS
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
 
+pytestmark = pytest.mark.extra
+
 SIZE = 1280, 960
 LENSES = {
     "SIMPLE_PINHOLE": [700, 640, 480],

@@ -43,6 +43,8 @@ from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.peers.driven import drive_ceres
 from jaxba.peers.model import observed, step_facts
 
+pytestmark = pytest.mark.extra
+
 MANIFOLD = StepOptions(rotation="manifold")
 NEVER = Tolerances(ftol=0.0, xtol=0.0, gtol=0.0)
 SOME = Schedule(values=(1e-3, 1e-2, 1e-1, 1.0))

@@ -57,6 +57,7 @@ def test_the_public_list_is_sorted_and_has_no_name_twice():
     assert jaxba.__all__ == sorted(upper) + sorted(classes) + sorted(functions)
 
 
+@pytest.mark.extra
 @pytest.mark.parametrize("module", [m.name for m in pkgutil.walk_packages(jaxba.__path__, "jaxba.")])
 def test_every_module_can_be_imported_and_says_what_it_is_for(module):
     missing = [name for name in ("pyceres", "pycolmap") if importlib.util.find_spec(name) is None]
