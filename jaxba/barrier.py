@@ -1,10 +1,13 @@
-"""Boundaries: one that XLA does not fuse across, and one that makes it do one thing after another."""
+"""Boundaries: two that XLA does not fuse across, and one that makes it do one thing after another."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 
 def materialized(rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
@@ -20,6 +23,28 @@ def materialized(rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
 
 def _times_one(rows: Array) -> Array:
     return jnp.matmul(jnp.eye(rows.shape[0], dtype=rows.dtype), rows, precision="highest")
+
+
+def apart(function: Callable[..., Array], *operands: Array, index: Int[Array, ""]) -> Array:
+    """`function(*operands)`, computed by itself: XLA fuses it with nothing that comes before or after it.
+
+    A kernel that writes its result into its place in a larger array, as the last one in the body of a loop does, runs
+    on one core; and what a gather reads is fused into it and computed anew for every row that it takes. On a CPU the
+    way out is a branch that is always taken: branches are computations of their own, and cost a few microseconds. On a
+    GPU, where a branch makes the host wait, nothing is done.
+
+    Args:
+        function: of arrays, to one array.
+        operands: its arguments.
+        index: any index that is an argument of the whole program: it is never negative, which XLA does not know.
+    """
+
+    def nothing(*operands: Array) -> Array:
+        result = jax.eval_shape(function, *operands)
+        return jnp.zeros(result.shape, result.dtype)
+
+    branch = lambda *operands: lax.cond(index >= 0, function, nothing, *operands)
+    return lax.platform_dependent(*operands, cpu=branch, default=function)
 
 
 def after(first: Array, then: Array) -> Array:

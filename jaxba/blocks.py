@@ -5,6 +5,7 @@ from __future__ import annotations
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxba.barrier import apart
 from jaxba.pairs import PairLayout
 from jaxba.sums import outer_sum, take_rows, tree_sum
 
@@ -20,13 +21,15 @@ def pair_products(
         width: unknowns of a block's side.
     """
 
-    def multiply(sides: tuple[Array, Array]) -> Array:
+    def batch(parts: tuple[Array, Array, Array]) -> Array:
+        *sides, sums = parts
         left, right = (take_rows(rows, side).reshape(side.shape[0], -1, width) for side in sides)
-        return outer_sum(left, right)
+        products = apart(outer_sum, left, right, index=sums[0, 0])
+        return apart(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums[0, 0])
 
-    # one batch after the other, so that the gathered operands stay small
-    chunks = lax.map(multiply, (pairs.left, pairs.right)).reshape(-1, width * width)
-    return tree_sum(chunks, pairs.levels)
+    # one batch after the other, so that what is gathered and its products stay in cache
+    partial = lax.map(batch, (pairs.left, pairs.right, pairs.sums)).reshape(-1, width * width)
+    return tree_sum(partial, pairs.levels)
 
 
 def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks square"], width: int) -> Float[Array, "n n"]:

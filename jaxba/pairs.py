@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from scipy.sparse import csr_matrix
 
 from jaxba.ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
@@ -19,7 +19,8 @@ PAIR_CHUNKS = (4, 8)
 """Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
 
 PAIR_BATCH = 2048
-"""Most chunks multiplied at once: bounds the gathered operands to 7 MB, which stay in cache."""
+"""Most chunks multiplied at once: bounds the gathered operands to 7 MB and the products to 1.3 MB, which stay in
+cache."""
 
 PAIR_ITEM_COST = 1.5
 """Cost of one partial 9 x 9 block, in pairs; decides between few long and many short chunks."""
@@ -36,8 +37,11 @@ class PairLayout:
     right: Int[AnyArray, "batches chunks width"]
     """Slot of the block column's camera, seen by the same point."""
 
+    sums: Int[AnyArray, "batches partial width_of_sums"]
+    """Chunks of the batch that are summed at once: those of one block. The last one of a batch is all padding."""
+
     levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Tree from chunks to blocks; the last block is always zero."""
+    """Tree from the partial sums of all batches to blocks; the last block is always zero."""
 
     block_camera: Int[AnyArray, " blocks"]
     """Camera of a block on the diagonal; the number of cameras for the others."""
@@ -129,14 +133,16 @@ def pair_layout(
     # where each pair goes, in the order of the blocks: those of a block stand together, and begin a row
     shift = width * (np.cumsum(chunks) - chunks) - (np.cumsum(counts) - counts)
     position = np.repeat(shift.astype(np.int32), counts) + np.arange(len(left), dtype=np.int32)
-    used, total = int(chunks.sum()), number_of(width) + 1  # at least one chunk is all padding
-    batches = -(-total // PAIR_BATCH)
-    batch = -(-total // batches)
+    most = int(chunks.sum()) if room is None else number_of(width)  # chunks for which there is room
+    batches = max(1, -(-most // (PAIR_BATCH - 1)))
+    batch = max(1, -(-most // batches))  # chunks of a batch; one more is all padding
+    position += position // (width * batch) * width
     padded = []
     for side in (left, right):
-        array = np.full(batches * batch * width, empty, np.int32)
+        array = np.full(batches * (batch + 1) * width, empty, np.int32)
         array[position] = slot[side[order]]
-        padded.append(array.reshape(batches, batch, width))
+        padded.append(array.reshape(batches, batch + 1, width))
+    sums, levels = _batch_sums(chunks, batches, batch, None if room is None else -(-room.most // width))
     table = None
     if factor and not banded:
         table = np.full(cameras * cameras, len(names), np.int32)
@@ -154,13 +160,8 @@ def pair_layout(
     return PairLayout(
         left=padded[0],
         right=padded[1],
-        levels=sum_tree(
-            np.arange(used),
-            np.append(chunks, 0),
-            total - 1,
-            TREE_WIDTH,
-            None if room is None else Room(total - 1, -(-room.most // width)),
-        ),
+        sums=sums,
+        levels=levels,
         block_camera=block_camera,
         block_row=block_row,
         block_column=block_column,
@@ -169,6 +170,42 @@ def pair_layout(
         table=table,
         band=band_of(names, rank, reach) if banded else None,
     )
+
+
+def _batch_sums(
+    chunks: Int[np.ndarray, " blocks"], batches: int, batch: int, most: int | None
+) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...]]:
+    """What is summed within each batch, and the tree from there to the blocks and one more that is empty.
+
+    Args:
+        chunks: of each block, one block after the other.
+        batches: number of batches.
+        batch: chunks of each.
+        most: chunks of a block at most, where all shapes are to follow from that and the numbers above; else None.
+    """
+    block = np.repeat(np.arange(len(chunks)), chunks)
+    home, place = np.divmod(np.arange(len(block)), batch)
+    run = (np.diff(block, prepend=-1) != 0) | (place == 0)  # chunks of one block within one batch begin here
+    within = _since(run)
+    begins = within % TREE_WIDTH == 0
+    owner, target = home[begins], block[begins]  # of each partial sum
+    counts = np.bincount(owner, minlength=batches)
+    partial = int(counts.max()) if most is None else chunks_at_most(batch, len(chunks), TREE_WIDTH)
+    number = _since(np.diff(owner, prepend=-1) != 0)
+    sums = np.full((batches, partial + 1, TREE_WIDTH), batch, np.int32)
+    sums[home, number[np.cumsum(begins) - 1], within % TREE_WIDTH] = place
+    room = None
+    if most is not None:
+        touched = min(batches, (most - 1) // batch + 2)  # batches among which the chunks of one block can be
+        room = Room(batches * partial, chunks_at_most(most, touched, TREE_WIDTH))
+    counts = np.bincount(target, minlength=len(chunks) + 1)
+    return sums, sum_tree(owner * (partial + 1) + number, counts, batches * (partial + 1) - 1, TREE_WIDTH, room)
+
+
+def _since(marks: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """How many places each one is past the last mark; the first is marked."""
+    first = np.flatnonzero(marks)
+    return np.arange(len(marks)) - np.repeat(first, np.diff(first, append=len(marks)))
 
 
 class _Blocks(NamedTuple):

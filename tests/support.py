@@ -322,6 +322,11 @@ def difference(problem: BundleProblem, after: BundleProblem, options: StepOption
     return np.concatenate([cameras.ravel(), (after.points - problem.points).ravel()])
 
 
+def batch_sums(pairs, chunks: np.ndarray) -> np.ndarray:
+    """What a batch after the other sums of its own chunks, all in one row."""
+    return np.concatenate([row[sums].sum(axis=-1) for row, sums in zip(chunks, np.asarray(pairs.sums), strict=True)])
+
+
 def check_sums(layout: Layout, rng: np.random.Generator) -> None:
     """Sums over points and over cameras equal `np.add.at`, for random values in every slot that is used."""
     values = np.where(layout.slot_mask, rng.normal(size=(4, layout.num_slots)), 0)

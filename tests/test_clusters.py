@@ -177,8 +177,10 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
             blocks[a, b] += left * expected.get((column, b), 0)
     pairs = found.pairs
     assert pairs.table is not None
-    chunks = (sums[pairs.left] * sums[pairs.right]).sum(axis=-1).ravel()
-    assert np.array_equal(sum_by_levels(chunks, pairs.levels)[np.asarray(pairs.table)], blocks)
+    chunks = (sums[pairs.left] * sums[pairs.right]).sum(axis=-1)
+    assert np.array_equal(
+        sum_by_levels(support.batch_sums(pairs, chunks), pairs.levels)[np.asarray(pairs.table)], blocks
+    )
     assert np.array_equal(np.asarray(pairs.block_camera)[np.diagonal(pairs.table)], np.arange(count))
 
 

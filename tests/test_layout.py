@@ -190,8 +190,8 @@ def blocks_by_layout(layout: Layout, weights: np.ndarray) -> np.ndarray:
     """Sum over the listed pairs of the product of their slots' weights, per block of the lower triangle."""
     pairs = layout.pairs
     weights = np.where(layout.slot_mask, weights, 0)
-    chunks = (weights[pairs.left] * weights[pairs.right]).sum(axis=-1).ravel()
-    return sum_by_levels(chunks, pairs.levels)[np.asarray(pairs.table)]
+    chunks = (weights[pairs.left] * weights[pairs.right]).sum(axis=-1)
+    return sum_by_levels(support.batch_sums(pairs, chunks), pairs.levels)[np.asarray(pairs.table)]
 
 
 def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.ndarray) -> np.ndarray:
