@@ -29,7 +29,7 @@ def pair_products(
 
     # one batch after the other, so that what is gathered and its products stay in cache
     partial = lax.map(batch, (pairs.left, pairs.right, pairs.sums)).reshape(-1, width * width)
-    return tree_sum(partial, pairs.levels)
+    return apart(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums[0, 0, 0])
 
 
 def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks square"], width: int) -> Float[Array, "n n"]:

@@ -19,6 +19,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.band import band_factor, band_factor_and_solve
+from jaxba.barrier import apart
 from jaxba.blocks import dense_blocks, pair_products
 from jaxba.capacitance import capacitance_solve
 from jaxba.cg import conjugate_gradients
@@ -121,9 +122,12 @@ def reduced_blocks(
     """The blocks of the reduced camera system's lower triangle, in the order of `PairLayout`; the last is zero."""
     pairs = _pairs(layout)
     products = pair_products(pairs, coupling_rows(linear, points), 9)
-    zero = jnp.zeros((1, 81), products.dtype)
-    blocks = take_rows(jnp.concatenate([system.blocks.reshape(-1, 81), zero]), pairs.block_camera) - products
-    return blocks.reshape(-1, 9, 9)
+
+    def subtracted(own: Array, products: Array) -> Array:
+        own = jnp.concatenate([own.reshape(-1, 81), jnp.zeros((1, 81), own.dtype)])
+        return (take_rows(own, pairs.block_camera) - products).reshape(-1, 9, 9)
+
+    return apart(subtracted, system.blocks, products, index=pairs.block_row[0])
 
 
 def solve_dense(
