@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 
 from jaxba.pairs import PairLayout, pair_layout
 from jaxba.problem import AnyArray
-from jaxba.trees import TREE_WIDTH, sum_tree
+from jaxba.trees import fitting_width, sum_tree
 
 CLUSTER_CAMERAS = 8
 """Cameras a cluster; larger where that would make more than `MAX_CLUSTERS`. On the real problems at hand 8 took as many
@@ -78,7 +78,7 @@ def cluster_layout(
     return ClusterLayout(
         label=label.astype(np.int32),
         members=cluster_members(label, clusters, int(np.bincount(label).max())),
-        levels=sum_tree(slot[order], np.append(counts, 0), empty, TREE_WIDTH),
+        levels=sum_tree(slot[order], np.append(counts, 0), empty, fitting_width(counts)),
         point=slot_point[np.append(slot[order][first], empty)],
         pairs=pair_layout(names % clusters, coarse, seen_by, start, clusters, len(names), factor=True, banded=False),
     )

@@ -19,12 +19,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
 from jaxba.barrier import materialized
 from jaxba.blocks import dense_blocks, pair_products
 from jaxba.clusters import ClusterLayout
+from jaxba.dense import factor_panels
 from jaxba.eliminate import CameraSystem, PointSystem
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization
@@ -73,14 +73,13 @@ def coarse_preconditioner(
     unknowns = matrix.shape[0]
     shift = jnp.where(diagonal > 0, SHIFT * unknowns * float(jnp.finfo(matrix.dtype).eps), 1.0)
     scaled = matrix * scale[:, None] * scale + jnp.diag(shift)
-    factor = jnp.linalg.cholesky(scaled, symmetrize_input=False)
-    root = solve_triangular(factor, jnp.diag(scale), lower=True)
-    root = jnp.where(jnp.isfinite(root).all(), root, jnp.zeros_like(root))
+    panels = factor_panels(scaled, 256)
+    found = jnp.isfinite(panels.inverses[-1]).all()  # what fails in one panel spoils all later ones
 
     def apply(r: Array) -> Array:
         inner = cluster_sum(clusters, jnp.einsum("cam,ca->cm", modes, r))
-        half = jnp.matmul(root, inner.reshape(-1), precision="highest")
-        moved = jnp.matmul(root.T, half, precision="highest").reshape(-1, MODES)
+        moved = scale * panels.solve(scale * inner.reshape(-1))
+        moved = jnp.where(found, moved, jnp.zeros_like(moved)).reshape(-1, MODES)
         return jnp.einsum("cam,cm->ca", modes, take_rows(moved, clusters.label))
 
     return apply

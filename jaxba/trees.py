@@ -61,6 +61,11 @@ def sum_tree(
         most, width = -(-most // width), TREE_WIDTH
 
 
+def fitting_width(counts: np.ndarray) -> int:
+    """Items summed at once on the first level, so that least is read where most targets have few: padding is read too."""
+    return min(range(2, TREE_WIDTH + 1), key=lambda width: int((-(-counts // width)).sum()) * (width + 1))
+
+
 def chunks_at_most(items: int, targets: int, width: int) -> int:
     """Most chunks of a width that items make, however they belong to targets: the sum of `ceil(count / width)`."""
     return min(items, (items + targets * (width - 1)) // width)
