@@ -1,6 +1,6 @@
 """Static index arrays that turn a problem's sparse sums into dense ones.
 
-A *slot* holds one observation. Points are put in buckets by track length and a bucket of `n` points with
+A *slot* holds one observation. Points are put in buckets by track length, in tiles of `n`; a tile of points with
 up to `t` observations owns `t x n` slots, so the sum over a point's observations is a dense sum over
 `t`. Sums over a camera, or over a block of the reduced camera system, are trees: rows are gathered in
 chunks of fixed width that belong to one target, summed densely, and the partial sums again, until one row
@@ -79,8 +79,8 @@ class Layout:
     lenses: LensTies | None
     """None where every camera has a lens of its own, all of it free."""
 
-    buckets: tuple[tuple[int, int], ...] = field(metadata={"static": True})
-    """(slots per point, points) of each bucket; none where sizes are padded."""
+    buckets: tuple[tuple[int, int, int], ...] = field(metadata={"static": True})
+    """(tiles, slots per point, points of a tile) of each bucket; none where sizes are padded."""
 
     @property
     def num_slots(self) -> int:

@@ -1,4 +1,4 @@
-"""Which slot holds which observation: buckets by track length, or one row of slots of a given size."""
+"""Which slot holds which observation: buckets by track length, cut into tiles, or one row of slots of a given size."""
 
 from __future__ import annotations
 
@@ -11,7 +11,17 @@ from jaxba.padding import Capacity, room_for
 from jaxba.trees import TREE_WIDTH, sum_tree
 
 MAX_PADDING = 0.10
-"""Largest share of slots that may be empty because track lengths share a bucket (design, section 3)."""
+"""Largest share of slots that may be empty (design, section 3); one point of padding is there besides."""
+
+TILE = 8
+"""Points whose slots stand together in a large bucket. A pass over a bucket's points reads as many places at once as
+they have observations; where these are a whole bucket apart, neither the caches' prefetching nor their tables of pages
+keep up: a pass took twice as long (docs/optimisations.md). As many numbers fit the widest vectors."""
+
+TILED_POINTS = 512
+"""Smaller buckets are one tile: what a pass over them reads is in the cache, and nothing is lost to rounding."""
+
+_SHARED = MAX_PADDING - (TILE - 1) / TILED_POINTS  # of the padding, where track lengths share a bucket
 
 CHEAPER = 0.8
 """Factor on the price of a bucket while more than that is empty."""
@@ -30,7 +40,7 @@ class Slots(NamedTuple):
     """Problem index of the point of each column, by bucket; padding repeats an index out of range."""
 
     buckets: tuple[tuple[int, int], ...]
-    """(slots per point, points) of each bucket; none where points are summed by a tree."""
+    """(tiles, slots per point, points of a tile) of each bucket; none where points are summed by a tree."""
 
     levels: tuple[Int[np.ndarray, "_ _"], ...] | None
     """Tree from slots to columns; None where there are buckets."""
@@ -40,7 +50,7 @@ class Slots(NamedTuple):
 
 
 def bucket_slots(tracks: Int[np.ndarray, " points"], point: Int[np.ndarray, " observations"]) -> Slots:
-    """Puts points of similar track length into buckets of `t x n` slots.
+    """Puts points of similar track length into buckets of `tiles x t x n` slots.
 
     Args:
         tracks: observations of each point.
@@ -50,33 +60,35 @@ def bucket_slots(tracks: Int[np.ndarray, " points"], point: Int[np.ndarray, " ob
     lengths = _bucket_lengths(tracks)
     which = np.searchsorted(lengths, tracks)
     column = np.zeros(len(tracks), np.int64)  # column of a point in its bucket
-    bucket_points, offsets, columns_before = [], [], []
+    bucket_points, slot_point, offsets, buckets = [], [], [], []
     slots = columns = 0
     for number, length in enumerate(lengths):
         members = np.flatnonzero((which == number) & (tracks > 0))
         column[members] = np.arange(len(members))
-        if number == 0:  # one empty point, so that there always is an empty slot
-            members = np.append(members, len(tracks))
-        bucket_points.append(members.astype(np.int32))
+        wanted = len(members) + (number == 0)  # one empty point, so that there always is an empty slot
+        tile = TILE if wanted >= TILED_POINTS else wanted
+        tiles = -(-wanted // tile)
+        if number == 0:
+            empty = int(len(members) // tile * length * tile + len(members) % tile)
+        padding = np.full(tiles * tile - len(members), len(tracks))
+        bucket_points.append(np.concatenate([members, padding]).astype(np.int32))
+        own = np.arange(columns, columns + tiles * tile, dtype=np.int32).reshape(tiles, 1, tile)
+        slot_point.append(np.repeat(own, length, axis=1).ravel())
         offsets.append(slots)
-        columns_before.append(columns)
-        slots += length * len(members)
-        columns += len(members)
-    size = np.array([len(members) for members in bucket_points])
+        buckets.append((tiles, int(length), tile))
+        slots += tiles * length * tile
+        columns += tiles * tile
+    bucket = which[point]
+    tile = np.array([tile for _, _, tile in buckets])[bucket]
     step = np.arange(len(point)) - start[point]
-    slot_point = np.concatenate(
-        [
-            np.tile(np.arange(len(members), dtype=np.int32) + before, length)
-            for members, length, before in zip(bucket_points, lengths, columns_before, strict=True)
-        ]
-    )
+    before, place = np.divmod(column[point], tile)
     return Slots(
-        slot=np.array(offsets)[which[point]] + step * size[which[point]] + column[point],
-        point=slot_point,
+        slot=np.array(offsets)[bucket] + (before * lengths[bucket] + step) * tile + place,
+        point=np.concatenate(slot_point),
         members=tuple(bucket_points),
-        buckets=tuple((int(length), len(members)) for length, members in zip(lengths, bucket_points, strict=True)),
+        buckets=tuple(buckets),
         levels=None,
-        empty=int(len(bucket_points[0]) - 1),  # the first bucket's empty point
+        empty=empty,
     )
 
 
@@ -111,12 +123,12 @@ def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
     """Largest track length of each bucket: few buckets with little padding.
 
     Dynamic programme over the distinct lengths. A bucket has a price, in slots, which is lowered until padding stays
-    below `MAX_PADDING`: every bucket is a part of the program, and costs time to compile.
+    below the share: every bucket is a part of the program, and costs time to compile.
     """
     values, counts = np.unique(tracks[tracks > 0], return_counts=True)
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
-    price = total * MAX_PADDING
+    price = total * _SHARED
     while True:
         best = np.zeros(len(values) + 1)
         cut = np.zeros(len(values) + 1, int)
@@ -128,6 +140,6 @@ def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
         while end:
             ends.append(end - 1)
             end = cut[end]
-        if best[-1] - price * len(ends) <= (1 + MAX_PADDING) * total:
+        if best[-1] - price * len(ends) <= (1 + _SHARED) * total:
             return values[ends[::-1]]
         price *= CHEAPER

@@ -62,8 +62,9 @@ def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "
         # every point of the tree reads the empty slot: were it not a number for one, it would be for all
         return tree_sum(jnp.where(layout.slot_mask, values, jnp.zeros_like(values)).T, layout.point_levels).T
     parts, start = [], 0
-    for length, points in layout.buckets:
-        block = values[:, start : start + length * points]
-        parts.append(jnp.sum(block.reshape(-1, length, points), axis=1))
-        start += length * points
+    for tiles, length, tile in layout.buckets:
+        size = tiles * length * tile
+        block = values[:, start : start + size].reshape(-1, tiles, length, tile)
+        parts.append(jnp.sum(block, axis=2).reshape(-1, tiles * tile))
+        start += size
     return jnp.concatenate(parts, axis=1)

@@ -62,7 +62,7 @@ def sum_tree(
 
 
 def fitting_width(counts: np.ndarray) -> int:
-    """Items summed at once on the first level, so that least is read where most targets have few: padding is read too."""
+    """Items summed at once on the first level, so that least is read where most targets have few: padding counts."""
     return min(range(2, TREE_WIDTH + 1), key=lambda width: int((-(-counts // width)).sum()) * (width + 1))
 
 

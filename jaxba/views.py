@@ -9,6 +9,7 @@ point iterations over 347,173 observations from 36 to 6 ms (docs/optimisations.m
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from math import prod
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -82,7 +83,7 @@ def point_passes(
         sums = []
         for cut, columns in _buckets(layout):
             mask, whitening = cut(layout.slot_mask), None if layout.whitening is None else cut(layout.whitening)
-            own = [jnp.broadcast_to(row, mask.shape) for row in points[:, columns]]
+            own = [jnp.broadcast_to(row.reshape(mask.shape[0], 1, -1), mask.shape) for row in points[:, columns]]
             at_slots = stored.at(cut(layout.slot_camera))
             views = Views(at_slots, own, mask, cut(layout.pixels), whitening, False)
             sums.append(_sums_over_tracks(terms(views, *map(cut, slots))))
@@ -92,20 +93,19 @@ def point_passes(
 
 
 def _buckets(layout: Layout) -> Iterator[tuple[Callable[[AnyArray], Array], slice]]:
-    """For each bucket what cuts its slots out of all, as [..., track, points], and its points' columns."""
+    """For each bucket what cuts its slots out of all, as [..., tiles, track, tile], and its points' columns."""
     slot = column = 0
-    for length, count in layout.buckets:
+    for tiles, length, tile in layout.buckets:
 
-        def cut(values: AnyArray, begin: int = slot, shape: tuple[int, int] = (length, count)) -> Array:
-            end = begin + shape[0] * shape[1]
-            return jnp.asarray(values)[..., begin:end].reshape(*values.shape[:-1], *shape)
+        def cut(values: AnyArray, begin: int = slot, shape: tuple[int, int, int] = (tiles, length, tile)) -> Array:
+            return jnp.asarray(values)[..., begin : begin + prod(shape)].reshape(*values.shape[:-1], *shape)
 
-        yield cut, slice(column, column + count)
-        slot, column = slot + length * count, column + count
+        yield cut, slice(column, column + tiles * tile)
+        slot, column = slot + tiles * length * tile, column + tiles * tile
 
 
-def _sums_over_tracks(values: list[Float[Array, "track points"]]) -> list[Float[Array, " points"]]:
-    """All sums over the first axis in one loop."""
+def _sums_over_tracks(values: list[Float[Array, "tiles track tile"]]) -> list[Float[Array, " points"]]:
+    """All sums over the tracks in one loop."""
     zeros = [jnp.zeros((), value.dtype) for value in values]
     add = lambda left, right: [a + b for a, b in zip(left, right, strict=True)]
-    return list(lax.reduce(values, zeros, add, (0,)))
+    return [row.reshape(-1) for row in lax.reduce(values, zeros, add, (1,))]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from math import prod
 
 import jax
 import numpy as np
@@ -98,7 +99,7 @@ def test_every_observation_is_in_exactly_one_slot(case, duplicates):
     seen = np.unique(problem.point_index)
     assert np.array_equal(np.sort(columns[columns < problem.num_points]), seen)
     assert np.array_equal(layout.camera_seen, np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0)
-    assert layout.num_slots == sum(length * points for length, points in layout.buckets)
+    assert layout.num_slots == sum(prod(bucket) for bucket in layout.buckets)
     assert layout.num_points == len(columns)
 
 
@@ -107,7 +108,7 @@ def test_every_observation_is_in_exactly_one_slot(case, duplicates):
 def test_at_most_a_tenth_is_padding_whatever_the_track_lengths(case):
     problem = problem_of(*case, seed=0)
     layout = build_layout(problem, pairs=False)
-    spare = layout.buckets[0][0]  # the one point of padding that is always there
+    spare = layout.buckets[0][1]  # the one point of padding that is always there
     assert layout.num_slots - spare <= (1 + MAX_PADDING) * problem.num_observations
 
 
@@ -117,7 +118,7 @@ def test_long_tails_need_few_buckets(longest):
     lengths = np.clip((np.random.default_rng(0).pareto(1.2, 4000) * 2 + 2).astype(int), 2, longest)
     layout = build_layout(problem_of(lengths, longest, seed=1), pairs=False)
     assert len(layout.buckets) <= 25
-    assert layout.num_slots <= (1 + MAX_PADDING) * lengths.sum() + layout.buckets[0][0]
+    assert layout.num_slots <= (1 + MAX_PADDING) * lengths.sum() + layout.buckets[0][1]
 
 
 def test_the_order_of_the_observations_does_not_matter():
