@@ -67,6 +67,9 @@ class CameraSystem(NamedTuple):
     gradient: Float[Array, "cameras 9"]  # g_c, manifold coordinates
     right: Float[Array, "cameras 9"]  # right-hand side of the reduced system
     damping: Float[Array, "cameras 9"]  # D_c, diagonal in the options' coordinates
+    rows: Float[Array, "chunks terms 11"] | None = (
+        None  # J_c, r, r - Q h in the order of the cameras, two an observation
+    )
     ties: LensTies | None = None  # where cameras share a lens: the damping of its numbers is in equal parts theirs
 
 
@@ -119,7 +122,7 @@ def camera_system(
     turned = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
     added = extra[:, :, None] * jnp.eye(9, dtype=extra.dtype)
     added = added.at[:, :3, :3].set(turned)
-    return CameraSystem(blocks + added, added, gradient, right, extra, ties)
+    return CameraSystem(blocks + added, added, gradient, right, extra, gathered, ties)
 
 
 def back_substitute(
@@ -140,6 +143,14 @@ def apply_reduced(
     first, second = linear.camera_jacobian
     columns = jnp.stack([first[a] * lifted[0] + second[a] * lifted[1] for a in range(9)])
     return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(columns.T, layout.camera_levels)
+
+
+def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "places 27"]:
+    """`Y = J_c^T Q` in the order of the cameras, the point's index slow and the camera's fast."""
+    assert system.rows is not None
+    over, under = points.projected
+    projected = take_rows(jnp.stack([*over, *under]).T, layout.camera_levels[0].reshape(-1)).reshape(-1, 2, 3)
+    return outer_sum(projected, system.rows[..., :9].reshape(-1, 2, 9)).reshape(-1, 27)
 
 
 def coupling_rows(linear: Linearization, points: PointSystem) -> Float[Array, "slots 27"]:

@@ -27,7 +27,7 @@ from jaxba.partition import Partition, partition_layout
 from jaxba.problem import AnyArray, BundleProblem
 from jaxba.slots import bucket_slots, padded_slots
 from jaxba.ties import LensTies, lens_ties
-from jaxba.trees import sum_tree
+from jaxba.trees import sum_tree, with_spare_row
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
@@ -58,7 +58,8 @@ class Layout:
     """Tree from slots to points where sizes are padded (padding.py); buckets are summed as they stand."""
 
     camera_levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Tree from slots to cameras."""
+    """Tree from slots to cameras. The rows of its first level, one after the other, are the *order of the cameras*; an
+    empty slot is among them."""
 
     camera_seen: Bool[AnyArray, " cameras"]
     """Cameras with at least one observation; the others never move."""
@@ -159,8 +160,9 @@ def build_layout(
     if problem.whitening is not None:
         whitening = np.zeros((2, 2, slots))
         whitening[:, :, slot] = np.moveaxis(np.asarray(problem.whitening)[order], 0, -1)
-    by_camera = np.argsort(camera, kind="stable")
     room = None if capacity is None else room_for(seen, capacity.observations, capacity.points)
+    by_camera = np.argsort(camera, kind="stable")
+    camera_levels = with_spare_row(sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room), empty)
     table = None
     columns = sum(map(len, made.members))
     if pairs and factor and grid and is_dense(camera, point, tracks, cameras, columns):
@@ -170,8 +172,12 @@ def build_layout(
     ties = lens_ties(problem.lenses, seen > 0) if lenses and problem.lenses is not None else None
     if pairs and table is None:
         banded = ties is None or not ties.shared  # a shared lens couples cameras that have no point in common
+        ordered = camera_levels[0].ravel()
+        place = np.zeros(slots, np.int32)
+        place[ordered] = np.arange(len(ordered))
+        spare = int(place[empty])
         listed = pair_layout(
-            camera, slot, tracks, start, cameras, empty, factor=factor, banded=banded, capacity=capacity
+            camera, place[slot], tracks, start, cameras, spare, factor=factor, banded=banded, capacity=capacity
         )
     drawn = None
     if partitions is not None:
@@ -188,7 +194,7 @@ def build_layout(
         whitening=whitening,
         bucket_points=made.members,
         point_levels=made.levels,
-        camera_levels=sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room),
+        camera_levels=camera_levels,
         camera_seen=seen > 0,
         pairs=listed,
         grid=table,

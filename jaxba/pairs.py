@@ -1,4 +1,8 @@
-"""Which pairs of observations multiply into which block of the reduced camera system."""
+"""Which pairs of observations multiply into which block of the reduced camera system.
+
+Observations are named by their place in the order of the cameras (layout.py): a block reads two short stretches of
+memory then, where its observations would be scattered over all slots.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +33,13 @@ PAIR_ITEM_COST = 1.5
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PairLayout:
-    """Which slots multiply into which block of the reduced camera system (lower triangle)."""
+    """Which observations multiply into which block of the reduced camera system (lower triangle)."""
 
     left: Int[AnyArray, "batches chunks width"]
-    """Slot of the block row's camera."""
+    """Place of the view by the block row's camera."""
 
     right: Int[AnyArray, "batches chunks width"]
-    """Slot of the block column's camera, seen by the same point."""
+    """Place of the view of the same point by the block column's camera."""
 
     sums: Int[AnyArray, "batches partial width_of_sums"]
     """Chunks of the batch that are summed at once: those of one block. The last one of a batch is all padding."""
@@ -67,7 +71,7 @@ class PairLayout:
 
 def pair_layout(
     camera: np.ndarray,
-    slot: np.ndarray,
+    place: np.ndarray,
     tracks: np.ndarray,
     start: np.ndarray,
     cameras: int,
@@ -81,16 +85,16 @@ def pair_layout(
 
     Args:
         camera: of each observation; those of one point stand together.
-        slot: of each observation.
+        place: of each observation among the rows that are to be multiplied.
         tracks: observations of each point.
         start: number of each point's first observation.
         cameras: number of cameras.
-        empty: a slot that holds no observation.
+        empty: a place whose row is zero.
         factor: whether the system will be factored.
         banded: whether it may be factored as a band, where that is cheaper.
         capacity: makes all shapes follow from it: every block of the lower triangle is there, and no band.
     """
-    camera, slot = camera.astype(np.int32), slot.astype(np.int32)
+    camera, place = camera.astype(np.int32), place.astype(np.int32)
     lefts, rights = [], []
     for length in np.unique(tracks[tracks > 0]):
         first = start[np.flatnonzero(tracks == length)].astype(np.int32)
@@ -113,8 +117,8 @@ def pair_layout(
         rank, reach = camera_order(row, column, cameras)
     banded = banded and is_banded(cameras, reach)
     if banded:  # from here on cameras go by their rank, and the lower triangle is that of the ranks
-        place = rank.astype(np.int32)
-        rows, columns = place[rows], place[columns]
+        ranks = rank.astype(np.int32)
+        rows, columns = ranks[rows], ranks[columns]
         swap = rows < columns
         left, right = np.where(swap, right, left), np.where(swap, left, right)
         rows, columns = np.maximum(rows, columns), np.minimum(rows, columns)
@@ -140,7 +144,7 @@ def pair_layout(
     padded = []
     for side in (left, right):
         array = np.full(batches * (batch + 1) * width, empty, np.int32)
-        array[position] = slot[side[order]]
+        array[position] = place[side[order]]
         padded.append(array.reshape(batches, batch + 1, width))
     sums, levels = _batch_sums(chunks, batches, batch, None if room is None else -(-room.most // width))
     table = None

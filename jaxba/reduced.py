@@ -26,7 +26,7 @@ from jaxba.cg import conjugate_gradients
 from jaxba.coarse import Anchor
 from jaxba.dense import factor_and_solve, factor_panels
 from jaxba.density import has_few_points
-from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_rows
+from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
 from jaxba.layout import Layout, PairLayout
 from jaxba.linearize import Linearization
 from jaxba.options import StepOptions
@@ -121,7 +121,7 @@ def reduced_blocks(
 ) -> Float[Array, "blocks 9 9"]:
     """The blocks of the reduced camera system's lower triangle, in the order of `PairLayout`; the last is zero."""
     pairs = _pairs(layout)
-    products = pair_products(pairs, coupling_rows(linear, points), 9)
+    products = pair_products(pairs, coupling_by_camera(layout, points, system), 9)
 
     def subtracted(own: Array, products: Array) -> Array:
         own = jnp.concatenate([own.reshape(-1, 81), jnp.zeros((1, 81), own.dtype)])

@@ -39,7 +39,7 @@ class Slots(NamedTuple):
     members: tuple[Int[np.ndarray, " _"], ...]
     """Problem index of the point of each column, by bucket; padding repeats an index out of range."""
 
-    buckets: tuple[tuple[int, int], ...]
+    buckets: tuple[tuple[int, int, int], ...]
     """(tiles, slots per point, points of a tile) of each bucket; none where points are summed by a tree."""
 
     levels: tuple[Int[np.ndarray, "_ _"], ...] | None

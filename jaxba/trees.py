@@ -61,6 +61,15 @@ def sum_tree(
         most, width = -(-most // width), TREE_WIDTH
 
 
+def with_spare_row(levels: tuple[np.ndarray, ...], empty: int) -> tuple[np.ndarray, ...]:
+    """The same tree with a row that is all padding on its first level; only a tree of one level may be without."""
+    if len(levels) > 1:
+        return levels
+    level = np.asarray(*levels)
+    spare = np.full((1, level.shape[1]), empty, np.int32)
+    return np.concatenate([level, spare]), np.arange(len(level), dtype=np.int32)[:, None]
+
+
 def fitting_width(counts: np.ndarray) -> int:
     """Items summed at once on the first level, so that least is read where most targets have few: padding counts."""
     return min(range(2, TREE_WIDTH + 1), key=lambda width: int((-(-counts // width)).sum()) * (width + 1))

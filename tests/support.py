@@ -327,6 +327,11 @@ def batch_sums(pairs, chunks: np.ndarray) -> np.ndarray:
     return np.concatenate([row[sums].sum(axis=-1) for row, sums in zip(chunks, np.asarray(pairs.sums), strict=True)])
 
 
+def by_camera(layout: Layout, values: np.ndarray) -> np.ndarray:
+    """Values of slots in the order of the cameras."""
+    return values[np.asarray(layout.camera_levels[0]).ravel()]
+
+
 def check_sums(layout: Layout, rng: np.random.Generator) -> None:
     """Sums over points and over cameras equal `np.add.at`, for random values in every slot that is used."""
     values = np.where(layout.slot_mask, rng.normal(size=(4, layout.num_slots)), 0)

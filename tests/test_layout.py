@@ -190,7 +190,7 @@ def test_a_camera_with_thousands_of_observations_is_summed_in_chunks():
 def blocks_by_layout(layout: Layout, weights: np.ndarray) -> np.ndarray:
     """Sum over the listed pairs of the product of their slots' weights, per block of the lower triangle."""
     pairs = layout.pairs
-    weights = np.where(layout.slot_mask, weights, 0)
+    weights = support.by_camera(layout, np.where(layout.slot_mask, weights, 0))
     chunks = (weights[pairs.left] * weights[pairs.right]).sum(axis=-1)
     return sum_by_levels(support.batch_sums(pairs, chunks), pairs.levels)[np.asarray(pairs.table)]
 
@@ -223,7 +223,8 @@ def test_the_number_of_pairs_is_that_of_the_track_lengths():
     problem = support.tiny()
     layout = build_layout(problem, grid=False)
     tracks = np.bincount(problem.point_index)
-    listed = np.asarray(layout.slot_mask)[layout.pairs.left] & np.asarray(layout.slot_mask)[layout.pairs.right]
+    seen = support.by_camera(layout, np.asarray(layout.slot_mask))
+    listed = seen[layout.pairs.left] & seen[layout.pairs.right]
     assert listed.sum() == (tracks * (tracks + 1) // 2).sum()
 
 
