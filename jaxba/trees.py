@@ -63,9 +63,9 @@ def sum_tree(
 
 def with_spare_row(levels: tuple[np.ndarray, ...], empty: int) -> tuple[np.ndarray, ...]:
     """The same tree with a row that is all padding on its first level; only a tree of one level may be without."""
-    if len(levels) > 1:
+    level, *others = levels
+    if others:
         return levels
-    level = np.asarray(*levels)
     spare = np.full((1, level.shape[1]), empty, np.int32)
     return np.concatenate([level, spare]), np.arange(len(level), dtype=np.int32)[:, None]
 
