@@ -9,6 +9,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
+from jaxba.problem import AnyArray
+
 
 def materialized(rows: Float[Array, "k n"]) -> Float[Array, "k n"]:
     """The same rows, made once and stored, for values that many later expressions share.
@@ -25,7 +27,7 @@ def _times_one(rows: Array) -> Array:
     return jnp.matmul(jnp.eye(rows.shape[0], dtype=rows.dtype), rows, precision="highest")
 
 
-def apart(function: Callable[..., Array], *operands: Array, index: Int[Array, ""]) -> Array:
+def apart(function: Callable[..., Array], *operands: Array, index: Int[AnyArray, "..."]) -> Array:
     """`function(*operands)`, computed by itself: XLA fuses it with nothing that comes before or after it.
 
     A kernel that writes its result into its place in a larger array, as the last one in the body of a loop does, runs
@@ -36,14 +38,15 @@ def apart(function: Callable[..., Array], *operands: Array, index: Int[Array, ""
     Args:
         function: of arrays, to one array.
         operands: its arguments.
-        index: any index that is an argument of the whole program: it is never negative, which XLA does not know.
+        index: any index array that is an argument of the whole program: nowhere negative, which XLA does not know.
     """
 
     def nothing(*operands: Array) -> Array:
         result = jax.eval_shape(function, *operands)
         return jnp.zeros(result.shape, result.dtype)
 
-    branch = lambda *operands: lax.cond(index >= 0, function, nothing, *operands)
+    taken = jnp.reshape(jnp.asarray(index), -1)[0] >= 0
+    branch = lambda *operands: lax.cond(taken, function, nothing, *operands)
     return lax.platform_dependent(*operands, cpu=branch, default=function)
 
 

@@ -24,12 +24,12 @@ def pair_products(
     def batch(parts: tuple[Array, Array, Array]) -> Array:
         *sides, sums = parts
         left, right = (take_rows(rows, side).reshape(side.shape[0], -1, width) for side in sides)
-        products = apart(outer_sum, left, right, index=sums[0, 0])
-        return apart(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums[0, 0])
+        products = apart(outer_sum, left, right, index=sums)
+        return apart(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums)
 
     # one batch after the other, so that what is gathered and its products stay in cache
     partial = lax.map(batch, (pairs.left, pairs.right, pairs.sums)).reshape(-1, width * width)
-    return apart(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums[0, 0, 0])
+    return apart(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums)
 
 
 def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks square"], width: int) -> Float[Array, "n n"]:

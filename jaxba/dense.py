@@ -70,10 +70,15 @@ def _whole(matrix: Array, right: Array) -> Array:
     return solve_triangular(factor, half, lower=True, trans="T")
 
 
-def factor_panels(matrix: Float[Array, "n n"], least: int = PANEL) -> Panels:
-    """Left-looking factorisation of a matrix with a diagonal near one: a panel subtracts all earlier ones first."""
+def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Panels:
+    """Left-looking factorisation of a matrix with a diagonal near one: a panel subtracts all earlier ones first.
+
+    Args:
+        matrix: symmetric; its lower triangle is read.
+        least: columns of a panel at least, `PANEL` where nothing is said.
+    """
     n = matrix.shape[0]
-    width = max(least, -(-n // MAX_PANELS))
+    width = max(least or PANEL, -(-n // MAX_PANELS))
     inverses, belows = [], []
     for number, start in enumerate(range(0, n, width)):
         size = min(width, n - start)

@@ -127,7 +127,7 @@ def reduced_blocks(
         own = jnp.concatenate([own.reshape(-1, 81), jnp.zeros((1, 81), own.dtype)])
         return (take_rows(own, pairs.block_camera) - products).reshape(-1, 9, 9)
 
-    return apart(subtracted, system.blocks, products, index=pairs.block_row[0])
+    return apart(subtracted, system.blocks, products, index=pairs.block_row)
 
 
 def solve_dense(

@@ -19,6 +19,9 @@ HIDDEN_DECREASE = 100.0
 step that lambda made short says nothing about how far the minimum is."""
 
 
+SHARE_ROUNDING = 64.0
+"""Rounding units within which a share of damping is one: under a lambda of 1e30 it came out as one or just below."""
+
 COST_ROUNDING = 8.0
 """Rounding units of a cost within which the promise of a refused step tells nothing: 1e-6 in float32, where costs of
 real problems have errors of that size (docs/performance.md), 2e-15 in float64."""
@@ -106,10 +109,15 @@ def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
 
 def _is_little(decrease: Float[Array, ""], step: StepInfo, tolerance: Any) -> Bool[Array, ""]:
     """Whether a decrease is within a tolerance relative to the cost, also as it would be without damping."""
-    share = step.damping_share
-    hidden = decrease > HIDDEN_DECREASE * (1 - share) * (1 + share) * tolerance * step.previous_cost
+    hidden = decrease > HIDDEN_DECREASE * _undamped(step) * (1 + step.damping_share) * tolerance * step.previous_cost
     whole = ~(step.share < 1)  # a step that had to be shortened says nothing either
     return (decrease <= tolerance * step.previous_cost) & ~hidden & whole
+
+
+def _undamped(step: StepInfo) -> Float[Array, ""]:
+    """What damping leaves of the step's curvature, as a share; none where it would be told by the last digits alone."""
+    left = 1 - step.damping_share
+    return jnp.where(left <= SHARE_ROUNDING * float(jnp.finfo(step.cost.dtype).eps), jnp.zeros_like(left), left)
 
 
 def termination_of(
@@ -119,7 +127,7 @@ def termination_of(
     solve as converged."""
     by_cost = converged_in_cost(step, tolerances.ftol)
     bound = tolerances.xtol * (step.parameter_norm + tolerances.xtol)
-    hidden = step.step_norm > HIDDEN_DECREASE * (1 - step.damping_share) * bound
+    hidden = step.step_norm > HIDDEN_DECREASE * _undamped(step) * bound
     by_step = step.accepted & (step.step_norm <= bound) & ~hidden & ~(step.share < 1)
     by_gradient = step.gradient_max <= tolerances.gtol
     limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
