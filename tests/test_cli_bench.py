@@ -232,6 +232,7 @@ def test_a_suite_names_problems_by_globs_and_variables(tmp_path, undrawn, capsys
 BAD = {
     "unknown solver": (["scene:tiny", "--solvers", "ceres,cerse"], "unknown damping policy 'cerse'"),
     "unknown method": (["scene:tiny", "--solvers", "sgd+ceres"], "unknown method 'sgd'"),
+    "missing policy": (["scene:tiny", "--solvers", "no.safetensors"], "no.safetensors: No such file"),
     "no solver": (["scene:tiny", "--solvers", ","], "--solvers names no solver"),
     "missing file": (["no-such-file.txt"], "no-such-file.txt: no such file"),
     "directory": (["."], "a directory without a COLMAP model"),

@@ -232,6 +232,26 @@ def test_ctrl_c_stops_after_the_iteration_and_writes_what_there_is(tiny, tmp_pat
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_second_ctrl_c_ends_at_once_with_one_line(tiny, tmp_path, capsys, monkeypatch):
+    def interrupted(*_):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(table, "row", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    assert run([str(tiny), "--output", str(tmp_path / "out.txt")]) == 130
+    assert capsys.readouterr().err.splitlines()[1:] == ["interrupted"]
+    assert not (tmp_path / "out.txt").exists()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("moment", ["heading", "summary"])
+def test_ctrl_c_before_or_after_the_iterations_is_one_line(moment, tiny, capsys, monkeypatch):
+    monkeypatch.setattr(table, moment, lambda *_: signal.raise_signal(signal.SIGINT))
+    assert run([str(tiny), "--max-iterations", "1"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
 # What does not
 
 
@@ -247,6 +267,12 @@ def cut_short(path: Path, share: float) -> Path:
     return path
 
 
+def garbage(tiny: Path) -> Path:
+    path = tiny.parent / "garbage.safetensors"
+    path.write_bytes(b"no policy")
+    return path
+
+
 BAD = {
     "missing file": (lambda tiny: [str(tiny) + ".none"], "No such file"),
     "directory": (lambda tiny: [str(tiny.parent)], "directory"),
@@ -254,6 +280,8 @@ BAD = {
     "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),
     "unknown damping": (lambda tiny: [str(tiny), "--damping", "cerse"], "unknown damping policy 'cerse'"),
     "lambda that is no number": (lambda tiny: [str(tiny), "--damping", "constant:x"], "positive number"),
+    "missing policy": (lambda tiny: [str(tiny), "--damping", "no.safetensors"], "no.safetensors: No such file"),
+    "policy that is none": (lambda tiny: [str(tiny), "--damping", str(garbage(tiny))], "not a safetensors file"),
     "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm, ddlm, poba"),
     "size of no clusters": (lambda tiny: [str(tiny), "--method", "poba:3"], "no clusters"),
     "solver of a method": (lambda tiny: [str(tiny), "--method", "poba", "--linear-solver", "sparse"], "has its own"),

@@ -27,19 +27,26 @@ class UsageError(ValueError):
 def run_command(
     arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
 ) -> int:
-    """Parses the command line and runs `main`; every expected error becomes one line on stderr and status 2."""
+    """Parses the command line and runs `main`; every expected error becomes one line on stderr and status 2, and so
+    does Ctrl-C, with status 130, where `main` does not deal with it."""
     import tyro
 
-    parsed = tyro.cli(arguments, args=argv, description=description)
-    from jaxba.damping.registry import UnknownPolicyError
-    from jaxba.methods import UnknownMethodError
-    from jaxba.naming import SolverNameError
-    from jaxba.problem import ProblemError
-
     try:
-        return main(parsed)
-    except (ProblemError, UsageError, UnknownPolicyError, UnknownMethodError, SolverNameError) as error:
-        return complain(str(error))
+        parsed = tyro.cli(arguments, args=argv, description=description)
+        from jaxba.damping.learned import PolicyFileError
+        from jaxba.damping.registry import UnknownPolicyError
+        from jaxba.methods import UnknownMethodError
+        from jaxba.naming import SolverNameError
+        from jaxba.problem import ProblemError
+
+        names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
+        try:
+            return main(parsed)
+        except (ProblemError, UsageError, PolicyFileError, *names) as error:
+            return complain(str(error))
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
 
 
 def complain(message: str) -> int:
