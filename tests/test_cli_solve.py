@@ -97,6 +97,16 @@ def test_a_search_for_points_is_told_and_rows_count_through(tmp_path, capsys):
     np.testing.assert_allclose(record["final_cost"], geometry.cost(problem), rtol=1e-5)
 
 
+@pytest.mark.parametrize("loss", ["squared", "cauchy"])
+def test_the_rms_is_that_of_the_residuals_whatever_the_loss(loss, tiny, tmp_path, capsys):
+    output = tmp_path / "out.txt"
+    assert run([str(tiny), "--loss", loss, "--max-iterations", "3", "--output", str(output)]) == 0
+    found = re.search(r"\(rms (.*) -> (.*) px\)", capsys.readouterr().out)
+    assert found
+    rms = [np.sqrt(np.mean(np.sum(geometry.residuals(read_bal(path)) ** 2, axis=1))) for path in (tiny, output)]
+    np.testing.assert_allclose([float(number) for number in found.groups()], rms, rtol=1e-3)
+
+
 def test_padded_sizes_are_said_and_so_is_why_there_are_none(tiny, capsys):
     fast = [str(tiny), "--max-iterations", "1", "--damping", "ceres", "--pad"]
     assert run(fast) == 0
