@@ -285,6 +285,7 @@ def garbage(tiny: Path) -> Path:
 
 BAD = {
     "missing file": (lambda tiny: [str(tiny) + ".none"], "No such file"),
+    "empty name": (lambda tiny: [""], "the name of the problem is empty"),
     "directory": (lambda tiny: [str(tiny.parent)], "directory"),
     "truncated file": (lambda tiny: [str(cut_short(tiny, 0.5))], "tiny.txt"),
     "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),

@@ -116,6 +116,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _solve(args: Arguments) -> int:
+    if args.problem == "":
+        raise common.UsageError("the name of the problem is empty")
     common.check_positive(
         max_iterations=args.max_iterations, ftol=args.ftol, xtol=args.xtol, gtol=args.gtol, loss_scale=args.loss_scale
     )
@@ -152,7 +154,7 @@ def _solve(args: Arguments) -> int:
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
     name = SolverName(args.damping, refine, args.dtype, args.method)
     policy, options = name.build()
-    problem = read_problem(resolve(args.problem)) if args.problem else embedded_sources()[0].read()
+    problem = embedded_sources()[0].read() if args.problem is None else read_problem(resolve(args.problem))
     common.prepare_process(untraced=True)
     options = replace(
         options,
