@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -253,6 +255,15 @@ def test_a_second_ctrl_c_ends_at_once_with_one_line(tiny, tmp_path, capsys, monk
     assert capsys.readouterr().err.splitlines()[1:] == ["interrupted"]
     assert not (tmp_path / "out.txt").exists()
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_solution_is_written_where_nobody_reads_the_table_to_its_end(tiny, tmp_path, monkeypatch):
+    output, (reader, writer) = tmp_path / "out.txt", os.pipe()
+    os.close(reader)
+    with open(writer, "w") as closed:
+        monkeypatch.setattr(sys, "stdout", closed)
+        assert run([str(tiny), "--max-iterations", "2", "--output", str(output)]) == 0
+    assert geometry.cost(read_bal(output)) < geometry.cost(support.tiny())
 
 
 @pytest.mark.parametrize("moment", ["heading", "summary"])

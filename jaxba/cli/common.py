@@ -55,13 +55,26 @@ def complain(message: str) -> int:
     return BAD_INPUT
 
 
+def say(text: str) -> None:
+    """Prints to stdout at once; where its reader has gone the work goes on, and what is said is lost."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        _close_pipe()
+
+
 def exit_with(status: int) -> NoReturn:
     """Ends the process after flushing; a closed pipe on stdout is no error."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _close_pipe()
     sys.exit(status)
+
+
+def _close_pipe() -> None:
+    """Stdout, and what waits in its buffer, goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def prepare_process(*, untraced: bool = False) -> None:

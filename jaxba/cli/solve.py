@@ -164,19 +164,19 @@ def _solve(args: Arguments) -> int:
         intrinsics=args.intrinsics,
         loss=Loss(args.loss, args.loss_scale),
     )
-    print(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
+    common.say(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
     steps: list[IterationRecord] = []
     with Interrupt("iteration", gentle=True) as interrupt:
 
         def show(record: IterationRecord) -> bool:
             if not steps:
-                print(table.header(float(record.step.previous_cost)))
-            print(table.row(record, steps[-1].time_s if steps else 0.0), flush=True)
+                common.say(table.header(float(record.step.previous_cost)))
+            common.say(table.row(record, steps[-1].time_s if steps else 0.0))
             steps.append(record)
             return interrupt.asked
 
         def tell(found: Retriangulation) -> None:
-            print(table.retriangulated(found, args.ftol), flush=True)
+            common.say(table.retriangulated(found, args.ftol))
 
         search: dict[str, Any] = {"on_search": tell} if args.retriangulate else {}
         solution = (solve_and_retriangulate if args.retriangulate else solve)(
@@ -192,9 +192,9 @@ def _solve(args: Arguments) -> int:
             compilation=args.compilation,
             **search,
         )
-    print(table.summary(problem, solution))
+    common.say(table.summary(problem, solution))
     if args.pad:
-        print(table.padding(problem, solution))
+        common.say(table.padding(problem, solution))
     if args.output:
         try:
             if model is None:
@@ -203,16 +203,16 @@ def _solve(args: Arguments) -> int:
                 write_colmap(solution.problem, model, like=str(args.problem))
         except OSError as error:
             raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
-        print(f"wrote {args.output}")
+        common.say(f"wrote {args.output}")
         if model is None and not table.fits_bal(problem):
-            print("note: shared lenses and weights of observations are not in that file, which has no place for them")
+            common.say("note: shared lenses and weights of observations are not in that file, which has no place for them")
     if args.log:
         record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
         try:
             write_text(Path(args.log), json.dumps(record_to_json(record), allow_nan=False) + "\n")
         except OSError as error:
             raise common.UsageError(f"--log {args.log}: {error.strerror or error}") from None
-        print(f"wrote {args.log}")
+        common.say(f"wrote {args.log}")
     return 0
 
 
