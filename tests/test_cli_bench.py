@@ -11,6 +11,7 @@ import pytest
 import support
 import yaml
 
+import jaxba
 from jaxba import geometry, write_bal
 from jaxba.bench import report
 from jaxba.bench import run as bench_run
@@ -149,6 +150,37 @@ def test_another_problem_of_the_same_name_may_not_continue_in_the_folder(folder,
     path = tmp_path / "tiny.txt"
     write_bal(support.paper(0), path)
     check_one_line(bench(folder, str(path), *BRIEF), capsys.readouterr().err, "another tiny")
+
+
+def changed_file(folder: Path) -> Path:
+    """A problem of which the folder has results, and that has become another one since."""
+    path = folder.parent / "one.txt"
+    write_bal(support.tiny(), path)
+    assert bench(folder, str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "5") == 0
+    write_bal(support.tiny().replace(points=support.tiny().points + 0.01), path)
+    return path
+
+
+def test_another_problem_in_the_same_file_may_not_continue_in_the_folder(folder, undrawn, capsys):
+    path = changed_file(folder)
+    check_one_line(bench(folder, str(path), *BRIEF), capsys.readouterr().err, "another one;")
+
+
+def test_a_folder_that_knows_no_files_yet_is_continued(folder, undrawn, capsys):
+    path = changed_file(folder)
+    settings = json.loads((folder / "settings.json").read_text())
+    assert list(settings.pop("files")) == ["one"]
+    (folder / "settings.json").write_text(json.dumps(settings))
+    assert bench(folder, str(path), *BRIEF) == 0
+
+
+def test_another_policy_in_the_same_file_may_not_continue_in_the_folder(folder, undrawn, capsys):
+    shipped, mine = Path(jaxba.__file__).parent / "policies", folder.parent / "mine.safetensors"
+    argv = ["scene:tiny", "--solvers", str(mine), "--repeats", "1", "--max-iterations", "5"]
+    shutil.copy(shipped / "plain.safetensors", mine)
+    assert bench(folder, *argv) == 0
+    shutil.copy(shipped / "driver.safetensors", mine)
+    check_one_line(bench(folder, *argv), capsys.readouterr().err, f"another {mine};")
 
 
 def test_a_damaged_result_file_is_named_with_its_line(folder, undrawn, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -14,8 +15,9 @@ import jax
 
 import jaxba
 from jaxba.bench.records import Record, TracePoint, append_record, read_records
-from jaxba.bench.sources import Source
+from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.bench.summary import write_text
+from jaxba.damping.registry import SUFFIX
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 from jaxba.peers import require
@@ -189,29 +191,49 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
 
 
-def open_folder(folder: Path, settings: RunSettings, sources: Sequence[Source]) -> list[Record]:
+def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:
     """Makes the folder, or finds what an earlier run left there.
 
     Raises:
-        ProblemError: the folder holds runs with other settings, or of other problems under the same names.
+        ProblemError: the folder holds runs with other settings, or of other problems or policies under the same names.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
-    mine: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}}
+    sources = dict.fromkeys(job.source for job in jobs)
+    places = {s.name: s.location for s in sources if not s.location.startswith(SCENE_PREFIX)}
+    places |= {job.solver.policy: job.solver.policy for job in jobs if job.solver.policy.endswith(SUFFIX)}
+    files = {name: digest for name, place in places.items() if (digest := _digest(Path(place)))}
+    mine: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}, "files": files}
     if path.exists():
         try:
             before = json.loads(path.read_text())
             known = dict(before.pop("problems"))
+            known_files = dict(before.pop("files", {}))  # not in folders of jaxba 0.1
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
         other = [key for key, value in asdict(settings).items() if before.get(key) != value]
         other += [name for name, place in mine["problems"].items() if known.get(name, place) != place]
+        other += [name for name, digest in files.items() if known_files.get(name, digest) != digest]
         if other:
             raise ProblemError(f"{folder} holds a run with another {other[0]}; give another --out, or remove it")
         mine["problems"] = {**known, **mine["problems"]}
+        mine["files"] = {**known_files, **files}
     write_text(path, json.dumps(mine, indent=1) + "\n")
     results = folder / RESULTS
     return read_records(results) if results.exists() else []
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a COLMAP model; empty where they cannot be read, which is said later."""
+    parts = sorted(p for p in path.iterdir() if p.suffix in (".bin", ".txt")) if path.is_dir() else [path]
+    total = hashlib.sha256()
+    try:
+        for part in parts:
+            with open(part, "rb") as file:
+                total.update(hashlib.file_digest(file, "sha256").digest())
+    except OSError:
+        return ""
+    return total.hexdigest()
 
 
 def execute(

@@ -91,7 +91,7 @@ def _bench(args: Arguments) -> int:
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
     folder = Path(args.out)
     try:
-        done = run.open_folder(folder, settings, places)
+        done = run.open_folder(folder, settings, jobs)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     common.prepare_process()

@@ -205,7 +205,7 @@ def _solve(args: Arguments) -> int:
             raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
         common.say(f"wrote {args.output}")
         if model is None and not table.fits_bal(problem):
-            common.say("note: shared lenses and weights of observations are not in that file, which has no place for them")
+            common.say("note: that file has no place for shared lenses and weights of observations, which are not in it")
     if args.log:
         record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
         try:
