@@ -208,7 +208,7 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> lis
         try:
             before = json.loads(path.read_text())
             known = dict(before.pop("problems"))
-            known_files = dict(before.pop("files", {}))  # not in folders of jaxba 0.1
+            known_files = dict(before.pop("files", {}))  # folders of earlier versions have none
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
         other = [key for key, value in asdict(settings).items() if before.get(key) != value]
@@ -225,9 +225,9 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> lis
 
 def _digest(path: Path) -> str:
     """SHA-256 of a file, or of all files of a COLMAP model; empty where they cannot be read, which is said later."""
-    parts = sorted(p for p in path.iterdir() if p.suffix in (".bin", ".txt")) if path.is_dir() else [path]
     total = hashlib.sha256()
     try:
+        parts = sorted(p for p in path.iterdir() if p.suffix in (".bin", ".txt")) if path.is_dir() else [path]
         for part in parts:
             with open(part, "rb") as file:
                 total.update(hashlib.file_digest(file, "sha256").digest())
