@@ -272,6 +272,7 @@ BAD = {
     "bad seed": (["scene:tiny:x"], "the seed must be a whole number"),
     "no repeats": (["scene:tiny", "--repeats", "0"], "--repeats must be positive"),
     "no iterations": (["scene:tiny", "--max-iterations", "-1"], "--max-iterations must be positive"),
+    "too many iterations": (["scene:tiny", "--max-iterations", "10000000000"], "at most 2147483647"),
     "tolerance 0": (["scene:tiny", "--tolerance", "0"], "--tolerance must lie between 0 and 1"),
     "tolerance 1": (["scene:tiny", "--tolerance", "1"], "--tolerance must lie between 0 and 1"),
     "missing suite": (["--suite", "no-such-suite.yaml"], "No such file"),

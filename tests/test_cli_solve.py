@@ -314,11 +314,24 @@ BAD = {
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must not be negative"),
     "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be positive"),
     "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be positive"),
+    "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
     "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
     "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
     "loss without scale": (lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"], "--loss-scale"),
     "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
     "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "--output"),
+    "output named as a directory": (
+        lambda tiny: [str(tiny), "--output", f"{tiny.parent}/new/"],
+        "new/: is the name of a directory",
+    ),
+    "output that would be read as Bundler's": (
+        lambda tiny: [str(tiny), "--output", "o.out"],
+        "cannot write o.out: Bundler",
+    ),
+    "compressed output of Bundler's": (
+        lambda tiny: [str(tiny), "--output", "o.out.gz"],
+        "cannot write o.out.gz: Bundler",
+    ),
     "log in a missing folder": (lambda tiny: [str(tiny), "--log", str(tiny.parent / "no" / "log.json")], "--log"),
     "log is a directory": (lambda tiny: [str(tiny), "--log", str(tiny.parent)], "--log"),
 }

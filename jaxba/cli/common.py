@@ -20,6 +20,10 @@ CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable: folder of compiled programs; `off` switches the cache off."""
 
 
+LARGEST_COUNT = 2**31 - 1
+"""Programs count in 32 bits."""
+
+
 class UsageError(ValueError):
     """Arguments that make no sense. The message is one line for a person."""
 
@@ -119,13 +123,15 @@ def check_writable(option: str, path: str | None) -> None:
     """Refuses an output file that could not be written later, before any work is done.
 
     Raises:
-        UsageError: the folder is missing or not writable, or the path is a folder.
+        UsageError: the folder is missing or not writable, or the path is a folder or ends as that of one.
     """
     if path is None:
         return
     target = Path(path)
     if target.is_dir():
         raise UsageError(f"{option} {path}: is a directory")
+    if path.endswith(tuple(filter(None, (os.sep, os.altsep)))):
+        raise UsageError(f"{option} {path}: is the name of a directory, not of a file")
     if not target.absolute().parent.is_dir():
         raise UsageError(f"{option} {path}: folder {target.parent} does not exist")
     if not os.access(target.absolute().parent, os.W_OK):
@@ -142,13 +148,13 @@ def check_folder(option: str, path: str) -> None:
     if target.exists() and not target.is_dir():
         raise UsageError(f"{option} {path}: is a file, not a folder")
     if not target.exists():
-        check_writable(option, path)
+        check_writable(option, str(Path(path)))  # without a separator at its end
     elif not os.access(target, os.W_OK):
         raise UsageError(f"{option} {path}: folder cannot be written")
 
 
 def check_positive(**values: Any) -> None:
-    """Refuses numbers that are not positive (or, for tolerances, negative).
+    """Refuses numbers that are not positive (or, for tolerances, negative), and counts that programs cannot hold.
 
     Raises:
         UsageError: naming the option.
@@ -160,3 +166,5 @@ def check_positive(**values: Any) -> None:
                 raise UsageError(f"{option} must not be negative, is {value:g}")
         elif not value > 0:
             raise UsageError(f"{option} must be positive, is {value:g}")
+        elif isinstance(value, int) and value > LARGEST_COUNT:
+            raise UsageError(f"{option} must be at most {LARGEST_COUNT}, is {value}")

@@ -127,9 +127,12 @@ def _solve(args: Arguments) -> int:
         raise common.UsageError(f"--linear-solver is for --method lm; {args.method} has its own")
     if args.intrinsics == "fixed" and (args.method != DEFAULT_METHOD or args.linear_solver not in ("auto", "explicit")):
         raise common.UsageError("--intrinsics fixed needs --method lm and the explicit linear solver")
+    from jaxba.io import check_output
+
     model = _output_model(args)
     if model is None:
         common.check_writable("--output", args.output)
+        check_output(args.output or "")
     else:
         common.check_folder("--output", model)
     common.check_writable("--log", args.log)
@@ -205,7 +208,8 @@ def _solve(args: Arguments) -> int:
             raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
         common.say(f"wrote {args.output}")
         if model is None and not table.fits_bal(problem):
-            common.say("note: that file has no place for shared lenses and weights of observations, which are not in it")
+            lost = "shared lenses and weights of observations are not in that file, which has no place for them"
+            common.say(f"note: {lost}")
     if args.log:
         record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
         try:
