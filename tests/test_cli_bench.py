@@ -232,6 +232,16 @@ def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(tmp
     ]
 
 
+def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undrawn, capsys):
+    path = tmp_path / "seq[red]:cat:.txt"
+    write_bal(support.tiny(), path)
+    argv = [str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
+    assert bench(tmp_path / "run[bold]", *argv) == 0
+    out = capsys.readouterr().out
+    assert "\nseq[red]:cat: ceres #1: 1 iterations" in f"\n{out}"
+    assert f"see {tmp_path / 'run[bold]' / 'report.html'}" in out.replace("\n", "")
+
+
 def test_two_files_of_one_name_get_two_names(tmp_path, undrawn, capsys):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

@@ -95,9 +95,9 @@ def _bench(args: Arguments) -> int:
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     common.prepare_process()
-    console = Console()
+    console = Console(markup=False, emoji=False)  # names are printed as they are
     if not console.is_terminal:
-        console = Console(width=FILE_WIDTH)
+        console = Console(width=FILE_WIDTH, markup=False, emoji=False)
     wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
     records: list[Record] = [r for r in done if (r.problem, r.solver, r.repeat) in wanted]
     if records:
@@ -126,7 +126,7 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[now]}"),
+        TextColumn("{task.fields[now]}", markup=False),
     )
     failures = []
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
