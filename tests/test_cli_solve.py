@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -264,6 +265,16 @@ def test_the_solution_is_written_where_nobody_reads_the_table_to_its_end(tiny, t
         monkeypatch.setattr(sys, "stdout", closed)
         assert run([str(tiny), "--max-iterations", "2", "--output", str(output)]) == 0
     assert geometry.cost(read_bal(output)) < geometry.cost(support.tiny())
+
+
+def test_a_name_that_stdout_cannot_encode_is_printed_escaped(tmp_path, monkeypatch):
+    path = tmp_path / "büro.txt"
+    write_bal(support.tiny(), path)
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stdout)
+    assert run([str(path), "--max-iterations", "1"]) == 0
+    stdout.seek(0)
+    assert "b\\xfcro.txt: 6 cameras" in stdout.read()
 
 
 @pytest.mark.parametrize("moment", ["heading", "summary"])

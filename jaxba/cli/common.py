@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -35,6 +36,7 @@ def run_command(
     does Ctrl-C, with status 130, where `main` does not deal with it."""
     import tyro
 
+    print_all_names()
     try:
         parsed = tyro.cli(arguments, args=argv, description=description)
         from jaxba.damping.learned import PolicyFileError
@@ -51,6 +53,13 @@ def run_command(
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def print_all_names() -> None:
+    """Escapes what the encoding of stdout or stderr lacks, such as stray bytes in a file's name, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def complain(message: str) -> int:
