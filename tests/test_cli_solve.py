@@ -277,6 +277,23 @@ def test_a_name_that_stdout_cannot_encode_is_printed_escaped(tmp_path, monkeypat
     assert "b\\xfcro.txt: 6 cameras" in stdout.read()
 
 
+def test_a_log_goes_where_a_link_points_and_into_a_pipe(tiny, tmp_path):
+    target, link, pipe = tmp_path / "log.json", tmp_path / "link.json", tmp_path / "pipe"
+    link.symlink_to(target)
+    os.mkfifo(pipe)
+    fast = [str(tiny), "--max-iterations", "1"]
+    assert run([*fast, "--log", str(link)]) == 0
+    assert link.is_symlink()
+    assert list(json.loads(target.read_text())) == RECORD_KEYS
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        assert run([*fast, "--log", str(pipe)]) == 0
+        assert list(json.loads(os.read(reader, 1 << 16))) == RECORD_KEYS
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
+
+
 @pytest.mark.parametrize("moment", ["heading", "summary"])
 def test_ctrl_c_before_or_after_the_iterations_is_one_line(moment, tiny, capsys, monkeypatch):
     monkeypatch.setattr(table, moment, lambda *_: signal.raise_signal(signal.SIGINT))
@@ -343,6 +360,7 @@ BAD = {
         lambda tiny: [str(tiny), "--output", "o.out.gz"],
         "cannot write o.out.gz: Bundler",
     ),
+    "log is the problem": (lambda tiny: [str(tiny), "--log", f"{tiny.parent}/../in/tiny.txt"], "the problem's file"),
     "log in a missing folder": (lambda tiny: [str(tiny), "--log", str(tiny.parent / "no" / "log.json")], "--log"),
     "log is a directory": (lambda tiny: [str(tiny), "--log", str(tiny.parent)], "--log"),
 }

@@ -102,7 +102,7 @@ class Arguments:
     model, in a folder of this name, unless it ends in .txt, .bal, .ply, .bz2, .gz or .xz."""
 
     log: str | None = None
-    """Write a JSON record of the solve here."""
+    """Write a JSON record of the solve here, compressed by its ending."""
 
 
 def main() -> None:
@@ -142,11 +142,11 @@ def _solve(args: Arguments) -> int:
     from jaxba.bench.records import record_to_json
     from jaxba.bench.run import record_of
     from jaxba.bench.sources import embedded_sources
-    from jaxba.bench.summary import write_text
     from jaxba.cli import table
     from jaxba.damping import is_learned
     from jaxba.data.places import resolve
     from jaxba.io import read_problem, write_colmap, write_problem
+    from jaxba.io.files import open_output
     from jaxba.losses import Loss
     from jaxba.naming import SolverName
     from jaxba.retriangulate import Retriangulation
@@ -157,7 +157,10 @@ def _solve(args: Arguments) -> int:
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
     name = SolverName(args.damping, refine, args.dtype, args.method)
     policy, options = name.build()
-    problem = embedded_sources()[0].read() if args.problem is None else read_problem(resolve(args.problem))
+    place = None if args.problem is None else resolve(args.problem)
+    if place and args.log and Path(place).resolve() == Path(args.log).resolve():
+        raise common.UsageError(f"--log names the problem's file, {args.log}")
+    problem = embedded_sources()[0].read() if place is None else read_problem(place)
     common.prepare_process(untraced=True)
     options = replace(
         options,
@@ -212,10 +215,8 @@ def _solve(args: Arguments) -> int:
             common.say(f"note: {lost}")
     if args.log:
         record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
-        try:
-            write_text(Path(args.log), json.dumps(record_to_json(record), allow_nan=False) + "\n")
-        except OSError as error:
-            raise common.UsageError(f"--log {args.log}: {error.strerror or error}") from None
+        with open_output(args.log) as file:
+            file.write(json.dumps(record_to_json(record), allow_nan=False).encode() + b"\n")
         common.say(f"wrote {args.log}")
     return 0
 
