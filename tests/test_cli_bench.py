@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -207,6 +209,31 @@ def test_ctrl_c_keeps_what_is_done_and_the_next_run_does_the_rest(tmp_path, undr
     assert "interrupted" in capsys.readouterr().out
     assert bench(folder, "scene:tiny", *BRIEF) == 0
     assert [line["solver"] for line in lines(folder)] == ["classic", "ceres"]
+
+
+def test_two_processes_may_not_write_into_one_folder(folder, undrawn, capsys):
+    before = (folder / "results.jsonl").read_bytes()
+    with bench_run.only_writer(folder):
+        status = bench(folder, "scene:tiny", "--solvers", "gtsam", "--repeats", "1", "--max-iterations", "5")
+    check_one_line(status, capsys.readouterr().err, "another jaxba-bench is writing here")
+    assert (folder / "results.jsonl").read_bytes() == before
+
+
+def test_a_run_that_two_processes_have_done_counts_once(folder, undrawn, capsys):
+    path = folder / "results.jsonl"
+    path.write_bytes(2 * path.read_bytes())
+    assert bench(folder, "scene:tiny", *BRIEF) == 0
+    assert "2 of 2 runs are already in" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("module", "writer"), [(bench_run, "append_record"), (report, "write_all")])
+def test_a_full_disk_is_one_line_and_status_2(module, writer, tmp_path, capsys, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(module, writer, full)
+    status = bench(tmp_path / "run", "scene:tiny", *BRIEF)
+    check_one_line(status, capsys.readouterr().err, f"--out {tmp_path / 'run'}: No space left on device")
 
 
 def test_repeats_are_lines_of_their_own(tmp_path, undrawn, capsys):

@@ -7,6 +7,7 @@ import json
 import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,11 @@ from jaxba.problem import BundleProblem, ProblemError
 from jaxba.solve import MAX_ITERATIONS, Solution, solve
 from jaxba.stepwise import IterationRecord
 from jaxba.termination import Tolerances
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 RESULTS = "results.jsonl"
 """One line a run."""
@@ -191,8 +197,32 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
 
 
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Makes the folder and keeps other processes from writing results there, where the system can lock folders.
+
+    Raises:
+        ProblemError: another process has it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ProblemError(f"{folder}: another jaxba-bench is writing here") from None
+        except OSError:
+            pass  # some network file systems lock no folders
+        yield
+    finally:
+        os.close(handle)
+
+
 def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:
-    """Makes the folder, or finds what an earlier run left there.
+    """Makes the folder, or finds what an earlier run left there: of each run one record.
 
     Raises:
         ProblemError: the folder holds runs with other settings, or of other problems or policies under the same names.
@@ -220,7 +250,10 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> lis
         mine["files"] = {**known_files, **files}
     write_text(path, json.dumps(mine, indent=1) + "\n")
     results = folder / RESULTS
-    return read_records(results) if results.exists() else []
+    first: dict[tuple[str, str, int], Record] = {}
+    for record in read_records(results) if results.exists() else []:
+        first.setdefault((record.problem, record.solver, record.repeat), record)  # two processes may have done the same
+    return list(first.values())
 
 
 def _digest(path: Path) -> str:
@@ -248,6 +281,9 @@ def execute(
     """Does the jobs that have no record yet, appending each result as soon as it is there.
 
     A problem that cannot be read is reported once and skipped, and so is a solver that refuses one.
+
+    Raises:
+        OSError: a result cannot be written.
     """
     finished = {(r.problem, r.solver, r.repeat) for r in done}
     problem, loaded, broken = None, None, set()

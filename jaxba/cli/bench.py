@@ -78,22 +78,29 @@ def _bench(args: Arguments) -> int:
     common.check_positive(repeats=repeats, max_iterations=max_iterations)
     if not solvers:
         raise common.UsageError("--solvers names no solver")
-    from rich.console import Console
-
-    from jaxba.bench import report, run
-    from jaxba.bench.records import Record
+    from jaxba.bench import run
     from jaxba.bench.sources import embedded_sources, sources
-    from jaxba.bench.summary import summarize
-    from jaxba.bench.tables import print_summary
 
     places = sources(list(args.problems)) if args.problems else embedded_sources()
     jobs = run.plan(places, solvers, repeats)
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
-    folder = Path(args.out)
     try:
-        done = run.open_folder(folder, settings, jobs)
+        with run.only_writer(Path(args.out)):
+            return _fill(Path(args.out), jobs, settings, tolerance)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
+
+
+def _fill(folder: Path, jobs: Any, settings: Any, tolerance: float) -> int:
+    """Runs what is missing in the folder and draws. Raises OSError where it cannot be written, as on a full disk."""
+    from rich.console import Console
+
+    from jaxba.bench import report, run
+    from jaxba.bench.records import Record
+    from jaxba.bench.summary import summarize
+    from jaxba.bench.tables import print_summary
+
+    done = run.open_folder(folder, settings, jobs)
     common.prepare_process()
     console = Console(markup=False, emoji=False)  # names are printed as they are
     if not console.is_terminal:
