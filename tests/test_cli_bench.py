@@ -269,6 +269,15 @@ def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undraw
     assert f"see {tmp_path / 'run[bold]' / 'report.html'}" in out.replace("\n", "")
 
 
+def test_a_file_whose_name_is_no_text_is_reported_under_an_escaped_one(tmp_path, capsys):
+    path = tmp_path / os.fsdecode(b"b\xfcro.txt")
+    write_bal(support.tiny(), path)
+    argv = [str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
+    assert bench(tmp_path / "run", *argv) == 0
+    assert [line["problem"] for line in lines(tmp_path / "run")] == ["b\\udcfcro"]
+    assert "b\\udcfcro" in (tmp_path / "run" / "report.html").read_text()
+
+
 def test_two_files_of_one_name_get_two_names(tmp_path, undrawn, capsys):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
