@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 import support
 import yaml
 
+import jaxba
 from jaxba import geometry, write_bal
 from jaxba.bench import report
 from jaxba.bench import run as bench_run
@@ -151,6 +154,37 @@ def test_another_problem_of_the_same_name_may_not_continue_in_the_folder(folder,
     check_one_line(bench(folder, str(path), *BRIEF), capsys.readouterr().err, "another tiny")
 
 
+def changed_file(folder: Path) -> Path:
+    """A problem of which the folder has results, and that has become another one since."""
+    path = folder.parent / "one.txt"
+    write_bal(support.tiny(), path)
+    assert bench(folder, str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "5") == 0
+    write_bal(support.tiny().replace(points=support.tiny().points + 0.01), path)
+    return path
+
+
+def test_another_problem_in_the_same_file_may_not_continue_in_the_folder(folder, undrawn, capsys):
+    path = changed_file(folder)
+    check_one_line(bench(folder, str(path), *BRIEF), capsys.readouterr().err, "another one;")
+
+
+def test_a_folder_that_knows_no_files_yet_is_continued(folder, undrawn, capsys):
+    path = changed_file(folder)
+    settings = json.loads((folder / "settings.json").read_text())
+    assert list(settings.pop("files")) == ["one"]
+    (folder / "settings.json").write_text(json.dumps(settings))
+    assert bench(folder, str(path), *BRIEF) == 0
+
+
+def test_another_policy_in_the_same_file_may_not_continue_in_the_folder(folder, undrawn, capsys):
+    shipped, mine = Path(jaxba.__file__).parent / "policies", folder.parent / "mine.safetensors"
+    argv = ["scene:tiny", "--solvers", str(mine), "--repeats", "1", "--max-iterations", "5"]
+    shutil.copy(shipped / "plain.safetensors", mine)
+    assert bench(folder, *argv) == 0
+    shutil.copy(shipped / "driver.safetensors", mine)
+    check_one_line(bench(folder, *argv), capsys.readouterr().err, f"another {mine};")
+
+
 def test_a_damaged_result_file_is_named_with_its_line(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     path.write_bytes(b"no json\n" + path.read_bytes())
@@ -177,6 +211,31 @@ def test_ctrl_c_keeps_what_is_done_and_the_next_run_does_the_rest(tmp_path, undr
     assert [line["solver"] for line in lines(folder)] == ["classic", "ceres"]
 
 
+def test_two_processes_may_not_write_into_one_folder(folder, undrawn, capsys):
+    before = (folder / "results.jsonl").read_bytes()
+    with bench_run.only_writer(folder):
+        status = bench(folder, "scene:tiny", "--solvers", "gtsam", "--repeats", "1", "--max-iterations", "5")
+    check_one_line(status, capsys.readouterr().err, "another jaxba-bench is writing here")
+    assert (folder / "results.jsonl").read_bytes() == before
+
+
+def test_a_run_that_two_processes_have_done_counts_once(folder, undrawn, capsys):
+    path = folder / "results.jsonl"
+    path.write_bytes(2 * path.read_bytes())
+    assert bench(folder, "scene:tiny", *BRIEF) == 0
+    assert "2 of 2 runs are already in" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("module", "writer"), [(bench_run, "append_record"), (report, "write_all")])
+def test_a_full_disk_is_one_line_and_status_2(module, writer, tmp_path, capsys, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(module, writer, full)
+    status = bench(tmp_path / "run", "scene:tiny", *BRIEF)
+    check_one_line(status, capsys.readouterr().err, f"--out {tmp_path / 'run'}: No space left on device")
+
+
 def test_repeats_are_lines_of_their_own(tmp_path, undrawn, capsys):
     argv = ["--solvers", "ceres", "--repeats", "2", "--max-iterations", "5"]
     assert bench(tmp_path / "run", "scene:tiny", *argv) == 0
@@ -198,6 +257,25 @@ def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(tmp
         ("good", "classic"),
         ("good", "ceres"),
     ]
+
+
+def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undrawn, capsys):
+    path = tmp_path / "seq[red]:cat:.txt"
+    write_bal(support.tiny(), path)
+    argv = [str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
+    assert bench(tmp_path / "run[bold]", *argv) == 0
+    out = capsys.readouterr().out
+    assert "\nseq[red]:cat: ceres #1: 1 iterations" in f"\n{out}"
+    assert f"see {tmp_path / 'run[bold]' / 'report.html'}" in out.replace("\n", "")
+
+
+def test_a_file_whose_name_is_no_text_is_reported_under_an_escaped_one(tmp_path, capsys):
+    path = tmp_path / os.fsdecode(b"b\xfcro.txt")
+    write_bal(support.tiny(), path)
+    argv = [str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
+    assert bench(tmp_path / "run", *argv) == 0
+    assert [line["problem"] for line in lines(tmp_path / "run")] == ["b\\udcfcro"]
+    assert "b\\udcfcro" in (tmp_path / "run" / "report.html").read_text()
 
 
 def test_two_files_of_one_name_get_two_names(tmp_path, undrawn, capsys):
@@ -232,6 +310,7 @@ def test_a_suite_names_problems_by_globs_and_variables(tmp_path, undrawn, capsys
 BAD = {
     "unknown solver": (["scene:tiny", "--solvers", "ceres,cerse"], "unknown damping policy 'cerse'"),
     "unknown method": (["scene:tiny", "--solvers", "sgd+ceres"], "unknown method 'sgd'"),
+    "missing policy": (["scene:tiny", "--solvers", "no.safetensors"], "no.safetensors: No such file"),
     "no solver": (["scene:tiny", "--solvers", ","], "--solvers names no solver"),
     "missing file": (["no-such-file.txt"], "no-such-file.txt: no such file"),
     "directory": (["."], "a directory without a COLMAP model"),
@@ -239,6 +318,7 @@ BAD = {
     "bad seed": (["scene:tiny:x"], "the seed must be a whole number"),
     "no repeats": (["scene:tiny", "--repeats", "0"], "--repeats must be positive"),
     "no iterations": (["scene:tiny", "--max-iterations", "-1"], "--max-iterations must be positive"),
+    "too many iterations": (["scene:tiny", "--max-iterations", "10000000000"], "at most 2147483647"),
     "tolerance 0": (["scene:tiny", "--tolerance", "0"], "--tolerance must lie between 0 and 1"),
     "tolerance 1": (["scene:tiny", "--tolerance", "1"], "--tolerance must lie between 0 and 1"),
     "missing suite": (["--suite", "no-such-suite.yaml"], "No such file"),

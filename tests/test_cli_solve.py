@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import re
 import signal
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -95,6 +98,16 @@ def test_a_search_for_points_is_told_and_rows_count_through(tmp_path, capsys):
     assert [int(line[0]) for line in rows(printed)] == list(range(record["iterations"] + 1))
     assert [point["iteration"] for point in record["trace"]] == list(range(record["iterations"] + 1))
     np.testing.assert_allclose(record["final_cost"], geometry.cost(problem), rtol=1e-5)
+
+
+@pytest.mark.parametrize("loss", ["squared", "cauchy"])
+def test_the_rms_is_that_of_the_residuals_whatever_the_loss(loss, tiny, tmp_path, capsys):
+    output = tmp_path / "out.txt"
+    assert run([str(tiny), "--loss", loss, "--max-iterations", "3", "--output", str(output)]) == 0
+    found = re.search(r"\(rms (.*) -> (.*) px\)", capsys.readouterr().out)
+    assert found
+    rms = [np.sqrt(np.mean(np.sum(geometry.residuals(read_bal(path)) ** 2, axis=1))) for path in (tiny, output)]
+    np.testing.assert_allclose([float(number) for number in found.groups()], rms, rtol=1e-3)
 
 
 def test_padded_sizes_are_said_and_so_is_why_there_are_none(tiny, capsys):
@@ -232,6 +245,62 @@ def test_ctrl_c_stops_after_the_iteration_and_writes_what_there_is(tiny, tmp_pat
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def test_a_second_ctrl_c_ends_at_once_with_one_line(tiny, tmp_path, capsys, monkeypatch):
+    def interrupted(*_):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(table, "row", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    assert run([str(tiny), "--output", str(tmp_path / "out.txt")]) == 130
+    assert capsys.readouterr().err.splitlines()[1:] == ["interrupted"]
+    assert not (tmp_path / "out.txt").exists()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_the_solution_is_written_where_nobody_reads_the_table_to_its_end(tiny, tmp_path, monkeypatch):
+    output, (reader, writer) = tmp_path / "out.txt", os.pipe()
+    os.close(reader)
+    with open(writer, "w") as closed:
+        monkeypatch.setattr(sys, "stdout", closed)
+        assert run([str(tiny), "--max-iterations", "2", "--output", str(output)]) == 0
+    assert geometry.cost(read_bal(output)) < geometry.cost(support.tiny())
+
+
+def test_a_name_that_stdout_cannot_encode_is_printed_escaped(tmp_path, monkeypatch):
+    path = tmp_path / "büro.txt"
+    write_bal(support.tiny(), path)
+    stdout = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stdout)
+    assert run([str(path), "--max-iterations", "1"]) == 0
+    stdout.seek(0)
+    assert "b\\xfcro.txt: 6 cameras" in stdout.read()
+
+
+def test_a_log_goes_where_a_link_points_and_into_a_pipe(tiny, tmp_path):
+    target, link, pipe = tmp_path / "log.json", tmp_path / "link.json", tmp_path / "pipe"
+    link.symlink_to(target)
+    os.mkfifo(pipe)
+    fast = [str(tiny), "--max-iterations", "1"]
+    assert run([*fast, "--log", str(link)]) == 0
+    assert link.is_symlink()
+    assert list(json.loads(target.read_text())) == RECORD_KEYS
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        assert run([*fast, "--log", str(pipe)]) == 0
+        assert list(json.loads(os.read(reader, 1 << 16))) == RECORD_KEYS
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
+
+
+@pytest.mark.parametrize("moment", ["heading", "summary"])
+def test_ctrl_c_before_or_after_the_iterations_is_one_line(moment, tiny, capsys, monkeypatch):
+    monkeypatch.setattr(table, moment, lambda *_: signal.raise_signal(signal.SIGINT))
+    assert run([str(tiny), "--max-iterations", "1"]) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
 # What does not
 
 
@@ -247,13 +316,22 @@ def cut_short(path: Path, share: float) -> Path:
     return path
 
 
+def garbage(tiny: Path) -> Path:
+    path = tiny.parent / "garbage.safetensors"
+    path.write_bytes(b"no policy")
+    return path
+
+
 BAD = {
     "missing file": (lambda tiny: [str(tiny) + ".none"], "No such file"),
+    "empty name": (lambda tiny: [""], "the name of the problem is empty"),
     "directory": (lambda tiny: [str(tiny.parent)], "directory"),
     "truncated file": (lambda tiny: [str(cut_short(tiny, 0.5))], "tiny.txt"),
     "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),
     "unknown damping": (lambda tiny: [str(tiny), "--damping", "cerse"], "unknown damping policy 'cerse'"),
     "lambda that is no number": (lambda tiny: [str(tiny), "--damping", "constant:x"], "positive number"),
+    "missing policy": (lambda tiny: [str(tiny), "--damping", "no.safetensors"], "no.safetensors: No such file"),
+    "policy that is none": (lambda tiny: [str(tiny), "--damping", str(garbage(tiny))], "not a safetensors file"),
     "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm, ddlm, poba"),
     "size of no clusters": (lambda tiny: [str(tiny), "--method", "poba:3"], "no clusters"),
     "solver of a method": (lambda tiny: [str(tiny), "--method", "poba", "--linear-solver", "sparse"], "has its own"),
@@ -264,11 +342,25 @@ BAD = {
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must not be negative"),
     "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be positive"),
     "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be positive"),
+    "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
     "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
     "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
     "loss without scale": (lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"], "--loss-scale"),
     "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
     "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "--output"),
+    "output named as a directory": (
+        lambda tiny: [str(tiny), "--output", f"{tiny.parent}/new/"],
+        "new/: is the name of a directory",
+    ),
+    "output that would be read as Bundler's": (
+        lambda tiny: [str(tiny), "--output", "o.out"],
+        "cannot write o.out: Bundler",
+    ),
+    "compressed output of Bundler's": (
+        lambda tiny: [str(tiny), "--output", "o.out.gz"],
+        "cannot write o.out.gz: Bundler",
+    ),
+    "log is the problem": (lambda tiny: [str(tiny), "--log", f"{tiny.parent}/../in/tiny.txt"], "the problem's file"),
     "log in a missing folder": (lambda tiny: [str(tiny), "--log", str(tiny.parent / "no" / "log.json")], "--log"),
     "log is a directory": (lambda tiny: [str(tiny), "--log", str(tiny.parent)], "--log"),
 }

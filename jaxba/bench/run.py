@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,9 @@ import jax
 
 import jaxba
 from jaxba.bench.records import Record, TracePoint, append_record, read_records
-from jaxba.bench.sources import Source
+from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.bench.summary import write_text
+from jaxba.damping.registry import SUFFIX
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 from jaxba.peers import require
@@ -23,6 +26,11 @@ from jaxba.problem import BundleProblem, ProblemError
 from jaxba.solve import MAX_ITERATIONS, Solution, solve
 from jaxba.stepwise import IterationRecord
 from jaxba.termination import Tolerances
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 RESULTS = "results.jsonl"
 """One line a run."""
@@ -189,29 +197,76 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
 
 
-def open_folder(folder: Path, settings: RunSettings, sources: Sequence[Source]) -> list[Record]:
-    """Makes the folder, or finds what an earlier run left there.
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Makes the folder and keeps other processes from writing results there, where the system can lock folders.
 
     Raises:
-        ProblemError: the folder holds runs with other settings, or of other problems under the same names.
+        ProblemError: another process has it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ProblemError(f"{folder}: another jaxba-bench is writing here") from None
+        except OSError:
+            pass  # some network file systems lock no folders
+        yield
+    finally:
+        os.close(handle)
+
+
+def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:
+    """Makes the folder, or finds what an earlier run left there: of each run one record.
+
+    Raises:
+        ProblemError: the folder holds runs with other settings, or of other problems or policies under the same names.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
-    mine: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}}
+    sources = dict.fromkeys(job.source for job in jobs)
+    places = {s.name: s.location for s in sources if not s.location.startswith(SCENE_PREFIX)}
+    places |= {job.solver.policy: job.solver.policy for job in jobs if job.solver.policy.endswith(SUFFIX)}
+    files = {name: digest for name, place in places.items() if (digest := _digest(Path(place)))}
+    mine: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}, "files": files}
     if path.exists():
         try:
             before = json.loads(path.read_text())
             known = dict(before.pop("problems"))
+            known_files = dict(before.pop("files", {}))  # folders of earlier versions have none
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
         other = [key for key, value in asdict(settings).items() if before.get(key) != value]
         other += [name for name, place in mine["problems"].items() if known.get(name, place) != place]
+        other += [name for name, digest in files.items() if known_files.get(name, digest) != digest]
         if other:
             raise ProblemError(f"{folder} holds a run with another {other[0]}; give another --out, or remove it")
         mine["problems"] = {**known, **mine["problems"]}
+        mine["files"] = {**known_files, **files}
     write_text(path, json.dumps(mine, indent=1) + "\n")
     results = folder / RESULTS
-    return read_records(results) if results.exists() else []
+    first: dict[tuple[str, str, int], Record] = {}
+    for record in read_records(results) if results.exists() else []:
+        first.setdefault((record.problem, record.solver, record.repeat), record)  # two processes may have done the same
+    return list(first.values())
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a COLMAP model; empty where they cannot be read, which is said later."""
+    total = hashlib.sha256()
+    try:
+        parts = sorted(p for p in path.iterdir() if p.suffix in (".bin", ".txt")) if path.is_dir() else [path]
+        for part in parts:
+            with open(part, "rb") as file:
+                total.update(hashlib.file_digest(file, "sha256").digest())
+    except OSError:
+        return ""
+    return total.hexdigest()
 
 
 def execute(
@@ -226,6 +281,9 @@ def execute(
     """Does the jobs that have no record yet, appending each result as soon as it is there.
 
     A problem that cannot be read is reported once and skipped, and so is a solver that refuses one.
+
+    Raises:
+        OSError: a result cannot be written.
     """
     finished = {(r.problem, r.solver, r.repeat) for r in done}
     problem, loaded, broken = None, None, set()

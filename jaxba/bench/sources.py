@@ -8,6 +8,7 @@ from pathlib import Path
 
 from jaxba.data.places import resolve
 from jaxba.io import is_colmap, read_problem
+from jaxba.io.files import display_name
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, like, random_scene
 
@@ -80,7 +81,8 @@ def sources(locations: list[str]) -> list[Source]:
             label = re.sub(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$", "", Path(name).name) or path.name
             if path.is_dir():
                 label = _model_name(path)
-            family = path.resolve().parent.name
+            # stray bytes of a name have no place in reports and pictures
+            label, family = display_name(label), display_name(path.resolve().parent.name)
         taken = {source.name for source in found}
         if label in taken and f"{family}-{label}" not in taken:
             label = f"{family}-{label}"

@@ -78,26 +78,33 @@ def _bench(args: Arguments) -> int:
     common.check_positive(repeats=repeats, max_iterations=max_iterations)
     if not solvers:
         raise common.UsageError("--solvers names no solver")
-    from rich.console import Console
-
-    from jaxba.bench import report, run
-    from jaxba.bench.records import Record
+    from jaxba.bench import run
     from jaxba.bench.sources import embedded_sources, sources
-    from jaxba.bench.summary import summarize
-    from jaxba.bench.tables import print_summary
 
     places = sources(list(args.problems)) if args.problems else embedded_sources()
     jobs = run.plan(places, solvers, repeats)
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
-    folder = Path(args.out)
     try:
-        done = run.open_folder(folder, settings, places)
+        with run.only_writer(Path(args.out)):
+            return _fill(Path(args.out), jobs, settings, tolerance)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
+
+
+def _fill(folder: Path, jobs: Any, settings: Any, tolerance: float) -> int:
+    """Runs what is missing in the folder and draws. Raises OSError where it cannot be written, as on a full disk."""
+    from rich.console import Console
+
+    from jaxba.bench import report, run
+    from jaxba.bench.records import Record
+    from jaxba.bench.summary import summarize
+    from jaxba.bench.tables import print_summary
+
+    done = run.open_folder(folder, settings, jobs)
     common.prepare_process()
-    console = Console()
+    console = Console(markup=False, emoji=False)  # names are printed as they are
     if not console.is_terminal:
-        console = Console(width=FILE_WIDTH)
+        console = Console(width=FILE_WIDTH, markup=False, emoji=False)
     wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
     records: list[Record] = [r for r in done if (r.problem, r.solver, r.repeat) in wanted]
     if records:
@@ -126,7 +133,7 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
-        TextColumn("{task.fields[now]}"),
+        TextColumn("{task.fields[now]}", markup=False),
     )
     failures = []
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:

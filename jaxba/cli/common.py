@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -20,6 +21,10 @@ CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable: folder of compiled programs; `off` switches the cache off."""
 
 
+LARGEST_COUNT = 2**31 - 1
+"""Programs count in 32 bits."""
+
+
 class UsageError(ValueError):
     """Arguments that make no sense. The message is one line for a person."""
 
@@ -27,19 +32,34 @@ class UsageError(ValueError):
 def run_command(
     arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
 ) -> int:
-    """Parses the command line and runs `main`; every expected error becomes one line on stderr and status 2."""
+    """Parses the command line and runs `main`; every expected error becomes one line on stderr and status 2, and so
+    does Ctrl-C, with status 130, where `main` does not deal with it."""
     import tyro
 
-    parsed = tyro.cli(arguments, args=argv, description=description)
-    from jaxba.damping.registry import UnknownPolicyError
-    from jaxba.methods import UnknownMethodError
-    from jaxba.naming import SolverNameError
-    from jaxba.problem import ProblemError
-
+    print_all_names()
     try:
-        return main(parsed)
-    except (ProblemError, UsageError, UnknownPolicyError, UnknownMethodError, SolverNameError) as error:
-        return complain(str(error))
+        parsed = tyro.cli(arguments, args=argv, description=description)
+        from jaxba.damping.learned import PolicyFileError
+        from jaxba.damping.registry import UnknownPolicyError
+        from jaxba.methods import UnknownMethodError
+        from jaxba.naming import SolverNameError
+        from jaxba.problem import ProblemError
+
+        names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
+        try:
+            return main(parsed)
+        except (ProblemError, UsageError, PolicyFileError, *names) as error:
+            return complain(str(error))
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def print_all_names() -> None:
+    """Escapes what the encoding of stdout or stderr lacks, such as stray bytes in a file's name, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def complain(message: str) -> int:
@@ -48,13 +68,26 @@ def complain(message: str) -> int:
     return BAD_INPUT
 
 
+def say(text: str) -> None:
+    """Prints to stdout at once; where its reader has gone the work goes on, and what is said is lost."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        _close_pipe()
+
+
 def exit_with(status: int) -> NoReturn:
     """Ends the process after flushing; a closed pipe on stdout is no error."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _close_pipe()
     sys.exit(status)
+
+
+def _close_pipe() -> None:
+    """Stdout, and what waits in its buffer, goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def prepare_process(*, untraced: bool = False) -> None:
@@ -99,13 +132,15 @@ def check_writable(option: str, path: str | None) -> None:
     """Refuses an output file that could not be written later, before any work is done.
 
     Raises:
-        UsageError: the folder is missing or not writable, or the path is a folder.
+        UsageError: the folder is missing or not writable, or the path is a folder or ends as that of one.
     """
     if path is None:
         return
     target = Path(path)
     if target.is_dir():
         raise UsageError(f"{option} {path}: is a directory")
+    if path.endswith(tuple(filter(None, (os.sep, os.altsep)))):
+        raise UsageError(f"{option} {path}: is the name of a directory, not of a file")
     if not target.absolute().parent.is_dir():
         raise UsageError(f"{option} {path}: folder {target.parent} does not exist")
     if not os.access(target.absolute().parent, os.W_OK):
@@ -122,13 +157,13 @@ def check_folder(option: str, path: str) -> None:
     if target.exists() and not target.is_dir():
         raise UsageError(f"{option} {path}: is a file, not a folder")
     if not target.exists():
-        check_writable(option, path)
+        check_writable(option, str(Path(path)))  # without a separator at its end
     elif not os.access(target, os.W_OK):
         raise UsageError(f"{option} {path}: folder cannot be written")
 
 
 def check_positive(**values: Any) -> None:
-    """Refuses numbers that are not positive (or, for tolerances, negative).
+    """Refuses numbers that are not positive (or, for tolerances, negative), and counts that programs cannot hold.
 
     Raises:
         UsageError: naming the option.
@@ -140,3 +175,5 @@ def check_positive(**values: Any) -> None:
                 raise UsageError(f"{option} must not be negative, is {value:g}")
         elif not value > 0:
             raise UsageError(f"{option} must be positive, is {value:g}")
+        elif isinstance(value, int) and value > LARGEST_COUNT:
+            raise UsageError(f"{option} must be at most {LARGEST_COUNT}, is {value}")

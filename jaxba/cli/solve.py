@@ -102,7 +102,7 @@ class Arguments:
     model, in a folder of this name, unless it ends in .txt, .bal, .ply, .bz2, .gz or .xz."""
 
     log: str | None = None
-    """Write a JSON record of the solve here."""
+    """Write a JSON record of the solve here, compressed by its ending."""
 
 
 def main() -> None:
@@ -116,6 +116,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _solve(args: Arguments) -> int:
+    if args.problem == "":
+        raise common.UsageError("the name of the problem is empty")
     common.check_positive(
         max_iterations=args.max_iterations, ftol=args.ftol, xtol=args.xtol, gtol=args.gtol, loss_scale=args.loss_scale
     )
@@ -125,9 +127,12 @@ def _solve(args: Arguments) -> int:
         raise common.UsageError(f"--linear-solver is for --method lm; {args.method} has its own")
     if args.intrinsics == "fixed" and (args.method != DEFAULT_METHOD or args.linear_solver not in ("auto", "explicit")):
         raise common.UsageError("--intrinsics fixed needs --method lm and the explicit linear solver")
+    from jaxba.io import check_output
+
     model = _output_model(args)
     if model is None:
         common.check_writable("--output", args.output)
+        check_output(args.output or "")
     else:
         common.check_folder("--output", model)
     common.check_writable("--log", args.log)
@@ -137,11 +142,11 @@ def _solve(args: Arguments) -> int:
     from jaxba.bench.records import record_to_json
     from jaxba.bench.run import record_of
     from jaxba.bench.sources import embedded_sources
-    from jaxba.bench.summary import write_text
     from jaxba.cli import table
     from jaxba.damping import is_learned
     from jaxba.data.places import resolve
     from jaxba.io import read_problem, write_colmap, write_problem
+    from jaxba.io.files import open_output
     from jaxba.losses import Loss
     from jaxba.naming import SolverName
     from jaxba.retriangulate import Retriangulation
@@ -152,7 +157,10 @@ def _solve(args: Arguments) -> int:
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
     name = SolverName(args.damping, refine, args.dtype, args.method)
     policy, options = name.build()
-    problem = read_problem(resolve(args.problem)) if args.problem else embedded_sources()[0].read()
+    place = None if args.problem is None else resolve(args.problem)
+    if place and args.log and Path(place).resolve() == Path(args.log).resolve():
+        raise common.UsageError(f"--log names the problem's file, {args.log}")
+    problem = embedded_sources()[0].read() if place is None else read_problem(place)
     common.prepare_process(untraced=True)
     options = replace(
         options,
@@ -162,19 +170,19 @@ def _solve(args: Arguments) -> int:
         intrinsics=args.intrinsics,
         loss=Loss(args.loss, args.loss_scale),
     )
-    print(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
+    common.say(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
     steps: list[IterationRecord] = []
     with Interrupt("iteration", gentle=True) as interrupt:
 
         def show(record: IterationRecord) -> bool:
             if not steps:
-                print(table.header(float(record.step.previous_cost)))
-            print(table.row(record, steps[-1].time_s if steps else 0.0), flush=True)
+                common.say(table.header(float(record.step.previous_cost)))
+            common.say(table.row(record, steps[-1].time_s if steps else 0.0))
             steps.append(record)
             return interrupt.asked
 
         def tell(found: Retriangulation) -> None:
-            print(table.retriangulated(found, args.ftol), flush=True)
+            common.say(table.retriangulated(found, args.ftol))
 
         search: dict[str, Any] = {"on_search": tell} if args.retriangulate else {}
         solution = (solve_and_retriangulate if args.retriangulate else solve)(
@@ -190,9 +198,9 @@ def _solve(args: Arguments) -> int:
             compilation=args.compilation,
             **search,
         )
-    print(table.summary(problem, solution))
+    common.say(table.summary(problem, solution))
     if args.pad:
-        print(table.padding(problem, solution))
+        common.say(table.padding(problem, solution))
     if args.output:
         try:
             if model is None:
@@ -201,16 +209,15 @@ def _solve(args: Arguments) -> int:
                 write_colmap(solution.problem, model, like=str(args.problem))
         except OSError as error:
             raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
-        print(f"wrote {args.output}")
+        common.say(f"wrote {args.output}")
         if model is None and not table.fits_bal(problem):
-            print("note: shared lenses and weights of observations are not in that file, which has no place for them")
+            lost = "shared lenses and weights of observations are not in that file, which has no place for them"
+            common.say(f"note: {lost}")
     if args.log:
         record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
-        try:
-            write_text(Path(args.log), json.dumps(record_to_json(record), allow_nan=False) + "\n")
-        except OSError as error:
-            raise common.UsageError(f"--log {args.log}: {error.strerror or error}") from None
-        print(f"wrote {args.log}")
+        with open_output(args.log) as file:
+            file.write(json.dumps(record_to_json(record), allow_nan=False).encode() + b"\n")
+        common.say(f"wrote {args.log}")
     return 0
 
 

@@ -67,8 +67,8 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
 def summary(problem: BundleProblem, solution: Solution) -> str:
     """How it ended, in lines for a person."""
     state = "converged" if solution.converged else "not converged"
-    count = solution.problem.num_observations
-    rms = [np.sqrt(2 * cost / count) for cost in (solution.initial_cost, solution.final_cost)]
+    # of the residuals themselves: the cost may be that of a robust loss
+    rms = [np.sqrt(2 * geometry.cost(p) / p.num_observations) for p in (problem, solution.problem)]
     lines = [
         f"{state}: {solution.termination.reason}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e} (rms {rms[0]:.4g} -> {rms[1]:.4g} px)",

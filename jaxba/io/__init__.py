@@ -8,11 +8,12 @@ from pathlib import PurePath
 from jaxba.io.bal import read_bal, write_bal
 from jaxba.io.bundler import read_bundler
 from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
-from jaxba.io.files import StrPath, strip_compression
+from jaxba.io.files import StrPath, display_name, strip_compression
 from jaxba.io.ply import write_ply
-from jaxba.problem import BundleProblem
+from jaxba.problem import BundleProblem, ProblemError
 
 __all__ = [
+    "check_output",
     "is_colmap",
     "read_bal",
     "read_bundler",
@@ -41,9 +42,20 @@ def write_problem(problem: BundleProblem, path: StrPath) -> None:
     """Writes a problem: `.ply` is a point cloud for viewers, every other name a BAL file; each also compressed.
 
     Raises:
-        ProblemError: as `write_ply` and `write_bal` do.
+        ProblemError: as `check_output`, `write_ply` and `write_bal` do.
     """
+    check_output(path)
     (write_ply if _kind(path) == ".ply" else write_bal)(problem, path)
+
+
+def check_output(path: StrPath) -> None:
+    """Refuses a name under which `read_problem` would not find what `write_problem` writes.
+
+    Raises:
+        ProblemError: the name is that of a Bundler model; in one line.
+    """
+    if _kind(path) == ".out":
+        raise ProblemError(f"cannot write {display_name(path)}: Bundler models are only read; .txt is for BAL")
 
 
 def _kind(path: StrPath) -> str:
