@@ -132,6 +132,8 @@ def test_automatic_keyframes_skip_frames_that_stand_still():
     assert keyframes.choose(tracks, 10, "all", CALIBRATION, tuple(range(10))) == list(range(10))
     with pytest.raises(ProblemError, match="hardly moves in frames 0 to 2"):
         keyframes.choose(tracks.restrict([0, 1, 2]), 3, "auto", CALIBRATION, (0, 1, 2))
+    with pytest.raises(ProblemError, match="--keyframes 99 leaves one key-frame of 10 in frames 0 to 9"):
+        keyframes.choose(tracks, 10, "99", CALIBRATION, tuple(range(10)))
     for choice in ("0", "some", "-1", "1.5"):
         with pytest.raises(ProblemError, match="--keyframes must be"):
             keyframes.choose(tracks, 10, choice, CALIBRATION, tuple(range(10)))

@@ -111,5 +111,5 @@ def build(
             moved = views_of_poses(noisy)
     report("triangulation", 0, 1)
     whole = assemble(tracks, views, sequence.calibration, frames, options.filters, options.min_views, moved)
-    dropped = tuple(sorted(set(sequence.numbers[: linked.frames[-1] + 1]) - set(numbers)))
+    dropped = tuple(sorted(set(sequence.numbers) - set(numbers)))
     return Built(whole, len(sequence), dropped, tracks.count, restarts)

@@ -71,7 +71,10 @@ def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, n
             if len(a) < max(SHARE * own, MIN_SHARED) or parallax(rays[a], rays[b], calibration.fx) >= PARALLAX:
                 chosen.append(i)
     if len(chosen) < 2:
-        raise ProblemError(f"the camera hardly moves in frames {numbers[0]} to {numbers[images - 1]}: one key-frame")
+        where = f"frames {numbers[0]} to {numbers[images - 1]}"
+        if choice == "auto":
+            raise ProblemError(f"the camera hardly moves in {where}: one key-frame")
+        raise ProblemError(f"--keyframes {choice} leaves one key-frame of {images} in {where}, not 2")
     for i, j in pairwise(chosen):
         shared = len(tracks.shared(i, j)[0])
         if shared < MIN_SHARED:
