@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxba import geometry
 from jaxba.kitti import keyframes
 from jaxba.kitti.assemble import assemble, poses_of_cameras, windows
+from jaxba.kitti.odometry import Odometry, visual_odometry
 from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.starts import drift
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
@@ -145,6 +146,66 @@ def test_keyframes_that_share_too_little_are_named():
     )
     with pytest.raises(ProblemError, match="key-frames 7 and 9 share 0 tracks"):
         keyframes.choose(tracks, 3, "2", CALIBRATION, (7, 8, 9))
+
+
+# Visual odometry
+
+
+def drive(steps: list[float], links: list[list[int]], seed: int = 0) -> Tracks:
+    """Tracks of a drive by these steps: 80 points ahead for every list of views that see them, to 0.1 pixels."""
+    random = np.random.default_rng(seed)
+    places = np.concatenate([[0.0], np.cumsum(steps)])[:, None] * [0.3, 0.0, 1.0]
+    image, track, pixels = [], [], []
+    for link, views in enumerate(links):
+        points = places[views[0]] + random.uniform([-8, -4, 10], [8, 3, 30], (80, 3))
+        for view in views:
+            local = points - places[view]
+            rays = local[:, :2] / local[:, 2:]
+            seen = rays * [CALIBRATION.fx, CALIBRATION.fy] + [CALIBRATION.cx, CALIBRATION.cy]
+            image.append(np.full(80, view))
+            track.append(80 * link + np.arange(80))
+            pixels.append(seen + 0.1 * random.standard_normal(seen.shape))
+    return make_tracks(*map(np.concatenate, (image, track, pixels)))
+
+
+def steps_of(found: Odometry) -> np.ndarray:
+    """Lengths of the steps between views, the first one 1."""
+    lengths = np.linalg.norm(np.diff(found.views.centers(), axis=0), axis=1)
+    return lengths / lengths[0]
+
+
+def test_the_few_known_points_that_two_views_share_tell_the_length_of_the_step():
+    """View 4 is 2.5 steps away from view 3 and knows 8 points of it, too few to be placed by them."""
+    tracks = drive([1.0, 1.0, 1.0, 2.5], [[0, 1, 2, 3], [3, 4], [0, 1, 2, 3, 4]])
+    tracks = tracks.keep((tracks.track < 160 + 8), 2)
+    found = visual_odometry(tracks, 5, CALIBRATION, Filters(), 0, tuple(range(5)))
+    assert found.restarts == (4,)
+    np.testing.assert_allclose(steps_of(found), [1, 1, 1, 2.5], rtol=0.03)
+
+
+def test_without_known_points_a_step_has_the_pace_of_the_steps_before():
+    """View 4 is three frames after view 3 and shares no known point with it."""
+    tracks = drive([1.0, 1.0, 1.0, 3.0], [[0, 1, 2, 3], [3, 4]])
+    found = visual_odometry(tracks, 5, CALIBRATION, Filters(), 0, (0, 1, 2, 3, 6))
+    assert found.restarts == (4,)
+    np.testing.assert_allclose(steps_of(found), [1, 1, 1, 3], rtol=0.03)
+
+
+def test_a_stop_without_known_points_leaves_the_scale():
+    """Views 3 to 5 stand in one place and share new points only, as behind a lorry that passes."""
+    tracks = drive([1.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0], [[0, 1, 2, 3], [3, 4], [4, 5], [5, 6, 7]])
+    found = visual_odometry(tracks, 8, CALIBRATION, Filters(), 0, tuple(range(8)))
+    assert found.restarts[:3] == (4, 5, 6)
+    np.testing.assert_allclose(steps_of(found), [1, 1, 1, 0, 0, 1, 1], rtol=0.05, atol=1e-9)
+
+
+def test_a_slow_drive_has_a_start():
+    """Every step is a hundredth of the depth or less: OpenCV takes points beyond 50 baselines to be nowhere."""
+    tracks = drive([0.1] * 30, [list(range(31))])
+    found = visual_odometry(tracks, 31, CALIBRATION, Filters(), 0, tuple(range(31)))
+    assert not found.restarts
+    end = found.views.centers()[-1]
+    np.testing.assert_allclose(end / np.linalg.norm(end), np.array([0.3, 0, 1]) / np.hypot(0.3, 1), atol=0.03)
 
 
 # Triangulation

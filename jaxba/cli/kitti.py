@@ -189,7 +189,7 @@ def _build(args: Arguments) -> int:
     console.print(_build_table([part for part, _ in parts], built, poses))
     for words, numbers in (
         ("left out, too few matches", built.dropped),
-        ("placed without enough known points, with the scale of the step before", built.restarts),
+        ("placed relative to the key-frame beside, without enough known points", built.restarts),
     ):
         if numbers:
             console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")

@@ -62,7 +62,7 @@ class Built:
     """Tracks over the key-frames, of which not all became points."""
 
     restarts: tuple[int, ...] = ()
-    """Frame numbers that visual odometry placed without enough known points: the scale was carried over."""
+    """Frame numbers that visual odometry placed relative to the key-frame beside, without enough known points."""
 
 
 def build(

@@ -8,16 +8,18 @@ is that of the first baseline, and nothing is adjusted: errors accumulate as the
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxba.kitti.features import essential
+from jaxba.kitti.keyframes import parallax, turn
 from jaxba.kitti.opencv import cv2
 from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.tracks import Tracks
-from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate
+from jaxba.kitti.triangulate import Filters, Sightings, Triangulated, Views, triangulate
 from jaxba.problem import ProblemError
 
 BOOTSTRAP_ANGLE = 2.0
@@ -39,15 +41,29 @@ PNP_ITERATIONS = 300
 
 EPIPOLAR_PIXELS = 1.0
 
+FARTHEST = 1e9
+"""Depth in baselines up to which points say on which side of the cameras they are. OpenCV's 50 leaves out all points of
+a slow drive."""
+
+MIN_KNOWN = 3
+"""Known points that tell the length of a step: the median of three bears one wrong."""
+
+STILL_PIXELS = 1.0
+"""Median parallax of a camera that stands: key-points are found to less than a pixel."""
+
+MOVED_PIXELS = 3.0
+"""... and of one that surely moves."""
+
+PACE_STEPS = 5
+"""Steps whose median length a frame is taken where no known point is shared."""
+
 
 class Odometry(NamedTuple):
     """Poses of all views, and what happened."""
 
     views: Views  # world to camera, the first view at the origin
     bootstrap: tuple[int, int]
-    restarts: tuple[
-        int, ...
-    ]  # views placed without enough known points: the scale was carried over from the step before
+    restarts: tuple[int, ...]  # views placed relative to their neighbour, without enough known points
 
 
 class _Map:
@@ -134,7 +150,7 @@ def _bootstrap(scene: _Map, views: int, names: tuple[int, ...]) -> tuple[int, in
         for j in range(i + 1, min(i + 1 + BOOTSTRAP_REACH, views)):
             found = _relative(scene, i, j)
             if found is None:
-                break
+                continue
             rotation, translation, angle = found
             if best is None or angle > best[0]:
                 best = (angle, i, j, rotation, translation)
@@ -164,15 +180,22 @@ def _relative(scene: _Map, i: int, j: int) -> tuple[np.ndarray, np.ndarray, floa
     if matrix is None or inliers.sum() < MIN_POINTS:
         return None
     a, b = scene.rays[a[inliers]], scene.rays[b[inliers]]
-    _, rotation, translation, _ = cv2.recoverPose(matrix, np.ascontiguousarray(a), np.ascontiguousarray(b), np.eye(3))
+    first, second = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    _, rotation, translation, *_ = cv2.recoverPose(matrix, first, second, np.eye(3), FARTHEST)
     rotation, translation = np.asarray(rotation), np.asarray(translation).ravel()
     views = Views(np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation]))
-    track = np.repeat(np.arange(len(a)), 2)
-    found = triangulate(views, Sightings(np.tile([0, 1], len(a)), track, np.stack([a, b], axis=1).reshape(-1, 2)))
-    good = found.good(track, Filters(angle=0.0, pixels=scene.filters.pixels), scene.calibration.fx)
+    found, good = _two_views(scene, views, a, b)
     if good.sum() < MIN_POINTS:
         return None
     return rotation, translation, float(np.median(found.angle[good]))
+
+
+def _two_views(scene: _Map, views: Views, first: np.ndarray, second: np.ndarray) -> tuple[Triangulated, np.ndarray]:
+    """Points of matched rays of two views, and which are good, whatever their angle."""
+    track = np.repeat(np.arange(len(first)), 2)
+    rays = np.stack([first, second], axis=1).reshape(-1, 2)
+    found = triangulate(views, Sightings(np.tile([0, 1], len(first)), track, rays))
+    return found, found.good(track, Filters(angle=0.0, pixels=scene.filters.pixels), scene.calibration.fx)
 
 
 def _neighbour(scene: _Map, view: int) -> int:
@@ -218,22 +241,56 @@ def _resect(scene: _Map, view: int) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _carry_on(scene: _Map, view: int, names: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a view relative to its neighbour alone, with the length of the step before it."""
+    """Pose of a view relative to its neighbour alone, the length of the step by the points that both see."""
     near = _neighbour(scene, view)
-    found = _relative(scene, near, view)
-    if found is None:
-        shared = len(scene.tracks.shared(near, view)[0])
-        raise ProblemError(
-            f"too few matches: key-frames {names[near]} and {names[view]} share {shared} tracks that fit one motion "
-            f"badly, {MIN_POINTS} good ones are needed; choose other --frames or --features"
-        )
-    rotation, translation, _ = found
-    centers = Views(scene.rotation, scene.translation).centers()
-    before = near + (1 if near > view else -1)
-    step = 1.0
-    if 0 <= before < len(centers) and scene.placed[before]:
-        step = float(np.linalg.norm(centers[near] - centers[before]))
+    a, b = scene.tracks.shared(near, view)
+    if len(a) >= MIN_POINTS and parallax(scene.rays[a], scene.rays[b], scene.calibration.fx) < STILL_PIXELS:
+        rotation, translation, step = turn(scene.rays[a], scene.rays[b]), np.zeros(3), 0.0
+    else:
+        found = _relative(scene, near, view)
+        if found is None:
+            raise ProblemError(
+                f"too few matches: key-frames {names[near]} and {names[view]} share {len(a)} tracks that fit one "
+                f"motion badly, {MIN_POINTS} good ones are needed; choose other --frames or --features"
+            )
+        rotation, translation, _ = found
+        step = _known_length(scene, near, view, rotation, translation)
+        if step is None:
+            step = _pace(scene, near, names) * abs(names[view] - names[near])
     return rotation @ scene.rotation[near], rotation @ scene.translation[near] + step * translation
+
+
+def _known_length(scene: _Map, near: int, view: int, rotation: np.ndarray, translation: np.ndarray) -> float | None:
+    """Length of a step, whose direction is known, by the known points that both views see; None if they are too few."""
+    a, b = scene.tracks.shared(near, view)
+    known = scene.points[scene.tracks.track[a]]
+    use = np.isfinite(known[:, 0])
+    if use.sum() < MIN_KNOWN:
+        return None
+    views = Views(np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation]))
+    found, good = _two_views(scene, views, scene.rays[a[use]], scene.rays[b[use]])
+    if good.sum() < MIN_KNOWN:
+        return None
+    depth = (known[use][good] @ scene.rotation[near].T + scene.translation[near])[:, 2]
+    length = float(np.median(depth / found.points[good, 2]))
+    return length if length > 0 else None
+
+
+def _pace(scene: _Map, near: int, names: tuple[int, ...]) -> float:
+    """Median length a frame of the steps nearest to a view in which the camera moved."""
+    placed = np.flatnonzero(scene.placed)
+    centers = Views(scene.rotation, scene.translation).centers()
+    steps = sorted(pairwise(placed.tolist()), key=lambda step: abs(step[0] + step[1] - 2 * near))
+    paces: list[float] = []
+    for i, j in steps:
+        a, b = scene.tracks.shared(i, j)
+        if len(a) >= MIN_POINTS and parallax(scene.rays[a], scene.rays[b], scene.calibration.fx) >= MOVED_PIXELS:
+            paces.append(float(np.linalg.norm(centers[j] - centers[i])) / abs(names[j] - names[i]))
+        if len(paces) == PACE_STEPS:
+            break
+    if not paces:  # nothing but the first two views, which are a step of 1
+        return 1.0 / abs(names[placed[-1]] - names[placed[0]])
+    return float(np.median(paces))
 
 
 def views_of_poses(poses: Float[np.ndarray, "views 3 4"]) -> Views:
