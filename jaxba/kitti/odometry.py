@@ -181,7 +181,7 @@ def _relative(scene: _Map, i: int, j: int) -> tuple[np.ndarray, np.ndarray, floa
         return None
     a, b = scene.rays[a[inliers]], scene.rays[b[inliers]]
     first, second = np.ascontiguousarray(a), np.ascontiguousarray(b)
-    _, rotation, translation, *_ = cv2.recoverPose(matrix, first, second, np.eye(3), FARTHEST)
+    _, rotation, translation, *_ = cv2.recoverPose(matrix, first, second, np.eye(3), distanceThresh=FARTHEST)
     rotation, translation = np.asarray(rotation), np.asarray(translation).ravel()
     views = Views(np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation]))
     found, good = _two_views(scene, views, a, b)
