@@ -210,6 +210,19 @@ def test_two_views_far_from_all_points_have_a_start(seed):
     np.testing.assert_allclose(found.views.centers()[1], [1, 0, 0], atol=0.2)
 
 
+def test_wrong_matches_of_the_first_views_do_not_make_the_start():
+    """Views 0 and 1 share 40 matches that fit no motion well; those of the views after are good."""
+    good = drive([1.0] * 5, [[1, 2, 3], [1, 2, 3, 4, 5], [0, 1, 2]])
+    wrong = np.random.default_rng(0).uniform(0, 400, (80, 2))
+    tracks = make_tracks(
+        np.concatenate([good.image, np.repeat([0, 1], 40)]),
+        np.concatenate([good.track, good.count + np.tile(np.arange(40), 2)]),
+        np.concatenate([good.pixels, wrong]),
+    )
+    found = visual_odometry(tracks, 6, CALIBRATION, Filters(), 0, tuple(range(6)))
+    np.testing.assert_allclose(steps_of(found), np.ones(5), rtol=0.05)
+
+
 # Triangulation
 
 
