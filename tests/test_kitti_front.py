@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from kitti_scene import OTHER, SMALL, Camera, cv2, render, textures, write_sequence
 
-from jaxba import geometry, read_bal
+from jaxba import BundleProblem, geometry, read_bal
 from jaxba.cli.kitti import run
 from jaxba.cli.solve import run as solve
+from jaxba.io import write_problem
 from jaxba.kitti import front, klt
 from jaxba.kitti.features import KeyPoints, detect, essential, match
-from jaxba.kitti.sequence import Calibration
+from jaxba.kitti.sequence import Calibration, image_reader, read_sequence
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
@@ -331,6 +332,39 @@ def test_a_camera_that_only_turns_is_refused(sequence, tmp_path, capsys, choice)
     assert message.count("\n") == 1
 
 
+@pytest.mark.parametrize("features", ["sift", "klt"])
+def test_frames_left_out_at_the_end_are_named(sequence, tmp_path, capsys, features):
+    for number in (FRAMES - 2, FRAMES - 1):
+        cv2.imwrite(str(image(sequence, number)), np.zeros((SMALL.height, SMALL.width), np.uint8))
+    assert build(sequence, tmp_path / "p.txt", "--features", features) == 0
+    assert "note: left out, too few matches: frames 12, 13\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("features", ["sift", "orb", "klt"])
+def test_images_of_one_pixel_are_an_error_in_one_line(sequence, tmp_path, capsys, features):
+    for number in range(FRAMES):
+        cv2.imwrite(str(image(sequence, number)), np.full((1, 1), 100, np.uint8))
+    assert build(sequence, tmp_path / "p.txt", "--features", features) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: too few matches: frame 0 shares 0")
+    assert message.count("\n") == 1
+
+
+@pytest.mark.parametrize("bits", [12, 16])
+def test_images_of_more_than_eight_bits_are_seen_as_those_of_eight(rendered, sequence, bits):
+    """The highest used bits count, whichever frame is read first, and a brighter frame is no darker than white."""
+    for number in range(FRAMES):
+        grey = cv2.imread(str(image(sequence, number)), 0)
+        grey[0, 0] = 255 if number == 0 else grey[0, 0]
+        cv2.imwrite(str(image(sequence, number)), grey.astype(np.uint16) << (bits - 8))
+    read, eight = (image_reader(read_sequence(folder)) for folder in (sequence, rendered[SMALL]))
+    for number in (3, 0, 3, 7):
+        np.testing.assert_array_equal(read(number)[1:], eight(number)[1:])
+    bright = np.full((SMALL.height, SMALL.width), 2**16 - 1, np.uint16)
+    cv2.imwrite(str(image(sequence, 5)), bright)
+    assert read(5).min() == 255
+
+
 def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
     path = image(sequence, 3)
     good = path.read_bytes()
@@ -339,6 +373,7 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
         (b"", "is no image"),
         (b"not a png", "is no image"),
         (b"\x89PNG\r\n\x1a\n" + b"x" * 50, "is no image"),
+        (good[: len(good) // 2] + bytes(200) + good[len(good) // 2 + 200 :], "is no image"),
     ):
         path.write_bytes(data)
         assert build(sequence, tmp_path / "p.txt") == 2
@@ -362,6 +397,9 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
         (["--out", "p.ply"], "the problem is a BAL file"),
         (["--out", "nowhere/p.txt"], "does not exist"),
         (["--seed", "-1"], "--seed must lie"),
+        (["--max-error", "inf"], "--max-error must be finite"),
+        (["--rotation-sigma", "nan"], "--rotation-sigma must be finite"),
+        (["--keyframes", "99", "--frames", "0:5"], "--keyframes 99 leaves one key-frame of 5"),
         (["--frames", "0:99"], "ends after the last frame, 13"),
         (["--poses", "nowhere.txt"], "cannot be read"),
         (["--keyframes", "few", "--frames", "0:3"], "--keyframes must be"),
@@ -404,6 +442,24 @@ def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, caps
     (tmp_path / "p.frames.json").write_text("{}")
     assert run(["evaluate", str(out)]) == 2
     assert "is no side file" in capsys.readouterr().err
+
+
+def test_an_error_that_is_not_finite_is_said_in_one_line(rendered, tmp_path, capsys):
+    """A point in the plane of a camera that sees it has no projection."""
+    out, bad = tmp_path / "p.txt", tmp_path / "bad.txt"
+    assert build(rendered[SMALL], out) == 0
+    problem = read_bal(out)
+    cameras, points = np.array(problem.cameras), np.array(problem.points)
+    cameras[np.asarray(problem.camera_index)[0], :6] = 0
+    points[np.asarray(problem.point_index)[0]] = 1, 1, 0
+    observations = np.asarray(problem.observations), problem.camera_index, problem.point_index
+    write_problem(BundleProblem.create(cameras, points, *observations), bad)
+    capsys.readouterr()
+    assert run(["evaluate", str(out), str(bad), "--out", str(tmp_path / "e")]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ")
+    assert f"{bad}: an error is not finite" in message
+    assert message.count("\n") == 1
 
 
 # Real frames

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from jaxba import geometry
 from jaxba.kitti import keyframes
 from jaxba.kitti.assemble import assemble, poses_of_cameras, windows
+from jaxba.kitti.odometry import Odometry, visual_odometry
 from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.starts import drift
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
@@ -132,6 +133,8 @@ def test_automatic_keyframes_skip_frames_that_stand_still():
     assert keyframes.choose(tracks, 10, "all", CALIBRATION, tuple(range(10))) == list(range(10))
     with pytest.raises(ProblemError, match="hardly moves in frames 0 to 2"):
         keyframes.choose(tracks.restrict([0, 1, 2]), 3, "auto", CALIBRATION, (0, 1, 2))
+    with pytest.raises(ProblemError, match="--keyframes 99 leaves one key-frame of 10 in frames 0 to 9"):
+        keyframes.choose(tracks, 10, "99", CALIBRATION, tuple(range(10)))
     for choice in ("0", "some", "-1", "1.5"):
         with pytest.raises(ProblemError, match="--keyframes must be"):
             keyframes.choose(tracks, 10, choice, CALIBRATION, tuple(range(10)))
@@ -143,6 +146,81 @@ def test_keyframes_that_share_too_little_are_named():
     )
     with pytest.raises(ProblemError, match="key-frames 7 and 9 share 0 tracks"):
         keyframes.choose(tracks, 3, "2", CALIBRATION, (7, 8, 9))
+
+
+# Visual odometry
+
+
+FORWARD = (0.3, 0.0, 1.0)
+
+
+def drive(steps: list[float], links: list[list[int]], direction: tuple[float, ...] = FORWARD, seed: int = 0) -> Tracks:
+    """Tracks of a drive by these steps: 80 points ahead for every list of views that see them, to 0.1 pixels."""
+    random = np.random.default_rng(seed)
+    places = np.concatenate([[0.0], np.cumsum(steps)])[:, None] * direction
+    image, track, pixels = [], [], []
+    for link, views in enumerate(links):
+        points = places[views[0]] + random.uniform([-8, -4, 10], [8, 3, 30], (80, 3))
+        for view in views:
+            local = points - places[view]
+            rays = local[:, :2] / local[:, 2:]
+            seen = rays * [CALIBRATION.fx, CALIBRATION.fy] + [CALIBRATION.cx, CALIBRATION.cy]
+            image.append(np.full(80, view))
+            track.append(80 * link + np.arange(80))
+            pixels.append(seen + 0.1 * random.standard_normal(seen.shape))
+    return make_tracks(*map(np.concatenate, (image, track, pixels)))
+
+
+def steps_of(found: Odometry) -> np.ndarray:
+    """Lengths of the steps between views, the first one 1."""
+    lengths = np.linalg.norm(np.diff(found.views.centers(), axis=0), axis=1)
+    return lengths / lengths[0]
+
+
+def test_the_few_known_points_that_two_views_share_tell_the_length_of_the_step():
+    """View 4 is 2.5 steps away from view 3 and knows 8 points of it, too few to be placed by them."""
+    tracks = drive([1.0, 1.0, 1.0, 2.5], [[0, 1, 2, 3], [3, 4], [0, 1, 2, 3, 4]])
+    tracks = tracks.keep((tracks.track < 160 + 8), 2)
+    found = visual_odometry(tracks, 5, CALIBRATION, Filters(), 0, tuple(range(5)))
+    assert found.restarts == (4,)
+    np.testing.assert_allclose(steps_of(found), [1, 1, 1, 2.5], rtol=0.03)
+
+
+def test_without_known_points_a_step_has_the_pace_of_the_steps_before():
+    """View 4 is three frames after view 3 and shares no known point with it."""
+    tracks = drive([1.0, 1.0, 1.0, 3.0], [[0, 1, 2, 3], [3, 4]])
+    found = visual_odometry(tracks, 5, CALIBRATION, Filters(), 0, (0, 1, 2, 3, 6))
+    assert found.restarts == (4,)
+    np.testing.assert_allclose(steps_of(found), [1, 1, 1, 3], rtol=0.03)
+
+
+def test_a_stop_without_known_points_leaves_the_scale():
+    """Views 3 to 5 stand in one place and share new points only, as behind a lorry that passes."""
+    tracks = drive([1.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0], [[0, 1, 2, 3], [3, 4], [4, 5], [5, 6, 7]])
+    found = visual_odometry(tracks, 8, CALIBRATION, Filters(), 0, tuple(range(8)))
+    assert found.restarts[:3] == (4, 5, 6)
+    np.testing.assert_allclose(steps_of(found), [1, 1, 1, 0, 0, 1, 1], rtol=0.05, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_views_far_from_all_points_have_a_start(seed):
+    """The median depth is 67 baselines: OpenCV takes points beyond 50 to be nowhere."""
+    tracks = drive([0.3], [[0, 1], [0, 1], [0, 1]], (1.0, 0.0, 0.0), seed)
+    found = visual_odometry(tracks, 2, CALIBRATION, Filters(), 0, (0, 1))
+    np.testing.assert_allclose(found.views.centers()[1], [1, 0, 0], atol=0.2)
+
+
+def test_wrong_matches_of_the_first_views_do_not_make_the_start():
+    """Views 0 and 1 share 40 matches that fit no motion well; those of the views after are good."""
+    good = drive([1.0] * 5, [[1, 2, 3], [1, 2, 3, 4, 5], [0, 1, 2]])
+    wrong = np.random.default_rng(0).uniform(0, 400, (80, 2))
+    tracks = make_tracks(
+        np.concatenate([good.image, np.repeat([0, 1], 40)]),
+        np.concatenate([good.track, good.count + np.tile(np.arange(40), 2)]),
+        np.concatenate([good.pixels, wrong]),
+    )
+    found = visual_odometry(tracks, 6, CALIBRATION, Filters(), 0, tuple(range(6)))
+    np.testing.assert_allclose(steps_of(found), np.ones(5), rtol=0.05)
 
 
 # Triangulation

@@ -54,6 +54,11 @@ def test_a_matrix_alone_is_a_calibration(folder):
     assert read_sequence(folder).calibration == Calibration(710.0, 720.0, 600.0, 180.0)
 
 
+def test_a_byte_order_mark_is_no_trouble(folder):
+    (folder / "calib.txt").write_text(CALIBRATION, encoding="utf-8-sig")
+    assert read_sequence(folder).calibration == Calibration(700.0, 700.0, 600.5, 180.25)
+
+
 def test_rays_of_pixels_are_the_inverse_of_the_matrix():
     calibration = Calibration(700.0, 650.0, 600.0, 180.0)
     place = np.array([0.3, -0.2, 2.0])

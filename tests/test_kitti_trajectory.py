@@ -183,6 +183,15 @@ def test_too_few_poses_or_a_straight_line_cannot_be_aligned(count):
         umeyama(line, line)
 
 
+@pytest.mark.parametrize("place", [1e200, 1e100])
+def test_poses_too_far_away_to_be_squared_cannot_be_aligned(place):
+    poses = wander(10, 0)
+    far = poses.copy()
+    far[3, :, 3] = place
+    with pytest.raises(ProblemError, match="cannot be aligned"):
+        align(far, poses)
+
+
 def test_poses_that_all_stand_in_one_place_cannot_be_aligned():
     with pytest.raises(ProblemError, match="cannot be aligned"):
         umeyama(np.ones((5, 3)), wander(5, 14)[:, :, 3])

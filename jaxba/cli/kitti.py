@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -129,6 +130,10 @@ def _build(args: Arguments) -> int:
     common.check_positive(
         keypoints=args.keypoints, reach=args.reach, max_error=args.max_error, min_matches=args.min_matches
     )
+    for name in ("max_error", "rotation_sigma", "translation_sigma"):
+        value = getattr(args, name)
+        if not math.isfinite(value):
+            raise common.UsageError(f"--{name.replace('_', '-')} must be finite, is {value:g}")
     if args.min_views < 2:
         raise common.UsageError(f"--min-views must be at least 2, is {args.min_views}")
     if not 0 <= args.min_angle < 180:
@@ -184,7 +189,7 @@ def _build(args: Arguments) -> int:
     console.print(_build_table([part for part, _ in parts], built, poses))
     for words, numbers in (
         ("left out, too few matches", built.dropped),
-        ("placed without enough known points, with the scale of the step before", built.restarts),
+        ("placed relative to the key-frame beside, without enough known points", built.restarts),
     ):
         if numbers:
             console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")

@@ -62,7 +62,7 @@ class Built:
     """Tracks over the key-frames, of which not all became points."""
 
     restarts: tuple[int, ...] = ()
-    """Frame numbers that visual odometry placed without enough known points: the scale was carried over."""
+    """Frame numbers that visual odometry placed relative to the key-frame beside, without enough known points."""
 
 
 def build(
@@ -111,5 +111,5 @@ def build(
             moved = views_of_poses(noisy)
     report("triangulation", 0, 1)
     whole = assemble(tracks, views, sequence.calibration, frames, options.filters, options.min_views, moved)
-    dropped = tuple(sorted(set(sequence.numbers[: linked.frames[-1] + 1]) - set(numbers)))
+    dropped = tuple(sorted(set(sequence.numbers) - set(numbers)))
     return Built(whole, len(sequence), dropped, tracks.count, restarts)

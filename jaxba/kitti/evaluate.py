@@ -129,9 +129,17 @@ def evaluate(
         else:
             similarity = trajectory.Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
         rms = float(np.sqrt(2 * geometry.cost(problem) / problem.num_observations))
+        if not np.isfinite([rms, *(() if scores is None else _numbers(scores))]).all():
+            raise ProblemError(f"{display_name(path)}: an error is not finite: a camera or point lies where it cannot")
         name = Path(strip_compression(path)).stem
         results.append(Evaluated(name, problem, similarity.poses(poses), similarity.points(points), rms, scores))
     return results
+
+
+def _numbers(scores: Scores) -> list[float]:
+    """All errors of a trajectory."""
+    parts = (scores.absolute, scores.relative.translation, scores.relative.rotation, scores.segments or ())
+    return [scores.scale, *(number for part in parts for number in part)]
 
 
 def as_json(results: Sequence[Evaluated], side: SideFile) -> dict[str, Any]:

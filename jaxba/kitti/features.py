@@ -27,6 +27,9 @@ EPIPOLAR_PIXELS = 1.0
 CONFIDENCE = 0.9999
 """Of the RANSAC for the essential matrix."""
 
+ORB_BORDER = 31
+"""OpenCV finds nothing nearer to the border, and fails on images too small for its pyramid (`edgeThreshold`)."""
+
 MIN_ESSENTIAL = 8
 """Fewer matches say nothing about the geometry: five determine it."""
 
@@ -53,13 +56,16 @@ def detect(image: np.ndarray, features: Features, count: int) -> KeyPoints:
         features: `sift` or `orb`.
         count: the strongest ones are kept.
     """
+    none = KeyPoints(np.empty((0, 2)), np.empty((0, 128 if features == "sift" else 32), np.uint8))
     if features == "sift":
         detector = cv2.SIFT.create(nfeatures=count, contrastThreshold=SIFT_CONTRAST)
+    elif min(image.shape) <= 2 * ORB_BORDER:
+        return none
     else:
-        detector = cv2.ORB.create(nfeatures=count, fastThreshold=ORB_FAST)
+        detector = cv2.ORB.create(nfeatures=count, fastThreshold=ORB_FAST, edgeThreshold=ORB_BORDER)
     found, descriptors = detector.detectAndCompute(image, None)
     if descriptors is None or not found:
-        return KeyPoints(np.empty((0, 2)), np.empty((0, 128 if features == "sift" else 32), np.uint8))
+        return none
     pixels = np.array([key.pt for key in found], np.float64)
     response = np.array([key.response for key in found])
     order = np.lexsort((pixels[:, 1], pixels[:, 0], -response))  # the order of detectors may depend on threads

@@ -12,7 +12,7 @@ import numpy as np
 from jaxba.kitti.features import Features, KeyPoints, Verified, detect, epipolar_inliers, match
 from jaxba.kitti.klt import Followed, follow, start
 from jaxba.kitti.opencv import cv2
-from jaxba.kitti.sequence import Sequence, image_reader, stamp
+from jaxba.kitti.sequence import Sequence, image_reader, spare_bits, stamp
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.kitti.work import Work, digest
 from jaxba.problem import ProblemError
@@ -74,7 +74,7 @@ def link(sequence: Sequence, options: FrontOptions, work: Work, report: Report) 
 
 def _match(sequence: Sequence, options: FrontOptions, work: Work, report: Report, stamps: list[str]) -> Linked:
     read = image_reader(sequence)
-    kind = (options.features, options.keypoints, cv2.__version__)
+    kind = (options.features, options.keypoints, cv2.__version__, spare_bits(sequence))
     recent: deque[KeyPoints] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
     pixels: list[np.ndarray] = []
     matches: dict[tuple[int, int], np.ndarray] = {}

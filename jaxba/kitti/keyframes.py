@@ -33,15 +33,20 @@ def parallax(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], 
         first: rays `(X / Z, Y / Z)` in one view.
         second: the same in the other view.
         focal: pixels.
+    """
+    turned = np.column_stack([first, np.ones(len(first))]) @ turn(first, second).T
+    return float(focal * np.median(np.linalg.norm(turned[:, :2] / turned[:, 2:] - second, axis=1)))
 
-    Source of the rotation: Kabsch 1976.
+
+def turn(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation that brings the rays of one view nearest to those of another.
+
+    Source: Kabsch 1976.
     """
     a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (first, second))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
     u, _, vt = np.linalg.svd(b.T @ a)
-    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    turned = a @ rotation.T
-    return float(focal * np.median(np.linalg.norm(turned[:, :2] / turned[:, 2:] - second, axis=1)))
+    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
 def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, numbers: tuple[int, ...]) -> list[int]:
@@ -71,7 +76,10 @@ def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, n
             if len(a) < max(SHARE * own, MIN_SHARED) or parallax(rays[a], rays[b], calibration.fx) >= PARALLAX:
                 chosen.append(i)
     if len(chosen) < 2:
-        raise ProblemError(f"the camera hardly moves in frames {numbers[0]} to {numbers[images - 1]}: one key-frame")
+        where = f"frames {numbers[0]} to {numbers[images - 1]}"
+        if choice == "auto":
+            raise ProblemError(f"the camera hardly moves in {where}: one key-frame")
+        raise ProblemError(f"--keyframes {choice} leaves one key-frame of {images} in {where}, not 2")
     for i, j in pairwise(chosen):
         shared = len(tracks.shared(i, j)[0])
         if shared < MIN_SHARED:

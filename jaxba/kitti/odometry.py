@@ -8,20 +8,34 @@ is that of the first baseline, and nothing is adjusted: errors accumulate as the
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from jaxba.kitti.features import essential
+from jaxba.kitti.front import MIN_MATCHES
+from jaxba.kitti.keyframes import parallax, turn
 from jaxba.kitti.opencv import cv2
 from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.tracks import Tracks
-from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate
+from jaxba.kitti.triangulate import Filters, Sightings, Triangulated, Views, triangulate
 from jaxba.problem import ProblemError
 
 BOOTSTRAP_ANGLE = 2.0
-"""Median angle in degrees between the rays of the first two views' points that is enough at once."""
+"""Median angle in degrees between the rays of the first two views' points that is enough."""
+
+BOOTSTRAP_MOST = 20.0
+"""... and beyond which the essential matrix is wrong: the points would be as near as three baselines."""
+
+BOOTSTRAP_ENOUGH = 5.0
+"""Angle from which on more good points count and a larger angle does not."""
+
+BOOTSTRAP_SHARE = 0.5
+"""Share of the common tracks that must be good: a wrong motion fits few of them."""
 
 BOOTSTRAP_LEAST = 0.5
 """... and the least that is taken where no pair has more. Noise of a pixel is 0.1 degrees at KITTI's focal length."""
@@ -39,15 +53,32 @@ PNP_ITERATIONS = 300
 
 EPIPOLAR_PIXELS = 1.0
 
+SOFT_SHARE = 0.5
+"""Share of `EPIPOLAR_PIXELS` from which on the refined motion feels a distance less than squared."""
+
+FARTHEST = 1e9
+"""Depth in baselines up to which points say on which side of the cameras they are. OpenCV's 50 leaves out all points of
+a slow drive."""
+
+MIN_KNOWN = 3
+"""Known points that tell the length of a step: the median of three bears one wrong."""
+
+STILL_PIXELS = 1.0
+"""Median parallax of a camera that stands: key-points are found to less than a pixel."""
+
+MOVED_PIXELS = 3.0
+"""... and of one that surely moves."""
+
+PACE_STEPS = 5
+"""Steps whose median length a frame is taken where no known point is shared."""
+
 
 class Odometry(NamedTuple):
     """Poses of all views, and what happened."""
 
     views: Views  # world to camera, the first view at the origin
     bootstrap: tuple[int, int]
-    restarts: tuple[
-        int, ...
-    ]  # views placed without enough known points: the scale was carried over from the step before
+    restarts: tuple[int, ...]  # views placed relative to their neighbour, without enough known points
 
 
 class _Map:
@@ -128,34 +159,51 @@ def visual_odometry(
 
 
 def _bootstrap(scene: _Map, views: int, names: tuple[int, ...]) -> tuple[int, int]:
-    """Places the two views from which everything else is placed: the earliest pair with parallax."""
-    best: tuple[float, int, int, np.ndarray, np.ndarray] | None = None
+    """Places the two views from which everything else is placed: the best pair of the first view that has a good one.
+
+    Good pairs have many good points and parallax; the best one has the most of both. Without a good one, the best of
+    all pairs is taken.
+    """
+    best: tuple[bool, float, int, int, _Motion] | None = None
+    largest, enough = 0.0, False
     for i in range(views - 1):
         for j in range(i + 1, min(i + 1 + BOOTSTRAP_REACH, views)):
-            found = _relative(scene, i, j)
-            if found is None:
-                break
-            rotation, translation, angle = found
-            if best is None or angle > best[0]:
-                best = (angle, i, j, rotation, translation)
-            if angle >= BOOTSTRAP_ANGLE:
-                break
-        if best is not None and best[0] >= BOOTSTRAP_ANGLE:
+            motion = _relative(scene, i, j)
+            if motion is None or motion.angle > BOOTSTRAP_MOST:
+                continue
+            largest = max(largest, motion.angle)
+            if motion.angle < BOOTSTRAP_LEAST:
+                continue
+            strong = motion.good >= max(MIN_MATCHES, BOOTSTRAP_SHARE * motion.shared)
+            value = motion.good * min(motion.angle, BOOTSTRAP_ENOUGH)
+            enough |= strong and motion.angle >= BOOTSTRAP_ANGLE
+            if best is None or (strong, value) > best[:2]:
+                best = (strong, value, i, j, motion)
+        if enough:
             break
-    if best is None or best[0] < BOOTSTRAP_LEAST:
-        angle = 0.0 if best is None else best[0]
+    if best is None:
         raise ProblemError(
             f"no two of the key-frames {names[0]} to {names[views - 1]} have enough parallax to start from "
-            f"(at most {angle:.2f} degrees, {BOOTSTRAP_LEAST} are needed): the camera stands still or only turns"
+            f"(at most {largest:.2f} degrees, {BOOTSTRAP_LEAST} are needed): the camera stands still or only turns"
         )
-    _, i, j, rotation, translation = best
+    _, _, i, j, motion = best
     scene.place(i, np.eye(3), np.zeros(3))
-    scene.place(j, rotation, translation)
+    scene.place(j, motion.rotation, motion.translation)
     return i, j
 
 
-def _relative(scene: _Map, i: int, j: int) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """Motion from view i to view j with a baseline of 1, and its points' median angle; None if they share little."""
+class _Motion(NamedTuple):
+    """From one view to another."""
+
+    rotation: np.ndarray
+    translation: np.ndarray  # of length 1
+    angle: float  # median of the good points, degrees
+    good: int  # points
+    shared: int  # tracks
+
+
+def _relative(scene: _Map, i: int, j: int) -> _Motion | None:
+    """Motion from view i to view j; None if they share little."""
     a, b = scene.tracks.shared(i, j)
     if len(a) < MIN_POINTS:
         return None
@@ -163,16 +211,48 @@ def _relative(scene: _Map, i: int, j: int) -> tuple[np.ndarray, np.ndarray, floa
     matrix, inliers = essential(scene.rays[a], scene.rays[b], threshold, scene.seed)
     if matrix is None or inliers.sum() < MIN_POINTS:
         return None
+    shared = len(a)
     a, b = scene.rays[a[inliers]], scene.rays[b[inliers]]
-    _, rotation, translation, _ = cv2.recoverPose(matrix, np.ascontiguousarray(a), np.ascontiguousarray(b), np.eye(3))
-    rotation, translation = np.asarray(rotation), np.asarray(translation).ravel()
+    first, second = np.ascontiguousarray(a), np.ascontiguousarray(b)
+    _, rotation, translation, *_ = cv2.recoverPose(matrix, first, second, np.eye(3), distanceThresh=FARTHEST)
+    rotation, translation = _refine(np.asarray(rotation), np.asarray(translation).ravel(), a, b, threshold)
     views = Views(np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation]))
-    track = np.repeat(np.arange(len(a)), 2)
-    found = triangulate(views, Sightings(np.tile([0, 1], len(a)), track, np.stack([a, b], axis=1).reshape(-1, 2)))
-    good = found.good(track, Filters(angle=0.0, pixels=scene.filters.pixels), scene.calibration.fx)
+    found, good = _two_views(scene, views, a, b)
     if good.sum() < MIN_POINTS:
         return None
-    return rotation, translation, float(np.median(found.angle[good]))
+    return _Motion(rotation, translation, float(np.median(found.angle[good])), int(good.sum()), shared)
+
+
+def _refine(
+    rotation: np.ndarray, translation: np.ndarray, first: np.ndarray, second: np.ndarray, threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The motion that fits all inliers, from that of five of them: three angles of the rotation, two of the direction.
+
+    Source of the distances: Sampson 1982; Hartley and Zisserman 2004, section 11.4.3.
+    """
+    a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (first, second))
+    tangent = np.linalg.svd(translation[None])[2][1:]
+
+    def motion(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        direction = translation + x[3:] @ tangent
+        return Rotation.from_rotvec(x[:3]).as_matrix() @ rotation, direction / np.linalg.norm(direction)
+
+    def distances(x: np.ndarray) -> np.ndarray:
+        turned, direction = motion(x)
+        matrix = np.cross(direction, turned, axisb=0, axisc=0)
+        lines, back = a @ matrix.T, b @ matrix
+        norm = np.sqrt((lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
+        return (lines * b).sum(1) / norm / threshold
+
+    return motion(least_squares(distances, np.zeros(5), loss="soft_l1", f_scale=SOFT_SHARE).x)
+
+
+def _two_views(scene: _Map, views: Views, first: np.ndarray, second: np.ndarray) -> tuple[Triangulated, np.ndarray]:
+    """Points of matched rays of two views, and which are good, whatever their angle."""
+    track = np.repeat(np.arange(len(first)), 2)
+    rays = np.stack([first, second], axis=1).reshape(-1, 2)
+    found = triangulate(views, Sightings(np.tile([0, 1], len(first)), track, rays))
+    return found, found.good(track, Filters(angle=0.0, pixels=scene.filters.pixels), scene.calibration.fx)
 
 
 def _neighbour(scene: _Map, view: int) -> int:
@@ -218,22 +298,56 @@ def _resect(scene: _Map, view: int) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _carry_on(scene: _Map, view: int, names: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a view relative to its neighbour alone, with the length of the step before it."""
+    """Pose of a view relative to its neighbour alone, the length of the step by the points that both see."""
     near = _neighbour(scene, view)
-    found = _relative(scene, near, view)
-    if found is None:
-        shared = len(scene.tracks.shared(near, view)[0])
-        raise ProblemError(
-            f"too few matches: key-frames {names[near]} and {names[view]} share {shared} tracks that fit one motion "
-            f"badly, {MIN_POINTS} good ones are needed; choose other --frames or --features"
-        )
-    rotation, translation, _ = found
-    centers = Views(scene.rotation, scene.translation).centers()
-    before = near + (1 if near > view else -1)
-    step = 1.0
-    if 0 <= before < len(centers) and scene.placed[before]:
-        step = float(np.linalg.norm(centers[near] - centers[before]))
+    a, b = scene.tracks.shared(near, view)
+    if len(a) >= MIN_POINTS and parallax(scene.rays[a], scene.rays[b], scene.calibration.fx) < STILL_PIXELS:
+        rotation, translation, step = turn(scene.rays[a], scene.rays[b]), np.zeros(3), 0.0
+    else:
+        found = _relative(scene, near, view)
+        if found is None:
+            raise ProblemError(
+                f"too few matches: key-frames {names[near]} and {names[view]} share {len(a)} tracks that fit one "
+                f"motion badly, {MIN_POINTS} good ones are needed; choose other --frames or --features"
+            )
+        rotation, translation = found.rotation, found.translation
+        step = _known_length(scene, near, view, rotation, translation)
+        if step is None:
+            step = _pace(scene, near, names) * abs(names[view] - names[near])
     return rotation @ scene.rotation[near], rotation @ scene.translation[near] + step * translation
+
+
+def _known_length(scene: _Map, near: int, view: int, rotation: np.ndarray, translation: np.ndarray) -> float | None:
+    """Length of a step, whose direction is known, by the known points that both views see; None if they are too few."""
+    a, b = scene.tracks.shared(near, view)
+    known = scene.points[scene.tracks.track[a]]
+    use = np.isfinite(known[:, 0])
+    if use.sum() < MIN_KNOWN:
+        return None
+    views = Views(np.stack([np.eye(3), rotation]), np.stack([np.zeros(3), translation]))
+    found, good = _two_views(scene, views, scene.rays[a[use]], scene.rays[b[use]])
+    if good.sum() < MIN_KNOWN:
+        return None
+    depth = (known[use][good] @ scene.rotation[near].T + scene.translation[near])[:, 2]
+    length = float(np.median(depth / found.points[good, 2]))
+    return length if length > 0 else None
+
+
+def _pace(scene: _Map, near: int, names: tuple[int, ...]) -> float:
+    """Median length a frame of the steps nearest to a view in which the camera moved."""
+    placed = np.flatnonzero(scene.placed)
+    centers = Views(scene.rotation, scene.translation).centers()
+    steps = sorted(pairwise(placed.tolist()), key=lambda step: abs(step[0] + step[1] - 2 * near))
+    paces: list[float] = []
+    for i, j in steps:
+        a, b = scene.tracks.shared(i, j)
+        if len(a) >= MIN_POINTS and parallax(scene.rays[a], scene.rays[b], scene.calibration.fx) >= MOVED_PIXELS:
+            paces.append(float(np.linalg.norm(centers[j] - centers[i])) / abs(names[j] - names[i]))
+        if len(paces) == PACE_STEPS:
+            break
+    if not paces:  # nothing but the first two views, which are a step of 1
+        return 1.0 / abs(names[placed[-1]] - names[placed[0]])
+    return float(np.median(paces))
 
 
 def views_of_poses(poses: Float[np.ndarray, "views 3 4"]) -> Views:

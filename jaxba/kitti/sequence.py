@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,8 +24,11 @@ CALIBRATION_FILES = ("calib.txt", "K.txt")
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
-PNG_END = b"IEND"
-"""Name of the last part of a PNG file."""
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a PNG file."""
+
+GREY_BITS = 8
+"""Of the images that key-points are found in."""
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of `R R^T - I` in a file of poses; KITTI writes 7 digits."""
@@ -213,7 +217,7 @@ def _times(path: Path, numbers: list[int]) -> np.ndarray | None:
 
 def _text(path: Path) -> str:
     try:
-        return path.read_text(encoding="ascii")
+        return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
     except UnicodeDecodeError:
@@ -240,36 +244,74 @@ Reader = Callable[[int], np.ndarray]
 def image_reader(sequence: Sequence) -> Reader:
     """Reads images as grey; all must have the size of the first one.
 
+    Images of 16 bits lose `spare_bits`.
+
     Raises:
         ImportError: OpenCV is missing.
         ProblemError: (when called) an image cannot be read or has another size.
     """
-    from jaxba.kitti.opencv import cv2
-
-    def decode(index: int) -> np.ndarray:
-        path = sequence.images[index]
-        try:
-            data = np.frombuffer(path.read_bytes(), np.uint8)
-        except OSError as error:
-            raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
-        whole = PNG_END in data[-16:].tobytes() or path.suffix.lower() != ".png"  # libpng complains on its own
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size and whole else None
-        if image is None:
-            raise ProblemError(f"{display_name(path)}: is no image that can be decoded")
-        return np.asarray(image)
-
     shape: list[tuple[int, ...]] = []
+    spare: list[int] = []
 
     def read(index: int) -> np.ndarray:
-        image = decode(index)
+        image = _decode(sequence.images[index])
         if not shape:
-            shape.append(image.shape if index == 0 else decode(0).shape)
+            shape.append(image.shape if index == 0 else _decode(sequence.images[0]).shape)
         if image.shape != shape[0]:
             sizes = [f"{s[1]} x {s[0]}" for s in (image.shape, shape[0])]
             raise ProblemError(f"{display_name(sequence.images[index])}: is {sizes[0]} pixels, the first is {sizes[1]}")
+        if image.dtype != np.uint8:
+            spare[:] = spare or [spare_bits(sequence)]
+            image = np.minimum(image >> spare[0], 2**GREY_BITS - 1).astype(np.uint8)
         return image
 
     return read
+
+
+def spare_bits(sequence: Sequence) -> int:
+    """Low bits that images of 16 bits lose, in all frames as many as make the first one fit into 8.
+
+    Cameras of 10 or 12 bits leave the highest ones empty.
+
+    Raises:
+        ProblemError: the first image cannot be read.
+    """
+    first = _decode(sequence.images[0])
+    return GREY_BITS if first.dtype == np.uint8 else max(int(first.max()).bit_length() - GREY_BITS, 0)
+
+
+def _decode(path: Path) -> np.ndarray:
+    """Grey image of a file, shape (height, width), uint8 or uint16."""
+    from jaxba.kitti.opencv import cv2
+
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
+    whole = _whole_png(data) if path.suffix.lower() == ".png" else bool(data)  # libpng complains on its own
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if whole else None
+    if image is None:
+        raise ProblemError(f"{display_name(path)}: is no image that can be decoded")
+    return np.asarray(image)
+
+
+def _whole_png(data: bytes) -> bool:
+    """Whether the bytes are a PNG file whose chunks all have their checksums, up to the last one.
+
+    Source: the PNG specification (ISO/IEC 15948), section 5.3: length, name, content, CRC-32 of name and content.
+    """
+    at = len(PNG_SIGNATURE)
+    if data[:at] != PNG_SIGNATURE:
+        return False
+    while len(data) >= at + 12:
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end
+    return False
 
 
 def stamp(path: StrPath) -> str:

@@ -79,12 +79,16 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) 
         raise ProblemError(f"an alignment needs 3 poses, not {len(source)}")
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     a, b = source - mean_source, target - mean_target
-    u, d, vt = np.linalg.svd(b.T @ a / len(a))
+    with np.errstate(over="ignore", invalid="ignore"):
+        covariance, square = b.T @ a / len(a), (a * a).sum()
+    if not (np.isfinite(covariance).all() and np.isfinite(square)):
+        raise ProblemError("the trajectories cannot be aligned: positions are too far apart to be squared")
+    u, d, vt = np.linalg.svd(covariance)
     if not d[1] > LEAST_SPREAD * d[0]:
         raise ProblemError("the trajectories cannot be aligned: the positions of one lie on a straight line")
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt
-    scale = float((d * sign).sum() / (a * a).sum() * len(a))
+    scale = float((d * sign).sum() / square * len(a))
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
 
 
