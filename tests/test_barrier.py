@@ -1,4 +1,4 @@
-"""What is stored once is what was computed, also under JAX's transformations."""
+"""What is stored once, or computed apart, is what was computed, also under JAX's transformations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba.barrier import materialized
+from jaxba.barrier import apart, materialized
 
 
 def rows(dtype=np.float64) -> np.ndarray:
@@ -54,3 +54,40 @@ def test_a_value_that_is_not_finite_stays_in_its_column():
     found = np.asarray(jax.jit(materialized)(values))
     assert np.isnan(found[1, 2])
     assert np.array_equal(np.delete(found, 2, axis=1), np.ones((3, 3)))
+
+
+INDEX = np.arange(3, dtype=np.int32)
+
+
+def squares(x, y):
+    return x[:, :, None] * x[:, None, :] + y
+
+
+@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["plain", "jit"])
+def test_what_is_computed_apart_is_what_was_asked_for(wrap):
+    x, y = jnp.asarray(np.random.default_rng(0).normal(size=(5, 4))), jnp.asarray(0.5)
+    found = wrap(lambda x, y, index: apart(squares, x, y, index=index))(x, y, INDEX)
+    assert np.array_equal(found, squares(x, y))
+
+
+def test_a_batch_is_computed_apart_as_its_members_are():
+    x, y = np.random.default_rng(0).normal(size=(3, 5, 4)), np.ones(3)
+    found = jax.jit(jax.vmap(lambda x, y, index: apart(squares, x, y, index=index)))(x, y, np.stack([INDEX] * 3))
+    assert np.array_equal(found, np.stack([squares(*one) for one in zip(x, y, strict=True)]))
+
+
+def test_derivatives_pass_through_what_is_computed_apart():
+    x, y = np.random.default_rng(0).normal(size=(5, 4)), jnp.asarray(0.5)
+    there = jax.jit(jax.grad(lambda x, index: jnp.sum(apart(squares, x, y, index=index) ** 2)))(x, INDEX)
+    here = jax.grad(lambda x: jnp.sum(squares(x, y) ** 2))(jnp.asarray(x))
+    np.testing.assert_allclose(there, here, rtol=1e-13)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
+def test_what_is_computed_apart_is_a_computation_of_its_own():
+    """So nothing is fused with it: what would be one kernel without is two, and a branch."""
+    x, y = jnp.ones((5, 4)), jnp.asarray(0.5)
+    fused = jax.jit(lambda x, index: squares(x, y) + index[0]).lower(x, INDEX).compile().as_text()
+    walled = jax.jit(lambda x, index: apart(squares, x, y, index=index) + index[0]).lower(x, INDEX).compile().as_text()
+    assert "conditional(" not in fused
+    assert walled.count("conditional(") == 1

@@ -12,10 +12,10 @@ import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxba import BundleProblem, Layout, build_layout
+from jaxba import BundleProblem, Layout, build_layout, pairs
 from jaxba.layout import CAMERA_CHUNK
-from jaxba.slots import MAX_PADDING
-from jaxba.trees import TREE_WIDTH, sum_tree
+from jaxba.slots import MAX_PADDING, TILE, TILED_POINTS
+from jaxba.trees import TREE_WIDTH, fitting_width, sum_tree, with_spare_row
 
 # Problems from track lengths
 
@@ -143,6 +143,19 @@ def test_one_observation_is_enough():
     assert blocks_by_layout(layout, np.arange(layout.num_slots) + 1.0).shape == (1, 1)
 
 
+@pytest.mark.parametrize("length", [2, 5])
+def test_a_large_bucket_is_cut_into_tiles(length):
+    """With slots of a tile side by side, a point of padding or more at its end, and every sum as it was."""
+    problem = problem_of(np.full(3 * TILED_POINTS, length), 9, seed=1)
+    layout = build_layout(problem, pairs=False)
+    assert layout.buckets == ((3 * TILED_POINTS // TILE + 1, length, TILE),)
+    assert rows_of(layout) == rows_of_problem(problem)
+    of_tile = np.asarray(layout.slot_point).reshape(-1, length, TILE)
+    assert np.array_equal(of_tile[:, 0].ravel(), np.arange(layout.num_points))
+    assert (of_tile == of_tile[:, :1]).all()
+    support.check_sums(layout, np.random.default_rng(0))
+
+
 # Sums
 
 
@@ -170,6 +183,20 @@ def test_a_sum_tree_sums_every_target_once(counts, width, seed):
     assert levels[0].shape[1] <= width
     assert all(level.shape[1] <= max(TREE_WIDTH, 1) for level in levels[1:])
     assert all(level.dtype == np.int32 for level in levels)
+
+
+def test_the_first_level_is_as_wide_as_reads_least():
+    assert fitting_width(np.full(50, 2)) == 2
+    assert fitting_width(np.full(50, 3)) == 3
+    assert fitting_width(np.full(50, 800)) == TREE_WIDTH
+
+
+def test_a_tree_of_one_level_gets_a_row_of_padding():
+    counts, rows = np.array([2, 0, 3]), np.append(np.arange(1, 6), 0)
+    levels = with_spare_row(sum_tree(np.arange(5), counts, 5, 3), 5)
+    assert (levels[0] == 5).all(axis=1).sum() == 2  # the target without items, and the new one
+    assert np.array_equal(sum_by_levels(rows, levels), [3, 0, 12])
+    assert with_spare_row(levels, 5) is levels
 
 
 @pytest.mark.parametrize("make", [support.tiny, support.odd], ids=["tiny", "odd"])
@@ -207,14 +234,16 @@ def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.nd
     return found
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10**6), st.integers(1, 12), st.integers(1, 25), st.integers(0, 6))
-def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates):
+@settings(max_examples=120, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 12), st.integers(1, 25), st.integers(0, 6), st.sampled_from([2, 7, 2048]))
+def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates, batch):
     """Random whole numbers as weights: a pair that is missing, doubled or in the wrong block changes a sum."""
     rng = np.random.default_rng(seed)
     tracks = np.append(1, rng.integers(0, cameras + 1, points))
     problem = problem_of(tracks, cameras, seed, duplicates)
-    layout = build_layout(problem, grid=False)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pairs, "PAIR_BATCH", batch)
+        layout = build_layout(problem, grid=False)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))
 

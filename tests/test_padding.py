@@ -13,7 +13,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_layout import blocks_by_brute_force, blocks_by_layout, problem_of, rows_of, rows_of_problem, sum_by_levels
 
-from jaxba import Ceres, Loss, StepOptions, Tolerances, build_layout, initial_state, random_scene, solve, solve_loop
+from jaxba import (
+    Ceres,
+    Loss,
+    StepOptions,
+    Tolerances,
+    build_layout,
+    initial_state,
+    pairs,
+    random_scene,
+    solve,
+    solve_loop,
+)
 from jaxba.layout import layout_for
 from jaxba.padding import (
     LEAST_OBSERVATIONS,
@@ -67,6 +78,9 @@ def stepwise(problem, damping="ceres", options=None, **settings):
     return solve(problem, damping, options, callback=lambda record: None, **settings)
 
 
+BATCHES = st.sampled_from([3, 40, 2048])
+"""Chunks of pairs that are multiplied at once; with the last of these small problems have one batch."""
+
 # The grid
 
 
@@ -86,8 +100,8 @@ def test_a_capacity_holds_its_problem_and_no_more_than_twice_that_or_its_slots_w
     found = capacity_of(problem)
     layout = build_layout(problem, grid=False)
     seen = support.by_camera(layout, layout.slot_mask)
-    pairs = np.sum(seen[layout.pairs.left] & seen[layout.pairs.right])
-    counts = (problem.num_observations + 1, problem.num_points, int(pairs))
+    listed = np.sum(seen[layout.pairs.left] & seen[layout.pairs.right])
+    counts = (problem.num_observations + 1, problem.num_points, int(listed))
     rooms = (found.observations, found.points, found.pairs)
     least = (LEAST_OBSERVATIONS, found.observations // LEAST_TRACK, found.observations * LEAST_PAIRS)
     assert all(n <= room and (room < 2 * n or room == low) for n, room, low in zip(counts, rooms, least, strict=True))
@@ -120,11 +134,13 @@ def test_a_tree_without_room_is_refused():
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 10**6), st.integers(1, 8), st.integers(1, 60), st.integers(0, 6))
-def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, cameras, points, duplicates):
+@given(st.integers(0, 10**6), st.integers(1, 8), st.integers(1, 60), st.integers(0, 6), BATCHES)
+def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, cameras, points, duplicates, batch):
     rng = np.random.default_rng(seed)
     problem = problem_of(np.append(1, rng.integers(0, cameras + 1, points)), cameras, seed, duplicates)
-    layout = build_layout(problem, grid=False, capacity=SMALL)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pairs, "PAIR_BATCH", batch)
+        layout = build_layout(problem, grid=False, capacity=SMALL)
     assert rows_of(layout) == rows_of_problem(problem)
     empty = ~np.asarray(layout.slot_mask)
     assert empty.any()
@@ -139,8 +155,8 @@ def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, ca
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10**6), st.integers(0, 10**6), st.booleans())
-def test_shapes_follow_from_the_capacity_alone(one, other, grid):
+@given(st.integers(0, 10**6), st.integers(0, 10**6), st.booleans(), BATCHES)
+def test_shapes_follow_from_the_capacity_alone(one, other, grid, batch):
     """Random sub-problems: any cameras, any points. Where the whole may be one dense product, it is so for both."""
     made = []
     for seed in (one, other):
@@ -150,7 +166,9 @@ def test_shapes_follow_from_the_capacity_alone(one, other, grid):
         tracks = np.append(cameras if grid else 1, rng.integers(low, cameras + 1, rng.integers(1, 60)))
         if grid:  # every camera sees every point, and there are no cameras to pad
             cameras, tracks = 8, np.full(len(tracks), 8)
-        made.append(build_layout(problem_of(tracks, cameras, seed), grid=grid, capacity=SMALL))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pairs, "PAIR_BATCH", batch)
+            made.append(build_layout(problem_of(tracks, cameras, seed), grid=grid, capacity=SMALL))
     assert shapes(made[0]) == shapes(made[1])
     assert (made[0].grid is not None) == grid
 
