@@ -32,6 +32,7 @@ from jaxba.problem import BundleProblem, ProblemError
 from jaxba.programs import Compilation, Part, Stage, options_of, program, run_alone, stages
 from jaxba.stepwise import IterationRecord, run_stepwise
 from jaxba.termination import Termination, Tolerances
+from jaxba.transform import far_middle, shift
 
 MAX_ITERATIONS = 100
 """Iterations after which a solve has failed. Source: the paper."""
@@ -125,6 +126,9 @@ def solve(
             for it; the end of one solve comes soonest. They differ by rounding. On a GPU all are `full`. See
             programs.py.
 
+    A scene far from the origin for its size, as georeferenced ones are, is moved there to be solved, and back
+    (`transform.FAR`).
+
     Many problems of many shapes may be solved in one process: before their programs exceed what Linux lets a process
     map, all compiled programs of JAX are dropped (`host.release_programs`), and compiled anew where they are needed.
 
@@ -155,12 +159,14 @@ def solve(
     tolerances = tolerances or Tolerances()
     if dtype == "mixed":
         options, dtype = replace(options, algebra="mixed"), "float64"
+    middle = far_middle(problem)
+    here = problem if middle is None else shift(problem, -middle)
     with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
         with CompileClock() as clock:
             layout = jax.device_put(layout_for(problem, options, capacity))
             initial = program(initial_state, "options", "dtype", way="quick")
-            begin = problem if capacity is None else padded_parameters(problem, capacity)
+            begin = here if capacity is None else padded_parameters(here, capacity)
             state = jax.block_until_ready(run_alone(initial, layout, begin, options, jnp.dtype(dtype)))
         setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
@@ -176,8 +182,9 @@ def solve(
             host.release_programs()  # many problems in one process would end it
         count = int(final.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
+        found = _write_back(here, layout, final.state, options)
         return Solution(
-            problem=_write_back(problem, layout, final.state, options),
+            problem=found if middle is None else shift(found, middle),
             initial_cost=float(state.cost),
             final_cost=float(final.state.cost),
             iterations=count,

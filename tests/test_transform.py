@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import support
 from scipy.spatial.transform import Rotation
 
-from jaxba import geometry
+from jaxba import geometry, solve
 from jaxba.geometry import angle_axis, camera_centers, cost, depths, project, residuals, rotation_matrices
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.transform import drop_invalid, normalize, perturb, poba_start
+from jaxba.transform import FAR, drop_invalid, far_middle, normalize, perturb, poba_start, shift
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
@@ -293,3 +294,55 @@ def test_the_poba_start_of_ladybug_has_nothing_behind_a_camera():
     start = poba_start(read_problem(Path(str(DATA)) / "bal" / "problem-49-7776-pre.txt.bz2"))
     assert 31 <= 31843 - start.num_observations <= 100
     assert depths(start).min() >= 0.1
+
+
+# Far from the origin
+
+
+def test_a_shifted_scene_has_the_same_residuals_and_is_shifted_back():
+    problem = support.odd()  # with cameras and points that nobody observes
+    offset = np.array([3.0, -40.0, 7.0])
+    there = shift(problem, offset)
+    np.testing.assert_allclose(
+        residuals(there), residuals(problem), rtol=0, atol=1e-9 * np.abs(residuals(problem)).max()
+    )
+    seen = np.unique(problem.camera_index)
+    moved = camera_centers(there.cameras[seen]) - camera_centers(problem.cameras[seen])
+    np.testing.assert_allclose(moved, np.broadcast_to(offset, moved.shape), atol=1e-9)
+    unseen = (
+        np.setdiff1d(np.arange(problem.num_cameras), seen),
+        np.setdiff1d(np.arange(problem.num_points), problem.point_index),
+    )
+    assert unseen[0].size
+    assert unseen[1].size
+    assert np.array_equal(there.cameras[unseen[0]], problem.cameras[unseen[0]])
+    assert np.array_equal(there.points[unseen[1]], problem.points[unseen[1]])
+    back = shift(there, -offset)
+    np.testing.assert_allclose(back.cameras, problem.cameras, atol=1e-12)
+    np.testing.assert_allclose(back.points, problem.points, atol=1e-12)
+
+
+def test_only_scenes_far_from_the_origin_for_their_extent_are_far():
+    problem = support.tiny()
+    assert far_middle(problem) is None
+    centred = normalize(problem, 1.0)
+    extent = max(
+        np.median(np.linalg.norm(centred.points, axis=1)),
+        np.median(np.linalg.norm(camera_centers(centred.cameras), axis=1)),
+    )
+    assert far_middle(shift(centred, np.array([0.5 * FAR * extent, 0, 0]))) is None
+    offset = np.array([0, 0, 2 * FAR * extent])
+    np.testing.assert_allclose(far_middle(shift(centred, offset)), offset, atol=1e-9 * extent)
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [("float64", 1e-7), ("float32", 1e-3)])
+def test_a_scene_far_from_the_origin_is_solved_as_if_it_stood_there(dtype, rtol):
+    """As one in the coordinates of a country's grid: in float32 not even its start could be told from others."""
+    problem = normalize(support.tiny(), 1.0)
+    far = shift(problem, np.array([4e5, 5.6e6, 300.0]))
+    near, there = (solve(p, "ceres", dtype=dtype) for p in (problem, far))
+    assert abs(there.iterations - near.iterations) <= (dtype == "float32")
+    np.testing.assert_allclose(there.final_cost, near.final_cost, rtol=rtol)
+    np.testing.assert_allclose(cost(there.problem), near.final_cost, rtol=rtol)
+    middle = np.median(there.problem.points, axis=0)
+    assert np.linalg.norm(middle - np.median(far.points, axis=0)) < 1
