@@ -67,9 +67,8 @@ class CameraSystem(NamedTuple):
     gradient: Float[Array, "cameras 9"]  # g_c, manifold coordinates
     right: Float[Array, "cameras 9"]  # right-hand side of the reduced system
     damping: Float[Array, "cameras 9"]  # D_c, diagonal in the options' coordinates
-    rows: Float[Array, "chunks terms 11"] | None = (
-        None  # J_c, r, r - Q h in the order of the cameras, two an observation
-    )
+    # J_c, r and r - Q h in the order of the cameras, two rows an observation
+    rows: Float[Array, "chunks terms 11"] | None = None
     ties: LensTies | None = None  # where cameras share a lens: the damping of its numbers is in equal parts theirs
 
 

@@ -21,7 +21,9 @@ keep up: a pass took twice as long (docs/optimisations.md). As many numbers fit 
 TILED_POINTS = 512
 """Smaller buckets are one tile: what a pass over them reads is in the cache, and nothing is lost to rounding."""
 
-_SHARED = MAX_PADDING - (TILE - 1) / TILED_POINTS  # of the padding, where track lengths share a bucket
+_SHARED = (1 + MAX_PADDING) / (
+    1 + (TILE - 1) / TILED_POINTS
+) - 1  # what is left of it where track lengths share a bucket
 
 CHEAPER = 0.8
 """Factor on the price of a bucket while more than that is empty."""

@@ -159,10 +159,10 @@ def solve(
     tolerances = tolerances or Tolerances()
     if dtype == "mixed":
         options, dtype = replace(options, algebra="mixed"), "float64"
-    middle = far_middle(problem)
-    here = problem if middle is None else shift(problem, -middle)
     with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
+        middle = far_middle(problem)
+        here = problem if middle is None else shift(problem, -middle)
         with CompileClock() as clock:
             layout = jax.device_put(layout_for(problem, options, capacity))
             initial = program(initial_state, "options", "dtype", way="quick")

@@ -22,8 +22,8 @@ POBA_SEED = 38401
 
 FAR = 10.0
 """Distance of a scene from the origin, in units of its own extent, from which it is moved there to be solved. Turning a
-camera turns it about the origin: damping then holds back what moves the scene least, and digits are lost. On sba-9
-Ceres' rule took 9 iterations with the origin at 3 radii of the points, 20 at 10, 66 at 100, more than 100 at 1000."""
+camera turns it about the origin: damping then holds back what moves the scene least, and digits are lost
+(docs/game.md, "Far from the origin")."""
 
 MIN_TRACK = 2
 """A point needs two views to have a position. Source: rootba drops points with fewer."""
@@ -59,13 +59,22 @@ def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"] | None:
 
     The extent is the larger one of the median distances of points and of cameras from the middle of the points.
     """
-    points = np.asarray(problem.points, dtype=np.float64)[np.unique(problem.point_index)]
-    centers = camera_centers(np.asarray(problem.cameras, np.float64)[np.unique(problem.camera_index)])
-    middle = _upper_median(points)
+    cameras, points = _observed(problem)
+    if not points.any():
+        return None
     with np.errstate(all="ignore"):  # a scene without bounds is refused later, with a reason
-        extent = max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in (points, centers))
+        places = np.asarray(problem.points, np.float64)[points]
+        centers = camera_centers(np.asarray(problem.cameras, np.float64)[cameras])
+        middle = _upper_median(places)
+        extent = max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in (places, centers))
         far = np.linalg.norm(middle) > FAR * extent > 0
     return middle if far else None
+
+
+def _observed(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Which cameras, and which points, have observations."""
+    cameras = np.bincount(problem.camera_index, minlength=problem.num_cameras)
+    return cameras > 0, np.bincount(problem.point_index, minlength=problem.num_points) > 0
 
 
 def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProblem:
@@ -74,9 +83,9 @@ def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProbl
     What nobody observes is left in its place.
     """
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
-    seen = np.unique(problem.camera_index)
+    seen, placed = _observed(problem)
     cameras[seen, 3:6] -= rotation_matrices(cameras[seen, :3]) @ offset  # t = -R c
-    points[np.unique(problem.point_index)] += offset
+    points[placed] += offset
     return problem.replace(cameras=cameras, points=points)
 
 

@@ -112,6 +112,14 @@ def test_at_most_a_tenth_is_padding_whatever_the_track_lengths(case):
     assert layout.num_slots - spare <= (1 + MAX_PADDING) * problem.num_observations
 
 
+def test_tiles_stay_within_that_tenth():
+    """Many lengths, each with hardly more points than make a bucket one of tiles."""
+    problem = problem_of(np.repeat(np.arange(2, 30), TILED_POINTS + 1), 40, seed=0)
+    layout = build_layout(problem, pairs=False)
+    assert any(tile == TILE for _, _, tile in layout.buckets)
+    assert layout.num_slots - layout.buckets[0][1] <= (1 + MAX_PADDING) * problem.num_observations
+
+
 @pytest.mark.parametrize("longest", [300, 900])
 def test_long_tails_need_few_buckets(longest):
     """Every bucket costs compilation: a smooth distribution of lengths up to hundreds needs a dozen or two."""
