@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba import camera
@@ -14,7 +14,7 @@ from jaxba.losses import Loss
 from jaxba.options import Intrinsics
 from jaxba.programs import traced_once
 from jaxba.sums import take, total
-from jaxba.views import Views, all_views
+from jaxba.views import Views, all_views, view_terms
 
 
 class Present(NamedTuple):
@@ -113,21 +113,21 @@ def linearize(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Linearization:
     """Analytic Jacobians at the given parameters."""
-    frames = slot_frames(layout, cameras)
-    projection, residual = residuals(layout, frames, points)
-    # What the 26 Jacobian columns share is computed once, not once per column.
-    frames, projection, residual = lax.optimization_barrier((frames, projection, residual))
-    jacobians = camera.derivatives(frames, projection)
-    by_camera = _whiten_columns(layout, jacobians.camera)
-    by_point = _whiten_columns(layout, jacobians.point)
-    costs = slot_costs(loss, residual)
-    if not loss.trivial:
-        slope = loss(residual[0] * residual[0] + residual[1] * residual[1])[1]
-        root = jnp.sqrt(slope)
-        residual = [root * r for r in residual]
-        by_camera = [[root * column for column in row] for row in by_camera]
-        by_point = [[root * column for column in row] for row in by_point]
-    return Linearization(residual, by_camera, by_point, costs, projection.inverse_depth)
+    def terms(views: Views) -> list[Array]:
+        projection = views.projected()
+        residual = view_residuals(views, projection)
+        jacobians = camera.derivatives(views.frames, projection)
+        by_camera, by_point = _whiten_columns(views, jacobians.camera), _whiten_columns(views, jacobians.point)
+        costs = slot_costs(loss, residual)
+        rows = [*residual, *by_camera[0], *by_camera[1], *by_point[0], *by_point[1]]
+        if not loss.trivial:
+            root = jnp.sqrt(loss(residual[0] * residual[0] + residual[1] * residual[1])[1])
+            rows = [root * row for row in rows]
+        return [*rows, costs, projection.inverse_depth]
+
+    *rows, costs, inverse_depth = view_terms(layout, slot_frames(layout, cameras), points, terms)
+    residual, rows = rows[:2], rows[2:]
+    return Linearization(residual, [rows[:9], rows[9:18]], [rows[18:21], rows[21:24]], costs, inverse_depth)
 
 
 def with_free_lenses(

@@ -13,6 +13,10 @@ from jaxtyping import Float, Int
 from jaxba.layout import Layout
 from jaxba.problem import AnyArray
 
+WRITTEN_OUT = 32
+"""Sums over so few slots of a point are written out: XLA's own loop over them is not vectorised and waits for each
+addition. All eleven vectors of a point iteration in 0.46 to 0.7 of the time, 0.05 s longer to compile."""
+
 
 def take(values: Array, index: Int[AnyArray, "..."]) -> Array:
     """Columns (last axis) of `values` at `index`, which is known to be in range."""
@@ -65,6 +69,10 @@ def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "
     for tiles, length, tile in layout.buckets:
         size = tiles * length * tile
         block = values[:, start : start + size].reshape(-1, tiles, length, tile)
-        parts.append(jnp.sum(block, axis=2).reshape(-1, tiles * tile))
+        if length <= WRITTEN_OUT:
+            sums = functools.reduce(operator.add, [block[:, :, k] for k in range(length)])
+        else:
+            sums = jnp.sum(block, axis=2)
+        parts.append(sums.reshape(-1, tiles * tile))
         start += size
     return jnp.concatenate(parts, axis=1)

@@ -1,26 +1,20 @@
-"""Observations with what they need to know, and sums over each point's, in one pass.
-
-XLA on a CPU makes every vector of a program in a loop of its own, which computes anew, or reads anew from memory, what
-vectors share. One reduction of many operands is one loop: it looks up an observation's camera, projects its point, and
-adds all that is asked of it to that point's sums, and nothing is stored in between. That took a pass of
-point iterations over 347,173 observations from 36 to 6 ms (docs/optimisations.md).
-"""
+"""Observations with what they need to know, and sums over each point's."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from math import prod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba import camera
 from jaxba.barrier import materialized
 from jaxba.layout import Layout
 from jaxba.problem import AnyArray
-from jaxba.sums import point_sum, take
+from jaxba.sums import point_sum, take_each
+from jaxba.together import together
 
 
 class Views(NamedTuple):
@@ -51,11 +45,40 @@ def all_views(layout: Layout, frames: camera.Frames, points: Float[Array, "3 poi
         frames: of every slot.
         points: of the problem.
     """
-    return Views(frames, take(points, layout.slot_point), layout.slot_mask, layout.pixels, layout.whitening, True)
+    return Views(frames, jnp.stack(take_each(points, layout.slot_point)), layout.slot_mask, layout.pixels, layout.whitening, True)
 
 
 Terms = Callable[..., list[Array]]
-"""Makes vectors, which are to be summed, from `Views` and from what else there is to know of the same slots."""
+"""Makes vectors from `Views` and from what else there is to know of the same slots."""
+
+
+def view_terms(
+    layout: Layout,
+    frames: camera.Frames,
+    points: Float[Array, "3 points"],
+    terms: Terms,
+    *slots: Array,
+    fused: bool = True,
+) -> list[Float[Array, " slots"]]:
+    """Vectors over slots that follow from an observation, its camera and its point.
+
+    Args:
+        layout: slots.
+        frames: of every slot, stored.
+        points: of the problem.
+        terms: what they are.
+        slots: what else they follow from.
+        fused: one loop makes all (`together`). Else vectors that others need are stored: for programs that LLVM does
+            not optimise.
+    """
+    views = all_views(layout, frames, points)
+    if not fused:
+        return terms(views, *slots)
+
+    def of_views(frames: camera.Frames, points: Array, mask: Array, pixels: Array, whitening: Array | None, *slots: Array):
+        return terms(Views(frames, points, mask, pixels, whitening, False), *slots)
+
+    return together(of_views, *views[:-1], *slots)
 
 
 def point_passes(
@@ -66,46 +89,14 @@ def point_passes(
     Args:
         layout: slots.
         frames: of every camera.
-        fused: one loop for each bucket of the layout. Else, and where the layout is padded, vectors are stored and then
-            summed: a smaller program, which takes longer.
+        fused: see `view_terms`.
 
     Returns:
         A function of points, `Terms`, and any vectors over slots; its result is a vector over points for each term.
     """
-    if not fused or layout.point_levels is not None:
-        at_slots = frames.stored().at(layout.slot_camera).stacked()
-        return lambda points, terms, *slots: list(
-            point_sum(layout, jnp.stack(terms(all_views(layout, at_slots, points), *slots)))
-        )
-    stored = frames.stored()
+    at_slots = frames.stored().at(layout.slot_camera).stacked()
 
     def one_pass(points: Float[Array, "3 points"], terms: Terms, *slots: Array) -> list[Float[Array, " points"]]:
-        sums = []
-        for cut, columns in _buckets(layout):
-            mask, whitening = cut(layout.slot_mask), None if layout.whitening is None else cut(layout.whitening)
-            own = [jnp.broadcast_to(row.reshape(mask.shape[0], 1, -1), mask.shape) for row in points[:, columns]]
-            at_slots = stored.at(cut(layout.slot_camera))
-            views = Views(at_slots, own, mask, cut(layout.pixels), whitening, False)
-            sums.append(_sums_over_tracks(terms(views, *map(cut, slots))))
-        return [jnp.concatenate(of_buckets) for of_buckets in zip(*sums, strict=True)]
+        return list(point_sum(layout, jnp.stack(view_terms(layout, at_slots, points, terms, *slots, fused=fused))))
 
     return one_pass
-
-
-def _buckets(layout: Layout) -> Iterator[tuple[Callable[[AnyArray], Array], slice]]:
-    """For each bucket what cuts its slots out of all, as [..., tiles, track, tile], and its points' columns."""
-    slot = column = 0
-    for tiles, length, tile in layout.buckets:
-
-        def cut(values: AnyArray, begin: int = slot, shape: tuple[int, int, int] = (tiles, length, tile)) -> Array:
-            return jnp.asarray(values)[..., begin : begin + prod(shape)].reshape(*values.shape[:-1], *shape)
-
-        yield cut, slice(column, column + tiles * tile)
-        slot, column = slot + tiles * length * tile, column + tiles * tile
-
-
-def _sums_over_tracks(values: list[Float[Array, "tiles track tile"]]) -> list[Float[Array, " points"]]:
-    """All sums over the tracks in one loop."""
-    zeros = [jnp.zeros((), value.dtype) for value in values]
-    add = lambda left, right: [a + b for a, b in zip(left, right, strict=True)]
-    return [row.reshape(-1) for row in lax.reduce(values, zeros, add, (1,))]
