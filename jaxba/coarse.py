@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.barrier import materialized
+from jaxba.barrier import apart
 from jaxba.blocks import dense_blocks, pair_products
 from jaxba.clusters import ClusterLayout
 from jaxba.dense import factor_panels
@@ -127,7 +127,7 @@ def _shared_rows(
     moved = [[first[k] * over[i] + second[k] * under[i] for k in range(3)] for i in range(3)]
     lens = [[high[6 + k] * over[i] + low[6 + k] * under[i] for k in range(3)] for i in range(3)]
     columns = [column for i in range(3) for column in moved[i] + lens[i]]
-    sums = materialized(tree_sum(jnp.stack(columns).T, clusters.levels).T)
+    sums = apart(lambda rows: tree_sum(rows, clusters.levels), jnp.stack(columns).T, index=clusters.point).T
     x, y, z = take_each(positions, clusters.point)
     rows = []
     for i in range(3):

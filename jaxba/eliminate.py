@@ -19,13 +19,13 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba import camera
-from jaxba.barrier import materialized
 from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.sums import outer_sum, point_sum, take, take_each, take_rows, tree_sum
 from jaxba.ties import LensTies
+from jaxba.together import together
 
 
 class Coordinates(NamedTuple):
@@ -83,9 +83,9 @@ def eliminate_points(
         matrix[place] = matrix[place] + extra
     factor = cholesky3(matrix)
     solved = factor.forward(gradient)
-    at_slot = Cholesky3(*take(jnp.stack(factor), layout.slot_point))
-    projected = [at_slot.forward(row) for row in linear.point_jacobian]
-    return PointSystem(factor, gradient, diagonal, solved, projected)
+    at_slot = jnp.stack(take_each(list(factor), layout.slot_point))
+    rows = together(lambda entries, over, under: [*Cholesky3(*entries).forward(over), *Cholesky3(*entries).forward(under)], at_slot, *linear.point_jacobian)
+    return PointSystem(factor, gradient, diagonal, solved, [rows[:3], rows[3:]])
 
 
 def camera_system(
@@ -104,8 +104,8 @@ def camera_system(
         rows += [*linear.camera_jacobian[k], linear.residual[k], reduced]
     level, *levels = layout.camera_levels
     gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 11)
-    products = tree_sum(outer_sum(gathered, gathered), tuple(levels))
-    blocks, gradient, right = products[:, :9, :9], products[:, :9, 9], -products[:, :9, 10]
+    products = tree_sum(outer_sum(gathered[..., :9], gathered), tuple(levels))
+    blocks, gradient, right = products[:, :, :9], products[:, :, 9], -products[:, :, 10]
     rotation = jnp.einsum("cji,cjk,ckl->cil", coordinates.forward, blocks[:, :3, :3], coordinates.forward)
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
@@ -137,10 +137,13 @@ def apply_reduced(
 ) -> Float[Array, "cameras 9"]:
     """`S x` without forming S: two passes over the observations."""
     inner = project_to_points(layout, linear, points, x)
-    at_slot = take_each(inner, layout.slot_point)
-    lifted = materialized(jnp.stack([sum(points.projected[k][i] * at_slot[i] for i in range(3)) for k in range(2)]))
-    first, second = linear.camera_jacobian
-    columns = jnp.stack([first[a] * lifted[0] + second[a] * lifted[1] for a in range(9)])
+    at_slot = jnp.stack(take_each(inner, layout.slot_point))
+
+    def lifted(at_slot: Array, projected: list[list[Array]], first: list[Array], second: list[Array]) -> list[Array]:
+        over, under = (sum(row[i] * at_slot[i] for i in range(3)) for row in projected)
+        return [first[a] * over + second[a] * under for a in range(9)]
+
+    columns = jnp.stack(together(lifted, at_slot, points.projected, *linear.camera_jacobian))
     return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(columns.T, layout.camera_levels)
 
 
@@ -164,10 +167,13 @@ def project_to_points(
     layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras 9"]
 ) -> list[Array]:
     """`sum Y^T x` over each point's slots."""
-    at_slot = take_each(x.T, layout.slot_camera)
-    moved = materialized(jnp.stack([sum(row[a] * at_slot[a] for a in range(9)) for row in linear.camera_jacobian]))
-    inner = jnp.stack([points.projected[0][i] * moved[0] + points.projected[1][i] * moved[1] for i in range(3)])
-    return list(point_sum(layout, inner))
+    at_slot = jnp.stack(take_each(x.T, layout.slot_camera))
+
+    def inner(at_slot: Array, projected: list[list[Array]], jacobian: list[list[Array]]) -> list[Array]:
+        over, under = (sum(row[a] * at_slot[a] for a in range(9)) for row in jacobian)
+        return [projected[0][i] * over + projected[1][i] * under for i in range(3)]
+
+    return list(point_sum(layout, jnp.stack(together(inner, at_slot, points.projected, linear.camera_jacobian))))
 
 
 def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: Coordinates) -> Float[Array, ""]:

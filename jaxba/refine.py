@@ -26,11 +26,12 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba import camera
-from jaxba.blocks3 import cholesky3
+from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.layout import Layout
 from jaxba.linearize import point_terms
 from jaxba.losses import Loss
 from jaxba.sums import point_sum
+from jaxba.together import together
 from jaxba.views import Views, point_passes
 
 INITIAL_DAMPING = 1e-6
@@ -112,9 +113,12 @@ def refine_points(
         matrix = [best.system[k] for k in range(6)]
         for k in (0, 2, 5):
             matrix[k] = matrix[k] * (1 + best.damping)
+
+        def moved(points: Array, factor: Cholesky3, gradient: Array) -> list[Array]:
+            return [x - d for x, d in zip(points, factor.backward(factor.forward(list(gradient))), strict=True)]
+
         factor = cholesky3(matrix)
-        step = factor.backward(factor.forward([best.system[k] for k in range(6, 9)]))
-        return best.points - jnp.stack(step)
+        return jnp.stack(together(moved, best.points, factor, best.system[6:]) if fused else moved(best.points, factor, best.system[6:]))
 
     def body(carry: _Carry) -> _Carry:
         *system, costs, nearness = (found := one_pass(carry.trial, terms, *fronts))[:11]

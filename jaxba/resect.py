@@ -45,8 +45,8 @@ def refine_cameras(
     rows = [entry for k in range(2) for entry in (*linear.camera_jacobian[k], linear.residual[k])]
     level, *levels = layout.camera_levels
     gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 10)
-    products = tree_sum(outer_sum(gathered, gathered), tuple(levels))
-    blocks, gradient = products[:, :9, :9], products[:, :9, 9]
+    products = tree_sum(outer_sum(gathered[..., :9], gathered), tuple(levels))
+    blocks, gradient = products[:, :, :9], products[:, :, 9]
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     own_cost = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
     before = own_cost(linear.costs)
