@@ -20,7 +20,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,7 @@ from jaxba.layout import layout_for
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import parse_solver
 from jaxba.programs import Way, options_of
+from jaxba.together import in_haste
 
 LONGEST = 10.0
 """Seconds of repeats of one program."""
@@ -54,7 +54,9 @@ def measure(step: Any, arguments: tuple[Any, ...], way: Way, repeats: int) -> tu
     """Seconds of compilation, tracing included, and median seconds of a step."""
     options: Any = options_of(way)
     started = time.perf_counter()
-    compiled = jax.jit(lambda *given: step(way, *given)).lower(*arguments).compile(options)
+    with in_haste(options is not None):
+        lowered = jax.jit(step).lower(*arguments)
+    compiled = lowered.compile(options)
     compile_s = time.perf_counter() - started
     jax.block_until_ready(compiled(*arguments))
     times: list[float] = []
@@ -76,17 +78,15 @@ def rows(location: str, solver: str, linear_solver: str, repeats: int) -> Iterat
         layout = jax.device_put(layout_for(problem, options))
         state = jax.jit(lm.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
         given = (layout, state, jnp.asarray(1e-4, dtype))
-        # as in stepwise.py: what is compiled in a hurry should be small
-        how = lambda way: options if way == "full" else replace(options, fused_passes=False)
         parts: dict[str, tuple[Any, tuple[Any, ...]]] = {
-            "round": (lambda way, la, s, d: lm.lm_step(la, s, d, how(way)), given)
+            "round": (lambda la, s, d: lm.lm_step(la, s, d, options), given)
         }
         if options.in_two:
-            propose = lambda way, la, s, d: lm.propose(la, s, d, how(way))
-            proposal = jax.jit(lambda *given: propose("full", *given))(*given)
+            propose = lambda la, s, d: lm.propose(la, s, d, options)
+            proposal = jax.jit(lambda *given: propose(*given))(*given)  # not the program that is timed
             parts = {
                 "propose": (propose, given),
-                "judge": (lambda way, la, s, d, p: lm.judge(la, s, d, p, how(way)), (*given, proposal)),
+                "judge": (lambda la, s, d, p: lm.judge(la, s, d, p, options), (*given, proposal)),
             }
         for part, (function, arguments) in parts.items():
             measured = {way: measure(function, arguments, way, repeats) for way in WAYS}

@@ -195,14 +195,14 @@ def _separators(
     layout: Layout, cameras: Array, points: Array, damping: Array, partition: Partition, options: StepOptions
 ) -> tuple[Float[Array, "3 points"], Float[Array, ""]]:
     """Every separator after its embedded iterations, or a damped step where there are none; the cost after that."""
-    frames, fused = camera.frames(cameras), options.fused_passes
-    one_pass = point_passes(layout, frames, fused=fused)
+    frames = camera.frames(cameras)
+    one_pass = point_passes(layout, frames)
     terms = lambda views: point_terms(views, options.loss)[:10]
     *entries, before = one_pass(points, terms)
     if options.refine_points:
         there = residuals(layout, slot_frames(layout, cameras), points)[0]
         home = Home.of(layout, points, there.inverse_depth)
-        refined, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home, fused=fused)
+        refined, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home)
         costs = jnp.where(partition.separator, costs, before)
         return jnp.where(partition.separator, refined, points), total(costs)
     matrix = entries[:6]

@@ -84,7 +84,11 @@ def eliminate_points(
     factor = cholesky3(matrix)
     solved = factor.forward(gradient)
     at_slot = jnp.stack(take_each(list(factor), layout.slot_point))
-    rows = together(lambda entries, over, under: [*Cholesky3(*entries).forward(over), *Cholesky3(*entries).forward(under)], at_slot, *linear.point_jacobian)
+    rows = together(
+        lambda entries, over, under: [*Cholesky3(*entries).forward(over), *Cholesky3(*entries).forward(under)],
+        at_slot,
+        *linear.point_jacobian,
+    )
     return PointSystem(factor, gradient, diagonal, solved, [rows[:3], rows[3:]])
 
 

@@ -113,6 +113,7 @@ def linearize(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Linearization:
     """Analytic Jacobians at the given parameters."""
+
     def terms(views: Views) -> list[Array]:
         projection = views.projected()
         residual = view_residuals(views, projection)

@@ -69,10 +69,6 @@ class StepOptions:
     refine_points: int = 0
     """Embedded point iterations after each camera step."""
 
-    fused_passes: bool = True
-    """Whether point iterations are one loop over the observations each (views.py): faster on a CPU, longer to compile.
-    """
-
     trials: int = 1
     """How often a step is tried before it is rejected, each time a quarter as long; see `trial.py`."""
 

@@ -147,8 +147,7 @@ class Clusters(NamedTuple):
 def _refined(
     layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, iterations: int | Int[Array, ""]
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    fused = options.fused_passes
-    return refine_points(layout, frames(cameras), points, options.loss, iterations, home, fused=fused)
+    return refine_points(layout, frames(cameras), points, options.loss, iterations, home)
 
 
 def _costs(layout: Layout, cameras: Array, points: Array, options: StepOptions) -> Float[Array, " slots"]:

@@ -23,6 +23,7 @@ from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
 import jax
 
 from jaxba.stored import Store, Stored, compiled_here
+from jaxba.together import in_haste
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -120,7 +121,14 @@ class Program:
         self._static = [name if name in static else None for name in inspect.signature(function).parameters]
 
     def __call__(self, *arguments: Any) -> Any:
-        return self.jitted(*arguments)
+        with in_haste(self.options is not None):
+            return self.jitted(*arguments)
+
+    def lower(self, *arguments: Any) -> tuple[Any, Any]:
+        """What is compiled, and shapes and types of its results."""
+        with in_haste(self.options is not None):
+            traced = self.jitted.trace(*arguments)
+            return traced.lower(), traced.out_info
 
     def parted(self, arguments: tuple[Any, ...]) -> tuple[dict[str, Any], tuple[Any, ...]]:
         """Static arguments by name, and the others."""
@@ -198,8 +206,7 @@ class CompiledTogether:
             if (stored := store.load(place, given)) is not None:
                 self.loaded[function] = stored
                 return stored.out
-        traced = function.jitted.trace(*arguments)
-        lowered = traced.lower()
+        lowered, out = function.lower(*arguments)
 
         def compile_and_keep() -> None:
             if store is None:
@@ -208,11 +215,11 @@ class CompiledTogether:
             with compiled_here() as is_new:
                 compiled = lowered.compile()
             if is_new():
-                store.save(place, compiled, traced.out_info)
+                store.save(place, compiled, out)
 
         self._waiting.append(compile_and_keep)
         self._jobs.append(self._pool.submit(self._compile_next))
-        return traced.out_info
+        return out
 
     def run(self, function: Program, *arguments: Any) -> Any:
         """What the program computes."""

@@ -82,8 +82,6 @@ def refine_points(
     loss: Loss,
     iterations: int | Int[Array, ""],
     home: Home | None = None,
-    *,
-    fused: bool = True,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """Improves every point by `iterations` steps of its own.
 
@@ -96,13 +94,12 @@ def refine_points(
             one more where points are taken home.
         home: a point that lies behind a camera in front of which it was at home, or `FARTHEST` times as far from its
             cameras, starts from there.
-        fused: see `views.point_passes`.
 
     Returns:
         Points, and the cost of each point's observations there (pixels squared), never larger than where it
         started, which is its home for a point that was taken there.
     """
-    one_pass = point_passes(layout, frames, fused=fused)
+    one_pass = point_passes(layout, frames)
     fronts = () if home is None else (home.front,)
 
     def terms(views: Views, *front: Array) -> list[Array]:
@@ -118,7 +115,7 @@ def refine_points(
             return [x - d for x, d in zip(points, factor.backward(factor.forward(list(gradient))), strict=True)]
 
         factor = cholesky3(matrix)
-        return jnp.stack(together(moved, best.points, factor, best.system[6:]) if fused else moved(best.points, factor, best.system[6:]))
+        return jnp.stack(together(moved, best.points, factor, best.system[6:]))
 
     def body(carry: _Carry) -> _Carry:
         *system, costs, nearness = (found := one_pass(carry.trial, terms, *fronts))[:11]

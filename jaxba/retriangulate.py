@@ -108,8 +108,8 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
         way = way_after(VERDICTS, stages("judge", problem.num_observations))
-        search = program(_search, "loss", "fused", way=way)
-        given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss(), way == "full")
+        search = program(_search, "loss", way=way)
+        given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss())
         found = jax.device_get(run_alone(search, *given))
         host.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):
@@ -121,9 +121,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     )
 
 
-def _search(
-    layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss, fused: bool
-) -> _Found:
+def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss) -> _Found:
     """`retriangulate` in layout order; `origin` is where the rays start, in scene units."""
     state = initial_state(layout, problem, StepOptions(loss=loss), jnp.float64)
     frames, start = slot_frames(layout, state.cameras), state.points
@@ -140,7 +138,7 @@ def _search(
 
     def visit(best: tuple[Array, Array], place: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
         points, costs = best
-        trial, _ = refine_points(layout, of_cameras, place, loss, POINT_ITERATIONS, fused=fused)
+        trial, _ = refine_points(layout, of_cameras, place, loss, POINT_ITERATIONS)
         there, lost = look(trial)
         better = (there < costs) & (lost <= hidden)
         return (jnp.where(better, trial, points), jnp.where(better, there, costs)), None

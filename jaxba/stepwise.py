@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -59,16 +58,13 @@ class _Loop(NamedTuple):
         if decides_effort(self.policy):
             effort = call(program(effort_of, way="quick"), self.policy, carry.policy)
         part = lambda name, function: program(function, "options", way=ways[name])
-        # what is compiled in a hurry should be small
-        small = replace(options, fused_passes=False)
-        how = lambda name: options if ways[name] == "full" else small
         min_gain = jnp.asarray(self.policy.min_gain, state.cost.dtype)
         if options.in_two:
             given = (self.layout, state, carry.damping)
-            proposal = call(part("propose", propose), *given, how("propose"), carry.iteration, effort)
-            state, step = call(part("judge", judge), *given, proposal, how("judge"), min_gain, effort)
+            proposal = call(part("propose", propose), *given, options, carry.iteration, effort)
+            state, step = call(part("judge", judge), *given, proposal, options, min_gain, effort)
         else:
-            given = (self.layout, state, carry.damping, how("round"), min_gain, carry.iteration, effort)
+            given = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
             state, step = call(part("round", lm_step), *given)
         limit = jnp.asarray(self.max_iterations, jnp.int32)
         own = (carry._replace(state=None), step, self.policy, self.tolerances, limit)

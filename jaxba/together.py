@@ -16,9 +16,13 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+in_haste = jax.make_user_context(False)
+"""Whether what is traced is to be compiled quickly (programs.py). Without LLVM's optimisation a loop does all of its
+work, the half that is zero too, and what is written out takes longer to compile: there every vector has its own."""
+
 
 def together(function: Callable[..., list[Array]], *operands: Any) -> list[Array]:
-    """`function(*operands)`, in one loop on a CPU; elsewhere XLA does as much by itself.
+    """`function(*operands)`, in one loop on a CPU unless `in_haste`; elsewhere XLA does as much by itself.
 
     Args:
         function: of arrays whose last axis is the loop's, elementwise in it: it indexes the axes before alone, and
@@ -33,6 +37,10 @@ def together(function: Callable[..., list[Array]], *operands: Any) -> list[Array
         first = lax.broadcasted_iota(jnp.int32, rows[0].shape, 0) == 0
         zeros = [jnp.zeros((), row.dtype) for row in rows]
         add = lambda left, right: [a + b for a, b in zip(left, right, strict=True)]
-        return lax.reduce([jnp.where(first, row, zero) for row, zero in zip(rows, zeros, strict=True)], zeros, add, (0,))
+        return lax.reduce(
+            [jnp.where(first, row, zero) for row, zero in zip(rows, zeros, strict=True)], zeros, add, (0,)
+        )
 
+    if in_haste.value:
+        return function(*operands)
     return lax.platform_dependent(*operands, cpu=one_loop, default=function)

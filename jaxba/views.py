@@ -14,7 +14,7 @@ from jaxba.barrier import materialized
 from jaxba.layout import Layout
 from jaxba.problem import AnyArray
 from jaxba.sums import point_sum, take_each
-from jaxba.together import together
+from jaxba.together import in_haste, together
 
 
 class Views(NamedTuple):
@@ -45,7 +45,9 @@ def all_views(layout: Layout, frames: camera.Frames, points: Float[Array, "3 poi
         frames: of every slot.
         points: of the problem.
     """
-    return Views(frames, jnp.stack(take_each(points, layout.slot_point)), layout.slot_mask, layout.pixels, layout.whitening, True)
+    return Views(
+        frames, jnp.stack(take_each(points, layout.slot_point)), layout.slot_mask, layout.pixels, layout.whitening, True
+    )
 
 
 Terms = Callable[..., list[Array]]
@@ -58,9 +60,8 @@ def view_terms(
     points: Float[Array, "3 points"],
     terms: Terms,
     *slots: Array,
-    fused: bool = True,
 ) -> list[Float[Array, " slots"]]:
-    """Vectors over slots that follow from an observation, its camera and its point.
+    """Vectors over slots that follow from an observation, its camera and its point, made together.
 
     Args:
         layout: slots.
@@ -68,28 +69,25 @@ def view_terms(
         points: of the problem.
         terms: what they are.
         slots: what else they follow from.
-        fused: one loop makes all (`together`). Else vectors that others need are stored: for programs that LLVM does
-            not optimise.
     """
     views = all_views(layout, frames, points)
-    if not fused:
+    if in_haste.value:
         return terms(views, *slots)
 
-    def of_views(frames: camera.Frames, points: Array, mask: Array, pixels: Array, whitening: Array | None, *slots: Array):
+    def of_views(
+        frames: camera.Frames, points: Array, mask: Array, pixels: Array, whitening: Array | None, *slots: Array
+    ):
         return terms(Views(frames, points, mask, pixels, whitening, False), *slots)
 
     return together(of_views, *views[:-1], *slots)
 
 
-def point_passes(
-    layout: Layout, frames: camera.Frames, *, fused: bool = True
-) -> Callable[..., list[Float[Array, " points"]]]:
+def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Float[Array, " points"]]]:
     """What sums over each point's observations terms that follow from an observation, its camera and its point.
 
     Args:
         layout: slots.
         frames: of every camera.
-        fused: see `view_terms`.
 
     Returns:
         A function of points, `Terms`, and any vectors over slots; its result is a vector over points for each term.
@@ -97,6 +95,6 @@ def point_passes(
     at_slots = frames.stored().at(layout.slot_camera).stacked()
 
     def one_pass(points: Float[Array, "3 points"], terms: Terms, *slots: Array) -> list[Float[Array, " points"]]:
-        return list(point_sum(layout, jnp.stack(view_terms(layout, at_slots, points, terms, *slots, fused=fused))))
+        return list(point_sum(layout, jnp.stack(view_terms(layout, at_slots, points, terms, *slots))))
 
     return one_pass

@@ -140,16 +140,11 @@ def test_the_two_parts_are_the_step():
 class Failing(Program):
     """A program that cannot be compiled."""
 
-    out_info = None
-
     def __init__(self):
-        self.jitted = self
-
-    def trace(self):
-        return self
+        pass
 
     def lower(self):
-        return self
+        return self, None
 
     def compile(self):
         raise RuntimeError("no memory left")
@@ -175,7 +170,7 @@ def test_nothing_more_is_compiled_after_an_error():
     slow = Failing()
     slow.compile = lambda: compiled.append(time.sleep(0.05))
     stop = Failing()
-    stop.trace = interrupted
+    stop.lower = interrupted
     with pytest.raises(KeyboardInterrupt):
         _compile([*[slow] * 100, stop])
     assert len(compiled) < 50

@@ -1,4 +1,4 @@
-"""Sums over each point's observations in one pass: the same as sums of dense Jacobians, fused or not."""
+"""Sums over each point's observations: the same as sums of dense Jacobians, made together or in haste."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from jaxba.layout import Layout
 from jaxba.linearize import point_terms
 from jaxba.padding import capacity_of
 from jaxba.refine import refine_points
-from jaxba.views import Views, point_passes
+from jaxba.together import in_haste
+from jaxba.views import point_passes
 
 pytestmark = pytest.mark.step
 
@@ -38,17 +39,18 @@ def two_tracks() -> BundleProblem:
     )
 
 
-def sums(layout: Layout, problem: BundleProblem, loss: Loss, fused: bool, dtype: str = "float64") -> np.ndarray:
+def sums(layout: Layout, problem: BundleProblem, loss: Loss, haste: bool, dtype: str = "float64") -> np.ndarray:
     """The eleven sums that point iterations need, as [sum, point of the problem]."""
 
     def found(layout, problem):
         state = initial_state(layout, problem, StepOptions(loss=loss), jnp.dtype(dtype))
-        one_pass = point_passes(layout, camera.frames(state.cameras), fused=fused)
+        one_pass = point_passes(layout, camera.frames(state.cameras))
         return jnp.stack(one_pass(state.points, lambda views: point_terms(views, loss)))
 
     columns = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = columns < problem.num_points
-    values = np.asarray(jax.jit(found)(layout, problem))
+    with in_haste(haste):
+        values = np.asarray(jax.jit(found)(layout, problem))
     result = np.zeros((len(values), problem.num_points))
     result[:, columns[real]] = values[:, : len(columns)][:, real]
     return result
@@ -67,14 +69,14 @@ def dense_sums(problem: BundleProblem, loss: Loss) -> np.ndarray:
     return np.stack([*entries, *(gradient[first + i] for i in range(3)), cost])
 
 
-@pytest.mark.parametrize("fused", [True, False], ids=["fused", "stored"])
+@pytest.mark.parametrize("haste", [False, True], ids=["together", "in haste"])
 @pytest.mark.parametrize("loss", [Loss(), Loss("huber", 2.0)], ids=["squared", "huber"])
 @pytest.mark.parametrize("make", [two_tracks, support.odd, support.single])
-def test_sums_of_a_pass_are_those_of_dense_jacobians(make, loss, fused):
+def test_sums_of_a_pass_are_those_of_dense_jacobians(make, loss, haste):
     problem = make()
     layout = build_layout(problem)
     truth = dense_sums(problem, loss)
-    found = sums(layout, problem, loss, fused)[:10]
+    found = sums(layout, problem, loss, haste)[:10]
     scale = np.abs(truth).max(axis=0) + 1e-300
     np.testing.assert_allclose(found / scale, truth / scale, rtol=0, atol=1e-12)
 
@@ -85,18 +87,18 @@ def test_a_padded_layout_gives_the_same_sums():
     layout = build_layout(problem, capacity=capacity_of(problem))
     assert layout.point_levels is not None
     scale = np.abs(truth).max(axis=0) + 1e-300
-    np.testing.assert_allclose(sums(layout, problem, Loss(), True)[:10] / scale, truth / scale, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(sums(layout, problem, Loss(), False)[:10] / scale, truth / scale, rtol=0, atol=1e-12)
 
 
 def test_the_problem_of_these_tests_has_several_buckets():
     assert len(build_layout(two_tracks()).buckets) > 1
 
 
-@pytest.mark.parametrize("fused", [True, False], ids=["fused", "stored"])
-def test_a_pass_in_float32_loses_no_more_than_rounding(fused):
+@pytest.mark.parametrize("haste", [False, True], ids=["together", "in haste"])
+def test_a_pass_in_float32_loses_no_more_than_rounding(haste):
     problem = two_tracks()
     layout = build_layout(problem)
-    exact, found = (sums(layout, problem, Loss(), fused, dtype)[:10] for dtype in ("float64", "float32"))
+    exact, found = (sums(layout, problem, Loss(), haste, dtype)[:10] for dtype in ("float64", "float32"))
     # the cost and the gradient are sums of terms with residuals, which are differences of pixels
     scale = np.abs(exact).max(axis=0)
     assert (np.abs(found - exact)[:, scale > 0] / scale[scale > 0]).max() < 1e-3
@@ -108,46 +110,24 @@ def test_vectors_over_slots_reach_the_slots_they_belong_to():
     numbers = np.where(layout.slot_mask, np.arange(layout.num_slots, dtype=float), 0.0)
     truth = np.bincount(np.asarray(layout.slot_point), numbers, minlength=layout.num_points)
 
-    def found(layout, state, fused):
-        one_pass = point_passes(layout, camera.frames(state.cameras), fused=fused)
-        return one_pass(state.points, lambda views, number: [number], jnp.asarray(numbers))[0]
-
-    for fused in (True, False):
-        np.testing.assert_array_equal(found(layout, state, fused), truth)
-
-
-def test_a_fused_pass_stores_no_vector_over_observations():
-    """That is what it is for: stored vectors are written and read again."""
-    problem = two_tracks()
-    layout, state = start(problem)
-
-    def body(views: Views) -> list:
-        return point_terms(views, Loss())
-
-    def bytes_made(fused: bool) -> int:
-        def one(layout, state):
-            return point_passes(layout, camera.frames(state.cameras), fused=fused)(state.points, body)
-
-        found = jax.jit(one).lower(layout, state).compile().memory_analysis()
-        assert found is not None
-        return found.temp_size_in_bytes
-
-    one_vector = 8 * layout.num_slots
-    assert bytes_made(True) < 2 * one_vector + 8 * 14 * problem.num_cameras * 2 + 8 * 12 * layout.num_points
-    assert bytes_made(False) > 8 * one_vector
+    for haste in (True, False):
+        with in_haste(haste):
+            one_pass = point_passes(layout, camera.frames(state.cameras))
+            found = one_pass(state.points, lambda views, number: [number], jnp.asarray(numbers))[0]
+        np.testing.assert_array_equal(found, truth)
 
 
 @pytest.mark.parametrize("loss", [Loss(), Loss("huber", 2.0)], ids=["squared", "huber"])
-def test_point_iterations_are_the_same_fused_or_not(loss):
+def test_point_iterations_are_the_same_in_haste(loss):
     problem = two_tracks()
     layout, state = start(problem)
 
-    @jax.jit
-    def both(layout, state):
-        frames = camera.frames(state.cameras)
-        return [refine_points(layout, frames, state.points, loss, 3, fused=fused) for fused in (True, False)]
+    def found(haste: bool):
+        with in_haste(haste):
+            frames = camera.frames(state.cameras)
+            return jax.jit(lambda layout, points: refine_points(layout, frames, points, loss, 3))(layout, state.points)
 
-    (points, costs), (stored_points, stored_costs) = both(layout, state)
+    (points, costs), (stored_points, stored_costs) = found(False), found(True)
     np.testing.assert_allclose(points, stored_points, rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(costs, stored_costs, rtol=1e-9, atol=1e-12)
 
