@@ -27,7 +27,7 @@ from jaxba.partition import Partition, partition_layout
 from jaxba.problem import AnyArray, BundleProblem
 from jaxba.slots import bucket_slots, padded_slots
 from jaxba.ties import LensTies, lens_ties
-from jaxba.trees import sum_tree, with_spare_row
+from jaxba.trees import sorted_by, sum_tree, with_spare_row
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
@@ -147,7 +147,7 @@ def build_layout(
     start = np.concatenate([[0], np.cumsum(tracks)])
     seen = np.bincount(camera, minlength=cameras)
 
-    made = bucket_slots(tracks, point) if capacity is None else padded_slots(tracks, point, capacity)
+    made = bucket_slots(tracks) if capacity is None else padded_slots(tracks, point, capacity)
     slot, slot_point, empty = made.slot, made.point, made.empty
     slots = len(slot_point)
     mask = np.zeros(slots, bool)
@@ -161,7 +161,7 @@ def build_layout(
         whitening = np.zeros((2, 2, slots))
         whitening[:, :, slot] = np.moveaxis(np.asarray(problem.whitening)[order], 0, -1)
     room = None if capacity is None else room_for(seen, capacity.observations, capacity.points)
-    by_camera = np.argsort(camera, kind="stable")
+    by_camera = sorted_by(camera, cameras)
     camera_levels = with_spare_row(sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room), empty)
     table = None
     columns = sum(map(len, made.members))

@@ -12,12 +12,11 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Int
-from scipy.sparse import csr_matrix
 
 from jaxba.ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.padding import Capacity, room_for
 from jaxba.problem import AnyArray
-from jaxba.trees import TREE_WIDTH, Room, chunks_at_most, sum_tree
+from jaxba.trees import TREE_WIDTH, Room, chunks_at_most, sorted_by, sum_tree
 
 PAIR_CHUNKS = (4, 8)
 """Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
@@ -25,6 +24,9 @@ PAIR_CHUNKS = (4, 8)
 PAIR_BATCH = 2048
 """Most chunks multiplied at once: bounds the gathered operands to 7 MB and the products to 1.3 MB, which stay in
 cache."""
+
+MOST_COUNTED = 1 << 18
+"""Numbers of blocks, empty ones included, up to which pairs are counted for each: the counts stay in the cache."""
 
 PAIR_ITEM_COST = 1.5
 """Cost of one partial 9 x 9 block, in pairs; decides between few long and many short chunks."""
@@ -95,13 +97,7 @@ def pair_layout(
         capacity: makes all shapes follow from it: every block of the lower triangle is there, and no band.
     """
     camera, place = camera.astype(np.int32), place.astype(np.int32)
-    lefts, rights = [], []
-    for length in np.unique(tracks[tracks > 0]):
-        first = start[np.flatnonzero(tracks == length)].astype(np.int32)
-        a, b = (side.astype(np.int32) for side in np.tril_indices(length))
-        lefts.append((first[:, None] + a).ravel())
-        rights.append((first[:, None] + b).ravel())
-    left, right = np.concatenate(lefts), np.concatenate(rights)
+    left, right = _pairs_of_tracks(tracks, start)
     rows, columns = camera[left], camera[right]
     # a camera that sees a point twice: both orders add to the same diagonal block
     twice = np.flatnonzero(rows == columns)
@@ -176,6 +172,26 @@ def pair_layout(
     )
 
 
+def _pairs_of_tracks(
+    tracks: Int[np.ndarray, " points"], start: Int[np.ndarray, " starts"]
+) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
+    """All pairs of observations of one point, the later or same one first; points of equal track length together."""
+    lengths = np.bincount(tracks)
+    total = int(lengths @ (np.arange(len(lengths)) * np.arange(1, len(lengths) + 1) // 2))
+    left, right = np.empty(total, np.int32), np.empty(total, np.int32)
+    first, point, pair = start[sorted_by(tracks, len(lengths))].astype(np.int32), int(lengths[0]), 0
+    for length in np.flatnonzero(lengths[1:]) + 1:
+        count = np.arange(1, length + 1, dtype=np.int32)
+        later = np.repeat(count - 1, count)
+        earlier = np.arange(len(later), dtype=np.int32) - np.repeat(np.cumsum(count, dtype=np.int32) - count, count)
+        own = first[point : point + lengths[length], None]
+        shape, end = (len(own), len(later)), pair + len(own) * len(later)
+        np.add(own, later, out=left[pair:end].reshape(shape))
+        np.add(own, earlier, out=right[pair:end].reshape(shape))
+        point, pair = point + len(own), end
+    return left, right
+
+
 def _batch_sums(
     chunks: Int[np.ndarray, " blocks"], batches: int, batch: int, most: int | None
 ) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...]]:
@@ -227,13 +243,20 @@ class _Blocks(NamedTuple):
     @classmethod
     def of(cls, rows: Int[np.ndarray, " pairs"], columns: Int[np.ndarray, " pairs"], cameras: int) -> _Blocks:
         """Sorts pairs by the block of each."""
-        # by column, then by row: two sorts by counting, which is what the transposition of a sparse matrix is
-        order = _sorted_by(columns, cameras)
-        order = order[_sorted_by(rows[order], cameras)]
+        diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
+        if cameras**2 <= max(MOST_COUNTED, len(rows)):
+            keys = rows * np.int32(cameras) + columns
+            counts = np.bincount(keys, minlength=cameras**2)
+            listed = counts > 0
+            listed[diagonal] = True
+            names = np.flatnonzero(listed)
+            return cls(names, counts[names], sorted_by(keys, cameras**2))
+        # by column, then by row
+        order = sorted_by(columns, cameras)
+        order = order[sorted_by(rows[order], cameras)]
         names = rows[order].astype(np.int64) * cameras + columns[order]
         first = np.flatnonzero(np.diff(names, prepend=-1))
         counts = np.diff(first, append=len(names))
-        diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
         return cls(names[first], counts, order).with_these(diagonal)
 
     def with_these(self, wanted: Int[np.ndarray, " more"]) -> _Blocks:
@@ -246,10 +269,3 @@ class _Blocks(NamedTuple):
     def with_all(self, cameras: int) -> _Blocks:
         """The same with every block of the lower triangle."""
         return self.with_these(np.ravel_multi_index(np.tril_indices(cameras), (cameras, cameras)))
-
-
-def _sorted_by(keys: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " n"]:
-    """A stable `argsort` of numbers below `most`, in linear time."""
-    ones = np.ones(len(keys), np.int8)
-    rows = csr_matrix((ones, keys, np.arange(len(keys) + 1, dtype=np.int32)), shape=(len(keys), most))
-    return rows.tocsc().indices

@@ -51,14 +51,12 @@ class Slots(NamedTuple):
     """A slot without observation."""
 
 
-def bucket_slots(tracks: Int[np.ndarray, " points"], point: Int[np.ndarray, " observations"]) -> Slots:
+def bucket_slots(tracks: Int[np.ndarray, " points"]) -> Slots:
     """Puts points of similar track length into buckets of `tiles x t x n` slots.
 
     Args:
-        tracks: observations of each point.
-        point: of each observation, sorted.
+        tracks: observations of each point; they are sorted by point.
     """
-    start = np.concatenate([[0], np.cumsum(tracks)])
     lengths = _bucket_lengths(tracks)
     which = np.searchsorted(lengths, tracks)
     column = np.zeros(len(tracks), np.int64)  # column of a point in its bucket
@@ -80,12 +78,12 @@ def bucket_slots(tracks: Int[np.ndarray, " points"], point: Int[np.ndarray, " ob
         buckets.append((tiles, int(length), tile))
         slots += tiles * length * tile
         columns += tiles * tile
-    bucket = which[point]
-    tile = np.array([tile for _, _, tile in buckets])[bucket]
-    step = np.arange(len(point)) - start[point]
-    before, place = np.divmod(column[point], tile)
+    tile = np.array([tile for _, _, tile in buckets])[which]
+    before, place = np.divmod(column, tile)
+    first = np.array(offsets)[which] + before * lengths[which] * tile + place  # slot of each point's first observation
+    start = np.cumsum(tracks) - tracks
     return Slots(
-        slot=np.array(offsets)[bucket] + (before * lengths[bucket] + step) * tile + place,
+        slot=np.repeat(first - start * tile, tracks) + np.arange(int(tracks.sum())) * np.repeat(tile, tracks),
         point=np.concatenate(slot_point),
         members=tuple(bucket_points),
         buckets=tuple(buckets),
@@ -130,14 +128,15 @@ def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
     values, counts = np.unique(tracks[tracks > 0], return_counts=True)
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
+    slots = values[:, None] * (before[1:, None] - before[:-1]).astype(float)  # of a bucket, by its last and first length
     price = total * _SHARED
     while True:
         best = np.zeros(len(values) + 1)
         cut = np.zeros(len(values) + 1, int)
         for end in range(1, len(values) + 1):
-            cost = best[:end] + values[end - 1] * (before[end] - before[:end]) + price
-            cut[end] = np.argmin(cost)
-            best[end] = cost[cut[end]]
+            cost = best[:end] + slots[end - 1, :end]
+            cut[end] = begin = cost.argmin()
+            best[end] = cost[begin] + price
         ends, end = [], len(values)
         while end:
             ends.append(end - 1)
