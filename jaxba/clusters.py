@@ -15,7 +15,7 @@ from scipy.sparse import csr_matrix
 
 from jaxba.pairs import PairLayout, pair_layout
 from jaxba.problem import AnyArray
-from jaxba.trees import fitting_width, sum_tree
+from jaxba.trees import fitting_width, sorted_by, sum_tree
 
 CLUSTER_CAMERAS = 8
 """Cameras a cluster; larger where that would make more than `MAX_CLUSTERS`. On the real problems at hand 8 took as many
@@ -69,9 +69,11 @@ def cluster_layout(
     wanted = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
     label = agglomerate(shared_points(camera, point, cameras, points)[0], cameras, wanted)
     clusters = int(label.max()) + 1
-    key = point.astype(np.int64) * clusters + label[camera]
-    order = np.argsort(key, kind="stable")
-    names, first, counts = np.unique(key[order], return_index=True, return_counts=True)
+    order = sorted_by(label[camera], clusters)
+    order = order[sorted_by(point[order], points)]
+    names = point[order].astype(np.int64) * clusters + label[camera[order]]
+    first = np.flatnonzero(np.diff(names, prepend=-1))
+    names, counts = names[first], np.diff(first, append=len(names))
     seen_by = np.bincount(names // clusters, minlength=points)
     start = np.cumsum(seen_by) - seen_by
     coarse = np.arange(len(names))
@@ -119,12 +121,14 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
     """
     label, size, weight = np.arange(nodes), np.ones(nodes), shared
     while (groups := len(size)) > clusters:
-        edges = weight.tocoo()
-        affinity = edges.data / (size[edges.row] * size[edges.col])
-        order = np.lexsort((edges.col, -affinity, edges.row))
-        row, first = np.unique(edges.row[order], return_index=True)
+        degree, column = np.diff(weight.indptr), weight.indices
+        row = np.repeat(np.arange(groups), degree)
         best, strength = np.full(groups, -1), np.zeros(groups)
-        best[row], strength[row] = edges.col[order][first], affinity[order][first]
+        if len(row):
+            affinity = weight.data / (size[row] * size[column])
+            begin = weight.indptr[:-1][degree > 0]
+            strength[degree > 0] = np.maximum.reduceat(affinity, begin)
+            best[degree > 0] = np.minimum.reduceat(np.where(affinity == strength[row], column, groups), begin)
         pair = np.flatnonzero(best >= 0)
         pair = pair[(best[best[pair]] == pair) & (pair < best[pair])]
         if not len(pair):
@@ -134,9 +138,8 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
         into = np.arange(groups)
         into[best[pair]] = pair
         kept, new = np.unique(into, return_inverse=True)
-        merge = csr_matrix((np.ones(groups), (np.arange(groups), new)), shape=(groups, len(kept)))
-        weight = (merge.T @ weight @ merge).tocsr()
-        weight.setdiag(0)
-        weight.eliminate_zeros()
-        size, label = merge.T @ size, new[label]
+        row, column = new[row], new[column]
+        apart = row != column
+        weight = csr_matrix((weight.data[apart], (row[apart], column[apart])), shape=(len(kept), len(kept)))
+        size, label = np.bincount(new, size), new[label]
     return np.unique(label, return_inverse=True)[1]
