@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import math
 import operator
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.layout import Layout
 from jaxba.problem import AnyArray
 from jaxba.together import in_haste
+
+Bucket = tuple[int, int, int]
+"""Tiles, slots of a point, points of a tile (`slots.Slots`)."""
 
 WRITTEN_OUT = 32
 """Sums over so few slots of a point are written out: XLA's own loop over them is not vectorised and waits for each
@@ -66,14 +72,40 @@ def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "
     if layout.point_levels is not None:
         # every point of the tree reads the empty slot: were it not a number for one, it would be for all
         return tree_sum(jnp.where(layout.slot_mask, values, jnp.zeros_like(values)).T, layout.point_levels).T
+    return _bucket_sums(values, layout.buckets)
+
+
+def point_sums(layout: Layout, rows: list[Float[Array, " slots"]]) -> list[Float[Array, " points"]]:
+    """`point_sum` of vectors that are stored one by one. Those over tiles, which are long, are summed where they are."""
+    if layout.point_levels is not None or in_haste.value:
+        return list(point_sum(layout, jnp.stack(rows)))
     parts, start = [], 0
-    for tiles, length, tile in layout.buckets:
-        size = tiles * length * tile
-        block = values[:, start : start + size].reshape(-1, tiles, length, tile)
-        if length <= WRITTEN_OUT and not in_haste.value:
-            sums = functools.reduce(operator.add, [block[:, :, k] for k in range(length)])
+    for tiled, group in itertools.groupby(layout.buckets, key=lambda bucket: bucket[0] > 1):
+        buckets = tuple(group)
+        for some in ((one,) for one in buckets) if tiled else (buckets,):
+            size = sum(map(math.prod, some))
+            own = [row[start : start + size] for row in rows]
+            parts.append(_sums_over_tiles(own, *some) if tiled else list(_bucket_sums(jnp.stack(own), some)))
+            start += size
+    return [jnp.concatenate(pieces) for pieces in zip(*parts, strict=True)]
+
+
+def _sums_over_tiles(rows: list[Float[Array, " slots"]], bucket: Bucket) -> list[Float[Array, " points"]]:
+    """All sums in one loop."""
+    add = lambda left, right: [a + b for a, b in zip(left, right, strict=True)]
+    sums = lax.reduce([row.reshape(bucket) for row in rows], [jnp.zeros((), row.dtype) for row in rows], add, (1,))
+    return [one.reshape(-1) for one in sums]
+
+
+def _bucket_sums(values: Float[Array, "k slots"], buckets: Sequence[Bucket]) -> Float[Array, "k points"]:
+    parts, start = [], 0
+    for bucket in buckets:
+        size = math.prod(bucket)
+        block = values[:, start : start + size].reshape(-1, *bucket)
+        if bucket[1] <= WRITTEN_OUT and not in_haste.value:
+            sums = functools.reduce(operator.add, [block[:, :, k] for k in range(bucket[1])])
         else:
             sums = jnp.sum(block, axis=2)
-        parts.append(sums.reshape(-1, tiles * tile))
+        parts.append(sums.reshape(values.shape[0], -1))
         start += size
     return jnp.concatenate(parts, axis=1)

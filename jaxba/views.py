@@ -13,7 +13,7 @@ from jaxba import camera
 from jaxba.barrier import materialized
 from jaxba.layout import Layout
 from jaxba.problem import AnyArray
-from jaxba.sums import point_sum, take_each
+from jaxba.sums import point_sums, take_each
 from jaxba.together import in_haste, together
 
 
@@ -95,6 +95,6 @@ def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Fl
     at_slots = frames.stored().at(layout.slot_camera).stacked()
 
     def one_pass(points: Float[Array, "3 points"], terms: Terms, *slots: Array) -> list[Float[Array, " points"]]:
-        return list(point_sum(layout, jnp.stack(view_terms(layout, at_slots, points, terms, *slots))))
+        return point_sums(layout, view_terms(layout, at_slots, points, terms, *slots))
 
     return one_pass
