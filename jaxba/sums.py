@@ -76,7 +76,7 @@ def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "
 
 
 def point_sums(layout: Layout, rows: list[Float[Array, " slots"]]) -> list[Float[Array, " points"]]:
-    """`point_sum` of vectors that are stored one by one. Those over tiles, which are long, are summed where they are."""
+    """`point_sum` of vectors that are stored one by one. Those over tiles, which are long, are summed in place."""
     if layout.point_levels is not None or in_haste.value:
         return list(point_sum(layout, jnp.stack(rows)))
     parts, start = [], 0
