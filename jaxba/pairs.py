@@ -244,7 +244,7 @@ class _Blocks(NamedTuple):
     def of(cls, rows: Int[np.ndarray, " pairs"], columns: Int[np.ndarray, " pairs"], cameras: int) -> _Blocks:
         """Sorts pairs by the block of each."""
         diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
-        if cameras**2 <= max(MOST_COUNTED, len(rows)):
+        if cameras**2 <= MOST_COUNTED:
             keys = rows * np.int32(cameras) + columns
             counts = np.bincount(keys, minlength=cameras**2)
             listed = counts > 0

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from jaxba import BundleProblem, LMState, StepOptions, initial_state, like, lm_step, random_scene
 from jaxba.layout import Layout, layout_for
 from jaxba.lm import StepInfo
-from jaxba.sums import point_sum, tree_sum
+from jaxba.sums import point_sum, point_sums, tree_sum
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
@@ -338,6 +338,8 @@ def check_sums(layout: Layout, rng: np.random.Generator) -> None:
     column = np.zeros((4, layout.num_points))
     np.add.at(column.T, layout.slot_point, values.T)
     np.testing.assert_allclose(point_sum(layout, jnp.asarray(values)), column, rtol=1e-12, atol=1e-13)
+    apart = jax.jit(point_sums)(layout, list(jnp.asarray(values)))
+    np.testing.assert_allclose(jnp.stack(apart), column, rtol=1e-12, atol=1e-13)
     camera = np.zeros((layout.num_cameras, 4))
     np.add.at(camera, layout.slot_camera, values.T)
     np.testing.assert_allclose(tree_sum(jnp.asarray(values.T), layout.camera_levels), camera, rtol=1e-12, atol=1e-13)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from jaxba import BundleProblem, Layout, build_layout, pairs
 from jaxba.layout import CAMERA_CHUNK
 from jaxba.slots import MAX_PADDING, TILE, TILED_POINTS
+from jaxba.sums import WRITTEN_OUT
 from jaxba.trees import TREE_WIDTH, fitting_width, sum_tree, with_spare_row
 
 # Problems from track lengths
@@ -212,6 +213,16 @@ def test_point_and_camera_sums_equal_add_at(make):
     support.check_sums(build_layout(make()), np.random.default_rng(0))
 
 
+def test_points_of_long_and_short_tracks_in_tiles_and_out_of_them_are_summed():
+    lengths = np.repeat([3, WRITTEN_OUT, 2 * WRITTEN_OUT], [TILED_POINTS + 5, 300, 200])
+    layout = build_layout(problem_of(lengths, 70, seed=2), pairs=False)
+    shapes = [(tile == TILE, length > WRITTEN_OUT) for _, length, tile in layout.buckets]
+    assert (True, False) in shapes
+    assert (False, True) in shapes
+    assert (False, False) in shapes
+    support.check_sums(layout, np.random.default_rng(0))
+
+
 def test_a_camera_with_thousands_of_observations_is_summed_in_chunks():
     layout = build_layout(problem_of(np.full(5000, 2), 3, seed=2), pairs=False)
     assert layout.camera_levels[0].shape[1] == CAMERA_CHUNK
@@ -243,14 +254,22 @@ def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.nd
 
 
 @settings(max_examples=120, deadline=None)
-@given(st.integers(0, 10**6), st.integers(1, 12), st.integers(1, 25), st.integers(0, 6), st.sampled_from([2, 7, 2048]))
-def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates, batch):
+@given(
+    st.integers(0, 10**6),
+    st.integers(1, 12),
+    st.integers(1, 25),
+    st.integers(0, 6),
+    st.sampled_from([2, 7, 2048]),
+    st.sampled_from([0, pairs.MOST_COUNTED]),
+)
+def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates, batch, counted):
     """Random whole numbers as weights: a pair that is missing, doubled or in the wrong block changes a sum."""
     rng = np.random.default_rng(seed)
     tracks = np.append(1, rng.integers(0, cameras + 1, points))
     problem = problem_of(tracks, cameras, seed, duplicates)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pairs, "PAIR_BATCH", batch)
+        patch.setattr(pairs, "MOST_COUNTED", counted)
         layout = build_layout(problem, grid=False)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))

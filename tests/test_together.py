@@ -49,6 +49,14 @@ def test_a_batch_is_made_as_its_members_are():
         np.testing.assert_allclose(row, jnp.stack(truth), rtol=1e-14, atol=1e-15)
 
 
+def test_derivatives_pass_through_what_is_made_together():
+    pair, scale, mask = given()
+    both = lambda make: lambda pair: sum(jnp.sum(row**2) for row in make(vectors, pair, scale, mask))
+    ours, truth = both(together), both(lambda function, *operands: function(*operands))
+    np.testing.assert_allclose(jax.jit(jax.grad(ours))(pair), jax.grad(truth)(pair), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(jax.jvp(ours, (pair,), (pair,))[1], jax.jvp(truth, (pair,), (pair,))[1], rtol=1e-12)
+
+
 def test_trees_of_vectors_are_taken_as_operands():
     pair, scale, mask = given()
     found = together(
