@@ -24,6 +24,9 @@ conjugate gradient iterations as 4, and up to half of those with 16 (docs/perfor
 MAX_CLUSTERS = 128
 """1280 coarse unknowns at most: factoring them costs as much as two or three products with a system worth that many."""
 
+MOST_DENSE = 1 << 20
+"""Cameras times points up to which one side of the product that counts shared points is dense: in half of the time."""
+
 MAX_PRODUCTS = 2e7
 """Pairs of observations counted to find out which cameras share points; a second's work."""
 
@@ -106,7 +109,8 @@ def shared_points(
     if work > MAX_PRODUCTS:  # a sample of the points says as much
         kept = point % int(-(-work // MAX_PRODUCTS)) == 0
     seen = csr_matrix((np.ones(kept.sum(), np.float32), (camera[kept], point[kept])), shape=(cameras, points))
-    shared = (seen @ seen.T).tocsr()
+    few = cameras * points <= MOST_DENSE
+    shared = csr_matrix(seen @ seen.T.toarray()) if few else (seen @ seen.T).tocsr()
     own = shared.diagonal().astype(float)
     shared.setdiag(0)
     shared.eliminate_zeros()

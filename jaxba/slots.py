@@ -28,6 +28,9 @@ _SHARED = (1 + MAX_PADDING) / (
 CHEAPER = 0.8
 """Factor on the price of a bucket while more than that is empty."""
 
+PRICES = 16
+"""Prices that are tried at once."""
+
 
 class Slots(NamedTuple):
     """Where the observations of a layout are; they are sorted by point."""
@@ -128,21 +131,26 @@ def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
     values, counts = np.unique(tracks[tracks > 0], return_counts=True)
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
-    slots = values[:, None] * (before[1:, None] - before[:-1]).astype(
-        float
-    )  # of a bucket, by its last and first length
-    price = total * _SHARED
+    slots = values[:, None] * (before[1:, None] - before[:-1]).astype(float)  # by the bucket's last and first length
+    prices = total * _SHARED * CHEAPER ** np.arange(PRICES)
+    each = np.arange(PRICES)
     while True:
-        best = np.zeros(len(values) + 1)
-        cut = np.zeros(len(values) + 1, int)
+        best = np.zeros((PRICES, len(values) + 1))
+        filled, cut = (
+            np.zeros_like(best),
+            np.zeros(best.shape, int),
+        )  # the same without prices; where the last one begins
         for end in range(1, len(values) + 1):
-            cost = best[:end] + slots[end - 1, :end]
-            cut[end] = begin = cost.argmin()
-            best[end] = cost[begin] + price
+            cost = best[:, :end] + slots[end - 1, :end]
+            cut[:, end] = begin = cost.argmin(axis=1)
+            best[:, end] = cost[each, begin] + prices
+            filled[:, end] = filled[each, begin] + slots[end - 1, begin]
+        enough = np.flatnonzero(filled[:, -1] <= (1 + _SHARED) * total)
+        if not len(enough):
+            prices *= CHEAPER**PRICES
+            continue
         ends, end = [], len(values)
         while end:
             ends.append(end - 1)
-            end = cut[end]
-        if best[-1] - price * len(ends) <= (1 + _SHARED) * total:
-            return values[ends[::-1]]
-        price *= CHEAPER
+            end = cut[enough[0], end]
+        return values[ends[::-1]]
