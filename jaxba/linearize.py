@@ -79,11 +79,20 @@ def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, "*slots"]:
     return 0.5 * (squared if loss.trivial else loss(squared)[0])
 
 
+@traced_once("loss")
+def observation_costs(
+    layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
+) -> Float[Array, " slots"]:
+    """`slot_costs` at the given parameters; zero in empty slots."""
+    terms = lambda views: [slot_costs(loss, view_residuals(views, views.projected()))]
+    return view_terms(layout, slot_frames(layout, cameras), points, terms)[0]
+
+
 def cost(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Float[Array, ""]:
     """The objective `1/2 sum rho(|Sigma^(-1/2) r|^2)`, pixels squared (design, section 2)."""
-    return total(slot_costs(loss, residuals(layout, slot_frames(layout, cameras), points)[1]))
+    return total(observation_costs(layout, cameras, points, loss))
 
 
 def point_terms(views: Views, loss: Loss) -> list[Array]:

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 
 from jaxba.camera import frames
 from jaxba.layout import Layout
-from jaxba.linearize import residuals, slot_costs, slot_frames
+from jaxba.linearize import observation_costs
 from jaxba.options import StepOptions
 from jaxba.partition import Partition
 from jaxba.refine import Home, refine_points
@@ -78,7 +78,7 @@ class Whole(NamedTuple):
         """See `Parts`."""
         if options.refine_points:
             return _refined(self.layout, cameras, points, home, options, iterations)
-        return points, _costs(self.layout, cameras, points, options)
+        return points, observation_costs(self.layout, cameras, points, options.loss)
 
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
         """See `Parts`."""
@@ -125,7 +125,7 @@ class Clusters(NamedTuple):
         if options.refine_points:
             points, _ = _refined(self.layout, cameras, points, home, options, iterations)
             points = jnp.where(self.partition.separator, home.points, points)
-        return points, _costs(self.layout, cameras, points, options)
+        return points, observation_costs(self.layout, cameras, points, options.loss)
 
     def sums(self, terms: Float[Array, " slots"]) -> Float[Array, " clusters"]:
         """See `Parts`."""
@@ -148,7 +148,3 @@ def _refined(
     layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, iterations: int | Int[Array, ""]
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     return refine_points(layout, frames(cameras), points, options.loss, iterations, home)
-
-
-def _costs(layout: Layout, cameras: Array, points: Array, options: StepOptions) -> Float[Array, " slots"]:
-    return slot_costs(options.loss, residuals(layout, slot_frames(layout, cameras), points)[1])

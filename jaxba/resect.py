@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxba import camera
 from jaxba.layout import Layout
-from jaxba.linearize import linearize, residuals, slot_costs, slot_frames, with_free_lenses
+from jaxba.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.sums import outer_sum, take_rows, tree_sum
 
@@ -57,7 +57,7 @@ def refine_cameras(
         step = -solve_positive(damped, gradient).T
         # on the manifold, in which the Jacobian is written
         moved = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
-        costs = slot_costs(options.loss, residuals(layout, slot_frames(layout, moved), points)[1])
+        costs = observation_costs(layout, moved, points, options.loss)
         upright = moved[6] * cameras[6] >= 0  # as in trial.py
         better = (own_cost(costs) < before) & ~done & upright
         return (jnp.where(better, moved, best), done | better), None
