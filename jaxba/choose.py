@@ -55,9 +55,9 @@ TIED_COPIES = 5
 MAX_BYTES = 4e9
 """A solver that would need more memory than this is not chosen."""
 
-BYTES_PER_OBSERVATION = 1000.0
+BYTES_PER_OBSERVATION = 1100.0
 """Device memory of one implicit step in float64: arguments, results and temporaries. Half of it in float32. A scene of
-Ladybug-1197's size takes 857 (tests/test_memory.py, docs/performance.md)."""
+Ladybug-1197's size takes 1,072 (tests/test_memory.py, docs/performance.md)."""
 
 BYTES_PER_PAIR = 16.0
 """Index and padding; the products themselves are made in batches."""
