@@ -34,6 +34,8 @@ def together(function: Callable[..., list[Array]], *operands: Any) -> list[Array
     def one_loop(*operands: Any) -> list[Array]:
         twice = lambda x: jnp.broadcast_to(jnp.expand_dims(x, -2), (*x.shape[:-1], 2, x.shape[-1]))
         rows = function(*jax.tree.map(twice, operands))
+        if len(rows) == 1:  # a loop of its own anyway, where a sum of one operand would go to a library, and slowly
+            return function(*operands)
         first = lax.broadcasted_iota(jnp.int32, rows[0].shape, 0) == 0
         zeros = [jnp.zeros((), row.dtype) for row in rows]
         add = lambda left, right: [a + b for a, b in zip(left, right, strict=True)]

@@ -96,3 +96,10 @@ def test_what_is_compiled_in_haste_is_traced_anew():
         with in_haste(haste):
             function(1.0)
     assert seen == [False, True]
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
+def test_a_single_vector_is_no_sum():
+    """XLA hands a sum of one operand to a library, with its operand stored for both halves."""
+    text = jax.jit(lambda x: together(lambda x: [x * x + 1], x)).lower(given()[1]).compile().as_text()
+    assert "reduce(" not in text
