@@ -75,8 +75,13 @@ def view_terms(
         return terms(views, *slots)
 
     def of_views(
-        frames: camera.Frames, points: Array, mask: Array, pixels: Array, whitening: Array | None, *slots: Array
-    ):
+        frames: camera.Frames,
+        points: Array,
+        mask: AnyArray,
+        pixels: AnyArray,
+        whitening: AnyArray | None,
+        *slots: Array,
+    ) -> list[Array]:
         return terms(Views(frames, points, mask, pixels, whitening, False), *slots)
 
     return together(of_views, *views[:-1], *slots)
