@@ -139,7 +139,7 @@ def evaluate(
 def _numbers(scores: Scores) -> list[float]:
     """All errors of a trajectory."""
     parts = (scores.absolute, scores.relative.translation, scores.relative.rotation, scores.segments or ())
-    return [scores.scale, *(number for part in parts for number in part)]
+    return [scores.scale, *(float(number) for part in parts for number in part)]
 
 
 def as_json(results: Sequence[Evaluated], side: SideFile) -> dict[str, Any]:
