@@ -23,7 +23,7 @@ from jaxba.bench.sources import sources
 from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.dense import factor_and_solve
 from jaxba.layout import Layout, layout_for
-from jaxba.linearize import cost, linearize
+from jaxba.linearize import cost, linearize, slot_frames
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.refine import refine_points
@@ -125,7 +125,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     yield phase("cost", lambda s: cost(layout, s.cameras, s.points, plain.loss), state)
     count = options.refine_points
     if count:
-        refine = lambda s: refine_points(layout, camera.frames(s.cameras), s.points, plain.loss, count)
+        refine = lambda s: refine_points(layout, slot_frames(layout, s.cameras), s.points, plain.loss, count)
         yield phase(f"refine {count}", refine, state)
     yield phase("whole step", lambda la, s: lm.lm_step(la, s, damping, plain), layout, state)
     if count:

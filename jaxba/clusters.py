@@ -143,7 +143,7 @@ def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray
         into[best[pair]] = pair
         kept, new = np.unique(into, return_inverse=True)
         row, column = new[row], new[column]
-        apart = row != column
-        weight = csr_matrix((weight.data[apart], (row[apart], column[apart])), shape=(len(kept), len(kept)))
+        between = row != column
+        weight = csr_matrix((weight.data[between], (row[between], column[between])), shape=(len(kept), len(kept)))
         size, label = np.bincount(new, size), new[label]
     return np.unique(label, return_inverse=True)[1]

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba import camera
 from jaxba.blocks3 import cholesky3
 from jaxba.eliminate import (
     Coordinates,
@@ -32,13 +31,7 @@ from jaxba.eliminate import (
     largest_gradient,
 )
 from jaxba.layout import Layout
-from jaxba.linearize import (
-    Linearization,
-    linearize,
-    point_terms,
-    residuals,
-    slot_frames,
-)
+from jaxba.linearize import Linearization, linearize, point_terms, slot_frames
 from jaxba.normal import image
 from jaxba.options import StepOptions
 from jaxba.partition import Partition
@@ -48,7 +41,7 @@ from jaxba.schur import Step
 from jaxba.split import solve_clusters
 from jaxba.sums import take, total
 from jaxba.trial import NEGLIGIBLE, best_trial
-from jaxba.views import point_passes
+from jaxba.views import point_passes, view_terms
 
 LOCAL_FACTOR = 4.0
 """Factor on a cluster's own lambda after its step failed."""
@@ -195,13 +188,13 @@ def _separators(
     layout: Layout, cameras: Array, points: Array, damping: Array, partition: Partition, options: StepOptions
 ) -> tuple[Float[Array, "3 points"], Float[Array, ""]]:
     """Every separator after its embedded iterations, or a damped step where there are none; the cost after that."""
-    frames = camera.frames(cameras)
+    frames = slot_frames(layout, cameras)
     one_pass = point_passes(layout, frames)
     terms = lambda views: point_terms(views, options.loss)[:10]
     *entries, before = one_pass(points, terms)
     if options.refine_points:
-        there = residuals(layout, slot_frames(layout, cameras), points)[0]
-        home = Home.of(layout, points, there.inverse_depth)
+        (inverse_depth,) = view_terms(layout, frames, points, lambda views: [views.projected().inverse_depth])
+        home = Home.of(layout, points, inverse_depth)
         refined, costs = refine_points(layout, frames, points, options.loss, options.refine_points, home)
         costs = jnp.where(partition.separator, costs, before)
         return jnp.where(partition.separator, refined, points), total(costs)

@@ -84,11 +84,11 @@ def eliminate_points(
     factor = cholesky3(matrix)
     solved = factor.forward(gradient)
     at_slot = jnp.stack(take_each(list(factor), layout.slot_point))
-    rows = together(
-        lambda entries, over, under: [*Cholesky3(*entries).forward(over), *Cholesky3(*entries).forward(under)],
-        at_slot,
-        *linear.point_jacobian,
-    )
+
+    def projected(factor: Array, jacobian: list[list[Array]]) -> list[Array]:
+        return [entry for row in jacobian for entry in Cholesky3(*factor).forward(row)]
+
+    rows = together(projected, at_slot, linear.point_jacobian)
     return PointSystem(factor, gradient, diagonal, solved, [rows[:3], rows[3:]])
 
 

@@ -25,7 +25,7 @@ from jaxba.padding import Capacity, room_for
 from jaxba.pairs import PairLayout, pair_layout
 from jaxba.partition import Partition, partition_layout
 from jaxba.problem import AnyArray, BundleProblem
-from jaxba.slots import bucket_slots, padded_slots
+from jaxba.slots import Bucket, bucket_slots, padded_slots
 from jaxba.ties import LensTies, lens_ties
 from jaxba.trees import sorted_by, sum_tree, with_spare_row
 
@@ -80,8 +80,8 @@ class Layout:
     lenses: LensTies | None
     """None where every camera has a lens of its own, all of it free."""
 
-    buckets: tuple[tuple[int, int, int], ...] = field(metadata={"static": True})
-    """(tiles, slots per point, points of a tile) of each bucket; none where sizes are padded."""
+    buckets: tuple[Bucket, ...] = field(metadata={"static": True})
+    """Empty where sizes are padded."""
 
     @property
     def num_slots(self) -> int:

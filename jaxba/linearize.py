@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxba import camera
 from jaxba.layout import Layout
@@ -14,7 +14,7 @@ from jaxba.losses import Loss
 from jaxba.options import Intrinsics
 from jaxba.programs import traced_once
 from jaxba.sums import take, total
-from jaxba.views import Views, all_views, view_terms
+from jaxba.views import Views, view_terms
 
 
 class Present(NamedTuple):
@@ -48,29 +48,10 @@ def slot_frames(layout: Layout, cameras: Float[Array, "9 cameras"]) -> camera.Fr
     return camera.frames(cameras).stored().at(layout.slot_camera).stacked()
 
 
-@traced_once()
-def residuals(
-    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"]
-) -> tuple[camera.Projection, list[Array]]:
-    """Projects every slot through its frame (`slot_frames`).
-
-    Returns:
-        The projection, stored, and the whitened residual, pixels, as two vectors over slots; zero in empty slots.
-    """
-    views = all_views(layout, frames, points)
-    projection = views.projected()
-    return projection, view_residuals(views, projection)
-
-
 def view_residuals(views: Views, projection: camera.Projection) -> list[Array]:
     """The whitened residual `Sigma^(-1/2) (predicted - observed)`, pixels; zero where there is no observation."""
     measured = [row.astype(projection.radius.dtype) for row in views.pixels]
     return _whiten(views, [predicted - pixel for predicted, pixel in zip(projection.pixel, measured, strict=True)])
-
-
-def behind(projection: camera.Projection) -> Bool[Array, "*slots"]:
-    """Whether the point lies behind its camera, which looks down -z; false in empty slots."""
-    return projection.inverse_depth > 0
 
 
 def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, "*slots"]:

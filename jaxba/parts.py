@@ -12,9 +12,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.camera import frames
 from jaxba.layout import Layout
-from jaxba.linearize import observation_costs
+from jaxba.linearize import observation_costs, slot_frames
 from jaxba.options import StepOptions
 from jaxba.partition import Partition
 from jaxba.refine import Home, refine_points
@@ -147,4 +146,4 @@ class Clusters(NamedTuple):
 def _refined(
     layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, iterations: int | Int[Array, ""]
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    return refine_points(layout, frames(cameras), points, options.loss, iterations, home)
+    return refine_points(layout, slot_frames(layout, cameras), points, options.loss, iterations, home)

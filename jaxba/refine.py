@@ -87,7 +87,7 @@ def refine_points(
 
     Args:
         layout: slots.
-        frames: of every camera (`camera.frames`).
+        frames: of every slot (`linearize.slot_frames`).
         points: where to start.
         loss: robust loss.
         iterations: steps per point, none or more; each costs one pass over the observations, and so does the end, and

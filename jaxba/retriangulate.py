@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float
 from jaxba import camera, geometry, host
 from jaxba.blocks3 import cholesky3
 from jaxba.layout import Layout, build_layout
-from jaxba.linearize import behind, residuals, slot_costs, slot_frames
+from jaxba.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.lm import initial_state
 from jaxba.losses import Loss
 from jaxba.options import StepOptions
@@ -33,6 +33,7 @@ from jaxba.programs import program, run_alone, stages, way_after
 from jaxba.refine import refine_points
 from jaxba.solve import explain_start
 from jaxba.sums import point_sum
+from jaxba.views import Views, point_passes
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
 """Where to start from besides the midpoint of the rays: multiples of a point's distance from the first camera that sees
@@ -125,21 +126,19 @@ def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 poin
     """`retriangulate` in layout order; `origin` is where the rays start, in scene units."""
     state = initial_state(layout, problem, StepOptions(loss=loss), jnp.float64)
     frames, start = slot_frames(layout, state.cameras), state.points
-    of_cameras = camera.frames(state.cameras)
+    one_pass = point_passes(layout, frames)
 
-    def look(points: Float[Array, "3 points"]) -> tuple[Float[Array, " points"], Float[Array, " points"]]:
-        projection, residual = residuals(layout, frames, points)
-        costs, hidden = point_sum(
-            layout, jnp.stack([slot_costs(loss, residual), behind(projection).astype(points.dtype)])
-        )
-        return costs, hidden
+    def terms(views: Views) -> list[Array]:
+        projection = views.projected()
+        behind = projection.inverse_depth > 0  # a camera looks down -z
+        return [slot_costs(loss, view_residuals(views, projection)), behind.astype(start.dtype)]
 
-    own, hidden = look(start)
+    own, hidden = one_pass(start, terms)
 
     def visit(best: tuple[Array, Array], place: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
         points, costs = best
-        trial, _ = refine_points(layout, of_cameras, place, loss, POINT_ITERATIONS)
-        there, lost = look(trial)
+        trial, _ = refine_points(layout, frames, place, loss, POINT_ITERATIONS)
+        there, lost = one_pass(trial, terms)
         better = (there < costs) & (lost <= hidden)
         return (jnp.where(better, trial, points), jnp.where(better, there, costs)), None
 

@@ -25,6 +25,9 @@ _SHARED = (1 + MAX_PADDING) / (
     1 + (TILE - 1) / TILED_POINTS
 ) - 1  # what is left of it where track lengths share a bucket
 
+Bucket = tuple[int, int, int]
+"""Tiles, slots of a point, points of a tile."""
+
 CHEAPER = 0.8
 """Factor on the price of a bucket while more than that is empty."""
 
@@ -44,8 +47,8 @@ class Slots(NamedTuple):
     members: tuple[Int[np.ndarray, " _"], ...]
     """Problem index of the point of each column, by bucket; padding repeats an index out of range."""
 
-    buckets: tuple[tuple[int, int, int], ...]
-    """(tiles, slots per point, points of a tile) of each bucket; none where points are summed by a tree."""
+    buckets: tuple[Bucket, ...]
+    """Empty where points are summed by a tree."""
 
     levels: tuple[Int[np.ndarray, "_ _"], ...] | None
     """Tree from slots to columns; None where there are buckets."""
@@ -136,10 +139,8 @@ def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
     each = np.arange(PRICES)
     while True:
         best = np.zeros((PRICES, len(values) + 1))
-        filled, cut = (
-            np.zeros_like(best),
-            np.zeros(best.shape, int),
-        )  # the same without prices; where the last one begins
+        filled = np.zeros_like(best)  # the same without prices
+        cut = np.zeros(best.shape, int)  # where the last bucket begins
         for end in range(1, len(values) + 1):
             cost = best[:, :end] + slots[end - 1, :end]
             cut[:, end] = begin = cost.argmin(axis=1)

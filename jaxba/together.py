@@ -22,7 +22,7 @@ work, the half that is zero too, and what is written out takes longer to compile
 
 
 def together(function: Callable[..., list[Array]], *operands: Any) -> list[Array]:
-    """`function(*operands)`, in one loop on a CPU unless `in_haste`; elsewhere XLA does as much by itself.
+    """`function(*operands)`, in one loop on a CPU unless `in_haste`; elsewhere as XLA makes it.
 
     Args:
         function: of arrays whose last axis is the loop's, elementwise in it: it indexes the axes before alone, and
@@ -37,12 +37,14 @@ def together(function: Callable[..., list[Array]], *operands: Any) -> list[Array
         if len(rows) == 1:  # a loop of its own anyway, where a sum of one operand would go to a library, and slowly
             return function(*operands)
         first = lax.broadcasted_iota(jnp.int32, rows[0].shape, 0) == 0
-        zeros = [jnp.zeros((), row.dtype) for row in rows]
-        add = lambda left, right: [a + b for a, b in zip(left, right, strict=True)]
-        return lax.reduce(
-            [jnp.where(first, row, zero) for row, zero in zip(rows, zeros, strict=True)], zeros, add, (0,)
-        )
+        return sum_each([jnp.where(first, row, jnp.zeros_like(row)) for row in rows], 0)
 
     if in_haste.value:
         return function(*operands)
     return lax.platform_dependent(*operands, cpu=one_loop, default=function)
+
+
+def sum_each(rows: list[Array], axis: int) -> list[Array]:
+    """Sums vectors of one shape over an axis, all in one loop."""
+    add = lambda left, right: [a + b for a, b in zip(left, right, strict=True)]
+    return lax.reduce(rows, [jnp.zeros((), row.dtype) for row in rows], add, (axis,))

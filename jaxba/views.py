@@ -1,4 +1,4 @@
-"""Observations with what they need to know, and sums over each point's."""
+"""Observations with what they need to know, what follows from them, and sums of that over each point's."""
 
 from __future__ import annotations
 
@@ -21,33 +21,19 @@ class Views(NamedTuple):
     """Slots with their cameras and points, of any common shape."""
 
     frames: camera.Frames
-    points: Float[Array, "3 ..."] | list[Array]
+    points: Float[Array, "3 ..."]
     mask: Bool[AnyArray, "..."]  # whether there is an observation
     pixels: Float[AnyArray, "2 ..."]
     whitening: Float[AnyArray, "2 2 ..."] | None
-    stored: bool  # whether vectors that several others need are stored; else one loop makes all
 
     def projected(self) -> camera.Projection:
-        """Where the points are seen."""
+        """Where the points are seen; in haste stored, since every vector that needs it has a loop of its own then."""
         projection = camera.project(self.frames, self.points, self.mask)
-        return projection.stacked() if self.stored else projection
+        return projection.stacked() if in_haste.value else projection
 
     def kept(self, rows: list[Array]) -> list[Array]:
-        """The same vectors, which several others need."""
-        return list(materialized(jnp.stack(rows))) if self.stored else rows
-
-
-def all_views(layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"]) -> Views:
-    """All slots in their order; vectors are stored.
-
-    Args:
-        layout: slots.
-        frames: of every slot.
-        points: of the problem.
-    """
-    return Views(
-        frames, jnp.stack(take_each(points, layout.slot_point)), layout.slot_mask, layout.pixels, layout.whitening, True
-    )
+        """The same vectors, which several others need; in haste stored."""
+        return list(materialized(jnp.stack(rows))) if in_haste.value else rows
 
 
 Terms = Callable[..., list[Array]]
@@ -55,36 +41,19 @@ Terms = Callable[..., list[Array]]
 
 
 def view_terms(
-    layout: Layout,
-    frames: camera.Frames,
-    points: Float[Array, "3 points"],
-    terms: Terms,
-    *slots: Array,
+    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], terms: Terms, *slots: Array
 ) -> list[Float[Array, " slots"]]:
     """Vectors over slots that follow from an observation, its camera and its point, made together.
 
     Args:
         layout: slots.
-        frames: of every slot, stored.
+        frames: of every slot, stored (`linearize.slot_frames`).
         points: of the problem.
         terms: what they are.
         slots: what else they follow from.
     """
-    views = all_views(layout, frames, points)
-    if in_haste.value:
-        return terms(views, *slots)
-
-    def of_views(
-        frames: camera.Frames,
-        points: Array,
-        mask: AnyArray,
-        pixels: AnyArray,
-        whitening: AnyArray | None,
-        *slots: Array,
-    ) -> list[Array]:
-        return terms(Views(frames, points, mask, pixels, whitening, False), *slots)
-
-    return together(of_views, *views[:-1], *slots)
+    at_slots = jnp.stack(take_each(points, layout.slot_point))
+    return together(terms, Views(frames, at_slots, layout.slot_mask, layout.pixels, layout.whitening), *slots)
 
 
 def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Float[Array, " points"]]]:
@@ -92,14 +61,13 @@ def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Fl
 
     Args:
         layout: slots.
-        frames: of every camera.
+        frames: of every slot, stored.
 
     Returns:
         A function of points, `Terms`, and any vectors over slots; its result is a vector over points for each term.
     """
-    at_slots = frames.stored().at(layout.slot_camera).stacked()
 
     def one_pass(points: Float[Array, "3 points"], terms: Terms, *slots: Array) -> list[Float[Array, " points"]]:
-        return point_sums(layout, view_terms(layout, at_slots, points, terms, *slots))
+        return point_sums(layout, view_terms(layout, frames, points, terms, *slots))
 
     return one_pass

@@ -159,20 +159,23 @@ def _compile(functions):
 def test_a_failed_compilation_is_told_whoever_was_at_it():
     for count in (1, 2, 5):
         with pytest.raises(RuntimeError, match="no memory left"):
-            _compile([Failing()] * count)
+            _compile([Failing() for _ in range(count)])
 
 
 def test_nothing_more_is_compiled_after_an_error():
     def interrupted():  # not by a signal: who starts tests in the background may have them ignore it
         raise KeyboardInterrupt
 
+    def slow():  # programs are compiled once each, so that these are as many; all that one does is to take its time
+        program = Failing()
+        program.compile = lambda: compiled.append(time.sleep(0.05))
+        return program
+
     compiled = []
-    slow = Failing()
-    slow.compile = lambda: compiled.append(time.sleep(0.05))
     stop = Failing()
     stop.lower = interrupted
     with pytest.raises(KeyboardInterrupt):
-        _compile([*[slow] * 100, stop])
+        _compile([*(slow() for _ in range(100)), stop])
     assert len(compiled) < 50
 
 

@@ -16,8 +16,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from support import bal_file, needs_data, published_loss, same_bits, start, step
 
-from jaxba import BundleProblem, Loss, StepOptions, camera, geometry, read_bal, solve
-from jaxba.linearize import residuals, slot_frames
+from jaxba import BundleProblem, Loss, StepOptions, geometry, read_bal, solve
+from jaxba.linearize import linearize, slot_frames
 from jaxba.refine import FARTHEST, Home, refine_points
 
 pytestmark = pytest.mark.step
@@ -160,9 +160,8 @@ def mirrored(problem: BundleProblem, which: np.ndarray) -> BundleProblem:
 
 @functools.partial(jax.jit, static_argnames=("loss", "iterations"))
 def _at_home(layout, state, points, loss, iterations):
-    frames = slot_frames(layout, state.cameras)
-    home = Home.of(layout, state.points, residuals(layout, frames, state.points)[0].inverse_depth)
-    return refine_points(layout, camera.frames(state.cameras), points, loss, iterations, home)
+    home = Home.of(layout, state.points, linearize(layout, state.cameras, state.points, loss).inverse_depth)
+    return refine_points(layout, slot_frames(layout, state.cameras), points, loss, iterations, home)
 
 
 def test_points_that_a_step_sent_behind_a_camera_start_again_from_home():

@@ -11,9 +11,9 @@ import pytest
 import support
 from support import published_loss, start
 
-from jaxba import BundleProblem, Loss, StepOptions, build_layout, camera, initial_state
+from jaxba import BundleProblem, Loss, StepOptions, build_layout, initial_state
 from jaxba.layout import Layout
-from jaxba.linearize import point_terms
+from jaxba.linearize import point_terms, slot_frames
 from jaxba.padding import capacity_of
 from jaxba.refine import refine_points
 from jaxba.together import in_haste
@@ -44,7 +44,7 @@ def sums(layout: Layout, problem: BundleProblem, loss: Loss, haste: bool, dtype:
 
     def found(layout, problem):
         state = initial_state(layout, problem, StepOptions(loss=loss), jnp.dtype(dtype))
-        one_pass = point_passes(layout, camera.frames(state.cameras))
+        one_pass = point_passes(layout, slot_frames(layout, state.cameras))
         return jnp.stack(one_pass(state.points, lambda views: point_terms(views, loss)))
 
     columns = np.concatenate([np.asarray(members) for members in layout.bucket_points])
@@ -112,7 +112,7 @@ def test_vectors_over_slots_reach_the_slots_they_belong_to():
 
     for haste in (True, False):
         with in_haste(haste):
-            one_pass = point_passes(layout, camera.frames(state.cameras))
+            one_pass = point_passes(layout, slot_frames(layout, state.cameras))
             found = one_pass(state.points, lambda views, number: [number], jnp.asarray(numbers))[0]
         np.testing.assert_array_equal(found, truth)
 
@@ -124,7 +124,7 @@ def test_point_iterations_are_the_same_in_haste(loss):
 
     def found(haste: bool):
         with in_haste(haste):
-            frames = camera.frames(state.cameras)
+            frames = slot_frames(layout, state.cameras)
             return jax.jit(lambda layout, points: refine_points(layout, frames, points, loss, 3))(layout, state.points)
 
     (points, costs), (stored_points, stored_costs) = found(False), found(True)
@@ -138,7 +138,7 @@ def test_many_scenes_at_once_get_what_each_gets_alone():
 
     def found(layout, problem):
         state = initial_state(layout, problem, StepOptions(), jnp.float64)
-        one_pass = point_passes(layout, camera.frames(state.cameras))
+        one_pass = point_passes(layout, slot_frames(layout, state.cameras))
         return jnp.stack(one_pass(state.points, lambda views: point_terms(views, Loss())))
 
     stack = lambda trees: jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
