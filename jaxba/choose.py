@@ -1,6 +1,6 @@
 """Which solver of the reduced camera system is fastest for a problem: a cost model with measured constants.
 
-The constants were fitted on two x86-64 cores, float64 (benchmarks/phases.py measures what they stand for). Only ratios
+The constants were fitted on two x86-64 cores, float64 (`python -m benchmarks.choice --fit`). Only ratios
 matter for the choice, and those move little between machines.
 """
 
@@ -8,42 +8,73 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
-from jaxba.density import has_small_capacitance
-from jaxba.options import REDUCED_SOLVERS, LinearSolver, StepOptions
+from jaxba.density import DENSE_UNKNOWNS, has_small_capacitance, is_dense
+from jaxba.options import REDUCED_SOLVERS, LinearSolver, LinearSolverChoice, StepOptions
 from jaxba.ordering import camera_order, is_banded
 from jaxba.problem import CAMERA_SIZE, BundleProblem, ProblemError
 
-SECONDS_PER_PAIR = 1e-7
-"""Forming the blocks, per pair of observations of one point: 6e-8 on small problems, 1e-7 with 2.5 million pairs."""
 
-SECONDS_PER_BLOCK = 6e-8
-"""One product with the formed blocks, per block."""
+class Work(NamedTuple):
+    """Amounts of work of an iteration by kind, or the seconds that a unit of each takes (`SECONDS`)."""
 
-SECONDS_PER_OBSERVATION = 4e-8
-"""One implicit product, per observation."""
+    step: float = 0.0
+    """One iteration, whatever its size."""
 
-COARSE_SECONDS_PER_OBSERVATION = 2e-7
-"""Forming the coarse system of the two-level preconditioner, per observation."""
+    observation: float = 0.0
+    """What all solvers do beside the linear solve: an observation linearised, eliminated and its cost taken."""
 
-SECONDS_PER_CUBE = 4.5e-12
-"""Dense Cholesky factorisation, per cube of the number of unknowns."""
+    pair: float = 0.0
+    """Forming the blocks: a pair of observations of one point."""
 
-SECONDS_PER_PRODUCT = 1.2e-11
-"""A multiplication and addition in a dense product: 170 GFLOP/s (docs/optimisations.md)."""
+    dense_product: float = 0.0
+    """A multiplication and addition where the system is formed as one dense product (density.py)."""
 
-SECONDS_PER_BAND = 3.3e-11
-"""Band factorisation, per unknown times the square of the band's unknowns."""
+    square: float = 0.0
+    """The square of the unknowns of a dense factorisation: what is written, and what one core does."""
+
+    cube: float = 0.0
+    """The cube of the unknowns of a dense factorisation."""
+
+    band: float = 0.0
+    """Band factorisation: an unknown times the square of the band's unknowns."""
+
+    block: float = 0.0
+    """A product of conjugate gradients with the formed blocks: a block."""
+
+    implicit: float = 0.0
+    """A product without them: an observation."""
+
+    coarse: float = 0.0
+    """Forming the coarse system of the two-level preconditioner: an observation."""
+
+    @property
+    def seconds(self) -> float:
+        """Time that these amounts take."""
+        return sum(amount * each for amount, each in zip(self, SECONDS, strict=True))
+
+
+SECONDS = Work(
+    step=1.8e-4,
+    observation=1.7e-7,
+    pair=2.0e-8,
+    dense_product=2.7e-11,
+    square=4.8e-9,
+    cube=2.7e-12,
+    band=4.2e-11,
+    block=1.1e-7,
+    implicit=1.7e-8,
+    coarse=6.6e-8,
+)
+"""Fitted to steps with three point iterations in float64 on two cores of an x86-64 processor with AVX-512:
+`python -m benchmarks.choice --fit`."""
 
 ASSUMED_PRODUCTS = 12
 """Conjugate gradient iterations assumed for one step with the two-level preconditioner, which takes 6 to 20 on the
 problems at hand."""
-
-SHARED_SECONDS_PER_OBSERVATION = 2e-7
-"""What all solvers do beside the linear solve, per observation: 6.5 ms on bulani1 with its 36 k observations."""
 
 INEXACT_ITERATIONS = 1.2
 """Iterations to convergence that truncated conjugate gradients take, relative to a factorisation: geometric mean over
@@ -51,6 +82,9 @@ bulani1, bulani2, bulani4 and the rules ceres, ceres+refine3 and learned, which 
 
 TIED_COPIES = 5
 """The reduced camera system, its mirror image, the tied one, that scaled, its factor (ties.py, dense.py)."""
+
+DENSE_COPIES = 4
+"""The reduced camera system, its blocks' copy, its mirror image, its factor (blocks.py, dense.py)."""
 
 MAX_BYTES = 4e9
 """A solver that would need more memory than this is not chosen."""
@@ -73,45 +107,66 @@ MAX_COUNTED_CAMERAS = 20_000
 
 
 class SolverCosts(NamedTuple):
-    """Predicted seconds per iteration of what the solvers do not share; infinite where memory would not do."""
+    """Predicted seconds per iteration; infinite where memory would not do."""
 
     explicit: float
     sparse: float
     implicit: float
 
 
-def predict(problem: BundleProblem) -> SolverCosts:
-    """Costs from the numbers of cameras, observations, pairs and co-visible blocks."""
-    counts = count_pairs(problem)
-    unknowns, band = 9.0 * problem.num_cameras, 9.0 * counts.reach
-    forming = counts.pairs * SECONDS_PER_PAIR
-    formed_bytes = counts.pairs * BYTES_PER_PAIR + counts.blocks * BYTES_PER_BLOCK
+def work(problem: BundleProblem, products: float = ASSUMED_PRODUCTS) -> dict[str, Work]:
+    """Work of one iteration with each linear solver that has the memory for it.
+
+    Args:
+        problem: gives the numbers of cameras, observations, pairs and co-visible blocks.
+        products: of conjugate gradients, where they are used.
+    """
+    counts, observations = count_pairs(problem), problem.num_observations
+    every = Work(step=1.0, observation=observations)
+    blocks = _bytes_of_blocks(counts)
+    solvers = {"implicit": every._replace(coarse=observations, implicit=products * observations)}
+    if blocks <= MAX_BYTES:
+        solvers["sparse"] = every._replace(coarse=observations, block=products * counts.blocks, pair=counts.pairs)
+    explicit, needed = _factoring(problem, counts, blocks)
+    if needed <= MAX_BYTES:
+        solvers["explicit"] = explicit._replace(step=1.0, observation=observations)
+    return solvers
+
+
+def _factoring(problem: BundleProblem, counts: PairCounts, blocks: float) -> tuple[Work, float]:
+    """Work of forming and factoring the system, and the bytes that it takes."""
+    unknowns, band, points = 9.0 * problem.num_cameras, 9.0 * counts.reach, _observed_points(problem)
+    if _is_dense(problem):
+        if has_small_capacitance(points + 1, problem.num_cameras):
+            side, inner = 3.0 * (points + 1), unknowns
+        else:
+            side, inner = unknowns, 3.0 * points
+        forming = Work(dense_product=side**2 * inner, square=side**2, cube=side**3)
+        return forming, 3 * 8 * side * inner
+    forming = Work(pair=counts.pairs)
     if is_banded(problem.num_cameras, counts.reach):
-        factoring, factor_bytes = SECONDS_PER_BAND * unknowns * band**2, 3 * 8 * unknowns * band
-    else:
-        factoring, factor_bytes = SECONDS_PER_CUBE * unknowns**3, 4 * 8 * unknowns**2
-    if _few_points_once_each(problem):
-        coordinates = 3.0 * (_observed_points(problem) + 1)
-        forming, factoring = unknowns * coordinates**2 * SECONDS_PER_PRODUCT, SECONDS_PER_CUBE * coordinates**3
-        formed_bytes, factor_bytes = 0.0, 3 * 8 * unknowns * coordinates
-    coarse = COARSE_SECONDS_PER_OBSERVATION * problem.num_observations
-    return SolverCosts(
-        explicit=_within(formed_bytes + factor_bytes, forming + factoring),
-        sparse=_within(formed_bytes, forming + coarse + ASSUMED_PRODUCTS * SECONDS_PER_BLOCK * counts.blocks),
-        implicit=coarse + ASSUMED_PRODUCTS * SECONDS_PER_OBSERVATION * problem.num_observations,
-    )
+        return forming._replace(band=unknowns * band**2), blocks + 3 * 8 * unknowns * band
+    return forming._replace(square=unknowns**2, cube=unknowns**3), blocks + DENSE_COPIES * 8 * unknowns**2
+
+
+def predict(problem: BundleProblem) -> SolverCosts:
+    """Costs of one iteration with each linear solver."""
+    solvers = work(problem)
+    return SolverCosts(*(solvers[name].seconds if name in solvers else np.inf for name in SolverCosts._fields))
 
 
 def _observed_points(problem: BundleProblem) -> int:
     return int(np.count_nonzero(np.bincount(problem.point_index, minlength=1)))
 
 
-def _few_points_once_each(problem: BundleProblem) -> bool:
-    """Whether the explicit solver will factor a matrix of the points' size (`density.is_dense`)."""
-    point, cameras = np.asarray(problem.point_index, np.int64), problem.num_cameras
-    if not has_small_capacitance(_observed_points(problem) + 1, cameras):
+def _is_dense(problem: BundleProblem) -> bool:
+    """Whether the explicit solver will form the system as one dense product, or a matrix of the points' size."""
+    cameras, points = problem.num_cameras, _observed_points(problem)
+    if 9 * cameras > DENSE_UNKNOWNS and not has_small_capacitance(points + 1, cameras):
         return False
-    return len(np.unique(point * cameras + problem.camera_index)) == len(point)
+    order = np.lexsort((problem.camera_index, problem.point_index))
+    tracks = np.bincount(problem.point_index, minlength=1)
+    return is_dense(problem.camera_index[order], problem.point_index[order], tracks, cameras, points + 1)
 
 
 class PairCounts(NamedTuple):
@@ -122,11 +177,17 @@ class PairCounts(NamedTuple):
     reach: int  # in the better order of cameras, the largest distance of two that share a point
 
 
+def num_pairs(problem: BundleProblem) -> int:
+    """Pairs of observations of one point; an observation pairs with itself."""
+    tracks = np.bincount(problem.point_index, minlength=1)
+    return int(np.sum(tracks * (tracks + 1) // 2))
+
+
 def count_pairs(problem: BundleProblem) -> PairCounts:
     """Counts pairs; blocks and reach are exact up to `MAX_COUNTED_PAIRS` pairs, else upper bounds."""
     point, cameras = np.asarray(problem.point_index), problem.num_cameras
     tracks = np.bincount(point, minlength=problem.num_points)
-    pairs = int(np.sum(tracks * (tracks + 1) // 2))
+    pairs = num_pairs(problem)
     if pairs > MAX_COUNTED_PAIRS or cameras > MAX_COUNTED_CAMERAS:
         return PairCounts(pairs, min(pairs, cameras * (cameras + 1) // 2), cameras)
     order = np.argsort(point.astype(np.int64) * cameras + problem.camera_index, kind="stable")
@@ -143,10 +204,10 @@ def count_pairs(problem: BundleProblem) -> PairCounts:
 
 def choose(problem: BundleProblem) -> LinearSolver:
     """The solver with the lowest predicted time to the end; a tie goes to the more exact one."""
-    shared = SHARED_SECONDS_PER_OBSERVATION * problem.num_observations
-    costs = predict(problem)
-    times = {name: shared + seconds for name, seconds in costs._asdict().items()}
-    times = {name: time * (1 if name == "explicit" else INEXACT_ITERATIONS) for name, time in times.items()}
+    times = {
+        name: time if name == "explicit" else INEXACT_ITERATIONS * time
+        for name, time in predict(problem)._asdict().items()
+    }
     return min(times, key=lambda name: times[name])  # type: ignore[return-value]
 
 
@@ -166,35 +227,55 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_so
     if problem.lenses is not None and options.intrinsics == "free":
         wanted = options.linear_solver if linear_solver is None else linear_solver
         if options.linear_solver not in REDUCED_SOLVERS or wanted not in ("auto", "explicit"):
-            refused = wanted if options.linear_solver in REDUCED_SOLVERS else options.linear_solver
+            own = options.linear_solver not in get_args(LinearSolverChoice)
+            refused = (
+                "by this method"
+                if own
+                else wanted
+                if options.linear_solver in REDUCED_SOLVERS
+                else options.linear_solver
+            )
             raise ProblemError(f"shared or partly fixed lenses need plain LM, solved explicitly, not {refused}")
-        if problem.lenses.shared:
-            _check_memory(problem.num_cameras)
+        _check_memory(problem)
         return replace(options, linear_solver="explicit")
     if linear_solver is None or linear_solver == options.linear_solver:
+        if linear_solver == "explicit":
+            _check_memory(problem)
         return options
     if options.linear_solver not in REDUCED_SOLVERS:
         if linear_solver == "auto":
             return options
         raise ValueError(f"linear solver {linear_solver!r} is for plain LM steps; this method has its own")
-    if linear_solver == "auto":
-        linear_solver = choose(problem) if options.intrinsics == "free" else "explicit"
+    if linear_solver == "auto" and options.intrinsics == "free":
+        return replace(options, linear_solver=choose(problem))  # it looks at memory itself
+    linear_solver = "explicit" if linear_solver == "auto" else linear_solver
+    if linear_solver == "explicit":
+        _check_memory(problem)
     return replace(options, linear_solver=linear_solver)
 
 
-def _check_memory(cameras: int) -> None:
-    """Refuses what shared lenses would need more memory for than the machine has: they break bands and blocks."""
-    needed = TIED_COPIES * 8.0 * (CAMERA_SIZE * cameras) ** 2
+def _check_memory(problem: BundleProblem) -> None:
+    """Refuses what takes more memory to factor than the machine has. Shared lenses break bands and blocks."""
     try:
         there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return
+    shared = problem.lenses is not None and problem.lenses.shared
+    copies = TIED_COPIES if shared else DENSE_COPIES
+    needed = copies * 8.0 * (CAMERA_SIZE * problem.num_cameras) ** 2
+    if not shared:
+        most = num_pairs(problem)
+        needed += _bytes_of_blocks(PairCounts(most, min(most, problem.num_cameras**2), 0))
+        if needed > there:  # so it is without counting: there may be a band
+            counts = count_pairs(problem)
+            needed = _factoring(problem, counts, _bytes_of_blocks(counts))[1]
     if needed > there:
+        of, way = (" with shared lenses", "; with fixed intrinsics they may take less") if shared else ("", "")
         raise ProblemError(
-            f"{cameras} cameras with shared lenses take some {needed / 1e9:.0f} GB to solve, more than the "
-            f"{there / 1e9:.0f} GB of this machine; with fixed intrinsics they may take less"
+            f"{problem.num_cameras} cameras{of} take some {needed / 1e9:.0f} GB to "
+            f"solve by a factorisation, more than the {there / 1e9:.0f} GB of this machine{way}"
         )
 
 
-def _within(size: float, seconds: float) -> float:
-    return seconds if size <= MAX_BYTES else float("inf")
+def _bytes_of_blocks(counts: PairCounts) -> float:
+    return counts.pairs * BYTES_PER_PAIR + counts.blocks * BYTES_PER_BLOCK

@@ -42,7 +42,7 @@ MAX_OBSERVATIONS = 1 << 17
 """More slots are not padded: a step takes 0.4 us each (Ladybug-49), so that twenty take a second."""
 
 MAX_PAIRS = 1 << 20
-"""More pairs are not padded: a step takes 0.1 us each (choose.py), so that twenty take two seconds."""
+"""More pairs are not padded: a step took 0.1 us each, so that twenty took two seconds."""
 
 
 @dataclass(frozen=True)

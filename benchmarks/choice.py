@@ -1,0 +1,95 @@
+"""What the cost model of `choose.py` predicts, beside what the linear solvers take.
+
+    python -m benchmarks.choice [PROBLEM ...] [--damping ceres+refine3] [--iterations 8] [--repeats 5] [--fit]
+
+A problem is a file or a random scene (`scene:random-150`); without any, all of `JAXBA_DATA` and two random scenes.
+The loop of so many iterations is one compiled program for every linear solver, timed in turns. `loss` is the time of
+the solver that `auto` takes over that of the fastest. `--fit` prints the constants that fit these times best, given
+the products of conjugate gradients that were counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from scipy.optimize import nnls
+
+import jaxba
+from benchmarks.suite import LARGE_SCENES, real_problems
+from jaxba import host
+from jaxba.bench.sources import sources
+from jaxba.choose import SECONDS, Work, choose, work
+from jaxba.naming import parse_solver
+from jaxba.problem import BundleProblem
+
+
+class Timed(NamedTuple):
+    """One linear solver on one problem."""
+
+    seconds: float  # of an iteration
+    products: float  # of conjugate gradients, an iteration
+
+
+def measure(problem: BundleProblem, damping: str, iterations: int, repeats: int) -> dict[str, Timed]:
+    """Time of an iteration with each linear solver that has the memory, in turns; the first round compiles."""
+    seconds: dict[str, list[float]] = {name: [] for name in work(problem)}
+    products = {}
+    for repeat in range(repeats + 1):
+        for name, times in seconds.items():
+            policy, options = parse_solver(damping).build()
+            end = jaxba.solve(problem, policy, options, linear_solver=name, max_iterations=iterations)
+            products[name] = float(np.sum(end.history.cg_iterations)) / end.iterations
+            if repeat:
+                times.append(end.total_s / end.iterations)
+    return {name: Timed(statistics.median(times), products[name]) for name, times in seconds.items()}
+
+
+def fit(done: list[tuple[Work, float]]) -> Work:
+    """Constants, none negative, with the least sum of squared relative errors."""
+    seconds = np.array([each for _, each in done])
+    unit = np.array(SECONDS)
+    amounts = np.array([amounts for amounts, _ in done]) * unit / seconds[:, None]
+    found, _ = nnls(amounts, np.ones(len(done)))
+    return Work(*(found * unit).tolist())
+
+
+def main() -> None:
+    """Prints a line for every problem, and the fit."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("problem", nargs="*")
+    parser.add_argument("--damping", default="ceres+refine3")
+    parser.add_argument("--iterations", type=int, default=8)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--fit", action="store_true")
+    args = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    host.keep_memory()
+    done, losses = [], []
+    print("problem: solver measured ms (predicted, with the products counted) ...: loss of auto")
+    for source in sources(args.problem or [*real_problems(), *LARGE_SCENES]):
+        problem = source.read()
+        times = measure(problem, args.damping, args.iterations, args.repeats)
+        taken = choose(problem)
+        losses.append(times[taken].seconds / min(time.seconds for time in times.values()))
+        cells = []
+        for name, time in times.items():
+            amounts = work(problem, time.products)[name]
+            done.append((amounts, time.seconds))
+            mark = "*" if name == taken else ""
+            cells.append(f"{mark}{name} {1e3 * time.seconds:.2f} ({1e3 * amounts.seconds:.2f}, {time.products:.1f})")
+        print(f"{source.name}: {'; '.join(cells)}: {losses[-1]:.2f}", flush=True)
+    print(f"loss: geometric mean {np.exp(np.mean(np.log(losses))):.3f}, largest {max(losses):.2f}")
+    if args.fit:
+        for name, each in fit(done)._asdict().items():
+            print(f"{name}: {each:.2e} (stated: {getattr(SECONDS, name):.2e})")
+
+
+if __name__ == "__main__":
+    from jaxba.host import calm_blas
+
+    with calm_blas():
+        main()
