@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -16,6 +15,7 @@ from safetensors import safe_open
 from jaxba.cli.train import run
 from jaxba.damping.learned import load_policy
 from jaxba.game import metrics, play, task
+from jaxba.game.bank import TooFewScenes
 from jaxba.game.config import load
 
 TINY = [
@@ -91,7 +91,7 @@ def error_of(capsys, *argv: str) -> str:
 def test_a_run_leaves_policy_curve_log_and_configuration(finished):
     names = {path.name for path in finished.iterdir()}
     assert names == {
-        *("config.yaml", "bank.npz", "rules.json", "metrics.jsonl", "tensorboard", "checkpoints"),
+        *("config.yaml", "bank.npz", "rules.npz", "metrics.jsonl", "tensorboard", "checkpoints"),
         *("policy.safetensors", "curve.png", "curve.svg"),
     }
     assert load(str(finished / "config.yaml")) == load("fast", TINY)
@@ -157,7 +157,7 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(folder, finished, caps
 def test_an_agent_is_trained_for_the_method_that_is_named(tmp_path):
     out = tmp_path / "run"
     assert run([*COMMAND, "method=stba", "cluster_cameras=2", "chunks=1", "--out", str(out)]) == 0
-    assert json.loads((out / "rules.json").read_text()).keys() == {"stba", "ceres", "virtual best"}
+    assert list(task.build(load(str(out / "config.yaml")), out).rules) == ["stba", "ceres", "virtual best"]
     assert (out / "policy.safetensors").is_file()
 
 
@@ -183,7 +183,7 @@ def test_a_resumed_run_of_other_settings_is_refused(folder, capsys):
 
 def test_a_bank_without_useful_scenes_is_one_line(capsys, tmp_path, monkeypatch):
     def none(*_args, **_kwargs):
-        raise ValueError("only 0 of 9 scenes are of use: draw more")
+        raise TooFewScenes("only 0 of 9 scenes are of use: draw more")
 
     monkeypatch.setattr(task, "make_banks", none)
     assert "draw more" in error_of(capsys, *COMMAND, "--out", str(tmp_path / "run"))

@@ -22,7 +22,7 @@ from jaxba.damping.agent import begin, damping_of, observe
 from jaxba.damping.learned import Layer, Learned
 from jaxba.game.bank import Bank, info_of, initial_costs, reach, sieve
 from jaxba.game.env import POINT_ITERATION_COST, SHAPING_FLOOR, Game, GameConfig
-from jaxba.game.evaluate import compare, evaluate, score
+from jaxba.game.evaluate import evaluate, play_all, score, scores
 from jaxba.game.play import Trajectories, play
 from jaxba.game.protocol import Environment
 from jaxba.game.scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
@@ -532,7 +532,7 @@ def test_an_evaluation_is_the_score_of_playing():
 def test_the_virtual_best_is_no_worse_than_any_of_its_members_on_any_scene():
     bank = tiny_bank()
     policies = {name: (make_policy(name), StepOptions()) for name in ("ceres", "ceres:10", "ceres:1e-9")}
-    found = compare([KIND], [bank], policies, 1e-3, LIMIT)
+    found = scores({}, play_all([KIND], [bank], policies, LIMIT), [bank], 1e-3, LIMIT)
     assert list(found) == [*policies, "virtual best"]
     best = found["virtual best"]
     for name in policies:

@@ -179,9 +179,14 @@ def test_a_file_cut_short_is_refused_in_one_line(tmp_path):
 
 def test_a_large_file_is_refused_in_one_line(tmp_path):
     path = tmp_path / "large.safetensors"
-    save_policy(path, random_policy(0, width=512))
-    assert path.stat().st_size > LARGEST_FILE
+    path.write_bytes(bytes(LARGEST_FILE + 1))
     _refused(path, "larger")
+
+
+def test_a_policy_that_could_not_be_read_again_is_not_written(tmp_path):
+    with pytest.raises(PolicyFileError, match="more than the 1048576 of a policy file"):
+        save_policy(tmp_path / "large.safetensors", random_policy(0, width=512))
+    assert not list(tmp_path.iterdir())
 
 
 def test_every_shipped_policy_can_be_used_and_is_small():

@@ -178,6 +178,21 @@ def test_a_run_may_be_made_longer(whole, tmp_path):
     assert rows(folder) == rows(whole[0])
 
 
+@pytest.mark.parametrize("chunks", [1, 3])
+def test_a_run_made_shorter_ends_with_an_evaluation_of_what_it_has(chunks, tmp_path):
+    """Stopped after `chunks`, between two evaluations, it is told to end there."""
+    asked = iter([False] * (chunks - 1) + [True])
+    assert not run(tmp_path, stop=lambda: next(asked)).finished
+    shorter = dataclasses.replace(CONFIG, chunks=chunks)
+    handed: list[Best] = []
+    found = train.train(shorter, toys.SEEN, evaluate, tmp_path, Hooks(best=handed.append))
+    assert found.finished
+    assert found.best is not None
+    last = evaluate(found.state.learner)["score"]
+    assert found.best.score <= last
+    assert [best.chunk for best in handed] == ([chunks] if found.best.score == last else [])
+
+
 def test_several_agents_follow_each_other_also_after_a_kill(whole, tmp_path):
     config = dataclasses.replace(CONFIG, seeds=2, chunks=4)
     straight, broken = tmp_path / "straight", tmp_path / "broken"
@@ -334,6 +349,10 @@ def test_banks_survive_their_file(tmp_path):
     message = r"^[^\n]*older.npz: written by another version \([^\n]*best_cost[^\n]*\); begin in a new folder$"
     with pytest.raises(TrainError, match=message):
         task.read_banks(tmp_path / "older.npz")
+    for damage in (b"", b"no bank", (tmp_path / "bank.npz").read_bytes()[:-100]):
+        (tmp_path / "damaged.npz").write_bytes(damage)
+        with pytest.raises(TrainError, match=r"^[^\n]*damaged.npz: damaged; begin in a new folder$"):
+            task.read_banks(tmp_path / "damaged.npz")
 
 
 def test_the_log_is_json(whole):

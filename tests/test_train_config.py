@@ -58,6 +58,7 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
     assert (agent.low, agent.high, agent.history) == (-10.0, 2.0, 5)
     assert agent.step_options(StepOptions()) == StepOptions()  # plain LM steps
     assert (found.game.reward, found.game.bonus, found.loop.warmup_steps) == ("duration", 10.0, 500)
+    assert found.game.max_iterations == 100
 
 
 def test_an_empty_file_is_the_defaults_of_the_classes(tmp_path):
@@ -127,6 +128,9 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("envs=[10000000]", "loop.replay_capacity must be at least the 10000000 environments"),
         ("loop.replay_capacity=0", "loop: replay_capacity must be at least 1"),
         ("game.agent.history=30", "game.agent: history must be 1 to 20"),
+        ("loop.replay_capacity=3000000000", "loop: replay_capacity must be at most 2147483647"),
+        ("sac.width=512", "sac.width 512 with sac.layers 2 makes a policy of 1181704 bytes, more than the 1032192"),
+        ("game.agent.first_low=5", "game.agent: first_low must be at most high, 2.0, is 5"),
         ("sac.width=0", "sac.width must be at least 1"),
         ("sac.gamma=1.5", "sac.gamma must lie in (0, 1]"),
         ("sac.learning_rate=0", "sac.learning_rate must be positive"),

@@ -50,6 +50,12 @@ def run_command(
             return main(parsed)
         except (ProblemError, UsageError, PolicyFileError, *names) as error:
             return complain(str(error))
+        except Exception as error:
+            from jaxba.host import out_of_memory
+
+            if not out_of_memory(error):
+                raise
+            return complain("not enough memory")
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -73,7 +79,7 @@ def say(text: str) -> None:
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        _close_pipe()
+        close_pipe()
 
 
 def exit_with(status: int) -> NoReturn:
@@ -81,11 +87,11 @@ def exit_with(status: int) -> NoReturn:
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        _close_pipe()
+        close_pipe()
     sys.exit(status)
 
 
-def _close_pipe() -> None:
+def close_pipe() -> None:
     """Stdout, and what waits in its buffer, goes nowhere."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -134,17 +140,24 @@ def check_writable(option: str, path: str | None) -> None:
     Raises:
         UsageError: the folder is missing or not writable, or the path is a folder or ends as that of one.
     """
-    if path is None:
+    from jaxba.io.files import STREAMS
+
+    if path is None or path.startswith(STREAMS):
         return
-    target = Path(path)
+    target = Path(os.path.realpath(path))  # a link stays: what it points to is written
     if target.is_dir():
         raise UsageError(f"{option} {path}: is a directory")
     if path.endswith(tuple(filter(None, (os.sep, os.altsep)))):
         raise UsageError(f"{option} {path}: is the name of a directory, not of a file")
-    if not target.absolute().parent.is_dir():
-        raise UsageError(f"{option} {path}: folder {target.parent} does not exist")
-    if not os.access(target.absolute().parent, os.W_OK):
-        raise UsageError(f"{option} {path}: folder {target.parent} cannot be written")
+    if os.path.exists(path) and not os.path.isfile(path):  # a pipe or device is written itself
+        if not os.access(path, os.W_OK):
+            raise UsageError(f"{option} {path}: cannot be written")
+        return
+    folder = target.parent if Path(path).is_symlink() else Path(path).parent
+    if not target.parent.is_dir():
+        raise UsageError(f"{option} {path}: folder {folder} does not exist")
+    if not os.access(target.parent, os.W_OK):
+        raise UsageError(f"{option} {path}: folder {folder} cannot be written")
 
 
 def check_folder(option: str, path: str) -> None:

@@ -54,11 +54,10 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 def _train(args: Arguments) -> int:
     import jax
-    from rich.console import Console
 
     from jaxba import host
+    from jaxba.game import bank, task, train
     from jaxba.game import config as configs
-    from jaxba.game import task, train
 
     jax.config.update("jax_enable_x64", True)  # the game counts in float64, the agent's networks in float32
     overrides = tuple(item for group in args.overrides for item in group)
@@ -70,9 +69,7 @@ def _train(args: Arguments) -> int:
     except (configs.SettingsError, train.TrainError) as error:
         raise common.UsageError(str(error)) from None
     common.prepare_process()
-    console = Console(soft_wrap=True, highlight=False)
-    if not console.is_terminal:
-        console = Console(soft_wrap=True, highlight=False, width=FILE_WIDTH)
+    console = _console()
     with host.calm_blas(), Interrupt("chunk", gentle=False) as interrupt, _Progress(console, config) as progress:
         try:
             work = task.build(config, folder, progress.stage)
@@ -81,6 +78,7 @@ def _train(args: Arguments) -> int:
 
             def keep(best: train.Best) -> None:
                 _write_policy(folder, config, work, best)
+                progress.best = best
 
             hooks = train.Hooks(progress.stage, progress.row, keep, lambda: interrupt.asked)
             outcome = train.train(config, work.game, work.evaluate, folder, hooks)
@@ -88,12 +86,28 @@ def _train(args: Arguments) -> int:
         except KeyboardInterrupt:
             console.print(f"interrupted; go on from the last checkpoint with {_again(folder)}")
             return common.INTERRUPTED
-        except ValueError as error:
+        except (train.TrainError, configs.SettingsError, bank.TooFewScenes) as error:
             raise common.UsageError(str(error)) from None
+        except OSError as error:
+            raise common.UsageError(
+                f"{error.filename or folder}: {error.strerror or error}; {_again(folder)}"
+            ) from None
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
             return common.INTERRUPTED
         return _finish(folder, work, outcome.best, console, progress)
+
+
+def _console() -> Any:
+    """Where progress goes; if its reader has gone the training goes on, and brackets in names are no markup."""
+    from rich.console import Console
+
+    class Kept(Console):
+        def on_broken_pipe(self) -> None:
+            common.close_pipe()
+
+    console = Kept(soft_wrap=True, highlight=False, markup=False)
+    return console if console.is_terminal else Kept(soft_wrap=True, highlight=False, markup=False, width=FILE_WIDTH)
 
 
 def _again(folder: Path) -> str:
@@ -161,6 +175,7 @@ class _Progress:
 
         self.console, self.config = console, config
         self.rules: Mapping[str, Any] = {}
+        self.best: Any = None  # the best policy that this process has found
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=20),
@@ -174,7 +189,6 @@ class _Progress:
             disable=not console.is_terminal,
         )
         self._task: Any = None
-        self._best = float("inf")
 
     def __enter__(self) -> _Progress:
         self._bar.start()
@@ -215,7 +229,6 @@ class _Progress:
         rules = [f"{name} {self.rules[name].mean:.2f}" for name in ("ceres", "ceres+embedded") if name in self.rules]
         if rules:
             text += f" ({', '.join(rules)})"
-        if score < self._best:
-            self._best = score
+        if self.best is not None and (self.best.seed, self.best.chunk) == (row["seed"], row["chunk"]):
             text += ", best so far"
         return text

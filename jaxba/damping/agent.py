@@ -132,7 +132,9 @@ class AgentConfig:
             raise ValueError("patience and max_rejections must be at least 1")
         if not 0 <= self.min_gain < 1:
             raise ValueError(f"min_gain must be at least 0 and below 1, is {self.min_gain}")
-        if self.descent <= 0:
+        if not self.first_low <= self.high:
+            raise ValueError(f"first_low must be at most high, {self.high}, is {self.first_low}")
+        if not self.descent > 0:
             raise ValueError(f"descent must be positive, is {self.descent}")
         if not 0 <= self.escalate <= LARGEST_ESCALATION:
             raise ValueError(f"escalate must be 0 to {LARGEST_ESCALATION:g}, is {self.escalate}")

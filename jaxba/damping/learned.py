@@ -101,6 +101,9 @@ def save_policy(path: str | Path, policy: Learned, metadata: dict[str, str] | No
         path: where to; conventionally ends in `.safetensors`.
         policy: what to write.
         metadata: where it comes from, for people.
+
+    Raises:
+        PolicyFileError: it would be too large to be read again.
     """
     from safetensors.numpy import save
 
@@ -109,9 +112,13 @@ def save_policy(path: str | Path, policy: Learned, metadata: dict[str, str] | No
         tensors[f"layer{k}.kernel"] = np.asarray(layer.kernel, np.float32)
         tensors[f"layer{k}.bias"] = np.asarray(layer.bias, np.float32)
     facts = {**(metadata or {}), "format": FORMAT, "agent": json.dumps(asdict(policy.config))}
-    target = Path(path)
+    target, content = Path(path), save(tensors, facts)
+    if len(content) > LARGEST_FILE:
+        raise PolicyFileError(
+            f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy file"
+        )
     part = target.with_name(target.name + ".part")
-    part.write_bytes(save(tensors, facts))
+    part.write_bytes(content)
     part.replace(target)
 
 

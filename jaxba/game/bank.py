@@ -61,7 +61,7 @@ class Bank(NamedTuple):
     initial_cost: Float[Array, " scenes"]
     best_cost: Float[Array, " scenes"]
     info: ProblemInfo  # a field per scene
-    ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule to 1e-3 of the best cost
+    ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule, with the bank's steps, to the game's tolerance
 
 
 def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
@@ -129,6 +129,10 @@ class BankConfig:
             raise ValueError(f"warm_share must be 0 to 1, is {self.warm_share}")
 
 
+class TooFewScenes(ValueError):
+    """Of those drawn. The message is one line for a person."""
+
+
 class Draft(NamedTuple):
     """Scenes of one class with the runs of the portfolio, before sieving."""
 
@@ -147,6 +151,7 @@ def draft(
     rules: Sequence[str] = PORTFOLIO,
     on_rule: Callable[[str], None] = lambda _: None,
     warm_share: float = 0.0,
+    tolerance: float = 1e-3,
 ) -> Draft:
     """Makes scenes and solves them with every rule.
 
@@ -160,6 +165,7 @@ def draft(
         rules: the portfolio.
         on_rule: told when a rule begins.
         warm_share: share of the scenes with a warm start.
+        tolerance: that the first rule's iterations are counted to.
     """
     scenes = make_scenes(kind, key, count, dtype)
     initial = initial_costs(kind, scenes)
@@ -176,7 +182,7 @@ def draft(
         on_rule(rule)
         runs[rule] = play(kind, bank, make_policy(rule), options, PORTFOLIO_ITERATIONS, PORTFOLIO_FTOL)
     best = np.min([run.costs[:, -1] for run in runs.values()], axis=0)
-    to_best = reach(runs[rules[0]].costs, best, 1e-3)
+    to_best = reach(runs[rules[0]].costs, best, tolerance)
     bank = bank._replace(best_cost=jnp.asarray(best), ceres_iterations=jnp.asarray(to_best))
     ratio = np.asarray(initial) / best
     soonest = np.min([reach(run.costs, best, 1e-3) for run in runs.values()], axis=0)
@@ -198,6 +204,7 @@ def make_banks(
     options: StepOptions,
     limit: int,
     on_progress: Callable[[str], None] = lambda _: None,
+    tolerance: float = 1e-3,
 ) -> list[Split]:
     """Draws, solves, sieves and splits the scenes of every class.
 
@@ -207,17 +214,21 @@ def make_banks(
         options: of the portfolio's steps.
         limit: iterations of an episode.
         on_progress: told in words what begins.
+        tolerance: of the game; which scenes are of use does not depend on it.
+
+    Raises:
+        TooFewScenes: none of a class would be left to train on.
     """
     splits = []
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
         where = f"{kind.cameras} cameras x {kind.points} points"
         say = lambda rule, where=where, count=count: on_progress(f"{count} scenes of {where}: {rule}")
         own = jax.random.fold_in(key, number)
-        made = draft(kind, own, count, options, limit, config.dtype, PORTFOLIO, say, config.warm_share)
+        made = draft(kind, own, count, options, limit, config.dtype, PORTFOLIO, say, config.warm_share, tolerance)
         rows = np.flatnonzero(made.useful)
         held = max(1, round(HELD_OUT * len(rows)))
         if len(rows) <= held:
-            raise ValueError(f"only {len(rows)} of {count} scenes of {where} are of use: draw more")
+            raise TooFewScenes(f"only {len(rows)} of {count} scenes of {where} are of use: draw more")
         splits.append(Split(sieve(made.bank, rows[held:]), sieve(made.bank, rows[:held])))
     return splits
 

@@ -7,13 +7,15 @@ to that folder, so that there is one copy.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from jaxba.damping.agent import EffortMode
+from jaxba.damping.agent import AgentConfig, EffortMode
+from jaxba.damping.learned import LARGEST_FILE
 from jaxba.game import settings
 from jaxba.game.bank import BankConfig
 from jaxba.game.env import GameConfig
@@ -22,6 +24,9 @@ from jaxba.game.sac import SacConfig
 from jaxba.game.settings import SettingsError
 from jaxba.methods import DEFAULT_METHOD, MethodName, make_method
 from jaxba.options import StepOptions
+
+METADATA_BYTES = 1 << 14
+"""Left for what a policy file says about itself: the configuration in 3 kB."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +97,7 @@ class TrainConfig:
         if self.bank.dtype not in ("float64", "float32"):
             raise ValueError(f"bank.dtype must be float64 or float32, not {self.bank.dtype!r}")
         _check_agent(self.sac)
+        _check_size(self.sac, self.game.agent)
         _check_effort(self.game.agent.effort, self.method, self.step_options)
         if self.game.shaping and self.game.discount != self.sac.gamma:
             raise ValueError(f"game.discount must be sac.gamma, {self.sac.gamma}, where there is shaping")
@@ -123,6 +129,17 @@ def _check_agent(sac: SacConfig) -> None:
         raise ValueError(f"sac.log_std_min must be negative, not {sac.log_std_min}")
     if sac.max_grad_norm is not None and not sac.max_grad_norm > 0:
         raise ValueError(f"sac.max_grad_norm must be positive or null, not {sac.max_grad_norm}")
+
+
+def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
+    """A policy that is too large for its file would be noticed when all is trained."""
+    sizes = [agent.observation_size, *[sac.width] * sac.layers, 2 * agent.action_size]
+    numbers = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
+    if 4 * numbers > LARGEST_FILE - METADATA_BYTES:
+        raise ValueError(
+            f"sac.width {sac.width} with sac.layers {sac.layers} makes a policy of {4 * numbers} bytes, "
+            f"more than the {LARGEST_FILE - METADATA_BYTES} of a policy file"
+        )
 
 
 def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:

@@ -71,30 +71,39 @@ def evaluate(
     return score(runs, [np.asarray(bank.best_cost) for bank in banks], tolerance, limit)
 
 
-def compare(
+Runs = list[Trajectories]
+"""Of one policy, on each bank."""
+
+
+def play_all(
     kinds: Sequence[SceneClass],
     banks: Sequence[Bank],
     policies: Mapping[str, tuple[DampingPolicy, StepOptions]],
-    tolerance: float = 1e-3,
     limit: int = 40,
-) -> dict[str, Score]:
-    """The score of every policy, and under `virtual best` that of the best one of each scene.
-
-    Best costs are the lowest that the bank knew or any of the policies found.
-    """
-    runs = {
+) -> dict[str, Runs]:
+    """What every policy does on every scene, by the policy's name."""
+    return {
         name: [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
         for name, (policy, options) in policies.items()
     }
+
+
+def scores(
+    policies: Mapping[str, Runs], rules: Mapping[str, Runs], banks: Sequence[Bank], tolerance: float, limit: int
+) -> dict[str, Score]:
+    """The score of all policies and rules, and under `virtual best` that of the best rule of each scene.
+
+    Best costs are the lowest that the bank knew or any of all these runs found, the same for all.
+    """
+    runs = {**policies, **rules}
     best = [
         np.min([np.asarray(bank.best_cost), *(run[k].costs[:, -1] for run in runs.values())], axis=0)
         for k, bank in enumerate(banks)
     ]
-    scores = {name: score(run, best, tolerance, limit) for name, run in runs.items()}
     lowest = []
     for k in range(len(banks)):
-        together = [run[k] for run in runs.values()]
+        together = [run[k] for run in rules.values()]
         pick = lambda name, choose, together=together: choose([getattr(run, name) for run in together], axis=0)
         ended = np.min([np.where(run.converged, run.iterations, limit) for run in together], axis=0)
         lowest.append(Trajectories(pick("costs", np.min), together[0].dampings, ended, pick("converged", np.any)))
-    return {**scores, "virtual best": score(lowest, best, tolerance, limit)}
+    return {name: score(run, best, tolerance, limit) for name, run in {**runs, "virtual best": lowest}.items()}

@@ -26,6 +26,10 @@ TRACES: collections.Counter[str] = collections.Counter()
 """How often each compiled function was traced in this process; a test holds it at one per configuration."""
 
 
+LARGEST_COUNT = 2**31 - 1
+"""Programs count in 32 bits."""
+
+
 @dataclass(frozen=True)
 class LoopConfig:
     """Sizes of the training loop. Hashable: it is static in compiled programs."""
@@ -48,6 +52,8 @@ class LoopConfig:
         for name in ("replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
+            if getattr(self, name) > LARGEST_COUNT:
+                raise ValueError(f"{name} must be at most {LARGEST_COUNT}, not {getattr(self, name)}")
 
 
 class LoopState(NamedTuple):

@@ -44,7 +44,7 @@ def beam_search(
         step: one LM iteration from a state with a lambda; pure.
         start: first state.
         iterations: linear solves in a row.
-        width: states kept after each.
+        width: states kept after each, those of equal cost last: they are mostly one state under two lambdas.
         grid: lambdas.
     """
     pairs = [(state, damping) for state in range(width) for damping in range(len(grid))]

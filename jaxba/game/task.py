@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import typing
-from collections.abc import Callable, Mapping, Sequence
+import zipfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +21,15 @@ from jaxba.game import checkpoint
 from jaxba.game.bank import Bank, Split, make_banks
 from jaxba.game.config import TrainConfig
 from jaxba.game.env import Game, make_game
-from jaxba.game.evaluate import Score, compare, evaluate
+from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
+from jaxba.game.play import Trajectories
 from jaxba.game.sac import Learner
 from jaxba.game.train import TrainError
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.options import StepOptions
 
 BANK = "bank.npz"
-RULES = "rules.json"
+RULES = "rules.npz"
 
 YARDSTICKS = ("ceres", "classic", "gtsam", "gauss-newton", "schedule")
 """Rules that a run is measured against, with plain LM steps."""
@@ -51,8 +54,13 @@ class Task:
     held_out: tuple[Bank, ...]
     """Scenes that training never sees, a bank per class."""
 
-    rules: dict[str, Score]
-    """Yardsticks on the held-out scenes, `virtual best` among them."""
+    rule_runs: dict[str, Runs]
+    """What the yardsticks did on the held-out scenes."""
+
+    @cached_property
+    def rules(self) -> dict[str, Score]:
+        """Scores of the yardsticks, `virtual best` among them."""
+        return self._scores({})
 
     def policy(self, actor: Any) -> Learned:
         """The policy of an actor's parameters."""
@@ -73,9 +81,13 @@ class Task:
         return {"score": numbers.pop("mean"), **numbers}
 
     def compare(self, actor: Any) -> dict[str, Score]:
-        """A trained policy beside the yardsticks; the virtual best is that of the rules."""
-        with_policy = _compare(self.config, self.held_out, {LEARNED: (self.policy(actor), self.game.options)})
-        return {LEARNED: with_policy[LEARNED], **self.rules}
+        """A trained policy beside the yardsticks, by the best costs of all; the virtual best is that of the rules."""
+        learned = {LEARNED: (self.policy(actor), self.game.options)}
+        return self._scores(_play(self.config, self.held_out, learned))
+
+    def _scores(self, more: Mapping[str, Runs]) -> dict[str, Score]:
+        game = self.config.game
+        return scores(more, self.rule_runs, self.held_out, game.tolerance, game.max_iterations)
 
 
 def build(
@@ -93,7 +105,8 @@ def build(
         yardsticks: rules to measure against where that has not been done yet; `YARDSTICKS` if None.
 
     Raises:
-        ValueError: too few scenes are of use. One line for a person.
+        ValueError: too few scenes are of use, or another version wrote what is there. One line for a person.
+        OSError: the folder cannot be written, or not read.
     """
     path = folder / BANK
     if path.is_file():
@@ -101,7 +114,9 @@ def build(
         splits = read_banks(path)
     else:
         key = jax.random.key(config.seed)
-        splits = make_banks(config.bank, key, config.bank.options, config.game.max_iterations, say)
+        splits = make_banks(
+            config.bank, key, config.bank.options, config.game.max_iterations, say, config.game.tolerance
+        )
         _write_banks(path, splits)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
@@ -116,9 +131,9 @@ def _rules(
     path: Path,
     say: Callable[[str], None],
     yardsticks: Sequence[str],
-) -> dict[str, Score]:
+) -> dict[str, Runs]:
     if path.is_file():
-        return {name: Score(**numbers) for name, numbers in json.loads(path.read_text(encoding="utf-8")).items()}
+        return _read_runs(path)
     say("hand-written rules on the held-out scenes")
     plain = config.step_options
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
@@ -127,23 +142,26 @@ def _rules(
     embedded = replace(game.options, camera_damping=plain.camera_damping)
     if embedded != plain:
         policies[yardsticks[0] + EMBEDDED] = make_policy(yardsticks[0]), embedded
-    scores = _compare(config, held_out, policies)
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps({name: score._asdict() for name, score in scores.items()}, indent=1), encoding="utf-8")
-    part.replace(path)
-    return scores
+    runs = _play(config, held_out, policies)
+    fields = lambda name, number, run: {f"{name}/{number}/{field}": x for field, x in run._asdict().items()}
+    together = [fields(name, k, run) for name, own in runs.items() for k, run in enumerate(own)]
+    _write(path, {name: x for arrays in together for name, x in arrays.items()})  # in the order of the table
+    return runs
 
 
-def _compare(
+def _play(
     config: TrainConfig, held_out: tuple[Bank, ...], policies: Mapping[str, tuple[DampingPolicy, StepOptions]]
-) -> dict[str, Score]:
-    return compare(config.bank.classes, held_out, policies, config.game.tolerance, config.game.max_iterations)
+) -> dict[str, Runs]:
+    return play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
 
 
 def _write_banks(path: Path, splits: list[Split]) -> None:
+    _write(path, {name.replace(".", "/"): x for name, x in checkpoint.pack(splits).items()})
+
+
+def _write(path: Path, arrays: dict[str, Any]) -> None:
     part = path.with_suffix(".part")
     with part.open("wb") as file:
-        arrays: dict[str, Any] = {name.replace(".", "/"): x for name, x in checkpoint.pack(splits).items()}
         np.savez(file, **arrays)
     part.replace(path)
 
@@ -152,20 +170,38 @@ def read_banks(path: Path) -> list[Split]:
     """The scenes of a run's folder.
 
     Raises:
-        TrainError: another version wrote them.
+        TrainError: another version wrote them, or the file is damaged.
     """
-    with np.load(path) as file:
+    with _opened(path) as file:
         classes = sorted({int(name.split("/")[0]) for name in file.files})
-        try:
-            return [_named_tuple(Split, f"{number}/", file) for number in classes]
-        except KeyError as error:
-            raise TrainError(f"{path}: written by another version ({error.args[0]}); begin in a new folder") from None
+        return [_named_tuple(Split, f"{number}/", file) for number in classes]
 
 
-def _named_tuple(kind: Any, prefix: str, arrays: Mapping[str, np.ndarray]) -> Any:
+def _read_runs(path: Path) -> dict[str, Runs]:
+    with _opened(path) as file:
+        found: dict[str, Runs] = {}
+        for rule, number in dict.fromkeys(tuple(name.split("/")[:2]) for name in file.files):
+            found.setdefault(rule, []).append(_named_tuple(Trajectories, f"{rule}/{number}/", file, np.asarray))
+        return found
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with path.open("rb") as stream, np.load(stream) as file:
+            yield file
+    except KeyError as error:
+        raise TrainError(f"{path}: written by another version ({error.args[0]}); begin in a new folder") from None
+    except (zipfile.BadZipFile, ValueError, EOFError):
+        raise TrainError(f"{path}: damaged; begin in a new folder") from None
+
+
+def _named_tuple(
+    kind: Any, prefix: str, arrays: Mapping[str, np.ndarray], make: Callable[[Any], Any] = jnp.asarray
+) -> Any:
     """Puts nested named tuples together again, by the types of their fields."""
     values = {}
     for name, inner in typing.get_type_hints(kind).items():
         nested = isinstance(inner, type) and hasattr(inner, "_fields")
-        values[name] = _named_tuple(inner, f"{prefix}{name}/", arrays) if nested else jnp.asarray(arrays[prefix + name])
+        values[name] = _named_tuple(inner, f"{prefix}{name}/", arrays, make) if nested else make(arrays[prefix + name])
     return kind(**values)

@@ -149,6 +149,7 @@ class _Run:
         self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
         self.folder = folder / CHECKPOINTS
         self.seed, self.chunk, self.wall_s, size = 0, 0, 0.0, 0
+        self.evaluated = 0  # chunk of the agent after which it was evaluated last
         self.best: Best | None = None
         like = jax.eval_shape(lambda: start(config.sac, config.loop, env, self._key()))
         found = checkpoint.steps(self.folder)
@@ -182,6 +183,7 @@ class _Run:
             raise TrainError(f"the last checkpoint does not fit: {error}") from None
         self.state = whole["state"]
         self.seed, self.chunk, self.wall_s = facts["seed"], facts["chunk"], facts["wall_s"]
+        self.evaluated = facts.get("evaluated", 0)
         if facts["best"] is not None:
             self.best = Best(whole["best"], **facts["best"])
         return facts["log_size"]
@@ -194,6 +196,7 @@ class _Run:
             "seed": self.seed,
             "chunk": self.chunk,
             "wall_s": self.wall_s,
+            "evaluated": self.evaluated,
             "log_size": self.log.size,
             "best": None if self.best is None else {k: getattr(self.best, k) for k in ("score", "seed", "chunk")},
         }
@@ -209,9 +212,12 @@ class _Run:
                     self._save()
                 if stopping:
                     return Outcome(False, self.best, self.state)
+            if self.evaluated != self.chunk:  # it was to end later when it was begun
+                self.hooks.stage("evaluating the last policy")
+                self._evaluate()
             if self.seed + 1 >= config.seeds:
                 return Outcome(True, self.best, self.state)
-            self.seed, self.chunk = self.seed + 1, 0
+            self.seed, self.chunk, self.evaluated = self.seed + 1, 0, 0
             self._begin()
 
     def _advance(self) -> None:
@@ -231,11 +237,16 @@ class _Run:
         row |= {"updates_per_s": (row["updates"] - updates) / seconds, "cpu_per_wall": cpu / seconds, **means}
         if self.chunk % self.config.evaluate_every == 0 or self.chunk == self.config.chunks:
             wall = time.perf_counter()
-            scores = {name: float(value) for name, value in self.evaluate(self.state.learner).items()}
-            row |= {f"held_out/{name}": value for name, value in scores.items()}
+            row |= {f"held_out/{name}": value for name, value in self._evaluate().items()}
             row["evaluate_s"] = time.perf_counter() - wall
-            if self.best is None or scores["score"] < self.best.score:
-                actor = jax.tree.map(jnp.copy, self.state.learner.actor)  # the next chunk uses the state's memory up
-                self.best = Best(actor, scores["score"], self.seed, self.chunk)
-                self.hooks.best(self.best)
         self.hooks.row(self.log.write(row))
+
+    def _evaluate(self) -> dict[str, float]:
+        """Scores of the policy as it is; it is kept if it is better than all before."""
+        scores = {name: float(value) for name, value in self.evaluate(self.state.learner).items()}
+        self.evaluated = self.chunk
+        if self.best is None or scores["score"] < self.best.score:
+            actor = jax.tree.map(jnp.copy, self.state.learner.actor)  # the next chunk uses the state's memory up
+            self.best = Best(actor, scores["score"], self.seed, self.chunk)
+            self.hooks.best(self.best)
+        return scores

@@ -132,7 +132,7 @@ def game(config: PaperConfig, agent: Agent, settings: TrainConfig, train_on: Ban
 def _shared(config: PaperConfig, folder: Path, say: Callable[[str], None]) -> Split:
     """The run's one bank, made for the first who asks."""
     shared = folder / SCENES
-    if not (shared / task.BANK).is_file():
+    if not all((shared / name).is_file() for name in (task.BANK, task.RULES)):
         shared.mkdir(parents=True, exist_ok=True)
         task.build(train_config(config, OURS, 0), shared, say, YARDSTICKS)
     return task.read_banks(shared / task.BANK)[0]
