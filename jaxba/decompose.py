@@ -140,7 +140,7 @@ def decomposed_round(
         moved,
         jnp.minimum(after, cost),
         end.predicted,
-        end.gained / end.predicted,
+        jnp.where(end.predicted > 0, end.gained / end.predicted, 0),  # no cluster's matrix could be factored
         end.slope,
         end.curvature,
         end.gradient_max,

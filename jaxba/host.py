@@ -54,6 +54,13 @@ def keep_memory() -> bool:
     return all(mallopt(parameter, value) == 1 for parameter, value in settings)
 
 
+def out_of_memory(error: Exception) -> bool:
+    """Whether Python, NumPy or XLA, on a CPU or a GPU, could not get memory."""
+    return isinstance(error, MemoryError) or (
+        type(error).__name__ in ("JaxRuntimeError", "XlaRuntimeError") and "RESOURCE_EXHAUSTED" in str(error)
+    )
+
+
 def release_programs(share: float | None = None) -> bool:
     """Drops JAX's compiled programs if they come near what Linux lets a process map.
 

@@ -218,6 +218,11 @@ def layout_for(problem: BundleProblem, options: StepOptions, capacity: Capacity 
     )
 
 
+def turns(layout: Layout) -> int:
+    """Different steps that one state and lambda lead to: as many as there are partitions, which take turns."""
+    return 1 if layout.partitions is None else layout.partitions.label.shape[0]
+
+
 def partition_of(layout: Layout) -> Partition:
     """The partitions of a layout that has them."""
     if layout.partitions is None:

@@ -19,7 +19,7 @@ from jaxba.layout import Layout, partition_of
 from jaxba.linearize import Present, cost, linearize, with_free_lenses
 from jaxba.options import StepOptions
 from jaxba.parts import Whole
-from jaxba.problem import BundleProblem
+from jaxba.problem import AnyArray, BundleProblem
 from jaxba.schur import Step, solve_step
 from jaxba.trial import Trial, best_trial
 
@@ -143,6 +143,7 @@ def judge(
         trial,
         moved,
         damping,
+        layout.camera_seen,
         gradient_max=step.gradient_max,
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
@@ -174,6 +175,7 @@ def _round(
         found,
         [found.cameras - state.cameras, found.points - state.points],
         damping,
+        layout.camera_seen,
         gradient_max=found.gradient_max,
         cg_iterations=jnp.zeros((), jnp.int32),
         forcing=jnp.zeros_like(state.cost),
@@ -184,11 +186,17 @@ def _round(
 
 
 def _verdict(
-    state: LMState, found: Trial | Round, moved: list[Array], damping: Float[Array, ""], **facts: Array
+    state: LMState,
+    found: Trial | Round,
+    moved: list[Array],
+    damping: Float[Array, ""],
+    seen: Bool[AnyArray, " cameras"],
+    **facts: Array,
 ) -> tuple[LMState, StepInfo]:
     """The state after a candidate was accepted or not, and the record of it.
 
-    `moved` is the step that was tried; `facts` are the fields of `StepInfo` that are not set here.
+    `moved` is the step that was tried, `seen` are the cameras that take part; `facts` are the fields of
+    `StepInfo` that are not set here.
     """
     choose = lambda new, old: jnp.where(found.accepted, new, old)
     after = LMState(*(choose(*pair) for pair in zip(found[:3], state, strict=True)))
@@ -201,6 +209,6 @@ def _verdict(
         accepted=found.accepted,
         damping=damping,
         step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in moved)),
-        parameter_norm=jnp.sqrt(jnp.sum(state.cameras**2) + jnp.sum(state.points**2)),
+        parameter_norm=jnp.sqrt(jnp.sum(jnp.where(seen, state.cameras, 0) ** 2) + jnp.sum(state.points**2)),
         **facts,
     )

@@ -11,7 +11,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
-from jaxba.layout import Layout
+from jaxba.layout import Layout, turns
 from jaxba.linearize import linearize, with_free_lenses
 from jaxba.lm import LMState, StepInfo, lm_step
 from jaxba.options import StepOptions
@@ -44,7 +44,7 @@ class Carry(NamedTuple):
     termination: Int[Array, ""]
 
 
-def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: int) -> ProblemInfo:
+def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: Any) -> ProblemInfo:
     """What a policy may know before the first iteration."""
     unit = jnp.ones_like(state.cost)
     if options.scaling == "identity":
@@ -77,24 +77,34 @@ def after_step(
     iteration: Int[Array, ""],
     tolerances: Tolerances,
     max_iterations: Any,
+    turns: Any = 1,
 ) -> tuple[Any, Float[Array, ""], Int[Array, ""]]:
-    """The policy's answer to a step, and the stop rules: its next state, the next lambda, a `Termination`."""
+    """The policy's answer to a step, and the stop rules: its next state, the next lambda, a `Termination`.
+
+    `turns` is `layout.turns`: with several, the next step is another one though nothing has changed.
+    """
     after, damping = policy.propose(policy_state, step)
     # the same state and lambda after a rejection: the policy would ask for the same step for ever
     same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (policy_state, after)), strict=True)]
-    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping)
+    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping) & (jnp.asarray(turns) == 1)
     return after, damping, termination_of(step, stuck, iteration, tolerances, max_iterations)
 
 
 def advance(
-    carry: Carry, state: Any, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
+    carry: Carry,
+    state: Any,
+    step: StepInfo,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    max_iterations: Any,
+    turns: Any,
 ) -> Carry:
     """Everything of an iteration that follows the step.
 
     The parameters are handed on and not looked at; None leaves them out.
     """
     iteration = carry.iteration + 1
-    policy_state, damping, end = after_step(policy, carry.policy, step, iteration, tolerances, max_iterations)
+    policy_state, damping, end = after_step(policy, carry.policy, step, iteration, tolerances, max_iterations, turns)
     return Carry(state, policy_state, damping, iteration, end)
 
 
@@ -119,13 +129,24 @@ def solve_loop(
     tolerances: Tolerances,
     options: StepOptions,
     max_iterations: int,
+    limit: Int[Array, ""] | None = None,
 ) -> tuple[Carry, History]:
     """The loop as one program; vmappable over layouts and states of equal shape.
+
+    Args:
+        layout: the problem's observations.
+        state: start.
+        policy: chooses lambda.
+        tolerances: convergence tests.
+        options: static.
+        max_iterations: length of the histories, static.
+        limit: of linear solves, if it is a lower one.
 
     Returns:
         Final carry, and histories of length `max_iterations`, zero past the last iteration.
     """
-    carry = begin(problem_info(layout, state, options, max_iterations), policy, state)
+    most = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
+    carry = begin(problem_info(layout, state, options, most), policy, state)
 
     def step_of(c: Carry) -> tuple[LMState, StepInfo]:
         effort = effort_of(policy, c.policy)
@@ -138,6 +159,6 @@ def solve_loop(
         carry, history = loop
         state, step = step_of(carry)
         history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, history_of(step))
-        return advance(carry, state, step, policy, tolerances, max_iterations), history
+        return advance(carry, state, step, policy, tolerances, most, turns(layout)), history
 
     return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))

@@ -39,7 +39,8 @@ def _cauchy(s: Array) -> tuple[Array, Array]:
 
 def _tukey(s: Array) -> tuple[Array, Array]:
     rest = jnp.maximum(1 - s, 0)
-    return (1 - rest**3) / 3, rest**2
+    value = (1 - rest**3) / 3
+    return jnp.where(jnp.isfinite(s), value, s), rest**2  # what is no number is no outlier: it would spoil the step
 
 
 _SHAPES: dict[str, Callable[[Array], tuple[Array, Array]]] = {
@@ -68,8 +69,8 @@ class Loss:
     def __post_init__(self) -> None:
         if self.name not in _SHAPES:
             raise ValueError(f"unknown loss {self.name!r}; known: {', '.join(NAMES)}")
-        if not self.scale > 0:
-            raise ValueError(f"the scale of a loss must be positive, not {self.scale}")
+        if not (self.scale > 0 and 0 < self.scale * self.scale < float("inf")):
+            raise ValueError(f"the scale of a loss must be positive, and its square a finite number, not {self.scale}")
 
     @property
     def trivial(self) -> bool:

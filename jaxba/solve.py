@@ -26,7 +26,7 @@ from jaxba.lm import LMState, initial_state
 from jaxba.loop import Carry, History, solve_loop
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES, fitting_policy
-from jaxba.options import StepOptions
+from jaxba.options import REDUCED_SOLVERS, StepOptions
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.programs import Compilation, Part, Stage, options_of, program, run_alone, stages
@@ -36,6 +36,10 @@ from jaxba.transform import far_middle, shift
 
 MAX_ITERATIONS = 100
 """Iterations after which a solve has failed. Source: the paper."""
+
+
+LEAST_ROOM = 128
+"""Least iterations that a compiled loop keeps records of: one program for all lower limits. Else powers of two."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +162,10 @@ def solve(
     options = choose_linear_solver(problem, options, linear_solver)
     tolerances = tolerances or Tolerances()
     if dtype == "mixed":
+        if options.linear_solver not in REDUCED_SOLVERS:
+            raise ProblemError(
+                f"mixed types are for plain LM solved by {', '.join(REDUCED_SOLVERS)}; others have float64 or float32"
+            )
         options, dtype = replace(options, algebra="mixed"), "float64"
     with jax.enable_x64(dtype == "float64"), host.calm_blas():
         started = time.perf_counter()
@@ -237,7 +245,10 @@ def _run_compiled(
     """The loop as one optimised program; returns what `run_stepwise` does."""
     started = time.perf_counter()
     with CompileClock() as clock:
-        carry, history = jax.block_until_ready(solve_loop(layout, state, policy, tolerances, options, max_iterations))
+        room = max(LEAST_ROOM, 1 << (max_iterations - 1).bit_length())
+        limit = jnp.asarray(max_iterations, jnp.int32)
+        whole = solve_loop(layout, state, policy, tolerances, options, room, limit)
+        carry, history = jax.block_until_ready(whole)
     return carry, history, 0, clock.seconds, time.perf_counter() - started - clock.seconds
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, decides_effort, effort_of
-from jaxba.layout import Layout
+from jaxba.layout import Layout, turns
 from jaxba.lm import LMState, StepInfo, judge, lm_step, propose
 from jaxba.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.options import StepOptions
@@ -67,7 +67,7 @@ class _Loop(NamedTuple):
             given = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
             state, step = call(part("round", lm_step), *given)
         limit = jnp.asarray(self.max_iterations, jnp.int32)
-        own = (carry._replace(state=None), step, self.policy, self.tolerances, limit)
+        own = (carry._replace(state=None), step, self.policy, self.tolerances, limit, jnp.asarray(turns(self.layout)))
         carry, facts = call(program(_advance_and_tell, way="quick"), *own)
         return carry._replace(state=state), step, facts
 
@@ -144,10 +144,10 @@ def run_stepwise(
 
 
 def _advance_and_tell(
-    carry: Carry, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any
+    carry: Carry, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any, turns: Any
 ) -> tuple[Carry, Float[Array, " facts"]]:
     """`advance` without the parameters, and for the host the step and the end, as one array: one transfer, not 15."""
-    after = advance(carry, None, step, policy, tolerances, max_iterations)
+    after = advance(carry, None, step, policy, tolerances, max_iterations, turns)
     return after, jnp.stack([x.astype(step.cost.dtype) for x in (*step, after.termination)])
 
 

@@ -259,6 +259,30 @@ def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(tmp
     ]
 
 
+def test_a_bad_file_that_was_mended_is_done_in_the_same_folder(tmp_path, undrawn, capsys):
+    good, bad, folder = tmp_path / "good.txt", tmp_path / "bad.txt", tmp_path / "run"
+    write_bal(support.tiny(), good)
+    bad.write_bytes(good.read_bytes()[:500])
+    bench(folder, str(bad), str(good), *BRIEF)
+    bad.write_bytes(good.read_bytes())
+    assert bench(folder, str(bad), str(good), *BRIEF) == 0
+    assert sorted({line["problem"] for line in lines(folder)}) == ["bad", "good"]
+
+
+def test_what_a_solver_has_no_memory_for_is_reported_and_others_are_done(tmp_path, undrawn, capsys, monkeypatch):
+    def greedy(problem, source, solver, *arguments):
+        if str(solver) == "classic":
+            raise MemoryError
+        return solve(problem, source, solver, *arguments)
+
+    solve = bench_run.run_solver
+    monkeypatch.setattr(bench_run, "run_solver", greedy)
+    write_bal(support.tiny(), tmp_path / "good.txt")
+    status = bench(tmp_path / "run", str(tmp_path / "good.txt"), *BRIEF)
+    check_one_line(status, capsys.readouterr().err, "good, classic: not enough memory")
+    assert [line["solver"] for line in lines(tmp_path / "run")] == ["ceres"]
+
+
 def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undrawn, capsys):
     path = tmp_path / "seq[red]:cat:.txt"
     write_bal(support.tiny(), path)

@@ -277,6 +277,30 @@ def test_a_name_that_stdout_cannot_encode_is_printed_escaped(tmp_path, monkeypat
     assert "b\\xfcro.txt: 6 cameras" in stdout.read()
 
 
+def test_outputs_may_be_devices_and_streams(tiny, capfd):
+    assert run([str(tiny), "--max-iterations", "1", "--output", "/dev/null", "--log", "/dev/stdout"]) == 0
+    assert '"problem"' in capfd.readouterr().out
+
+
+def test_a_link_into_a_missing_folder_is_refused_before_the_solve(tiny, tmp_path, capsys):
+    link = tmp_path / "link.txt"
+    link.symlink_to(tmp_path / "missing" / "out.txt")
+    assert run([str(tiny), "--output", str(link)]) == 2
+    captured = capsys.readouterr()
+    assert "missing does not exist" in captured.err
+    assert captured.err.count("\n") == 1
+    assert not captured.out
+
+
+def test_not_enough_memory_is_one_line(tiny, capsys, monkeypatch):
+    def solve(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(sys.modules["jaxba.solve"], "solve", solve)
+    assert run([str(tiny)]) == 2
+    assert capsys.readouterr().err == "error: not enough memory\n"
+
+
 def test_a_log_goes_where_a_link_points_and_into_a_pipe(tiny, tmp_path):
     target, link, pipe = tmp_path / "log.json", tmp_path / "link.json", tmp_path / "pipe"
     link.symlink_to(target)

@@ -70,15 +70,22 @@ def test_single_precision_stays_single(name):
     assert np.isfinite(value).all()
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_no_number_costs_no_number(name):
+    """A point in a camera's plane would else be an outlier like others, and its infinite derivatives spoil the step."""
+    value, _ = Loss(name)(jnp.asarray([jnp.inf, jnp.nan]))
+    assert not np.isfinite(value).any()
+
+
 def test_an_unknown_loss_is_one_line_that_lists_the_known_ones():
     with pytest.raises(ValueError, match="unknown loss 'hubert'; known: squared, huber") as caught:
         Loss("hubert")
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan"), float("inf"), 1e-200, 1e200])
 def test_a_scale_that_is_not_positive_is_refused(scale):
-    with pytest.raises(ValueError, match="must be positive"):
+    with pytest.raises(ValueError, match="the scale of a loss must be positive"):
         Loss("huber", scale)
 
 

@@ -286,6 +286,21 @@ def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
     assert small
 
 
+def test_clusters_of_ddlm_that_cannot_be_factored_have_no_gain_while_separators_move(monkeypatch):
+    """A gain of 0 / 0 would become the next lambda."""
+    from jaxba import decompose
+
+    options = replace(DECOMPOSED, refine_points=3)
+    layout, state = start(support.tiny(), options)
+    monkeypatch.setattr(decompose, "solve_clusters", lambda *arguments: jnp.full_like(arguments[4], jnp.nan))
+    part = partition_of(layout).at(0)
+    found = jax.jit(lambda state: decomposed_round(layout, *state, jnp.asarray(1e-3), part, options, 0.0))(state)
+    assert found.accepted
+    assert found.cost < state.cost
+    assert found.gain == 0
+    assert found.predicted == 0
+
+
 @pytest.mark.slow
 def test_a_cluster_of_ddlm_that_cannot_be_factored_leaves_the_others_alone(monkeypatch):
     """Also that of camera 0, which owns the empty slots that padding reads."""

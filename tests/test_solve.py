@@ -143,6 +143,17 @@ def test_the_step_becomes_short():
     assert (solution.history.step_norm[:-1] > 1e-4 * size * (1 - 1e-3)).all()
 
 
+def test_another_limit_compiles_nothing_and_is_kept_to():
+    whole = solve(support.tiny(), "ceres")
+    programs = solve_loop._cache_size()
+    for limit in (1, 3, 128):
+        found = solve(support.tiny(), "ceres", max_iterations=limit)
+        assert found.iterations == len(found.history.cost) == min(limit, whole.iterations)
+        np.testing.assert_array_equal(found.history.cost, whole.history.cost[:limit])
+        assert (found.termination == Termination.MAX_ITERATIONS) == (limit < whole.iterations)
+    assert solve_loop._cache_size() == programs
+
+
 def test_the_gradient_vanishes_at_an_exact_optimum():
     """A noise-free scene started at its truth."""
     _, truth = random_scene_with_truth(replace(like("tiny"), noise=0.0), 0)
@@ -151,6 +162,27 @@ def test_the_gradient_vanishes_at_an_exact_optimum():
     assert solution.termination == Termination.GRADIENT
     assert solution.iterations == 1
     assert solution.history.gradient_max[0] <= 1e-6
+
+
+@pytest.mark.parametrize("cluster_cameras", [2, 100])
+def test_a_rejected_step_is_repeated_where_clusters_take_turns(cluster_cameras):
+    """With the same lambda the next clustering makes another step; a single cluster makes the same one for ever."""
+    options = StepOptions(linear_solver="clustered", cluster_cameras=cluster_cameras)
+    solution = stepwise(support.tiny(), "constant:1e30", options=options, max_iterations=5)
+    assert solution.accepted == 0
+    expected = (5, Termination.MAX_ITERATIONS) if cluster_cameras == 2 else (1, Termination.STALLED)
+    assert (solution.iterations, solution.termination) == expected
+
+
+def test_cameras_that_nobody_looks_through_make_no_step_short():
+    """`xtol` is relative to the size of what is optimised."""
+    problem = support.tiny()
+    idle = np.array([[0, 0, 0, 1e12, 0, 0, 500, 0, 0.0]])
+    more = problem.replace(cameras=np.concatenate([problem.cameras, idle]))
+    plain, found = stepwise(problem), stepwise(more)
+    np.testing.assert_allclose(found.history.cost, plain.history.cost, rtol=1e-9)
+    assert found.termination == plain.termination
+    np.testing.assert_array_equal(found.problem.cameras[-1], idle[0])
 
 
 def test_a_noise_free_scene_is_solved_to_zero():
@@ -423,6 +455,8 @@ def test_the_automatic_choice_of_the_linear_solver_is_told():
         ({"max_iterations": 0}, "max_iterations must be at least 1"),
         ({"damping": "cerse"}, "unknown damping policy"),
         ({"linear_solver": "dense"}, "linear_solver must be one of"),
+        ({"linear_solver": "power", "dtype": "mixed"}, "mixed types are for plain LM"),
+        ({"method": "stba", "dtype": "mixed"}, "mixed types are for plain LM"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(change, message, unchecked):

@@ -19,6 +19,7 @@ from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.bench.summary import write_text
 from jaxba.damping.registry import SUFFIX
+from jaxba.host import out_of_memory
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 from jaxba.peers import require
@@ -225,7 +226,8 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> lis
     """Makes the folder, or finds what an earlier run left there: of each run one record.
 
     Raises:
-        ProblemError: the folder holds runs with other settings, or of other problems or policies under the same names.
+        ProblemError: the folder holds runs with other settings, or results of other problems or policies under the
+            same names.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
@@ -234,6 +236,9 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> lis
     places |= {job.solver.policy: job.solver.policy for job in jobs if job.solver.policy.endswith(SUFFIX)}
     files = {name: digest for name, place in places.items() if (digest := _digest(Path(place)))}
     mine: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}, "files": files}
+    done = _results(folder / RESULTS)
+    tried = {record.problem for record in done}
+    used = lambda name: name in tried or (name.endswith(SUFFIX) and any(name in record.solver for record in done))
     if path.exists():
         try:
             before = json.loads(path.read_text())
@@ -242,16 +247,19 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> lis
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
         other = [key for key, value in asdict(settings).items() if before.get(key) != value]
-        other += [name for name, place in mine["problems"].items() if known.get(name, place) != place]
-        other += [name for name, digest in files.items() if known_files.get(name, digest) != digest]
+        other += [name for name, place in mine["problems"].items() if used(name) and known.get(name, place) != place]
+        other += [name for name, digest in files.items() if used(name) and known_files.get(name, digest) != digest]
         if other:
             raise ProblemError(f"{folder} holds a run with another {other[0]}; give another --out, or remove it")
         mine["problems"] = {**known, **mine["problems"]}
         mine["files"] = {**known_files, **files}
     write_text(path, json.dumps(mine, indent=1) + "\n")
-    results = folder / RESULTS
+    return done
+
+
+def _results(path: Path) -> list[Record]:
     first: dict[tuple[str, str, int], Record] = {}
-    for record in read_records(results) if results.exists() else []:
+    for record in read_records(path) if path.exists() else []:
         first.setdefault((record.problem, record.solver, record.repeat), record)  # two processes may have done the same
     return list(first.values())
 
@@ -303,6 +311,11 @@ def execute(
             record = run_solver(problem, job.source, job.solver, job.repeat, settings, on_iteration)
         except ProblemError as error:  # what this solver cannot do, others may
             on_error(job, ProblemError(f"{job.source.name}, {job.solver}: {error}"))
+            continue
+        except Exception as error:
+            if not out_of_memory(error):
+                raise
+            on_error(job, ProblemError(f"{job.source.name}, {job.solver}: not enough memory"))
             continue
         append_record(folder / RESULTS, record)
         yield record

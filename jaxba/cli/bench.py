@@ -48,10 +48,10 @@ class Arguments:
     """Runs of each solver on each problem; times are medians. Default 3."""
 
     max_iterations: int | None = None
-    """Linear solves after which a solver has failed. Default 100."""
+    """Linear solves at most; the tables count more than 100 as a failure. Default 100."""
 
     linear_solver: LinearSolverChoice = "auto"
-    """For all solvers."""
+    """For solvers of plain LM; other methods have their own."""
 
     out: str = "runs/bench"
     """Folder of the results. A second run into the same folder does only what is missing."""

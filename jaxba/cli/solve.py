@@ -128,7 +128,12 @@ def _solve(args: Arguments) -> int:
     if args.intrinsics == "fixed" and (args.method != DEFAULT_METHOD or args.linear_solver not in ("auto", "explicit")):
         raise common.UsageError("--intrinsics fixed needs --method lm and the explicit linear solver")
     from jaxba.io import check_output
+    from jaxba.losses import Loss
 
+    try:
+        loss = Loss(args.loss, args.loss_scale)
+    except ValueError as error:
+        raise common.UsageError(f"--loss-scale: {error}") from None
     model = _output_model(args)
     if model is None:
         common.check_writable("--output", args.output)
@@ -147,7 +152,6 @@ def _solve(args: Arguments) -> int:
     from jaxba.data.places import resolve
     from jaxba.io import read_problem, write_colmap, write_problem
     from jaxba.io.files import open_output
-    from jaxba.losses import Loss
     from jaxba.naming import SolverName
     from jaxba.retriangulate import Retriangulation
     from jaxba.solve import solve
@@ -168,7 +172,7 @@ def _solve(args: Arguments) -> int:
         rotation=args.rotation,
         preconditioner=args.preconditioner,
         intrinsics=args.intrinsics,
-        loss=Loss(args.loss, args.loss_scale),
+        loss=loss,
     )
     common.say(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
     steps: list[IterationRecord] = []

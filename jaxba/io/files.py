@@ -24,7 +24,9 @@ BLOCK_BYTES = 1 << 22
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError)
 """What reading and decompressing a file raises when the file, not this program, is at fault."""
 
-_STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")  # links to files where a shell redirects them
+STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")
+"""Names of open streams; links to files where a shell redirects them."""
+
 _MAGIC = {".bz2": b"BZh", ".gz": b"\x1f\x8b", ".xz": b"\xfd7zXZ\0"}
 
 
@@ -86,7 +88,7 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
     try:
         target = os.path.realpath(path)
         special = os.path.exists(target) and not stat.S_ISREG(os.stat(target).st_mode)
-        if special or os.fspath(path).startswith(_STREAMS):
+        if special or os.fspath(path).startswith(STREAMS):
             with open(path, "wb") as file, _compressor(file, path) as stream:
                 yield stream
             return
