@@ -12,7 +12,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from jaxba.density import DENSE_UNKNOWNS, has_small_capacitance, is_dense
+from jaxba.density import has_dense_shape, has_small_capacitance
 from jaxba.options import REDUCED_SOLVERS, LinearSolver, LinearSolverChoice, StepOptions
 from jaxba.ordering import camera_order, is_banded
 from jaxba.problem import CAMERA_SIZE, BundleProblem, ProblemError
@@ -161,12 +161,11 @@ def _observed_points(problem: BundleProblem) -> int:
 
 def _is_dense(problem: BundleProblem) -> bool:
     """Whether the explicit solver will form the system as one dense product, or a matrix of the points' size."""
-    cameras, points = problem.num_cameras, _observed_points(problem)
-    if 9 * cameras > DENSE_UNKNOWNS and not has_small_capacitance(points + 1, cameras):
+    tracks, cameras = np.bincount(problem.point_index, minlength=1), problem.num_cameras
+    if not has_dense_shape(tracks, cameras, _observed_points(problem) + 1):
         return False
-    order = np.lexsort((problem.camera_index, problem.point_index))
-    tracks = np.bincount(problem.point_index, minlength=1)
-    return is_dense(problem.camera_index[order], problem.point_index[order], tracks, cameras, points + 1)
+    views = np.asarray(problem.point_index, np.int64) * cameras + problem.camera_index
+    return len(np.unique(views)) == len(views)
 
 
 class PairCounts(NamedTuple):

@@ -27,6 +27,19 @@ def has_small_capacitance(columns: int, cameras: int) -> bool:
     return 3 * columns <= DENSE_UNKNOWNS and has_few_points(columns, cameras)
 
 
+def has_dense_shape(tracks: np.ndarray, cameras: int, columns: int) -> bool:
+    """`is_dense`, as far as lengths of tracks tell it: if no camera sees a point twice.
+
+    Args:
+        tracks: observations of each point.
+        cameras: number of cameras.
+        columns: points in layout order, padding included.
+    """
+    pairs = float(np.sum(tracks * (tracks + 1.0)) / 2)
+    dense = 9 * cameras <= DENSE_UNKNOWNS and pairs > DENSE_SHARE * np.count_nonzero(tracks) * cameras**2
+    return bool(dense or has_small_capacitance(columns, cameras))
+
+
 def is_dense(camera: np.ndarray, point: np.ndarray, tracks: np.ndarray, cameras: int, columns: int) -> bool:
     """Whether one dense product is cheaper than chosen pairs.
 
@@ -40,9 +53,6 @@ def is_dense(camera: np.ndarray, point: np.ndarray, tracks: np.ndarray, cameras:
         cameras: number of cameras.
         columns: points in layout order, padding included.
     """
-    twice = (camera[1:] == camera[:-1]) & (point[1:] == point[:-1])
-    if twice.any():
+    if not has_dense_shape(tracks, cameras, columns):
         return False
-    pairs = float(np.sum(tracks * (tracks + 1.0)) / 2)
-    dense = 9 * cameras <= DENSE_UNKNOWNS and pairs > DENSE_SHARE * np.count_nonzero(tracks) * cameras**2
-    return bool(dense or has_small_capacitance(columns, cameras))
+    return not np.any((camera[1:] == camera[:-1]) & (point[1:] == point[:-1]))
