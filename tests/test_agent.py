@@ -27,6 +27,7 @@ from jaxba.damping.agent import (
     observe,
     record,
 )
+from jaxba.game.env import _rule_damping
 
 _begin = jax.jit(begin, static_argnums=0)
 _observe = jax.jit(observe, static_argnums=0)
@@ -168,6 +169,19 @@ def test_in_charge_the_guard_is_ceres_rule(steps):
         if damping < lowest:
             return
         np.testing.assert_allclose(decades(config, memory, 0.9), np.log10(damping), atol=1e-6)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.booleans(), st.floats(1e-3, 1.5)), min_size=1, max_size=20))
+def test_what_is_demonstrated_is_ceres_rule_after_any_steps(steps):
+    memory = _begin(FREE, info())
+    state, damping = Ceres().init(info())
+    for accepted, gain in steps:
+        np.testing.assert_allclose(float(_rule_damping(FREE, memory)), np.log10(damping), atol=1e-6)
+        gain = gain if accepted else -gain
+        step = step_info(accepted, gain, damping, cost=1.0, previous_cost=1.5 if accepted else 1.0, candidate_cost=2.0)
+        state, damping = Ceres().propose(state, step)
+        memory = _record(FREE, memory, step)
 
 
 @pytest.mark.parametrize(

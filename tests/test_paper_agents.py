@@ -9,7 +9,7 @@ from support import paper
 
 from jaxba import StepOptions, solve
 from jaxba.game import settings
-from jaxba.game.bank import BankConfig, Split, make_banks
+from jaxba.game.bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, make_banks
 from jaxba.game.scenes import SceneClass
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
@@ -55,6 +55,21 @@ def split() -> Split:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jaxba.game.bank.PORTFOLIO", ("ceres",))
         return make_banks(made, jax.random.key(0), made.options, 40)[0]
+
+
+def test_held_out_scenes_are_no_scenes_to_train_on(split):
+    train, held_out = (set(map(bytes, np.asarray(bank.scenes.pixels))) for bank in split)
+    assert len(train) == len(split.train.initial_cost)
+    assert len(held_out) == len(split.held_out.initial_cost) == round((len(train) + len(held_out)) / 10)
+    assert not train & held_out
+
+
+def test_scenes_of_use_are_neither_solved_at_the_start_nor_out_of_reach(split):
+    for bank in split:
+        ratio = np.asarray(bank.initial_cost) / np.asarray(bank.best_cost)
+        assert (ratio > MIN_RATIO).all()
+        assert (ratio < MAX_RATIO).all()
+        assert (np.asarray(bank.ceres_iterations) <= EASY_ENOUGH).all()  # the portfolio is that rule alone
 
 
 def test_the_tables_scenes_are_no_agents(split, monkeypatch, tmp_path):

@@ -223,7 +223,7 @@ def make_banks(
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
         where = f"{kind.cameras} cameras x {kind.points} points"
         say = lambda rule, where=where, count=count: on_progress(f"{count} scenes of {where}: {rule}")
-        own = jax.random.fold_in(key, number)
+        own = jax.random.fold_in(key, number and MORE_CLASSES + number)
         made = draft(kind, own, count, options, limit, config.dtype, PORTFOLIO, say, config.warm_share, tolerance)
         rows = np.flatnonzero(made.useful)
         held = max(1, round(HELD_OUT * len(rows)))
@@ -232,6 +232,9 @@ def make_banks(
         splits.append(Split(sieve(made.bank, rows[held:]), sieve(made.bank, rows[:held])))
     return splits
 
+
+MORE_CLASSES = 2**30
+"""Offset of the random streams of all classes but the first from those of the agents, which begin at 1 (train.py)."""
 
 HELD_OUT = 0.1
 """Share of the useful scenes that training never sees."""

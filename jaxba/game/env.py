@@ -243,7 +243,8 @@ class Game:
         return rules.scale * reward
 
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
-        """Uniform actions on half of the environments; on the others Ceres' rule, with random boldness.
+        """Uniform actions on half of the environments; on the others Ceres' rule, on half of those two decades
+        bolder.
 
         What else there is in an action is uniform on all of them.
         """
