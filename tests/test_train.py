@@ -246,6 +246,14 @@ def test_a_run_that_never_came_to_anything_is_no_obstacle(tmp_path):
     assert load(str(tmp_path / "run" / train.CONFIG)).seed == 1
 
 
+@pytest.mark.parametrize("name", ["[x]", "a*", "what?"])
+def test_a_folder_whose_checkpoints_could_not_be_read_again_is_refused(name, tmp_path):
+    """Orbax takes the path for a pattern when it joins what it has written, and finds nothing."""
+    with pytest.raises(TrainError, match=r"^[^\n]*checkpoints cannot be kept where a name holds"):
+        prepare_folder(tmp_path / name / "run", CONFIG, False)
+    assert not list(tmp_path.iterdir())
+
+
 def test_nothing_to_resume(tmp_path):
     with pytest.raises(TrainError, match="holds no run to resume"):
         prepare_folder(tmp_path / "none", None, True)

@@ -7,6 +7,7 @@ cuts the log there and repeats what followed, with the same numbers.
 
 from __future__ import annotations
 
+import glob
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -80,10 +81,13 @@ def prepare_folder(
         overrides: `key=value` of a resumed run.
 
     Raises:
-        TrainError: there is a run where a new one should be, or none to resume, or another one.
+        TrainError: there is a run where a new one should be, or none to resume, or another one; or the folder's name
+            is one with which checkpoints could not be read again.
         SettingsError: the folder's configuration cannot be read.
     """
     path = folder / CONFIG
+    if glob.escape(place := str(folder.absolute())) != place:  # Orbax would look for parts of checkpoints elsewhere
+        raise TrainError(f"{folder}: checkpoints cannot be kept where a name holds one of * ? [")
     if path.is_file() and not resume and _others(folder):
         raise TrainError(f"{folder} holds a run already; --resume goes on with it, --out names another folder")
     if resume:
