@@ -1,6 +1,6 @@
 """What the cost model of `choose.py` predicts, beside what the linear solvers take.
 
-    python -m benchmarks.choice [PROBLEM ...] [--damping ceres+refine3] [--iterations 8] [--repeats 5] [--fit]
+    python -m benchmarks.choice [PROBLEM ...] [--damping ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
 
 A problem is a file or a random scene (`scene:random-150`); without any, all of `JAXBA_DATA` and two random scenes.
 The loop of so many iterations is one compiled program for every linear solver, timed in turns. `loss` is the time of
@@ -62,7 +62,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("problem", nargs="*")
     parser.add_argument("--damping", default="ceres+refine3")
-    parser.add_argument("--iterations", type=int, default=8)
+    parser.add_argument("--iterations", type=int, default=6)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--fit", action="store_true")
     args = parser.parse_args()

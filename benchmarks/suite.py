@@ -1,7 +1,7 @@
 """Speed of jaxba beside its peers, in one run.
 
-    python -m benchmarks.suite [--only iteration,scenes,cold,tolerance,large] [--solvers ...] [--repeats 3] [--gate]
-        [--update-baseline]
+    python -m benchmarks.suite [--only iteration,scenes,cold,tolerance,large,layout] [--solvers ...] [--repeats 3]
+        [--gate] [--update-baseline]
 
 Real problems come from the folder `JAXBA_DATA`; the C++ Ceres peer from `JAXBA_CERES` (benchmarks/README.md). What is
 missing is left out, and said. Ratios are compared with benchmarks/baseline.json by `--gate`.
@@ -63,6 +63,9 @@ LEAST_SOLVES = 5
 LARGE_SCENES = ("scene:random-150", "scene:ladybug-1197")
 """Random scenes larger than the real problems at hand; the second has the counts of a BAL file."""
 
+SMALL_SCENES = ("scene:tiny", "scene:paper")
+"""Scenes in which the fixed cost of a layout shows."""
+
 LARGE_ITERATIONS = 30
 """Limit of Ceres' iterations on them. Under its rule our step took 17 to f*(1 + 1e-3) (docs/game.md)."""
 
@@ -119,6 +122,16 @@ def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
                 yield Metric(f"{label}/ceres {mode}", theirs[mode], "s", "lower")
         best = min(theirs.values())
         yield Metric(f"{label}/jaxba over ceres", ours / best, "ratio", "lower", GATE_TOLERANCE, target=0.5)
+
+
+def layout_times(repeats: int) -> Iterator[Metric]:
+    """Layout over an iteration on every real problem, and on the smallest built-in scenes."""
+    from jaxba.bench.sources import sources
+
+    for source in sources([*real_problems(), *SMALL_SCENES]):
+        problem = source.read()
+        ours, host = _our_iteration(problem, repeats)[0], _layout_seconds(problem, repeats)
+        yield Metric(f"layout/{source.name}, over an iteration", host / ours, "ratio", "lower", GATE_TOLERANCE, 1.0)
 
 
 def _modes(problem: BundleProblem) -> list[str]:
@@ -274,7 +287,11 @@ def cold_start() -> Iterator[Metric]:
 def main() -> int:
     """Runs the parts asked for; status 1 when the gate finds a regression."""
     parser = argparse.ArgumentParser(description="Speed of jaxba beside its peers.")
-    parser.add_argument("--only", default="iteration,scenes,cold,tolerance,large", help="comma-separated parts")
+    parser.add_argument(
+        "--only",
+        default="iteration,scenes,cold,tolerance,large",
+        help="comma-separated parts; layout, on all problems, only if named",
+    )
     parser.add_argument("--solvers", default=",".join(TOLERANCE_SOLVERS), help="of the parts tolerance and large")
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--gate", action="store_true", help="fail when a ratio is worse than the baseline")
@@ -288,6 +305,7 @@ def main() -> int:
     solvers = args.solvers.split(",")
     parts = {
         "iteration": lambda: iteration_times(args.repeats, threads()),
+        "layout": lambda: layout_times(args.repeats),
         "scenes": lambda: scene_throughput(args.repeats),
         "cold": cold_start,
         "tolerance": lambda: time_to_tolerance("tolerance", real_problems(), solvers, 100, args.repeats, threads()),

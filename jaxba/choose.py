@@ -224,16 +224,10 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_so
         ProblemError: cameras share a lens, or some of it stays, and it is not the explicit solver that was asked for.
     """
     if problem.lenses is not None and options.intrinsics == "free":
-        wanted = options.linear_solver if linear_solver is None else linear_solver
-        if options.linear_solver not in REDUCED_SOLVERS or wanted not in ("auto", "explicit"):
-            own = options.linear_solver not in get_args(LinearSolverChoice)
-            refused = (
-                "by this method"
-                if own
-                else wanted
-                if options.linear_solver in REDUCED_SOLVERS
-                else options.linear_solver
-            )
+        own = linear_solver is None or options.linear_solver not in REDUCED_SOLVERS
+        asked = options.linear_solver if own else linear_solver
+        if asked not in ("auto", "explicit"):
+            refused = asked if asked in get_args(LinearSolverChoice) else "by this method"
             raise ProblemError(f"shared or partly fixed lenses need plain LM, solved explicitly, not {refused}")
         _check_memory(problem)
         return replace(options, linear_solver="explicit")

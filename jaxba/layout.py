@@ -218,7 +218,7 @@ def layout_for(problem: BundleProblem, options: StepOptions, capacity: Capacity 
     )
 
 
-def turns(layout: Layout) -> int:
+def turns_of(layout: Layout) -> int:
     """Different steps that one state and lambda lead to: as many as there are partitions, which take turns."""
     return 1 if layout.partitions is None else layout.partitions.label.shape[0]
 

@@ -11,7 +11,7 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
-from jaxba.layout import Layout, turns
+from jaxba.layout import Layout, turns_of
 from jaxba.linearize import linearize, with_free_lenses
 from jaxba.lm import LMState, StepInfo, lm_step
 from jaxba.options import StepOptions
@@ -81,7 +81,7 @@ def after_step(
 ) -> tuple[Any, Float[Array, ""], Int[Array, ""]]:
     """The policy's answer to a step, and the stop rules: its next state, the next lambda, a `Termination`.
 
-    `turns` is `layout.turns`: with several, the next step is another one though nothing has changed.
+    `turns` is `layout.turns_of`: with several, the next step is another one though nothing has changed.
     """
     after, damping = policy.propose(policy_state, step)
     # the same state and lambda after a rejection: the policy would ask for the same step for ever
@@ -159,6 +159,6 @@ def solve_loop(
         carry, history = loop
         state, step = step_of(carry)
         history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, history_of(step))
-        return advance(carry, state, step, policy, tolerances, most, turns(layout)), history
+        return advance(carry, state, step, policy, tolerances, most, turns_of(layout)), history
 
     return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))

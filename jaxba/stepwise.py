@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, decides_effort, effort_of
-from jaxba.layout import Layout, turns
+from jaxba.layout import Layout, turns_of
 from jaxba.lm import LMState, StepInfo, judge, lm_step, propose
 from jaxba.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.options import StepOptions
@@ -67,7 +67,14 @@ class _Loop(NamedTuple):
             given = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
             state, step = call(part("round", lm_step), *given)
         limit = jnp.asarray(self.max_iterations, jnp.int32)
-        own = (carry._replace(state=None), step, self.policy, self.tolerances, limit, jnp.asarray(turns(self.layout)))
+        own = (
+            carry._replace(state=None),
+            step,
+            self.policy,
+            self.tolerances,
+            limit,
+            jnp.asarray(turns_of(self.layout)),
+        )
         carry, facts = call(program(_advance_and_tell, way="quick"), *own)
         return carry._replace(state=state), step, facts
 

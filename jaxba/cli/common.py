@@ -21,10 +21,6 @@ CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable: folder of compiled programs; `off` switches the cache off."""
 
 
-LARGEST_COUNT = 2**31 - 1
-"""Programs count in 32 bits."""
-
-
 class UsageError(ValueError):
     """Arguments that make no sense. The message is one line for a person."""
 
@@ -181,6 +177,8 @@ def check_positive(**values: Any) -> None:
     Raises:
         UsageError: naming the option.
     """
+    from jaxba.host import LARGEST_COUNT
+
     for name, value in values.items():
         option = "--" + name.replace("_", "-")
         if name.endswith("tol"):

@@ -90,7 +90,7 @@ def _train(args: Arguments) -> int:
             raise common.UsageError(str(error)) from None
         except OSError as error:
             raise common.UsageError(
-                f"{error.filename or folder}: {error.strerror or error}; {_again(folder)}"
+                f"{error.filename or folder}: {error.strerror or error}; go on with {_again(folder)}"
             ) from None
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
