@@ -11,34 +11,14 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from typing import NamedTuple
 
 import jax
 
-import jaxba
 from benchmarks.suite import real_problems
 from jaxba import host
+from jaxba.bench.profile import CONVERGED
+from jaxba.bench.run import RunSettings, plan, run_solver
 from jaxba.bench.sources import sources
-from jaxba.naming import parse_solver
-from jaxba.problem import BundleProblem
-
-
-class End(NamedTuple):
-    """How a solve ended."""
-
-    iterations: int
-    converged: bool
-    cost: float
-
-
-def end_of(problem: BundleProblem, solver: str, limit: int) -> End:
-    """Solves a problem with `auto`'s linear solver."""
-    name = parse_solver(solver)
-    policy, options = name.build()
-    found = jaxba.solve(
-        problem, policy, options, method=name.method, linear_solver="auto", max_iterations=limit, dtype=name.dtype
-    )
-    return End(found.iterations, found.converged, found.final_cost)
 
 
 def main() -> None:
@@ -50,18 +30,21 @@ def main() -> None:
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     host.keep_memory()
-    solvers = args.solvers.split(",")
-    counts: dict[str, list[int]] = {solver: [] for solver in solvers}
-    print("| problem (iterations, in brackets if not converged; end above the best) |", " | ".join(solvers), "|")
-    print("| --- |", " --- |" * len(solvers))
-    for source in sources(args.problem or real_problems()):
-        ends = {solver: end_of(source.read(), solver, args.limit) for solver in solvers}
-        best = min(end.cost for end in ends.values())
+    settings = RunSettings(max_iterations=args.limit)
+    places = sources(args.problem or real_problems())
+    solvers = [job.solver for job in plan(places[:1], args.solvers.split(","), repeats=1)]
+    counts: dict[str, list[int]] = {str(solver): [] for solver in solvers}
+    print("| problem (iterations, in brackets if not converged; end above the best) |", " | ".join(counts), "|")
+    print("| --- |", " --- |" * len(counts))
+    for source in places:
+        problem = source.read()
+        ends = [run_solver(problem, source, solver, 0, settings) for solver in solvers]
+        best = min(end.final_cost for end in ends)
         cells = []
-        for solver, end in ends.items():
-            counts[solver].append(end.iterations)
-            count = f"{end.iterations}" if end.converged else f"({end.iterations})"
-            cells.append(f"{count}, {end.cost / best - 1:.1e}")
+        for end in ends:
+            counts[end.solver].append(end.iterations)
+            count = f"{end.iterations}" if end.termination in CONVERGED else f"({end.iterations})"
+            cells.append(f"{count}, {end.final_cost / best - 1:.1e}")
         print(f"| {source.name} |", " | ".join(cells), "|", flush=True)
     means = {solver: statistics.geometric_mean(each) for solver, each in counts.items()}
     print("| geometric mean |", " | ".join(f"{mean:.2f}" for mean in means.values()), "|")
