@@ -68,7 +68,9 @@ class SolverName:
         agent = policy.config if isinstance(policy, Learned) else AgentConfig()
         if self.refine_points is None:
             return policy, agent.step_options(base)
-        return policy, replace(base, refine_points=self.refine_points, camera_damping=agent.camera_damping)
+        if isinstance(policy, Learned):  # the coordinates that it knows
+            base = replace(base, camera_damping=agent.camera_damping, lens_step=agent.lens_step)
+        return policy, replace(base, refine_points=self.refine_points)
 
 
 def fitting_policy(policy: str, method: str = DEFAULT_METHOD, *, alone: bool = False, peer: bool = False) -> str:

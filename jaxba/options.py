@@ -17,6 +17,8 @@ Scaling = Literal["diagonal", "identity"]
 Rotation = Literal["angle-axis", "manifold"]
 Algebra = Literal["full", "mixed"]
 Intrinsics = Literal["free", "fixed"]
+LensStep = Literal["file", "pixels"]
+PointStarts = Literal["step", "rays"]
 
 DIAGONAL_MINIMUM = 1e-6
 """Smallest diagonal entry that damping multiplies. Source: Ceres min_lm_diagonal."""
@@ -66,8 +68,16 @@ class StepOptions:
     """Coordinates of a rotation step: `angle-axis` adds to the three numbers of the file, as Ceres does with
     BAL cameras; `manifold` multiplies by exp(step). They differ in what diagonal damping damps."""
 
+    lens_step: LensStep = "file"
+    """Coordinates in which a lens step is added: `file` adds to f, k1 and k2, as Ceres does with a BAL camera; `pixels`
+    to f and the distortion per pixel, which a zoom leaves alone (moves.py). They agree to first order."""
+
     refine_points: int = 0
     """Embedded point iterations after each camera step."""
+
+    point_starts: PointStarts = "step"
+    """Where embedded point iterations start: where the `step` took a point, or from the `rays` of its pixels, if that
+    is cheaper (triangulate.py)."""
 
     trials: int = 1
     """How often a step is tried before it is rejected, each time a quarter as long; see `trial.py`."""
@@ -105,6 +115,8 @@ class StepOptions:
             ("rotation", get_args(Rotation)),
             ("algebra", get_args(Algebra)),
             ("intrinsics", get_args(Intrinsics)),
+            ("lens_step", get_args(LensStep)),
+            ("point_starts", get_args(PointStarts)),
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")

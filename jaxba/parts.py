@@ -18,6 +18,7 @@ from jaxba.options import StepOptions
 from jaxba.partition import Partition
 from jaxba.refine import Home, refine_points
 from jaxba.sums import point_sum, take, total, tree_sum
+from jaxba.triangulate import better_starts
 
 
 @runtime_checkable
@@ -146,4 +147,7 @@ class Clusters(NamedTuple):
 def _refined(
     layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, iterations: int | Int[Array, ""]
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    return refine_points(layout, slot_frames(layout, cameras), points, options.loss, iterations, home)
+    frames = slot_frames(layout, cameras)
+    if options.point_starts == "rays":
+        points = better_starts(layout, frames, points, options.loss, home)
+    return refine_points(layout, frames, points, options.loss, iterations, home)

@@ -56,7 +56,7 @@ class Home(NamedTuple):
 
     points: Float[Array, "3 points"]
     front: Bool[Array, " slots"]  # whether the point lay in front of the camera
-    nearness: Float[Array, " points"]  # see `_gone`
+    nearness: Float[Array, " points"]  # see `gone`
 
     @classmethod
     def of(cls, layout: Layout, points: Float[Array, "3 points"], inverse_depth: Float[Array, " slots"]) -> Home:
@@ -70,7 +70,7 @@ class _Carry(NamedTuple):
     system: Float[Array, "9 points"]  # lower triangle of the block, then the gradient, there
     damping: Float[Array, " points"]
     trial: Float[Array, "3 points"]  # where to look next
-    nearness: Float[Array, " points"]  # of the start, see `_gone`
+    nearness: Float[Array, " points"]  # of the start, see `gone`
     late: Bool[Array, " points"]  # whether it was taken home, and so is a pass behind the others
     passes: Int[Array, ""]
 
@@ -121,11 +121,11 @@ def refine_points(
         *system, costs, nearness = (found := one_pass(carry.trial, terms, *fronts))[:11]
         astray, late = jnp.zeros_like(carry.late), carry.late
         if home is not None:
-            astray = (carry.passes == 0) & ((found[11] > 0) | _gone(nearness, home.nearness))
+            astray = (carry.passes == 0) & ((found[11] > 0) | gone(nearness, home.nearness))
             late = late | astray
         start = jnp.where(jnp.isinf(carry.costs), nearness, carry.nearness)
         going_on = ~astray & (late | (carry.passes <= iterations))
-        better = (costs < carry.costs) & ~_gone(nearness, start) & going_on
+        better = (costs < carry.costs) & ~gone(nearness, start) & going_on
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
         damping = jnp.where(better, carry.damping / DAMPING_FACTOR, grown)
         best = _Carry(
@@ -156,7 +156,7 @@ def refine_points(
     return carry.points, carry.costs
 
 
-def _gone(nearness: Float[Array, " points"], before: Float[Array, " points"]) -> Bool[Array, " points"]:
+def gone(nearness: Float[Array, " points"], before: Float[Array, " points"]) -> Bool[Array, " points"]:
     """Whether points in front of their cameras are more than `FARTHEST` times as far away as before, or behind.
 
     Nearness is the sum of inverse depths over a point's cameras, negative in front of them. What was behind is free.

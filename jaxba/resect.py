@@ -16,16 +16,6 @@ DAMPINGS = (1e-6, 1e-2)
 """Relative damping of a camera's step, and of a second one where the first did not help."""
 
 
-def move_cameras(
-    cameras: Float[Array, "9 cameras"], step: Float[Array, "9 cameras"], options: StepOptions
-) -> Float[Array, "9 cameras"]:
-    """Adds a step; on the manifold the rotation becomes `exp(step) R`."""
-    moved = cameras + step
-    if options.rotation == "angle-axis":
-        return moved
-    return moved.at[:3].set(camera.compose_left(step[:3], cameras[:3]))
-
-
 def refine_cameras(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], options: StepOptions
 ) -> Float[Array, "9 cameras"]:

@@ -21,8 +21,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxba import camera, geometry, host
-from jaxba.blocks3 import cholesky3
+from jaxba import geometry, host
 from jaxba.layout import Layout, build_layout
 from jaxba.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.lm import initial_state
@@ -32,15 +31,12 @@ from jaxba.problem import BundleProblem, ProblemError
 from jaxba.programs import program, run_alone, stages, way_after
 from jaxba.refine import refine_points
 from jaxba.solve import explain_start
-from jaxba.sums import point_sum
+from jaxba.triangulate import midpoints
 from jaxba.views import Views, point_passes
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
 """Where to start from besides the midpoint of the rays: multiples of a point's distance from the first camera that sees
 it. The last is its mirror image, in front of the camera if the point lies behind it. Chosen once, not fitted."""
-
-UNDISTORTIONS = 10
-"""Fixed-point iterations that turn a pixel into a ray; what they leave open the point's own steps make good."""
 
 POINT_ITERATIONS = 6
 """Steps of a point from each place, twice what the learned policy has in an iteration. Chosen once, not fitted."""
@@ -142,26 +138,7 @@ def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 poin
         better = (there < costs) & (lost <= hidden)
         return (jnp.where(better, trial, points), jnp.where(better, there, costs)), None
 
-    places = [origin + factor * (start - origin) for factor in PLACES] + [_midpoints(layout, frames)]
+    places = [origin + factor * (start - origin) for factor in PLACES] + [midpoints(layout, frames)]
     (points, costs), _ = lax.scan(visit, (start, own), jnp.stack(places))
     moved = own - costs > jnp.maximum(LEAST_GAIN * own, NEGLIGIBLE * jnp.mean(costs))
     return _Found(points, moved, jnp.sum(own), jnp.sum(jnp.where(moved, costs, own)))
-
-
-def _midpoints(layout: Layout, frames: camera.Frames) -> Float[Array, "3 points"]:
-    """The point nearest to all rays of its pixels, in least squares; somewhere along them where they are parallel."""
-    pixel = layout.pixels.astype(frames.focal.dtype)
-    plane = pixel / frames.focal
-    for _ in range(UNDISTORTIONS):
-        squared = jnp.sum(plane * plane, axis=0)
-        plane = pixel / (frames.focal * (1 + squared * (frames.k1 + squared * frames.k2)))
-    ray = jnp.stack([plane[0], plane[1], -jnp.ones_like(plane[0])])
-    ray = jnp.einsum("jin,jn->in", frames.rotation, ray / jnp.sqrt(jnp.sum(ray * ray, axis=0)))
-    center = -jnp.einsum("jin,jn->in", frames.rotation, frames.translation)
-    # sum of (I - u u^T) X = sum of (I - u u^T) c
-    along = jnp.sum(ray * center, axis=0)
-    matrix = [(1.0 if i == j else 0.0) - ray[i] * ray[j] for i in range(3) for j in range(i + 1)]
-    right = [center[i] - ray[i] * along for i in range(3)]
-    sums = point_sum(layout, jnp.where(layout.slot_mask, jnp.stack([*matrix, *right]), 0))
-    factor = cholesky3([sums[k] for k in range(6)])
-    return jnp.stack(factor.backward(factor.forward([sums[k] for k in range(6, 9)])))

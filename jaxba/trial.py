@@ -19,6 +19,7 @@ that are judged by themselves (`parts.py`), each has its own share, rounds and v
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -27,10 +28,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.effort import Effort
 from jaxba.linearize import Present
+from jaxba.moves import move_cameras
 from jaxba.options import StepOptions
 from jaxba.parts import Parts
 from jaxba.refine import Home
-from jaxba.resect import move_cameras, refine_cameras
+from jaxba.resect import refine_cameras
 from jaxba.schur import Step
 
 SHORTER = 0.25
@@ -98,8 +100,9 @@ def best_trial(
     home = Home.of(parts.layout, points, present.inverse_depth)
     one, none = jnp.ones_like(cost), jnp.zeros(cost.shape, jnp.int32)
     matters = step.predicted(one) > NEGLIGIBLE * cost
+    settled = replace(options, point_starts="step")  # points that a round finds where their cameras left them
 
-    def settle(cameras: Array, points: Array, share: Array, repairs: Array) -> Trial:
+    def settle(cameras: Array, points: Array, share: Array, repairs: Array, options: StepOptions) -> Trial:
         points, terms = parts.settle(cameras, points, home, options, point_iterations)
         candidate, decrease, predicted = parts.sums(terms), parts.sums(before - terms), step.predicted(share)
         gain = decrease / predicted
@@ -109,7 +112,7 @@ def best_trial(
     def repair(turn: tuple[Trial, Array]) -> tuple[Trial, Array]:
         trial, left = turn
         moved = refine_cameras(parts.layout, trial.cameras, trial.points, options)
-        again = settle(moved, trial.points, trial.share, trial.repairs + 1)
+        again = settle(moved, trial.points, trial.share, trial.repairs + 1, settled)
         return _where(parts, worth_it(turn), again, trial), left - 1
 
     def worth_it(turn: tuple[Trial, Array]) -> Bool[Array, "*parts"]:
@@ -117,10 +120,10 @@ def best_trial(
         return (left > 0) & (trial.gain < GOOD_GAIN) & (trial.cost < HOPELESS * cost) & matters
 
     def attempt(wanted: Array, share: Array, repairs: Array) -> Trial:
-        moved = move_cameras(cameras, parts.of_cameras(share) * step.cameras, options)
+        moved = move_cameras(parts.layout, cameras, parts.of_cameras(share) * step.cameras, options)
         if options.trials > 1:
             moved = jnp.where(moved[6] * cameras[6] < 0, cameras, moved)
-        trial = settle(moved, points + parts.of_points(share) * step.points, share, repairs)
+        trial = settle(moved, points + parts.of_points(share) * step.points, share, repairs, options)
         if not options.camera_rounds:
             return trial
         rounds = jnp.where(share == 1, options.camera_rounds, min(ROUNDS_OF_SHORTER, options.camera_rounds))

@@ -395,6 +395,8 @@ configs = st.builds(
     trials=st.integers(1, 6),
     camera_rounds=st.integers(0, 4),
     camera_damping=st.floats(1e-6, 1e6),
+    lens_step=st.sampled_from(["file", "pixels"]),
+    point_starts=st.sampled_from(["step", "rays"]),
 )
 
 
@@ -402,12 +404,8 @@ configs = st.builds(
 def test_a_configuration_comes_back_from_its_numbers(config):
     assert config_from(asdict(config)) == config
     made = config.step_options(StepOptions(cg_forcing=0.2))
-    assert (made.refine_points, made.trials, made.camera_rounds, made.camera_damping) == (
-        config.refine_points,
-        config.trials,
-        config.camera_rounds,
-        config.camera_damping,
-    )
+    own = "refine_points", "trials", "camera_rounds", "camera_damping", "lens_step", "point_starts"
+    assert [getattr(made, name) for name in own] == [getattr(config, name) for name in own]
     assert made.cg_forcing == 0.2
 
 
@@ -445,6 +443,8 @@ def test_a_configuration_comes_back_from_its_numbers(config):
         ({"trials": 0}, "trials"),
         ({"camera_rounds": -1}, "camera_rounds"),
         ({"camera_damping": 0.0}, "camera_damping"),
+        ({"lens_step": "zoom"}, "lens_step"),
+        ({"point_starts": True}, "point_starts"),
         ({"camera_damping": float("inf")}, "camera_damping"),
     ],
 )

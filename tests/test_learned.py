@@ -281,11 +281,14 @@ def test_the_path_of_a_policy_is_a_name(tmp_path, folder):
 def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     policy, options = parse_solver("learned").build()
     assert same_bits(policy.layers, load_policy(shipped["learned"]).layers)
-    assert options == StepOptions(refine_points=2, trials=3, camera_rounds=AGENT.camera_rounds)
+    rounds = AGENT.camera_rounds
+    own = StepOptions(lens_step="pixels")
+    assert options == replace(own, refine_points=2, trials=3, camera_rounds=rounds, point_starts="rays")
     policy, options = parse_solver("learned+refine0").build()
     assert same_bits(policy.layers, load_policy(shipped["learned-plain"]).layers)
-    assert options == StepOptions()
-    assert parse_solver("learned+refine3").build()[1] == StepOptions(refine_points=3)
+    assert options == own
+    assert parse_solver("learned+refine3").build()[1] == replace(own, refine_points=3)
+    assert parse_solver("ceres+refine3").build()[1] == StepOptions(refine_points=3)
     assert parse_solver("ceres+embedded").build()[1] == AgentConfig().step_options(StepOptions())
 
 
@@ -349,6 +352,14 @@ def test_an_agent_from_before_camera_damping_damps_cameras_as_points():
     values = asdict(AgentConfig())
     del values["camera_damping"]
     assert config_from(values).camera_damping == 1
+
+
+def test_an_agent_from_before_lenses_and_rays_steps_as_it_was_trained():
+    values = asdict(AgentConfig())
+    del values["lens_step"], values["point_starts"]
+    made = config_from(values)
+    assert (made.lens_step, made.point_starts) == ("file", "step")
+    assert (AgentConfig().lens_step, AgentConfig().point_starts) == ("pixels", "rays")
 
 
 @pytest.mark.slow

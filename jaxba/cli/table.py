@@ -22,10 +22,14 @@ _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      la
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
     """What is about to be solved, and how."""
     refine = f" + {options.refine_points} point iterations" if options.refine_points else ""
+    if refine and options.point_starts == "rays":
+        refine += " from the better of step and rays"
     if options.camera_rounds:
         refine += f", up to {options.camera_rounds} camera rounds"
     if options.trials > 1:
         refine += f", up to {options.trials} trials"
+    if options.lens_step == "pixels":
+        refine += ", distortion per pixel"
     if options.camera_damping != 1:
         refine += f", cameras damped by {options.camera_damping:g} lambda"
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"

@@ -19,7 +19,7 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.damping.rules import LARGEST, Ceres
 from jaxba.effort import Effort
 from jaxba.lm import StepInfo
-from jaxba.options import StepOptions
+from jaxba.options import LensStep, PointStarts, StepOptions
 from jaxba.trial import SHORTER
 
 Observation = Literal["scale-free", "paper", "released-code", "duration"]
@@ -110,6 +110,12 @@ class AgentConfig:
     camera_damping: float = 1.0
     """Damping of the cameras relative to that of the points in the step that it drives, see `StepOptions`."""
 
+    lens_step: LensStep = "pixels"
+    """How the step that it drives is added to a lens, see `StepOptions`."""
+
+    point_starts: PointStarts = "rays"
+    """Where embedded point iterations start in the step that it drives, see `StepOptions`."""
+
     effort: EffortMode = "fixed"
     """What an action decides beside lambda: nothing, or with a second number how many of the point iterations a step
     has, and with a third the forcing term of conjugate gradients. The guard's rule has all of them, and the smallest
@@ -143,13 +149,16 @@ class AgentConfig:
         self.step_options(StepOptions())
 
     def step_options(self, options: StepOptions) -> StepOptions:
-        """The options with the embedded iterations and the camera damping that the agent was trained with."""
+        """The options with the embedded iterations and the coordinates of damping and lenses that the agent was trained
+        with."""
         return replace(
             options,
             refine_points=self.refine_points,
             trials=self.trials,
             camera_rounds=self.camera_rounds,
             camera_damping=self.camera_damping,
+            lens_step=self.lens_step,
+            point_starts=self.point_starts,
         )
 
     @property
@@ -170,6 +179,10 @@ class AgentConfig:
         return self.history
 
 
+BEFORE = {"lens_step": "file", "point_starts": "step"}
+"""What a policy file means that is older than these settings."""
+
+
 def config_from(values: dict[str, Any]) -> AgentConfig:
     """The inverse of `dataclasses.asdict`.
 
@@ -177,6 +190,7 @@ def config_from(values: dict[str, Any]) -> AgentConfig:
         ValueError: unknown names or impossible values.
     """
     known = {field.name: field for field in fields(AgentConfig)}
+    values = {**BEFORE, **values}
     for name, value in values.items():
         if name not in known:
             raise ValueError(f"unknown setting {name!r}")

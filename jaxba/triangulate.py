@@ -1,0 +1,91 @@
+"""Points from the rays of their pixels: where a point may start when its cameras have moved."""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxba import camera
+from jaxba.blocks3 import cholesky3
+from jaxba.layout import Layout
+from jaxba.linearize import slot_costs, view_residuals
+from jaxba.losses import Loss
+from jaxba.refine import Home, gone
+from jaxba.sums import take_each
+from jaxba.views import Views, point_passes
+
+UNDISTORTIONS = 10
+"""Fixed-point iterations that turn a pixel into a ray; what they leave open the point's own steps make good ..."""
+
+FEW_UNDISTORTIONS = 3
+"""... and so many within a step, where it is done again and again."""
+
+
+def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDISTORTIONS) -> Float[Array, "3 points"]:
+    """The point nearest to all rays of its pixels, in least squares; anywhere along them, or not finite, where they are
+    parallel.
+
+    Args:
+        layout: slots.
+        frames: of every slot (`linearize.slot_frames`).
+        undistortions: fixed-point iterations.
+    """
+    nowhere = jnp.zeros((3, layout.num_points), frames.focal.dtype)
+    sums = point_passes(layout, frames)(nowhere, functools.partial(_ray_terms, undistortions))
+    factor = cholesky3(sums[:6])
+    return jnp.stack(factor.backward(factor.forward(sums[6:])))
+
+
+def _ray_terms(undistortions: int, views: Views) -> list[Array]:
+    """Of every observation the lower entries of `I - u u^T` (row by row) and `(I - u u^T) c`, for its ray u and the
+    centre c of its camera. Their sums are the normal equations of the point nearest to its rays."""
+    frame, pixel = views.frames, [row.astype(views.frames.focal.dtype) for row in views.pixels]
+    scaled = [row / frame.focal for row in pixel]
+    plane = scaled
+    for _ in range(undistortions):
+        squared = plane[0] * plane[0] + plane[1] * plane[1]
+        less = 1 / (1 + squared * (frame.k1 + squared * frame.k2))
+        plane = [row * less for row in scaled]
+    short = 1 / jnp.sqrt(plane[0] * plane[0] + plane[1] * plane[1] + 1)
+    inside = [plane[0] * short, plane[1] * short, -short]
+    turned = lambda vector: [sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)]
+    ray, center = turned(inside), [-x for x in turned(frame.translation)]
+    along = sum(ray[i] * center[i] for i in range(3))
+    matrix = [(1.0 if i == j else 0.0) - ray[i] * ray[j] for i in range(3) for j in range(i + 1)]
+    right = [center[i] - ray[i] * along for i in range(3)]
+    return [jnp.where(views.mask, row, jnp.zeros_like(row)) for row in [*matrix, *right]]
+
+
+def better_starts(
+    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], loss: Loss, home: Home
+) -> Float[Array, "3 points"]:
+    """The midpoint of its rays for every point that is cheaper there, where that is a place to start (`refine.Home`).
+
+    A step moves points by a linear model. Where that sends one behind its cameras, or so far away or so near that it
+    feels nothing any more, no small step of its own finds back; the rays of its pixels say where to look.
+
+    Args:
+        layout: slots.
+        frames: of every slot, where the cameras are now.
+        points: where the step took them.
+        loss: robust loss.
+        home: where they were before.
+    """
+    middle = midpoints(layout, frames, FEW_UNDISTORTIONS)
+
+    def terms(views: Views, front: Array, *other: Array) -> list[Array]:
+        found = []
+        for place in (views, views._replace(points=jnp.stack(other))):
+            projection = place.projected()
+            lost = (front & (projection.inverse_depth > 0)).astype(points.dtype)
+            found += [slot_costs(loss, view_residuals(place, projection)), lost, projection.inverse_depth]
+        return found
+
+    there = take_each(list(middle), layout.slot_point)
+    own, own_lost, nearness, costs, lost, other = point_passes(layout, frames)(points, terms, home.front, *there)
+    astray = (own_lost > 0) | gone(nearness, home.nearness)
+    better = ((costs < own) | astray) & (lost == 0) & ~gone(other, home.nearness) & jnp.isfinite(costs)
+    return jnp.where(better, middle, points)

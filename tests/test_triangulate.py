@@ -1,0 +1,119 @@
+"""Points from the rays of their pixels: the nearest point to all rays, and a start that is never worse."""
+
+from __future__ import annotations
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from test_retriangulate import solved, strayed, thrown
+
+from jaxba import BundleProblem, Loss, StepOptions, build_layout, geometry, initial_state, solve
+from jaxba.linearize import linearize, slot_frames
+from jaxba.refine import Home
+from jaxba.triangulate import better_starts, midpoints
+
+LOSS = Loss()
+
+
+@functools.partial(jax.jit, static_argnames=("loss",))
+def _starts(layout, cameras, before, points, loss):
+    home = Home.of(layout, before, linearize(layout, cameras, before, loss).inverse_depth)
+    return better_starts(layout, slot_frames(layout, cameras), points, loss, home)
+
+
+_midpoints = jax.jit(lambda layout, cameras: midpoints(layout, slot_frames(layout, cameras)))
+
+
+def order_of(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Columns of a layout's points that are points of the problem, and which."""
+    order = np.concatenate([np.asarray(members) for members in build_layout(problem).bucket_points])
+    real = np.flatnonzero(order < problem.num_points)
+    return real, order[real]
+
+
+def in_layout(problem: BundleProblem, points: np.ndarray) -> np.ndarray:
+    """Points in layout order."""
+    return np.asarray(initial_state(build_layout(problem), problem.replace(points=points), StepOptions()).points)
+
+
+def nearest_to_rays(problem: BundleProblem, point: int) -> np.ndarray:
+    """Least squares over a point's rays by NumPy, each undistorted by a root search."""
+    rows, right = [], []
+    for k in np.flatnonzero(problem.point_index == point):
+        camera = np.asarray(problem.cameras)[problem.camera_index[k]]
+        pixel = np.asarray(problem.observations)[k]
+        f, k1, k2 = camera[6:]
+        size = np.linalg.norm(pixel)
+        radius = brentq(lambda r, s=size, f=f, a=k1, b=k2: f * r * (1 + a * r**2 + b * r**4) - s, 0, 2 * size / f)
+        turn = geometry.rotation_matrices(camera[None, :3])[0]
+        ray = turn.T @ np.array([*(radius * pixel / size), -1])
+        ray /= np.linalg.norm(ray)
+        across = np.eye(3) - np.outer(ray, ray)
+        rows.append(across)
+        right.append(across @ -turn.T @ camera[3:6])
+    return np.linalg.lstsq(np.concatenate(rows), np.concatenate(right))[0]
+
+
+@pytest.mark.parametrize("make", [solved, lambda: thrown(1, 3.0)], ids=["at home", "far"])
+def test_midpoints_are_nearest_to_all_rays_wherever_points_are(make):
+    problem = make()
+    cameras = np.array(problem.cameras)
+    cameras[:, 7:] = 0.05, -0.02
+    problem = problem.replace(cameras=cameras)
+    found = np.asarray(_midpoints(build_layout(problem), cameras.T))
+    real, order = order_of(problem)
+    expected = np.array([nearest_to_rays(problem, point) for point in order])
+    np.testing.assert_allclose(found[:, real].T, expected, rtol=1e-6, atol=1e-8)
+
+
+def test_midpoints_of_exact_pixels_are_the_points():
+    problem = solved()
+    exact = problem.replace(observations=geometry.project(problem))
+    found = np.asarray(_midpoints(build_layout(exact), np.asarray(problem.cameras).T))
+    real, order = order_of(exact)
+    np.testing.assert_allclose(found[:, real].T, np.asarray(problem.points)[order], rtol=1e-6)
+
+
+def point_costs(problem: BundleProblem) -> np.ndarray:
+    squared = np.sum(geometry.residuals(problem) ** 2, axis=1)
+    return np.bincount(problem.point_index, 0.5 * squared, minlength=problem.num_points)
+
+
+@pytest.mark.parametrize("make", [lambda: thrown(2, 3.0), lambda: strayed(-1.0), lambda: strayed(1e4)])
+def test_a_start_costs_no_more_than_where_the_step_went_and_is_behind_no_camera(make):
+    home, gone = solved(), make()
+    layout, cameras = build_layout(home), np.asarray(home.cameras).T
+    args = cameras, in_layout(home, home.points), in_layout(home, gone.points)
+    found = np.asarray(_starts(layout, *args, LOSS))
+    real, order = order_of(home)
+    points = np.array(home.points)
+    points[order] = found[:, real].T
+    after = home.replace(points=points)
+    behind = np.bincount(gone.point_index, geometry.depths(gone) < 0, minlength=gone.num_points) > 0
+    before, now = point_costs(gone), point_costs(after)
+    assert (now[~behind] <= before[~behind] * (1 + 1e-12)).all()
+    assert (geometry.depths(after) > 0).all()  # as at home
+    moved = np.any(points != gone.points, axis=1)
+    assert moved.any()
+    assert now.sum() < 1e-2 * before.sum()
+
+
+def test_where_the_step_was_right_nothing_is_moved():
+    """At the minimum a point fits better than the midpoint of its rays, which minimises something else."""
+    problem = solved()
+    own = in_layout(problem, problem.points)
+    found = np.asarray(_starts(build_layout(problem), np.asarray(problem.cameras).T, own, own, LOSS))
+    np.testing.assert_array_equal(found, own)
+
+
+def test_points_that_lie_far_away_come_back_in_four_iterations_where_their_rays_are_asked():
+    start, best = strayed(30.0), geometry.cost(solved())
+    step = StepOptions(refine_points=3)
+    rays = StepOptions(refine_points=3, point_starts="rays")
+    found = solve(start, "gauss-newton", rays, max_iterations=4)
+    np.testing.assert_allclose(found.final_cost, best, rtol=1e-3)
+    other = solve(start, "gauss-newton", step, max_iterations=4)
+    assert other.final_cost > 1.1 * best
