@@ -92,3 +92,16 @@ def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Pane
         inverses.append(solve_triangular(factor, jnp.eye(size, dtype=matrix.dtype), lower=True))
         belows.append(jnp.matmul(panel[size:], inverses[-1].T, precision="highest"))
     return Panels(inverses, belows)
+
+
+def solve_positive(matrix: Float[Array, "n k k"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """Solves many small positive definite systems by Gauss-Jordan elimination without pivoting.
+
+    Written out instead of calling LAPACK: a batch of such calls inside nested loops never returned on a CPU (jax
+    0.10.2, two threads, 64 scenes of 10 cameras).
+    """
+    table = jnp.concatenate([matrix, right[:, :, None]], axis=2)
+    for k in range(matrix.shape[-1]):
+        row = table[:, k] / table[:, k, k, None]
+        table = (table - table[:, :, k, None] * row[:, None]).at[:, k].set(row)
+    return table[:, :, -1]

@@ -30,6 +30,7 @@ class LMState(NamedTuple):
     cameras: Float[Array, "9 cameras"]
     points: Float[Array, "3 points"]
     cost: Float[Array, ""]
+    remembered: Float[Array, "steps 9 cameras"] | None = None  # last changes of the cameras; None: of no use to a step
 
 
 class StepInfo(NamedTuple):
@@ -72,7 +73,16 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
     order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
     # padding points name an index out of range; they rest at the origin
     points = jnp.asarray(problem.points, dtype).at[order].get(mode="fill", fill_value=0).T
-    return LMState(cameras, points, cost(layout, cameras, points, options.loss))
+    return begin_at(cameras, points, cost(layout, cameras, points, options.loss), options)
+
+
+def begin_at(
+    cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], cost: Float[Array, ""], options: StepOptions
+) -> LMState:
+    """The state before the first iteration: where everything is, its cost, and nothing that is remembered."""
+    if not options.remembers:
+        return LMState(cameras, points, cost)
+    return LMState(cameras, points, cost, jnp.zeros((options.remembers, *cameras.shape), cameras.dtype))
 
 
 def lm_step(
@@ -120,7 +130,7 @@ def propose(
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = with_free_lenses(layout, linear, options.intrinsics)
-    step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn, effort)
+    step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn, effort, state.remembered)
     return Proposal(step, linear.present)
 
 
@@ -136,7 +146,7 @@ def judge(
     """The second part of `lm_step`: candidates along a step, and whether one is accepted."""
     damping = jnp.asarray(damping, state.cost.dtype)
     step = proposal.step
-    trial = best_trial(Whole(layout), *state, proposal.present, step, options, min_gain, effort)
+    trial = best_trial(Whole(layout), *state[:3], proposal.present, step, options, min_gain, effort)
     moved = [trial.share * step.cameras, trial.points - state.points]
     return _verdict(
         state,
@@ -169,7 +179,7 @@ def _round(
     """A round of domain decomposition in the place of a step: parts of it are accepted, each by itself."""
     _check_lenses(layout, options)
     partition = partition_of(layout).at(turn)
-    found = decomposed_round(layout, *state, damping, partition, options, min_gain)
+    found = decomposed_round(layout, *state[:3], damping, partition, options, min_gain)
     return _verdict(
         state,
         found,
@@ -199,7 +209,12 @@ def _verdict(
     `StepInfo` that are not set here.
     """
     choose = lambda new, old: jnp.where(found.accepted, new, old)
-    after = LMState(*(choose(*pair) for pair in zip(found[:3], state, strict=True)))
+    remembered = state.remembered
+    if remembered is not None:
+        latest = found.cameras - state.cameras
+        remembered = choose(jnp.concatenate([latest[None], remembered[:-1]]), remembered)
+    cameras, points, lower = (choose(*pair) for pair in zip(found[:3], state[:3], strict=True))
+    after = LMState(cameras, points, lower, remembered)
     return after, StepInfo(
         cost=after.cost,
         previous_cost=state.cost,

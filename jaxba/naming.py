@@ -17,7 +17,10 @@ from jaxba.options import StepOptions
 DTYPES = ("float64", "float32", "mixed")
 """Known floating point types; the first is understood where none is named."""
 
-PEERS = {"pyceres": ("dense", "sparse", "iterative")}
+INNER = "-inner"
+"""Ends a peer's mode that has embedded iterations of its own."""
+
+PEERS = {"pyceres": ("dense", "sparse", "iterative", f"dense{INNER}", f"sparse{INNER}")}
 """Libraries that can run as peers, and their modes."""
 
 
@@ -154,6 +157,8 @@ def _parse_peer(name: str) -> SolverName:
         raise SolverNameError(f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}")
     if not plus:
         return SolverName("", peer=peer)
+    if mode.endswith(INNER):  # Ceres credits them to the linear model, so that no policy could tell a gain
+        raise SolverNameError(f"{name!r} is no solver; {library} has inner iterations under its own rule alone")
     driver = parse_solver(policy)
     # lambda alone: the peer computes the step, in its own arithmetic
     embedded = driver.refine_points is None and (not is_learned(driver.policy) or policy.endswith("+embedded"))

@@ -53,6 +53,10 @@ class StepOptions:
     repairs: int = 4
     """Richardson steps that repair a clustered step. Source: STBA, authors' code."""
 
+    remembered_steps: int = 0
+    """Camera steps of earlier iterations in whose span that of a power series, or of conjugate gradients on all
+    variables, is made the best one (recall.py). Other solvers were found to have no use for them."""
+
     block_steps: int = 1
     """Steps of each cluster in a round of domain decomposition; one, so that a round is one linear solve."""
 
@@ -126,7 +130,7 @@ class StepOptions:
         for name in ("cluster_cameras", "block_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, is {getattr(self, name)}")
-        for name in ("preconditioner_order", "power_order", "repairs"):
+        for name in ("preconditioner_order", "power_order", "repairs", "remembered_steps"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
         if not 0 < self.camera_damping < float("inf"):
@@ -165,6 +169,11 @@ class StepOptions:
     def leaves_rest(self) -> bool:
         """Whether a step leaves a residual of the linear system that is not orthogonal to it."""
         return self.linear_solver in ("clustered", "power")
+
+    @property
+    def remembers(self) -> int:
+        """How many earlier camera steps take part in a step."""
+        return self.remembered_steps if self.linear_solver in ("power", "normal") else 0
 
     @property
     def uses_clusters(self) -> bool:

@@ -7,6 +7,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxba import camera
+from jaxba.dense import solve_positive
 from jaxba.layout import Layout
 from jaxba.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
@@ -55,16 +56,3 @@ def refine_cameras(
     # a scan and not two copies: half of it to compile
     unseen = ~jnp.asarray(layout.camera_seen)
     return lax.scan(attempt, (cameras, unseen), jnp.asarray(DAMPINGS, cameras.dtype))[0][0]
-
-
-def solve_positive(matrix: Float[Array, "n k k"], right: Float[Array, "n k"]) -> Float[Array, "n k"]:
-    """Solves many small positive definite systems by Gauss-Jordan elimination without pivoting.
-
-    Written out instead of calling LAPACK: a batch of such calls inside nested loops never returned on a CPU (jax
-    0.10.2, two threads, 64 scenes of 10 cameras).
-    """
-    table = jnp.concatenate([matrix, right[:, :, None]], axis=2)
-    for k in range(matrix.shape[-1]):
-        row = table[:, k] / table[:, k, k, None]
-        table = (table - table[:, :, k, None] * row[:, None]).at[:, k].set(row)
-    return table[:, :, -1]

@@ -18,6 +18,7 @@ from jaxba.eliminate import (
     CameraSystem,
     Coordinates,
     PointSystem,
+    apply_reduced,
     back_substitute,
     camera_system,
     eliminate_points,
@@ -27,6 +28,7 @@ from jaxba.layout import Layout, partition_of
 from jaxba.linearize import Linearization
 from jaxba.normal import image, solve_normal
 from jaxba.options import StepOptions
+from jaxba.recall import on_manifold, with_remembered
 from jaxba.reduced import solve_reduced
 from jaxba.split import clustered_step
 from jaxba.sums import point_sum, tree_sum
@@ -58,6 +60,7 @@ def solve_step(
     options: StepOptions,
     turn: int | Int[Array, ""] = 0,
     effort: Effort | None = None,
+    remembered: Float[Array, "steps 9 cameras"] | None = None,
 ) -> Step:
     """One damped step.
 
@@ -70,6 +73,7 @@ def solve_step(
         options: solver, scaling, coordinates.
         turn: number of the iteration, where the step depends on it (random clusters).
         effort: forcing term of conjugate gradients, where it is not that of the options.
+        remembered: last changes of the cameras, if the step is to be the best one together with them.
 
     Returns:
         The step; not finite where the factorisation failed, which the caller treats as a rejection.
@@ -80,25 +84,28 @@ def solve_step(
     anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
     eliminated = eliminate_points(layout, linear, damping, options)
     system = camera_system(layout, linear, eliminated, coordinates, damping, options)
+    point_step = None
     if options.linear_solver == "normal":
-        step, moves, iterations = solve_normal(layout, linear, eliminated, system, options, forcing)
-        point_step = list(moves)
+        step, point_step, iterations = solve_normal(layout, linear, eliminated, system, options, forcing)
     elif options.linear_solver == "clustered":
         partition = partition_of(layout).at(turn)
         step = clustered_step(layout, linear, eliminated, system, damping, partition, options)
         iterations = jnp.zeros((), jnp.int32)
     else:
         step, iterations = solve_reduced(layout, linear, eliminated, system, anchor, options, forcing)
+    if remembered is not None:  # the points then follow the cameras
+        product = lambda x: apply_reduced(layout, linear, eliminated, system, x)
+        step, point_step = with_remembered(product, system.right, step, on_manifold(cameras, remembered)), None
     step = jnp.where(layout.camera_seen[:, None], step, jnp.zeros_like(step))
-    if options.linear_solver != "normal":
-        point_step = back_substitute(layout, linear, eliminated, step)
+    if point_step is None:
+        point_step = jnp.stack(back_substitute(layout, linear, eliminated, step))
     camera_step = coordinates.given(step)
     slope, damped = _slope_and_damping(eliminated, system, step, camera_step, point_step)
-    if options.leaves_rest:
-        damped = slope - sum(jnp.sum(m * m) for m in image(layout, linear, step, jnp.stack(point_step)))
+    if options.leaves_rest and remembered is None:
+        damped = slope - sum(jnp.sum(m * m) for m in image(layout, linear, step, point_step))
     return Step(
         camera_step.T,
-        jnp.stack(point_step),
+        point_step,
         slope,
         damped,
         largest_gradient(eliminated, system, coordinates),
@@ -108,15 +115,14 @@ def solve_step(
 
 
 def _slope_and_damping(
-    points: PointSystem, system: CameraSystem, step: Array, camera_step: Array, point_step: list[Array]
+    points: PointSystem, system: CameraSystem, step: Array, camera_step: Array, moves: Array
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`-g.d` and `d.D d`, from which the linear model's decrease follows as a sum that does not cancel.
 
     For steps that solve the system. The decrease is `-(g.d + d.H d / 2)`. `(H + D) d = -g - rest` turns it into
     `(d.D d - g.d - d.rest) / 2`. The rest is zero for a factored system, and orthogonal to the step for conjugate
-    gradients started at zero. Both kept terms are positive.
+    gradients started at zero, as for the best step of a span. Both kept terms are positive.
     """
-    moves = jnp.stack(point_step)
     slope = jnp.sum(system.gradient * step) + jnp.sum(jnp.stack(points.gradient) * moves)
     damped = jnp.sum(system.damping * camera_step**2) + jnp.sum(jnp.stack(points.damping) * moves**2)
     return -slope, damped

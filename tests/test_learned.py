@@ -283,7 +283,8 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     assert same_bits(policy.layers, load_policy(shipped["learned"]).layers)
     rounds = AGENT.camera_rounds
     own = StepOptions(lens_step="pixels")
-    assert options == replace(own, refine_points=2, trials=3, camera_rounds=rounds, point_starts="rays")
+    embedded = {"refine_points": 2, "trials": 3, "camera_rounds": rounds, "point_starts": "rays"}
+    assert options == replace(own, **embedded, remembered_steps=1)
     policy, options = parse_solver("learned+refine0").build()
     assert same_bits(policy.layers, load_policy(shipped["learned-plain"]).layers)
     assert options == own
@@ -354,12 +355,13 @@ def test_an_agent_from_before_camera_damping_damps_cameras_as_points():
     assert config_from(values).camera_damping == 1
 
 
-def test_an_agent_from_before_lenses_and_rays_steps_as_it_was_trained():
+def test_an_older_agent_steps_as_it_was_trained():
+    """Before lenses were stepped per pixel, points started from rays, and steps were remembered."""
+    settings = lambda config: (config.lens_step, config.point_starts, config.remembered_steps)
     values = asdict(AgentConfig())
-    del values["lens_step"], values["point_starts"]
-    made = config_from(values)
-    assert (made.lens_step, made.point_starts) == ("file", "step")
-    assert (AgentConfig().lens_step, AgentConfig().point_starts) == ("pixels", "rays")
+    del values["lens_step"], values["point_starts"], values["remembered_steps"]
+    assert settings(config_from(values)) == ("file", "step", 0)
+    assert settings(AgentConfig()) == ("pixels", "rays", 1)
 
 
 @pytest.mark.slow

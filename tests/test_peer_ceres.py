@@ -316,6 +316,19 @@ def test_the_iterative_mode_counts_conjugate_gradients_and_the_direct_ones_have_
         assert set(terms) == {0.1 if mode == "iterative" else 0.0}  # Ceres' eta
 
 
+@pytest.mark.parametrize("mode", ["dense", "sparse"])
+def test_inner_iterations_go_further_with_the_same_first_step(mode):
+    """From the same lambda to a lower cost, and at last to the same minimum."""
+    one = {"max_iterations": 1}
+    plain, inner = (solve_by_ceres(support.tiny(), name, **one) for name in (mode, mode + "-inner"))
+    assert inner.history.damping[0] == plain.history.damping[0]
+    assert inner.final_cost < plain.final_cost * (1 - 1e-3)
+    np.testing.assert_allclose(inner.final_cost, geometry.cost(inner.problem), rtol=1e-12)
+    ends = [solve_by_ceres(support.tiny(), name) for name in (mode, mode + "-inner")]
+    assert all(end.termination.converged for end in ends)
+    np.testing.assert_allclose(ends[1].final_cost, ends[0].final_cost, rtol=1e-5)
+
+
 # Both
 
 

@@ -38,8 +38,8 @@ class Arguments:
     max_iterations."""
 
     solvers: str | None = None
-    """Comma-separated names, [method+]policy[+refineK|+embedded][@dtype], or pyceres:dense|sparse|iterative[+policy]
-    (extra `ceres`). Default: learned,classic,ceres,ceres+refine3,ceres+embedded."""
+    """Comma-separated names, [method+]policy[+refineK|+embedded][@dtype], or pyceres:dense|sparse|iterative[+policy],
+    pyceres:dense-inner|sparse-inner (extra `ceres`). Default: learned,classic,ceres,ceres+refine3,ceres+embedded."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default 1e-3."""

@@ -30,6 +30,8 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         refine += f", up to {options.trials} trials"
     if options.lens_step == "pixels":
         refine += ", distortion per pixel"
+    if options.remembers:
+        refine += f", {options.remembers} step{'s' * (options.remembers > 1)} remembered"
     if options.camera_damping != 1:
         refine += f", cameras damped by {options.camera_damping:g} lambda"
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"

@@ -116,6 +116,9 @@ class AgentConfig:
     point_starts: PointStarts = "rays"
     """Where embedded point iterations start in the step that it drives, see `StepOptions`."""
 
+    remembered_steps: int = 1
+    """Earlier steps that take part in the step that it drives, where its method has a use for them."""
+
     effort: EffortMode = "fixed"
     """What an action decides beside lambda: nothing, or with a second number how many of the point iterations a step
     has, and with a third the forcing term of conjugate gradients. The guard's rule has all of them, and the smallest
@@ -159,6 +162,7 @@ class AgentConfig:
             camera_damping=self.camera_damping,
             lens_step=self.lens_step,
             point_starts=self.point_starts,
+            remembered_steps=self.remembered_steps,
         )
 
     @property
@@ -179,7 +183,7 @@ class AgentConfig:
         return self.history
 
 
-BEFORE = {"lens_step": "file", "point_starts": "step"}
+BEFORE = {"lens_step": "file", "point_starts": "step", "remembered_steps": 0}
 """What a policy file means that is older than these settings."""
 
 

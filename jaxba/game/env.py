@@ -30,7 +30,7 @@ from jaxba.game.play import step_groups
 from jaxba.game.protocol import Step
 from jaxba.game.scenes import SceneClass
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.lm import LMState, StepInfo, lm_step
+from jaxba.lm import LMState, StepInfo, begin_at, lm_step
 from jaxba.options import StepOptions
 
 Reward = Literal["duration", "constant", "reduction", "reversed"]
@@ -168,7 +168,7 @@ class Game:
         """The episode of one scene before its first iteration."""
         scenes, initial, info = jax.tree.map(lambda x: x[scene], (bank.scenes, bank.initial_cost, bank.info))
         info = info._replace(max_iterations=jnp.asarray(self.config.max_iterations, jnp.int32))
-        state = LMState(scenes.cameras, scenes.points, initial)
+        state = begin_at(scenes.cameras, scenes.points, initial, self.options)
         return Episode(scene, state, begin(self.config.agent, info))
 
     def iterate(

@@ -21,7 +21,7 @@ from jaxba.game.bank import Bank
 from jaxba.game.play import Trajectories, step_groups
 from jaxba.game.scenes import SceneClass
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.lm import LMState, StepInfo, lm_step
+from jaxba.lm import LMState, StepInfo, begin_at, lm_step
 from jaxba.options import StepOptions
 
 GRID = tuple(10.0**decade for decade in (-8, -7, -6, -5, -4, -3, -2, -1, 0))
@@ -77,7 +77,7 @@ def _search(
 
     def one(scene: Bank) -> Array:
         own = with_scene(layout, scene.scenes.pixels, scene.scenes.mask)
-        start = LMState(scene.scenes.cameras, scene.scenes.points, scene.initial_cost)
+        start = begin_at(scene.scenes.cameras, scene.scenes.points, scene.initial_cost, options)
         return beam_search(lambda state, damping: lm_step(own, state, damping, options), start, iterations, width, grid)
 
     return lax.map(one, bank)

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.damping import DampingPolicy, effort_of
 from jaxba.game.scenes import SceneClass
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.lm import LMState, StepInfo, lm_step
+from jaxba.lm import LMState, StepInfo, begin_at, lm_step
 from jaxba.options import StepOptions
 from jaxba.termination import converged_in_cost
 
@@ -112,7 +112,7 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
         at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)
         start = at(bank.scenes)
         policy_state, damping = policy.init(at(bank.info))
-        state = LMState(start.cameras, start.points, at(bank.initial_cost))
+        state = begin_at(start.cameras, start.points, at(bank.initial_cost), options)
         return _Lane(scene, state, policy_state, damping, jnp.zeros((), jnp.int32))
 
     def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:

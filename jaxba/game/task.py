@@ -140,8 +140,9 @@ def _rules(
     names = tuple(dict.fromkeys((*own, *yardsticks)))
     policies: dict[str, tuple[DampingPolicy, StepOptions]] = {name: (make_policy(name), plain) for name in names}
     embedded = replace(game.options, camera_damping=plain.camera_damping)
-    # coordinates of a lens alone are no embedded iterations
-    if replace(embedded, lens_step=plain.lens_step, point_starts=plain.point_starts) != plain:
+    # neither coordinates of a lens alone nor what is remembered are embedded iterations
+    same = {name: getattr(plain, name) for name in ("lens_step", "point_starts", "remembered_steps")}
+    if replace(embedded, **same) != plain:
         policies[yardsticks[0] + EMBEDDED] = make_policy(yardsticks[0]), embedded
     runs = _play(config, held_out, policies)
     fields = lambda name, number, run: {f"{name}/{number}/{field}": x for field, x in run._asdict().items()}

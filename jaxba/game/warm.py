@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jaxba.game.play import step_groups
 from jaxba.game.scenes import SceneClass, Scenes
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.lm import LMState, lm_step
+from jaxba.lm import LMState, begin_at, lm_step
 from jaxba.options import StepOptions
 
 ITERATIONS = 10
@@ -64,7 +64,7 @@ def warm_starts(
             after, _ = lm_step(own, state, damping, options, 0.0, turn)
             return jax.tree.map(lambda new, old: jnp.where(turn < count, new, old), after, state)
 
-        return lax.fori_loop(0, ITERATIONS, body, LMState(scene.cameras, scene.points, cost))
+        return lax.fori_loop(0, ITERATIONS, body, begin_at(scene.cameras, scene.points, cost, options))
 
     moved = step_groups(one, scenes, initial, count, damping)
     return scenes._replace(cameras=moved.cameras, points=moved.points), moved.cost

@@ -16,6 +16,7 @@ from jaxtyping import Bool
 from jaxba import geometry
 from jaxba.lm import StepInfo
 from jaxba.loop import History
+from jaxba.naming import INNER
 from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
 from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.problem import BundleProblem, ProblemError
@@ -26,7 +27,8 @@ from jaxba.termination import Termination, Tolerances
 _log = logging.getLogger(__name__)
 
 LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
-"""Ceres' linear solvers by mode; the iterative one preconditions with SCHUR_JACOBI."""
+"""Ceres' linear solvers by mode, which may be followed by `naming.INNER`; the iterative one preconditions with
+SCHUR_JACOBI."""
 
 FORCING = 0.1
 """Forcing term of the iterative mode. Source: Ceres eta."""
@@ -47,9 +49,10 @@ Callback = Callable[[IterationRecord], Any]
 
 
 def solver_options(mode: str, threads: int) -> Any:
-    """Ceres' defaults with the linear solver of a mode, and silence."""
+    """Ceres' defaults with the linear solver of a mode, inner iterations if it has them, and silence."""
     options = pyceres.SolverOptions()
-    options.linear_solver_type = getattr(pyceres.LinearSolverType, LINEAR_SOLVERS[mode])
+    options.use_inner_iterations = mode.endswith(INNER)
+    options.linear_solver_type = getattr(pyceres.LinearSolverType, LINEAR_SOLVERS[mode.removesuffix(INNER)])
     options.preconditioner_type = pyceres.PreconditionerType.SCHUR_JACOBI
     options.eta = FORCING
     options.num_threads = threads
@@ -234,7 +237,7 @@ def solve_by_ceres(
 
     Args:
         problem: start of the optimisation.
-        mode: a key of `LINEAR_SOLVERS`.
+        mode: a key of `LINEAR_SOLVERS`, followed by `naming.INNER` for Ceres' inner iterations.
         max_iterations: limit of linear solves.
         tolerances: convergence tests; Ceres has no target.
         threads: of Ceres.
