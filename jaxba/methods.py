@@ -39,10 +39,6 @@ class Method:
     fixes: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     """Fields of `StepOptions` that make the method."""
 
-    soft: bool = False
-    """Whether `learned` was found to take fewer iterations with cameras damped less than points, at no worse an end
-    (docs/methods.md, "Which policy")."""
-
     def options(self, base: StepOptions) -> StepOptions:
         """The options of a step of this method; what it does not fix is that of `base`."""
         return replace(base, **self.fixes)
@@ -61,7 +57,6 @@ METHODS: dict[str, Method] = {
             "stochastic bundle adjustment: random clusters of cameras solved apart, then four repairs",
             "stba",
             _fixed(linear_solver="clustered"),
-            soft=True,
         ),
         # 1e-3 and 150: DeepLM, authors' code
         Method(
@@ -69,14 +64,12 @@ METHODS: dict[str, Method] = {
             "DeepLM's global solver: conjugate gradients on cameras and points together",
             "ceres",
             _fixed(linear_solver="normal", cg_forcing=1e-3, cg_max_iterations=150),
-            soft=True,
         ),
         Method(
             "ddlm",
             "DeepLM's stochastic domain decomposition: clusters optimised beside each other, then the points between",
             "ceres",
             _fixed(linear_solver="decomposed"),
-            soft=True,
         ),
         Method(
             "poba",
@@ -111,5 +104,4 @@ def make_method(name: str) -> Method:
         raise UnknownMethodError(f"{name!r}: {base} has no clusters whose size could be set")
     if not (size.isdecimal() and int(size) > 0):
         raise UnknownMethodError(f"{name!r}: the cameras of a cluster must be a positive number, not {size!r}")
-    # what is known of `soft` was measured with clusters of the published size
-    return replace(method, fixes=_fixed(**method.fixes, cluster_cameras=int(size)), soft=False)
+    return replace(method, fixes=_fixed(**method.fixes, cluster_cameras=int(size)))

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from jaxba.damping import DampingPolicy, Learned, is_learned, make_policy
 from jaxba.damping.agent import AgentConfig
-from jaxba.damping.registry import LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, LEARNED_SOFT, SUFFIX
+from jaxba.damping.registry import LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
 from jaxba.methods import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
 from jaxba.options import StepOptions
 
@@ -66,7 +66,7 @@ class SolverName:
             UnknownPolicyError, PolicyFileError, UnknownMethodError: as `make_policy`, `make_method`.
         """
         alone, peer = self.refine_points == 0, bool(self.peer)
-        policy = make_policy(fitting_policy(self.policy, self.method, alone=alone, peer=peer))
+        policy = make_policy(fitting_policy(self.policy, alone=alone, peer=peer))
         base = make_method(self.method).options(StepOptions())
         agent = policy.config if isinstance(policy, Learned) else AgentConfig()
         if self.refine_points is None:
@@ -76,28 +76,22 @@ class SolverName:
         return policy, replace(base, refine_points=self.refine_points)
 
 
-def fitting_policy(policy: str, method: str = DEFAULT_METHOD, *, alone: bool = False, peer: bool = False) -> str:
+def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> str:
     """The policy that a name means: `learned` is the shipped one that was found best for the step (docs/game.md).
 
     Args:
         policy: see `make_policy`.
-        method: how a step is made, see `jaxba.methods`.
         alone: whether lambda is all that there is to choose, without embedded iterations.
         peer: whether another library makes the step, which damps cameras as points.
 
     Returns:
         A name for `make_policy`; any but `learned` as it is.
-
-    Raises:
-        UnknownMethodError: as `make_method`.
     """
     if policy != LEARNED:
         return policy
     if peer:
         return LEARNED_DRIVER
-    if alone:
-        return LEARNED_PLAIN
-    return LEARNED_SOFT if make_method(method).soft else LEARNED
+    return LEARNED_PLAIN if alone else LEARNED
 
 
 def parse_solver(name: str) -> SolverName:

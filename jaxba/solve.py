@@ -25,7 +25,7 @@ from jaxba.layout import Layout, layout_for
 from jaxba.lm import LMState, initial_state
 from jaxba.loop import Carry, History, solve_loop
 from jaxba.methods import DEFAULT_METHOD, make_method
-from jaxba.naming import DTYPES, fitting_policy
+from jaxba.naming import DTYPES
 from jaxba.options import REDUCED_SOLVERS, StepOptions
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import BundleProblem, ProblemError
@@ -109,8 +109,7 @@ def solve(
 
     Args:
         problem: start of the optimisation.
-        damping: a policy, or the name of one (`jaxba.make_policy`). Without options `learned` is the shipped policy
-            that fits the method (`naming.fitting_policy`), with options the one for plain LM.
+        damping: a policy, or the name of one (`jaxba.make_policy`).
         options: how a step is made; if left out, as a learned policy was trained (`AgentConfig.step_options`).
         method: how a step is made (`jaxba.METHODS`); fixes the options that make it.
         linear_solver: overrides that of the options; `auto` asks the cost model in choose.py.
@@ -149,10 +148,7 @@ def solve(
         raise ValueError(f"compilation must be one of {', '.join(get_args(Compilation))}, not {compilation!r}")
     if max_iterations < 1:
         raise ValueError(f"max_iterations must be at least 1, is {max_iterations}")
-    if isinstance(damping, str):
-        policy = make_policy(damping if options is not None else fitting_policy(damping, method))
-    else:
-        policy = damping
+    policy = make_policy(damping) if isinstance(damping, str) else damping
     if options is None:
         options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
     options = make_method(method).options(options)

@@ -12,14 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
 from support import same_bits
 
 import jaxba
-from jaxba import StepOptions, like, make_policy, random_scene, solve, solve_loop
+from jaxba import METHODS, StepOptions, like, make_policy, random_scene, solve, solve_loop
 from jaxba.damping import registry
 from jaxba.damping.agent import AgentConfig, config_from
 from jaxba.damping.learned import (
@@ -34,7 +33,6 @@ from jaxba.damping.learned import (
 )
 from jaxba.game import sac
 from jaxba.game.config import load
-from jaxba.methods import make_method
 from jaxba.naming import SolverName, parse_solver
 
 AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0)
@@ -295,10 +293,8 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
 
 def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
     """Each with the camera damping that it was trained with: another library has none."""
-    files = {"lm": "learned", "stba": "learned-soft", "deeplm": "learned-soft", "ddlm": "learned-soft"}
-    files |= {"poba": "learned", "ddlm:3": "learned"}
-    for method, file in files.items():
-        expected = load_policy(shipped[file]).layers
+    expected = load_policy(shipped["learned"]).layers
+    for method in (*METHODS, "ddlm:3"):
         assert same_bits(parse_solver(f"{method}+learned").build()[0].layers, expected)
         assert same_bits(parse_solver(f"{method}+learned+refine3").build()[0].layers, expected)
         alone = parse_solver(f"{method}+learned+refine0").build()[0]
@@ -316,29 +312,10 @@ def test_a_shipped_policy_is_wired_as_the_preset_of_its_files_name(name):
     assert len(others) == len(set(registry.SHIPPED.values()))
 
 
-def test_options_that_are_given_are_met_by_the_policy_for_plain_lm(shipped):
-    """Cameras are then damped as the options say, so the policy must be the one that knows it so."""
-    options = make_method("stba").options(StepOptions(loss=jaxba.Loss("huber")))
-    named, given = (
-        solve(support.tiny(), policy, options, method="stba", max_iterations=2)
-        for policy in ("learned", load_policy(shipped["learned"]))
-    )
-    assert same_bits(named.history, given.history)
-
-
 def test_the_policy_that_drives_another_library_damps_cameras_as_points():
     """Which is all that Ceres' one radius can do."""
     policy, options = parse_solver("pyceres:dense+learned").build()
     assert policy.config.camera_damping == options.camera_damping == 1
-
-
-@pytest.mark.slow
-def test_a_solve_takes_the_shipped_policy_that_fits_its_method(shipped):
-    problem = support.tiny()
-    for method, file in (("lm", "learned"), ("deeplm", "learned-soft")):
-        named = solve(problem, "learned", method=method, max_iterations=2)
-        given = solve(problem, load_policy(shipped[file]), method=method, max_iterations=2)
-        assert same_bits(named.history, given.history)
 
 
 @pytest.mark.parametrize("refine", [None, 0, 4])

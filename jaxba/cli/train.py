@@ -27,7 +27,7 @@ class Arguments:
     """Options of `jaxba-train`."""
 
     config: str | None = None
-    """A preset (default, soft, plain, driver, fast, paper) or the path of a YAML file. A resumed run takes that of its
+    """A preset (default, plain, driver, fast, paper) or the path of a YAML file. A resumed run takes that of its
     folder."""
 
     overrides: Annotated[

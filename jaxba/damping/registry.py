@@ -23,15 +23,13 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
 }
 """Factory and one line of description by name."""
 
-LEARNED, LEARNED_SOFT, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-soft", "learned-plain", "learned-driver"
-"""The shipped policies, each where it is the best: for a step with embedded iterations; for the same of methods that
-gain by cameras that are damped less; for lambda alone (`learned+refine0`); and for lambda alone where another library
-makes the step and damps all variables alike. In the name of a solver `learned` means the one that fits (naming.py)."""
+LEARNED, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-plain", "learned-driver"
+"""The shipped policies, each where it is the best: for a step with embedded iterations; for lambda alone
+(`learned+refine0`); and for lambda alone where another library makes the step and damps all variables alike. In the
+name of a solver `learned` means the one that fits (naming.py)."""
 
 SHIPPED = {
     LEARNED: "default.safetensors",
-    "learned-default": "default.safetensors",
-    LEARNED_SOFT: "soft.safetensors",
     LEARNED_PLAIN: "plain.safetensors",
     LEARNED_DRIVER: "driver.safetensors",
 }
