@@ -282,7 +282,7 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     rounds = AGENT.camera_rounds
     own = StepOptions(lens_step="pixels")
     embedded = {"refine_points": 2, "trials": 3, "camera_rounds": rounds, "point_starts": "rays"}
-    assert options == replace(own, **embedded, remembered_steps=1)
+    assert options == replace(own, **embedded, remembered_steps=3)
     policy, options = parse_solver("learned+refine0").build()
     assert same_bits(policy.layers, load_policy(shipped["learned-plain"]).layers)
     assert options == own
@@ -338,7 +338,7 @@ def test_an_older_agent_steps_as_it_was_trained():
     values = asdict(AgentConfig())
     del values["lens_step"], values["point_starts"], values["remembered_steps"]
     assert settings(config_from(values)) == ("file", "step", 0)
-    assert settings(AgentConfig()) == ("pixels", "rays", 1)
+    assert settings(AgentConfig()) == ("pixels", "rays", 3)
 
 
 @pytest.mark.slow

@@ -116,7 +116,7 @@ class AgentConfig:
     point_starts: PointStarts = "rays"
     """Where embedded point iterations start in the step that it drives, see `StepOptions`."""
 
-    remembered_steps: int = 1
+    remembered_steps: int = 3
     """Earlier steps that take part in the step that it drives, where its method has a use for them."""
 
     effort: EffortMode = "fixed"
