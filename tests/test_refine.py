@@ -134,7 +134,7 @@ def test_points_whose_rays_are_parallel_stay_finite():
     layout, before = start(problem, options)
     for damping in (STILL, 1e-2, 1e-8, 1e-16):
         after, info = step(layout, before, damping, options)
-        assert all(np.isfinite(leaf).all() for leaf in after)
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after))
         assert info.cost <= info.previous_cost
 
 

@@ -140,7 +140,7 @@ def test_a_batch_of_steps_equals_a_loop_of_steps(sixty_four):
     apart = jax.tree.map(lambda *leaves: np.stack(leaves), *apart)
     assert 0 < np.sum(together[1].accepted) <= 64
     np.testing.assert_array_equal(together[1].accepted, apart[1].accepted)
-    for one, other in zip(together[0], apart[0], strict=True):
+    for one, other in zip(jax.tree.leaves(together[0]), jax.tree.leaves(apart[0]), strict=True):
         size = np.abs(other).max(axis=tuple(range(1, other.ndim)), keepdims=True)
         assert (np.abs(one - other) <= 1e-10 * size).all()
     for name in ("cost", "candidate_cost", "predicted", "gradient_max", "step_norm", "parameter_norm"):
