@@ -81,7 +81,7 @@ class StepOptions:
 
     point_starts: PointStarts = "step"
     """Where embedded point iterations start: where the `step` took a point, or from the `rays` of its pixels, if that
-    is cheaper (triangulate.py)."""
+    is cheaper; at last from both (triangulate.py)."""
 
     trials: int = 1
     """How often a step is tried before it is rejected, each time a quarter as long; see `trial.py`."""

@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.layout import Layout
 from jaxba.linearize import observation_costs, slot_frames
@@ -18,7 +18,14 @@ from jaxba.options import StepOptions
 from jaxba.partition import Partition
 from jaxba.refine import Home, refine_points
 from jaxba.sums import point_sum, take, total, tree_sum
-from jaxba.triangulate import better_starts
+from jaxba.triangulate import refine_from_starts
+
+
+class Search(NamedTuple):
+    """How far embedded point iterations go."""
+
+    iterations: int | Int[Array, ""]
+    both: Bool[Array, ""]  # whether from both places, where there are two (`triangulate.refine_from_starts`)
 
 
 @runtime_checkable
@@ -40,7 +47,7 @@ class Parts(Protocol):
         points: Float[Array, "3 points"],
         home: Home,
         options: StepOptions,
-        iterations: int | Int[Array, ""],
+        search: Search,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
         """The parts' own points after embedded iterations, if the options have any, and the cost in pieces."""
         ...
@@ -73,11 +80,11 @@ class Whole(NamedTuple):
         points: Float[Array, "3 points"],
         home: Home,
         options: StepOptions,
-        iterations: int | Int[Array, ""],
+        search: Search,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
         """See `Parts`."""
         if options.refine_points:
-            return _refined(self.layout, cameras, points, home, options, iterations)
+            return _refined(self.layout, cameras, points, home, options, search)
         return points, observation_costs(self.layout, cameras, points, options.loss)
 
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
@@ -119,11 +126,11 @@ class Clusters(NamedTuple):
         points: Float[Array, "3 points"],
         home: Home,
         options: StepOptions,
-        iterations: int | Int[Array, ""],
+        search: Search,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " slots"]]:
         """See `Parts`."""
         if options.refine_points:
-            points, _ = _refined(self.layout, cameras, points, home, options, iterations)
+            points, _ = _refined(self.layout, cameras, points, home, options, search)
             points = jnp.where(self.partition.separator, home.points, points)
         return points, observation_costs(self.layout, cameras, points, options.loss)
 
@@ -145,9 +152,9 @@ class Clusters(NamedTuple):
 
 
 def _refined(
-    layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, iterations: int | Int[Array, ""]
+    layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, search: Search
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     frames = slot_frames(layout, cameras)
-    if options.point_starts == "rays":
-        points = better_starts(layout, frames, points, options.loss, home)
-    return refine_points(layout, frames, points, options.loss, iterations, home)
+    if options.point_starts == "step":
+        return refine_points(layout, frames, points, options.loss, search.iterations, home)
+    return refine_from_starts(layout, frames, points, options.loss, search.iterations, home, search.both)

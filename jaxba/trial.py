@@ -30,7 +30,7 @@ from jaxba.effort import Effort
 from jaxba.linearize import Present
 from jaxba.moves import move_cameras
 from jaxba.options import StepOptions
-from jaxba.parts import Parts
+from jaxba.parts import Parts, Search
 from jaxba.refine import Home
 from jaxba.resect import refine_cameras
 from jaxba.schur import Step
@@ -53,6 +53,10 @@ one."""
 NEGLIGIBLE = 1e-6
 """Promised decrease relative to the cost that is not worth repairs or further trials. Source: Ceres
 function_tolerance."""
+
+LITTLE_LEFT = 1e-3
+"""Promised decrease relative to the cost below which points are refined from both of their starts. Before that most of
+what a second start brings is overtaken by the cameras' next move, and it takes as long as the first."""
 
 
 class Trial(NamedTuple):
@@ -100,10 +104,11 @@ def best_trial(
     home = Home.of(parts.layout, points, present.inverse_depth)
     one, none = jnp.ones_like(cost), jnp.zeros(cost.shape, jnp.int32)
     matters = step.predicted(one) > NEGLIGIBLE * cost
+    search = Search(point_iterations, jnp.all(step.predicted(one) <= LITTLE_LEFT * cost))
     settled = replace(options, point_starts="step")  # points that a round finds where their cameras left them
 
     def settle(cameras: Array, points: Array, share: Array, repairs: Array, options: StepOptions) -> Trial:
-        points, terms = parts.settle(cameras, points, home, options, point_iterations)
+        points, terms = parts.settle(cameras, points, home, options, search)
         candidate, decrease, predicted = parts.sums(terms), parts.sums(before - terms), step.predicted(share)
         gain = decrease / predicted
         accepted = (decrease > 0) & (candidate <= cost) & (predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import functools
+from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array
-from jaxtyping import Float
+from jax import Array, lax
+from jaxtyping import Bool, Float, Int
 
 from jaxba import camera
 from jaxba.blocks3 import cholesky3
 from jaxba.layout import Layout
 from jaxba.linearize import slot_costs, view_residuals
 from jaxba.losses import Loss
-from jaxba.refine import Home, gone
+from jaxba.refine import Home, gone, refine_points
 from jaxba.sums import take_each
 from jaxba.views import Views, point_passes
 
@@ -59,10 +60,17 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
     return [jnp.where(views.mask, row, jnp.zeros_like(row)) for row in [*matrix, *right]]
 
 
+class Starts(NamedTuple):
+    """Two places for every point."""
+
+    likely: Float[Array, "3 points"]  # the cheaper one
+    other: Float[Array, "3 points"]  # the same where there is no other
+
+
 def better_starts(
     layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], loss: Loss, home: Home
-) -> Float[Array, "3 points"]:
-    """The midpoint of its rays for every point that is cheaper there, where that is a place to start (`refine.Home`).
+) -> Starts:
+    """Where the step took a point and the midpoint of its rays, if that is a place to start (`refine.Home`).
 
     A step moves points by a linear model. Where that sends one behind its cameras, or so far away or so near that it
     feels nothing any more, no small step of its own finds back; the rays of its pixels say where to look.
@@ -87,5 +95,40 @@ def better_starts(
     there = take_each(list(middle), layout.slot_point)
     own, own_lost, nearness, costs, lost, other = point_passes(layout, frames)(points, terms, home.front, *there)
     astray = (own_lost > 0) | gone(nearness, home.nearness)
-    better = ((costs < own) | astray) & (lost == 0) & ~gone(other, home.nearness) & jnp.isfinite(costs)
-    return jnp.where(better, middle, points)
+    possible = (lost == 0) & ~gone(other, home.nearness) & jnp.isfinite(costs)
+    better = possible & ((costs < own) | astray)
+    return Starts(jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points))
+
+
+def refine_from_starts(
+    layout: Layout,
+    frames: camera.Frames,
+    points: Float[Array, "3 points"],
+    loss: Loss,
+    iterations: int | Int[Array, ""],
+    home: Home,
+    both: Bool[Array, ""],
+) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
+    """As `refine_points`, from the likelier of two starts or from both, of which the cheaper end counts.
+
+    A point has several minima along its rays, and the one that it is in need not be the lowest; which one that is shows
+    after a few steps of its own only.
+
+    Args:
+        layout: slots.
+        frames: of every slot, where the cameras are now.
+        points: where the step took them.
+        loss: robust loss.
+        iterations: steps per point and start.
+        home: where points were before.
+        both: whether to spend twice as much.
+    """
+    starts = jnp.stack(better_starts(layout, frames, points, loss, home))
+
+    def visit(turn: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
+        found, costs = refine_points(layout, frames, starts[turn], loss, iterations, home)
+        lower = costs < best[1]
+        return jnp.where(lower, found, best[0]), jnp.where(lower, costs, best[1])
+
+    nowhere = jnp.full_like(points[0], jnp.inf)
+    return lax.fori_loop(0, jnp.where(both, 2, 1), visit, (starts[0], nowhere))

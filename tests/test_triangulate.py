@@ -5,15 +5,16 @@ from __future__ import annotations
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 from test_retriangulate import solved, strayed, thrown
 
-from jaxba import BundleProblem, Loss, StepOptions, build_layout, geometry, initial_state, solve
+from jaxba import BundleProblem, Loss, StepOptions, build_layout, geometry, initial_state, lm_step, solve, trial
 from jaxba.linearize import linearize, slot_frames
-from jaxba.refine import Home
-from jaxba.triangulate import better_starts, midpoints
+from jaxba.refine import Home, refine_points
+from jaxba.triangulate import better_starts, midpoints, refine_from_starts
 
 LOSS = Loss()
 
@@ -22,6 +23,24 @@ LOSS = Loss()
 def _starts(layout, cameras, before, points, loss):
     home = Home.of(layout, before, linearize(layout, cameras, before, loss).inverse_depth)
     return better_starts(layout, slot_frames(layout, cameras), points, loss, home)
+
+
+def _there(layout, cameras, before):
+    return slot_frames(layout, cameras), Home.of(layout, before, linearize(layout, cameras, before, LOSS).inverse_depth)
+
+
+@jax.jit
+def _refined(layout, cameras, before, start):
+    """Points and costs, stacked."""
+    frames, home = _there(layout, cameras, before)
+    return jnp.concatenate([(found := refine_points(layout, frames, start, LOSS, 3, home))[0], found[1][None]])
+
+
+@jax.jit
+def _from_starts(layout, cameras, before, points, both):
+    frames, home = _there(layout, cameras, before)
+    found = refine_from_starts(layout, frames, points, LOSS, 3, home, both)
+    return jnp.concatenate([found[0], found[1][None]])
 
 
 _midpoints = jax.jit(lambda layout, cameras: midpoints(layout, slot_frames(layout, cameras)))
@@ -87,7 +106,7 @@ def test_a_start_costs_no_more_than_where_the_step_went_and_is_behind_no_camera(
     home, gone = solved(), make()
     layout, cameras = build_layout(home), np.asarray(home.cameras).T
     args = cameras, in_layout(home, home.points), in_layout(home, gone.points)
-    found = np.asarray(_starts(layout, *args, LOSS))
+    found = np.asarray(_starts(layout, *args, LOSS).likely)
     real, order = order_of(home)
     points = np.array(home.points)
     points[order] = found[:, real].T
@@ -105,8 +124,50 @@ def test_where_the_step_was_right_nothing_is_moved():
     """At the minimum a point fits better than the midpoint of its rays, which minimises something else."""
     problem = solved()
     own = in_layout(problem, problem.points)
-    found = np.asarray(_starts(build_layout(problem), np.asarray(problem.cameras).T, own, own, LOSS))
-    np.testing.assert_array_equal(found, own)
+    found = _starts(build_layout(problem), np.asarray(problem.cameras).T, own, own, LOSS)
+    np.testing.assert_array_equal(found.likely, own)
+    real, _ = order_of(problem)
+    assert not np.array_equal(np.asarray(found.other)[:, real], own[:, real])  # the midpoint
+
+
+def wrong(seed: int, size: float) -> tuple[BundleProblem, np.ndarray]:
+    """Wrong matches, which give points several minima, and places far from where they are."""
+    home, rng = solved(), np.random.default_rng(seed)
+    pixels = np.array(home.observations)
+    some = rng.random(len(pixels)) < 0.3
+    pixels[some] += 300 * rng.normal(size=(some.sum(), 2))
+    noise = np.random.default_rng(seed).normal(size=home.points.shape)
+    return home.replace(observations=pixels), home.points + size * noise
+
+
+@pytest.mark.parametrize(("seed", "size"), [(0, 0.3), (1, 0.3), (2, 3.0)])
+def test_from_both_starts_a_point_ends_at_the_cheaper_end_and_from_one_at_that_of_the_likely_one(seed, size):
+    """Against `refine_points` from each of them."""
+    home, points = wrong(seed, size)
+    args = build_layout(home), np.asarray(home.cameras).T, in_layout(home, home.points), in_layout(home, points)
+    apart = [np.asarray(_refined(*args[:3], start)) for start in _starts(*args, LOSS)]
+    one, both = (np.asarray(_from_starts(*args, jnp.asarray(both))) for both in (False, True))
+    np.testing.assert_array_equal(one, apart[0])
+    second = apart[1][3] < apart[0][3]
+    assert (apart[1][3] < apart[0][3] * (1 - 1e-3)).any()
+    np.testing.assert_array_equal(both, np.where(second, apart[1], apart[0]))
+
+
+def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
+    """Cameras that hardly move: the candidate is what points alone find from where they are."""
+    home, points = wrong(2, 3.0)
+    problem = home.replace(points=points)
+    args = build_layout(home), np.asarray(home.cameras).T, *[in_layout(home, points)] * 2
+    options, damping = StepOptions(refine_points=3, point_starts="rays"), jnp.asarray(1e12)
+    costs = {}
+    for limit, both in ((trial.LITTLE_LEFT, True), (0.0, False)):
+        monkeypatch.setattr(trial, "LITTLE_LEFT", limit)
+        once = jax.jit(lambda layout, state: lm_step(layout, state, damping, options)[1])
+        info = once(args[0], initial_state(args[0], problem, options))
+        assert info.predicted < 1e-3 * info.previous_cost
+        costs[both] = float(np.sum(_from_starts(*args, jnp.asarray(both))[3]))
+        np.testing.assert_allclose(info.candidate_cost, costs[both], rtol=1e-6)
+    assert costs[True] < costs[False] * (1 - 3e-5)
 
 
 def test_points_that_lie_far_away_come_back_in_four_iterations_where_their_rays_are_asked():
