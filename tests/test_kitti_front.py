@@ -479,8 +479,9 @@ def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys, features):
 
 @needs_data
 @pytest.mark.slow
-def test_bundle_adjustment_brings_the_real_drive_nearer_to_the_truth(tmp_path, capsys):
-    """200 frames, 145 m with a right turn, by the three commands of the documentation."""
+def test_bundle_adjustment_ends_within_a_hundredth_of_the_real_drive_of_the_truth(tmp_path, capsys):
+    """200 frames, 145 m with a right turn, by the three commands of the documentation. Odometry has begun 0.6 to 3.4 m
+    from the truth on different machines; the lowest cost, also Ceres' rule's, lies at 1.0 to 1.3 m (docs/kitti.md)."""
     assert DATA is not None
     root = Path(DATA) / "kitti"
     out, solved, poses = tmp_path / "k.txt.bz2", tmp_path / "s.txt.bz2", str(root / "poses" / "00.txt")
@@ -488,5 +489,5 @@ def test_bundle_adjustment_brings_the_real_drive_nearer_to_the_truth(tmp_path, c
     assert solve([str(out), "--output", str(solved)]) == 0
     assert run(["evaluate", str(out), str(solved), "--poses", poses, "--out", str(tmp_path / "e")]) == 0
     before, after = json.loads((tmp_path / "e" / "evaluation.json").read_text())["results"]
-    assert after["ate_m"]["rmse"] < before["ate_m"]["rmse"]
+    assert after["ate_m"]["rmse"] < 0.01 * 144.9
     assert after["rms_px"] < before["rms_px"]
