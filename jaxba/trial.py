@@ -55,8 +55,8 @@ NEGLIGIBLE = 1e-6
 function_tolerance."""
 
 LITTLE_LEFT = 1e-3
-"""Promised decrease relative to the cost below which points are refined from both of their starts. Before that most of
-what a second start brings is overtaken by the cameras' next move, and it takes as long as the first."""
+"""Promised decrease relative to the cost below which points are refined from both of their starts, which takes as
+long again. In every trial it brought no more (docs/game.md, "From both starts")."""
 
 
 class Trial(NamedTuple):

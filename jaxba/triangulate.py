@@ -63,7 +63,7 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
 class Starts(NamedTuple):
     """Two places for every point."""
 
-    likely: Float[Array, "3 points"]  # the cheaper one
+    likely: Float[Array, "3 points"]  # the cheaper one, or the one that is not astray
     other: Float[Array, "3 points"]  # the same where there is no other
 
 
