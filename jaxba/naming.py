@@ -1,6 +1,6 @@
 """Solver names, the same in every command, table and file: `[method+]policy[+refineK|+embedded][@dtype]`.
 
-A peer has its library's name: `pyceres:MODE`, and `pyceres:MODE+policy` where a policy drives it.
+A peer has its library's name: `pyceres:MODE`, and `pyceres:MODE+policy[+refineK|+embedded]` where a policy drives it.
 """
 
 from __future__ import annotations
@@ -49,15 +49,19 @@ class SolverName:
     """`LIBRARY:MODE` where another library computes the steps; its own rule chooses lambda if `policy` is empty."""
 
     def __str__(self) -> str:
+        around = "+embedded" if self.refine_points is None else f"+refine{self.refine_points}" if self.embeds else ""
         if self.peer:
-            return f"{self.peer}+{self.policy}" if self.policy else self.peer
+            return f"{self.peer}+{self.policy}{around}" if self.policy else self.peer
+        if is_learned(self.policy):  # which embeds unless told not to
+            around = "" if self.refine_points is None else f"+refine{self.refine_points}"
         method = "" if self.method == DEFAULT_METHOD else f"{self.method}+"
-        if self.refine_points is None:
-            refine = "" if is_learned(self.policy) else "+embedded"
-        else:
-            refine = f"+refine{self.refine_points}" if self.refine_points or is_learned(self.policy) else ""
         dtype = "" if self.dtype == DTYPES[0] else f"@{self.dtype}"
-        return f"{method}{self.policy}{refine}{dtype}"
+        return f"{method}{self.policy}{around}{dtype}"
+
+    @property
+    def embeds(self) -> bool:
+        """Whether there are embedded iterations."""
+        return self.refine_points != 0
 
     def build(self) -> tuple[DampingPolicy, StepOptions]:
         """The policy, and the options of the step that it drives.
@@ -89,9 +93,9 @@ def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> s
     """
     if policy != LEARNED:
         return policy
-    if peer:
-        return LEARNED_DRIVER
-    return LEARNED_PLAIN if alone else LEARNED
+    if not alone:
+        return LEARNED
+    return LEARNED_DRIVER if peer else LEARNED_PLAIN
 
 
 def parse_solver(name: str) -> SolverName:
@@ -154,8 +158,8 @@ def _parse_peer(name: str) -> SolverName:
     if mode.endswith(INNER):  # Ceres credits them to the linear model, so that no policy could tell a gain
         raise SolverNameError(f"{name!r} is no solver; {library} has inner iterations under its own rule alone")
     driver = parse_solver(policy)
-    # lambda alone: the peer computes the step, in its own arithmetic
-    embedded = driver.refine_points is None and (not is_learned(driver.policy) or policy.endswith("+embedded"))
-    if embedded or driver.refine_points or driver != SolverName(driver.policy, driver.refine_points):
-        raise SolverNameError(f"{name!r} is no solver; a policy drives {library} by lambda alone: {peer}+policy")
-    return SolverName(driver.policy, peer=peer)
+    if driver != SolverName(driver.policy, driver.refine_points):
+        raise SolverNameError(f"{name!r} is no solver; the form is {peer}+policy[+refineK|+embedded]")
+    # the peer's own steps, unless more is asked for: a learned policy then brings nothing either
+    asked = driver.embeds and not (is_learned(driver.policy) and policy.strip().endswith(driver.policy))
+    return SolverName(driver.policy, driver.refine_points if asked else 0, peer=peer)

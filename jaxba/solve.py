@@ -186,7 +186,7 @@ def solve(
             host.release_programs()  # many problems in one process would end it
         count = int(final.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
-        found = _write_back(here, layout, final.state, options)
+        found = write_back(here, layout, final.state, options)
         return Solution(
             problem=found if middle is None else shift(found, middle),
             initial_cost=float(state.cost),
@@ -248,7 +248,7 @@ def _run_compiled(
     return carry, history, 0, clock.seconds, time.perf_counter() - started - clock.seconds
 
 
-def _write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:
+def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:
     """Optimised parameters in the problem's own order; what was not optimised is copied bit by bit."""
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
     seen = np.flatnonzero(layout.camera_seen)  # cameras of padding are not seen

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -33,6 +34,7 @@ from jaxba.bench import report
 from jaxba.bench.records import read_records
 from jaxba.cli.bench import run as run_bench
 from jaxba.clock import CompileClock
+from jaxba.naming import parse_solver
 
 pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")
 pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
@@ -58,10 +60,10 @@ def real(name: str) -> BundleProblem:
     return read_problem(f"{DATA}/{name}.txt.bz2")
 
 
-def scattered(seed: int) -> BundleProblem:
-    """`tiny` with its points thrown 3 units, a third of the way to the cameras."""
+def scattered(seed: int, far: float = 3) -> BundleProblem:
+    """`tiny` with its points thrown some units; three are a third of the way to the cameras."""
     problem = support.tiny()
-    return problem.replace(points=problem.points + 3 * np.random.default_rng(seed).normal(size=problem.points.shape))
+    return problem.replace(points=problem.points + far * np.random.default_rng(seed).normal(size=problem.points.shape))
 
 
 # The problem
@@ -272,14 +274,16 @@ def test_a_policy_that_is_rejected_goes_on_from_the_same_state():
     np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["learned-driver", "ceres", "schedule"])
+@pytest.mark.parametrize("name", ["learned+refine0", "ceres", "schedule", "learned+embedded"])
 def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
     jax.clear_caches()
     before = []
     start = Run.start
     with CompileClock() as clock:
         monkeypatch.setattr(Run, "start", lambda run: (before.append(clock.seconds), start(run)))
-        drive_ceres(support.tiny(), "dense", make_policy(name))
+        solver = parse_solver(f"pyceres:dense+{name}")
+        policy, options = solver.build()
+        drive_ceres(support.tiny(), "dense", policy, embedded=options if solver.embeds else None)
         assert clock.seconds == before[0] > 0
 
 
@@ -288,6 +292,55 @@ def test_every_lambda_is_possible(damping):
     found = drive_ceres(support.tiny(), "dense", Schedule(values=(damping,)), max_iterations=2)
     assert found.history.damping[0] == damping
     assert found.final_cost <= found.initial_cost
+
+
+@pytest.mark.parametrize("name", ["learned+embedded", "ceres+embedded", "classic+refine2"])
+@pytest.mark.parametrize("make", [support.tiny, lambda: scattered(7)])
+def test_with_embedded_iterations_ceres_does_what_our_step_does(name, make):
+    policy, options = parse_solver(f"pyceres:dense+{name}").build()
+    found = drive_ceres(make(), "dense", policy, embedded=options, max_iterations=12)
+    ours = solve(make(), policy, replace(options, rotation="manifold"), max_iterations=12)
+    assert (found.iterations, found.termination) == (ours.iterations, ours.termination)
+    np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
+    np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-3)
+    np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-7)
+    np.testing.assert_allclose(found.final_cost, geometry.cost(found.problem), rtol=1e-12)
+
+
+def test_ceres_makes_the_same_step_when_it_is_not_to_judge_it():
+    """With nothing embedded, steps as long as Ceres makes them."""
+    bare = StepOptions(rotation="manifold")
+    found, plain = (drive_ceres(support.tiny(), "dense", SOME, max_iterations=6, embedded=it) for it in (bare, None))
+    np.testing.assert_allclose(found.history.cost, plain.history.cost, rtol=1e-10)
+    np.testing.assert_allclose(found.history.gain_ratio, plain.history.gain_ratio, rtol=1e-6)
+    np.testing.assert_allclose(found.history.gradient_max, plain.history.gradient_max, rtol=1e-6)
+    np.testing.assert_allclose(found.history.step_norm, plain.history.step_norm, rtol=1e-6)
+
+
+def test_a_step_that_ceres_would_refuse_is_judged_and_then_leaves_every_bit():
+    bold, problem = Schedule(values=(1e-9,)), scattered(4, far=5)
+    plain, bare = (drive_ceres(problem, "dense", bold, max_iterations=1, embedded=it) for it in (None, StepOptions()))
+    for refused in (plain, bare):
+        assert refused.history.candidate_cost[0] > 1e3 * refused.initial_cost
+        assert not refused.history.accepted[0]
+        assert same_bits(refused.problem, problem)
+    # shorter trials and points mend it
+    around = StepOptions(refine_points=5, point_starts="rays", trials=4)
+    mended = drive_ceres(problem, "dense", bold, max_iterations=1, embedded=around)
+    assert mended.history.accepted[0]
+    assert mended.final_cost < 1e-2 * mended.initial_cost
+
+
+@pytest.mark.parametrize("mode", ["sparse", "iterative"])
+def test_other_modes_embed_as_well_and_tell_what_conjugate_gradients_took(mode):
+    policy, options = parse_solver(f"pyceres:{mode}+learned+embedded").build()
+    terms = []
+    note = lambda record: terms.append(float(record.step.forcing))
+    found = drive_ceres(support.tiny(), mode, policy, embedded=options, callback=note)
+    assert found.termination.converged
+    assert (found.history.cg_iterations > 0).all() == (mode == "iterative")
+    assert set(terms) == {0.1 if mode == "iterative" else 0.0}
+    np.testing.assert_allclose(found.final_cost, solve_by_ceres(support.tiny(), "dense").final_cost, rtol=1e-4)
 
 
 def test_driven_by_its_own_rule_ceres_does_what_it_does_alone():
@@ -399,22 +452,35 @@ def test_a_backend_names_its_versions():
 
 def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "write_all", lambda *_, **__: [])
-    names = ["ceres", "pyceres:sparse", "pyceres:dense+ceres", "pyceres:dense+learned"]
+    names = ["ceres", "pyceres:sparse", *(f"pyceres:dense+{name}" for name in ("ceres", "learned", "learned+embedded"))]
     argv = ["scene:tiny", "--solvers", ",".join(names), "--repeats", "1", "--out", str(tmp_path)]
     assert run_bench(argv) == 0
     ours, *peers = read_records(tmp_path / "results.jsonl")
     assert [record.solver for record in peers] == names[1:]
-    for record, mode in zip(peers, ("sparse", "dense", "dense"), strict=True):
+    for record, mode in zip(peers, ("sparse", "dense", "dense", "dense"), strict=True):
         assert record.backend == backend(mode)
         assert (record.device, record.dtype, record.termination) == ("cpu: host", "float64", "cost")
         assert record.threads == ours.threads
         assert [point.iteration for point in record.trace] == list(range(record.iterations + 1))
         np.testing.assert_allclose(record.initial_cost, ours.initial_cost, rtol=1e-12)
         np.testing.assert_allclose(record.final_cost, ours.final_cost, rtol=1e-4)
-    assert [record.trace[1].damping for record in peers] == [1e-4, 1e-4, pytest.approx(1e-5)]
+    assert [record.trace[1].damping for record in peers] == [1e-4, 1e-4, *2 * [pytest.approx(1e-5)]]
+    assert len(peers[3].trace) < len(peers[1].trace)
 
 
 # Real problems
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*IN_FRONT[:2], LADYBUG])
+def test_real_problems_end_as_with_our_step_where_iterations_are_embedded(name):
+    policy, options = parse_solver("pyceres:dense+learned+embedded").build()
+    found = drive_ceres(real(name), "dense", policy, embedded=options)
+    ours = solve(real(name), policy, replace(options, rotation="manifold"))
+    assert found.termination.converged
+    assert abs(found.iterations - ours.iterations) <= 1  # the network turns rounding into differences of lambda
+    np.testing.assert_allclose(found.final_cost, ours.final_cost, rtol=1e-5)
 
 
 @needs_data

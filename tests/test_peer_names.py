@@ -25,6 +25,10 @@ from jaxba.options import StepOptions
         ("pyceres:dense-inner", SolverName("", peer="pyceres:dense-inner"), None),
         ("pyceres:dense+learned", SolverName("learned", peer="pyceres:dense"), None),
         ("pyceres:dense+learned+refine0", SolverName("learned", peer="pyceres:dense"), "pyceres:dense+learned"),
+        ("pyceres:dense+learned+embedded", SolverName("learned", None, peer="pyceres:dense"), None),
+        ("pyceres:sparse+ceres+embedded", SolverName("ceres", None, peer="pyceres:sparse"), None),
+        ("pyceres:dense+ceres+refine3", SolverName("ceres", 3, peer="pyceres:dense"), None),
+        ("pyceres:dense+ceres+refine0", SolverName("ceres", peer="pyceres:dense"), "pyceres:dense+ceres"),
         ("pyceres:sparse+constant:1e+2", SolverName("constant:1e+2", peer="pyceres:sparse"), None),
         ("pyceres:iterative+classic:0.03", SolverName("classic:0.03", peer="pyceres:iterative"), None),
     ],
@@ -47,12 +51,11 @@ def test_peers_have_the_names_of_the_contract(text, name, shortest):
         ("pyceres:sparse-inner+ceres", SolverNameError, "inner iterations under its own rule alone"),
         ("pyceres:dense+", SolverNameError, "is no solver"),
         ("pyceres:dense+cerse", UnknownPolicyError, "unknown damping policy 'cerse'"),
-        ("pyceres:dense+ceres+refine3", SolverNameError, "by lambda alone: pyceres:dense+policy"),
-        ("pyceres:dense+ceres+embedded", SolverNameError, "by lambda alone"),
-        ("pyceres:dense+learned+embedded", SolverNameError, "by lambda alone"),
-        ("pyceres:dense+ceres@float32", SolverNameError, "by lambda alone"),
-        ("pyceres:dense+pyceres:dense", SolverNameError, "by lambda alone"),
-        ("pyceres:dense+pyceres:dense+ceres", SolverNameError, "by lambda alone"),
+        ("pyceres:dense+ceres+refine", SolverNameError, "unknown method 'ceres'"),
+        ("pyceres:dense+stba+ceres", SolverNameError, "the form is pyceres:dense+policy[+refineK|+embedded]"),
+        ("pyceres:dense+ceres@float32", SolverNameError, "the form is pyceres:dense+policy[+refineK|+embedded]"),
+        ("pyceres:dense+pyceres:dense", SolverNameError, "the form is pyceres:dense+policy"),
+        ("pyceres:dense+pyceres:dense+ceres", SolverNameError, "the form is pyceres:dense+policy"),
         ("lm+pyceres:dense", UnknownPolicyError, "unknown damping policy 'pyceres:dense'"),
     ],
 )
@@ -68,6 +71,15 @@ def test_a_learned_policy_drives_a_peer_by_lambda_alone():
     assert isinstance(policy, Learned)
     assert (policy.config.refine_points, policy.config.trials, policy.config.camera_rounds) == (0, 1, 0)
     assert options == StepOptions()
+
+
+def test_with_embedded_iterations_a_learned_policy_is_that_of_our_own_step():
+    policy, options = parse_solver("pyceres:dense+learned+embedded").build()
+    ours, same = parse_solver("learned").build()
+    assert isinstance(policy, Learned)
+    assert isinstance(ours, Learned)
+    assert policy.config == ours.config
+    assert options == same
 
 
 def test_every_peer_says_what_brings_it():

@@ -117,7 +117,8 @@ def _run_peer(
         "callback": watch,
     }
     if solver.policy:
-        solution = drive_ceres(problem, mode, solver.build()[0], **shared)
+        policy, options = solver.build()
+        solution = drive_ceres(problem, mode, policy, embedded=options if solver.embeds else None, **shared)
     else:
         solution = solve_by_ceres(problem, mode, **shared)
     record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)

@@ -33,12 +33,8 @@ class ColmapProblem:
         """
         if problem.whitening is not None or problem.lenses is not None:
             raise ProblemError("Ceres as a peer takes no covariances or weights, and no shared or partly fixed lenses")
-        cameras = np.asarray(problem.cameras, np.float64)
         self.start = problem
-        self.poses = np.hstack([colmap_quaternions(cameras[:, :3]), cameras[:, 3:6] * FLIP])
-        self.lenses = np.zeros((len(cameras), LENS_SIZE))
-        self.lenses[:, [0, 3, 4]] = cameras[:, 6:]
-        self.points = np.array(problem.points, np.float64, order="C")
+        self.poses, self.lenses, self.points = _parameters(problem)
         self.pixels = np.asarray(problem.observations, np.float64) * FLIP[:2]
         self.ceres = pyceres.Problem()
         self._points, self._poses, self._lenses = list(self.points), list(self.poses), list(self.lenses)
@@ -69,6 +65,11 @@ class ColmapProblem:
         self.in_python[new] = True
         return len(new)
 
+    def add(self, cost: Any, point: int) -> None:
+        """Adds an error of one point that is no observation."""
+        self._costs.append(cost)
+        self.ceres.add_residual_block(cost, None, [self._points[point]])
+
     def parameters(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Copies of `poses`, `lenses` and `points`."""
         return self.poses.copy(), self.lenses.copy(), self.points.copy()
@@ -77,6 +78,10 @@ class ColmapProblem:
         """Puts back what `parameters` returned, in place."""
         for block, old in zip((self.poses, self.lenses, self.points), parameters, strict=True):
             block[:] = old
+
+    def move_to(self, problem: BundleProblem) -> None:
+        """Takes over the parameters of another problem of the same shape, in place."""
+        self.restore(_parameters(problem))
 
     def residuals(self) -> Float[np.ndarray, " residuals"]:
         """What Ceres sees at the present parameters, pixels."""
@@ -88,3 +93,12 @@ class ColmapProblem:
         poses, lenses = self.poses[self.seen], self.lenses[self.seen]
         cameras[self.seen] = np.hstack([bal_rotations(poses[:, :4]), poses[:, 4:] * FLIP, lenses[:, [0, 3, 4]]])
         return self.start.replace(cameras=cameras, points=self.points.copy())
+
+
+def _parameters(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Poses, lenses and points, in arrays of their own."""
+    cameras = np.asarray(problem.cameras, np.float64)
+    lenses = np.zeros((len(cameras), LENS_SIZE))
+    lenses[:, [0, 3, 4]] = cameras[:, 6:]
+    poses = np.hstack([colmap_quaternions(cameras[:, :3]), cameras[:, 3:6] * FLIP])
+    return poses, lenses, np.array(problem.points, np.float64, order="C")

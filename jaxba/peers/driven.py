@@ -8,6 +8,7 @@ driven times only.
 
 from __future__ import annotations
 
+import functools
 import time
 from typing import Any
 
@@ -20,9 +21,11 @@ from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm import StepInfo
 from jaxba.loop import after_step
+from jaxba.options import StepOptions
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import Observed, observed, step_facts
+from jaxba.peers.verdict import Told, Verdict
 from jaxba.problem import BundleProblem
 from jaxba.solve import MAX_ITERATIONS, Solution
 from jaxba.termination import Termination, Tolerances
@@ -62,6 +65,7 @@ def drive_ceres(
     tolerances: Tolerances | None = None,
     threads: int = 1,
     callback: Callback | None = None,
+    embedded: StepOptions | None = None,
 ) -> Solution:
     """Ceres' steps under a policy, with jaxba's stop tests.
 
@@ -79,6 +83,8 @@ def drive_ceres(
         tolerances: convergence tests.
         threads: of Ceres.
         callback: called after every iteration; a true return value stops the solve.
+        embedded: what surrounds each step, and how it is added to a camera; then jaxba judges it (verdict.py), and the
+            policy sees what it sees of `lm_step`. How a step is solved does not matter.
 
     Returns:
         `total_s` holds Ceres' calls, the policy and `step_facts`, without compilation.
@@ -97,11 +103,17 @@ def drive_ceres(
     options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
     with jax.enable_x64(True), host.calm_blas(), CompileClock() as clock:
         started = time.perf_counter()
-        constant = observed(problem, run.colmap.pixels)
         state, damping = _init(policy, _problem_info(problem, run.initial_cost, max_iterations))
         # everything is compiled before the clock starts
         same = run.colmap.parameters()
-        jax.block_until_ready(step_facts(constant, same, same))
+        if embedded is None:
+            constant = observed(problem, run.colmap.pixels)
+            jax.block_until_ready(step_facts(constant, same, same))
+            iterate = functools.partial(_iterate, run, options, last.summaries, constant, mode)
+        else:
+            verdict = Verdict(run, embedded, policy.min_gain)
+            jax.block_until_ready(verdict.judged(same, float(damping), Told.nothing()))
+            iterate = functools.partial(_judged, run, options, last.summaries, verdict, mode)
         idle = _idle(run.cost, float(damping))
         # twice: the state that a policy returns need not be of the type of its first
         warm, _, _ = _answer(policy, state, idle, 1, tolerances, max_iterations)
@@ -111,7 +123,7 @@ def drive_ceres(
         end, iteration = Termination.RUNNING, 0
         while end == Termination.RUNNING:
             iteration += 1
-            step = _iterate(run, options, last.summaries, constant, mode, float(damping))
+            step = iterate(float(damping))
             state, damping, answer = _answer(policy, state, step, iteration, tolerances, max_iterations)
             end = Termination(int(answer))
             if run.record(step) and end == Termination.RUNNING:
@@ -146,6 +158,18 @@ def _iterate(run: Run, options: Any, summaries: list[Any], constant: Observed, m
         return step._replace(cost=whole)
     run.colmap.restore(before)
     return step._replace(accepted=False, cost=first.cost, step_norm=np.nan, damping_share=REJECTED_SHARE)
+
+
+def _judged(run: Run, options: Any, summaries: list[Any], verdict: Verdict, mode: str, damping: float) -> StepInfo:
+    """One linear solve by one call of Ceres; what becomes of its step jaxba decides."""
+    before = run.colmap.parameters()
+    options.initial_trust_region_radius = float(np.clip(1 / damping, SMALLEST_RADIUS, LARGEST_RADIUS))
+    summaries.clear()
+    verdict.forgiving.begin()
+    pyceres.solve(options, run.colmap.ceres, pyceres.SolverSummary())
+    if len(summaries) < 2 or not summaries[1].step_is_successful:  # no step could be computed
+        return _idle(run.cost, damping, *(summary.gradient_max_norm for summary in summaries[:1]))
+    return verdict.settle(before, damping, Told.of(summaries, mode))
 
 
 def _idle(cost: float, damping: float, gradient_max: float = np.nan) -> StepInfo:

@@ -42,7 +42,7 @@ def observed(problem: BundleProblem, pixels: np.ndarray) -> Observed:
 def step_facts(constant: Observed, before: Any, after: Any) -> StepFacts:
     """Facts about the step between two sets of parameters `(poses [c, 7], lenses [c, 5], points [p, 3])`."""
     poses, lenses, points = before
-    turn = _half_turn(poses[:, :4].T, after[0][:, :4].T)
+    turn = half_turn(poses[:, :4].T, after[0][:, :4].T)
     moved = (after[0][:, 4:] - poses[:, 4:]).T, (after[1] - lenses).T, (after[2] - points).T
     pose_rate = jnp.concatenate([_product(turn, poses[:, :4].T), moved[0]])
     camera, point = constant.camera_index, constant.point_index
@@ -84,7 +84,7 @@ def _product(vector: Float[Array, "3 n"], q: Float[Array, "4 n"]) -> Float[Array
     return jnp.concatenate([q[3] * vector + jnp.cross(vector, q[:3], axis=0), real[None]])
 
 
-def _half_turn(before: Float[Array, "4 n"], after: Float[Array, "4 n"]) -> Float[Array, "3 n"]:
+def half_turn(before: Float[Array, "4 n"], after: Float[Array, "4 n"]) -> Float[Array, "3 n"]:
     """`v` with `after = exp(v) before` for unit quaternions: half of the rotation between them, radians."""
     v, w = before[:3], before[3]
     vector = w * after[:3] - after[3] * v - jnp.cross(after[:3], v, axis=0)
