@@ -49,11 +49,13 @@ class SolverName:
     """`LIBRARY:MODE` where another library computes the steps; its own rule chooses lambda if `policy` is empty."""
 
     def __str__(self) -> str:
-        around = "+embedded" if self.refine_points is None else f"+refine{self.refine_points}" if self.embeds else ""
+        around = ""
+        if self.refine_points is None:
+            around = "" if is_learned(self.policy) else "+embedded"
+        elif self.embeds or is_learned(self.policy):
+            around = f"+refine{self.refine_points}"
         if self.peer:
             return f"{self.peer}+{self.policy}{around}" if self.policy else self.peer
-        if is_learned(self.policy):  # which embeds unless told not to
-            around = "" if self.refine_points is None else f"+refine{self.refine_points}"
         method = "" if self.method == DEFAULT_METHOD else f"{self.method}+"
         dtype = "" if self.dtype == DTYPES[0] else f"@{self.dtype}"
         return f"{method}{self.policy}{around}{dtype}"
@@ -160,6 +162,4 @@ def _parse_peer(name: str) -> SolverName:
     driver = parse_solver(policy)
     if driver != SolverName(driver.policy, driver.refine_points):
         raise SolverNameError(f"{name!r} is no solver; the form is {peer}+policy[+refineK|+embedded]")
-    # the peer's own steps, unless more is asked for: a learned policy then brings nothing either
-    asked = driver.embeds and not (is_learned(driver.policy) and policy.strip().endswith(driver.policy))
-    return SolverName(driver.policy, driver.refine_points if asked else 0, peer=peer)
+    return SolverName(driver.policy, driver.refine_points, peer=peer)

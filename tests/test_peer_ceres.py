@@ -274,7 +274,7 @@ def test_a_policy_that_is_rejected_goes_on_from_the_same_state():
     np.testing.assert_allclose(found.history.cost, ours.history.cost, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["learned+refine0", "ceres", "schedule", "learned+embedded"])
+@pytest.mark.parametrize("name", ["learned+refine0", "ceres", "schedule", "learned"])
 def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
     jax.clear_caches()
     before = []
@@ -294,7 +294,7 @@ def test_every_lambda_is_possible(damping):
     assert found.final_cost <= found.initial_cost
 
 
-@pytest.mark.parametrize("name", ["learned+embedded", "ceres+embedded", "classic+refine2"])
+@pytest.mark.parametrize("name", ["learned", "ceres+embedded", "classic+refine2"])
 @pytest.mark.parametrize("make", [support.tiny, lambda: scattered(7)])
 def test_with_embedded_iterations_ceres_does_what_our_step_does(name, make):
     policy, options = parse_solver(f"pyceres:dense+{name}").build()
@@ -333,7 +333,7 @@ def test_a_step_that_ceres_would_refuse_is_judged_and_then_leaves_every_bit():
 
 @pytest.mark.parametrize("mode", ["sparse", "iterative"])
 def test_other_modes_embed_as_well_and_tell_what_conjugate_gradients_took(mode):
-    policy, options = parse_solver(f"pyceres:{mode}+learned+embedded").build()
+    policy, options = parse_solver(f"pyceres:{mode}+learned").build()
     terms = []
     note = lambda record: terms.append(float(record.step.forcing))
     found = drive_ceres(support.tiny(), mode, policy, embedded=options, callback=note)
@@ -452,7 +452,7 @@ def test_a_backend_names_its_versions():
 
 def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "write_all", lambda *_, **__: [])
-    names = ["ceres", "pyceres:sparse", *(f"pyceres:dense+{name}" for name in ("ceres", "learned", "learned+embedded"))]
+    names = ["ceres", "pyceres:sparse", *(f"pyceres:dense+{name}" for name in ("ceres", "learned+refine0", "learned"))]
     argv = ["scene:tiny", "--solvers", ",".join(names), "--repeats", "1", "--out", str(tmp_path)]
     assert run_bench(argv) == 0
     ours, *peers = read_records(tmp_path / "results.jsonl")
@@ -475,7 +475,7 @@ def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*IN_FRONT[:2], LADYBUG])
 def test_real_problems_end_as_with_our_step_where_iterations_are_embedded(name):
-    policy, options = parse_solver("pyceres:dense+learned+embedded").build()
+    policy, options = parse_solver("pyceres:dense+learned").build()
     found = drive_ceres(real(name), "dense", policy, embedded=options)
     ours = solve(real(name), policy, replace(options, rotation="manifold"))
     assert found.termination.converged

@@ -23,9 +23,9 @@ from jaxba.options import StepOptions
         ("pyceres:sparse", SolverName("", peer="pyceres:sparse"), None),
         (" pyceres:iterative ", SolverName("", peer="pyceres:iterative"), "pyceres:iterative"),
         ("pyceres:dense-inner", SolverName("", peer="pyceres:dense-inner"), None),
-        ("pyceres:dense+learned", SolverName("learned", peer="pyceres:dense"), None),
-        ("pyceres:dense+learned+refine0", SolverName("learned", peer="pyceres:dense"), "pyceres:dense+learned"),
-        ("pyceres:dense+learned+embedded", SolverName("learned", None, peer="pyceres:dense"), None),
+        ("pyceres:dense+learned", SolverName("learned", None, peer="pyceres:dense"), None),
+        ("pyceres:dense+learned+refine0", SolverName("learned", peer="pyceres:dense"), None),
+        ("pyceres:dense+learned+embedded", SolverName("learned", None, peer="pyceres:dense"), "pyceres:dense+learned"),
         ("pyceres:sparse+ceres+embedded", SolverName("ceres", None, peer="pyceres:sparse"), None),
         ("pyceres:dense+ceres+refine3", SolverName("ceres", 3, peer="pyceres:dense"), None),
         ("pyceres:dense+ceres+refine0", SolverName("ceres", peer="pyceres:dense"), "pyceres:dense+ceres"),
@@ -66,15 +66,15 @@ def test_what_is_no_peer_is_one_clear_line(text, error, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_learned_policy_drives_a_peer_by_lambda_alone():
-    policy, options = parse_solver("pyceres:dense+learned").build()
+def test_without_embedded_iterations_a_policy_for_lambda_alone_drives_a_peer():
+    policy, options = parse_solver("pyceres:dense+learned+refine0").build()
     assert isinstance(policy, Learned)
     assert (policy.config.refine_points, policy.config.trials, policy.config.camera_rounds) == (0, 1, 0)
     assert options == StepOptions()
 
 
-def test_with_embedded_iterations_a_learned_policy_is_that_of_our_own_step():
-    policy, options = parse_solver("pyceres:dense+learned+embedded").build()
+def test_a_learned_policy_brings_its_embedded_iterations_to_a_peer():
+    policy, options = parse_solver("pyceres:dense+learned").build()
     ours, same = parse_solver("learned").build()
     assert isinstance(policy, Learned)
     assert isinstance(ours, Learned)

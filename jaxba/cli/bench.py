@@ -38,8 +38,9 @@ class Arguments:
     max_iterations."""
 
     solvers: str | None = None
-    """Comma-separated names, [method+]policy[+refineK|+embedded][@dtype], or pyceres:dense|sparse|iterative[+policy],
-    pyceres:dense-inner|sparse-inner (extra `ceres`). Default: learned,classic,ceres,ceres+refine3,ceres+embedded."""
+    """Comma-separated names, [method+]policy[+refineK|+embedded][@dtype], or with the extra `ceres`
+    pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]], pyceres:dense-inner|sparse-inner. Default:
+    learned,classic,ceres,ceres+refine3,ceres+embedded."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default 1e-3."""
