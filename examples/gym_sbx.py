@@ -99,7 +99,7 @@ def main() -> None:
     arguments = parser.parse_args()
 
     kind = SceneClass(5, 20)
-    config = GameConfig(agent=AgentConfig(trials=1, camera_rounds=0))
+    config = GameConfig(agent=AgentConfig(trials=1, camera_rounds=0, pattern_moves=0))
     options = config.agent.step_options(StepOptions())
     print("making scenes", flush=True)
     bank = BankConfig(classes=(kind,), scenes=(arguments.scenes,))

@@ -90,6 +90,10 @@ class StepOptions:
     """Rounds in which first every camera, then every point is re-optimised alone, where a step did much less than the
     linear model promised; one at most for a shortened candidate; see `trial.py`."""
 
+    pattern_moves: int = 0
+    """How often at most the way of an accepted step is repeated, each time twice as far, where the linear model did not
+    foresee what it did; see `trial.py`."""
+
     intrinsics: Intrinsics = "free"
     """Whether focal lengths and distortions are optimised, as in BAL, or stay: the seed paper optimises poses and
     points. `fixed` works with the explicit solver."""
@@ -124,7 +128,7 @@ class StepOptions:
         ):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
-        for name, least in (("refine_points", 0), ("camera_rounds", 0), ("trials", 1)):
+        for name, least in (("refine_points", 0), ("camera_rounds", 0), ("pattern_moves", 0), ("trials", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be at least {least}, is {getattr(self, name)}")
         for name in ("cluster_cameras", "block_steps"):

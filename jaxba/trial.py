@@ -10,11 +10,15 @@ what they see. Repairing that locally is cheap beside a linear solve, and lets b
 3. `trials`: a candidate that is still refused is tried again at a quarter of the length, with 1 and at most one round
    of 2. Where steps are tried again, a camera whose focal length would change its sign stays where it was: an image
    seen in a mirror fits for a while, and there is no way back.
+4. `pattern_moves`: an accepted candidate that the linear model did not foresee, or that damping held back, lies on the
+   floor of a valley, and so does the start; the way from one to the other is repeated, twice as far each time, with 1
+   and one round of 2, as long as that costs less.
 
 None of it takes another linear solve, so it is all one iteration (design, section 2). Where a problem falls into parts
 that are judged by themselves (`parts.py`), each has its own share, rounds and verdict. Source: 1 is Jeong et al. 2012,
 "embedded point iterations", and Ceres' inner iterations; 2 is resection and intersection (Chen, Chen, Wang 2019,
-"Bundle adjustment revisited"), here as a repair of second-order steps; 3 is a backtracking line search.
+"Bundle adjustment revisited"), here as a repair of second-order steps; 3 is a backtracking line search; 4 is the
+pattern move of direct search (Hooke, Jeeves 1961, "Direct search solution of numerical and statistical problems").
 """
 
 from __future__ import annotations
@@ -45,10 +49,17 @@ HOPELESS = 1.5
 """Candidates that cost more than this times the present cost get no camera rounds: wild points would pull the cameras
 after them. On Ladybug-49 under lambda 1e-6 a limit of 10 led into a minimum 19% above, 1.5 did not."""
 
-ROUNDS_OF_SHORTER = 1
-"""Camera rounds of a shortened candidate. On 457 held-out scenes `learned` came within 1e-4 of the best in 6.40
-iterations on average without any, 6.02 with one, 5.88 with three; on real problems three took a tenth more work than
-one."""
+ROUNDS_OF_OTHERS = 1
+"""Camera rounds of a shortened candidate, and of a pattern move. On 457 held-out scenes `learned` came within 1e-4 of
+the best in 6.40 iterations on average without any of a shortened one, 6.02 with one, 5.88 with three; on real problems
+three took a tenth more work than one."""
+
+FORESEEN = 0.25
+"""Difference of the gain ratio from one up to which a step did what the linear model promised."""
+
+FREE = 0.1
+"""Share of damping in a step's curvature up to which damping did not hold it back. A step that did what was promised
+and was free is Newton's, and there is nothing to be had beyond its end."""
 
 NEGLIGIBLE = 1e-6
 """Promised decrease relative to the cost that is not worth repairs or further trials. Source: Ceres
@@ -69,7 +80,7 @@ class Trial(NamedTuple):
     gain: Float[Array, "*parts"]  # actual over predicted decrease
     accepted: Bool[Array, "*parts"]
     share: Float[Array, "*parts"]  # length relative to the whole step
-    repairs: Int[Array, "*parts"]  # camera rounds and further trials that it took
+    repairs: Int[Array, "*parts"]  # camera rounds, further trials and pattern moves that it took
 
 
 def best_trial(
@@ -114,48 +125,82 @@ def best_trial(
         accepted = (decrease > 0) & (candidate <= cost) & (predicted > 0) & (gain > min_gain) & jnp.isfinite(candidate)
         return Trial(cameras, points, candidate, predicted, gain, accepted, share, repairs)
 
-    def repair(turn: tuple[Trial, Array]) -> tuple[Trial, Array]:
-        trial, left = turn
-        moved = refine_cameras(parts.layout, trial.cameras, trial.points, options)
-        again = settle(moved, trial.points, trial.share, trial.repairs + 1, settled)
-        return _where(parts, worth_it(turn), again, trial), left - 1
-
-    def worth_it(turn: tuple[Trial, Array]) -> Bool[Array, "*parts"]:
-        trial, left = turn
-        return (left > 0) & (trial.gain < GOOD_GAIN) & (trial.cost < HOPELESS * cost) & matters
-
-    def attempt(wanted: Array, share: Array, repairs: Array) -> Trial:
-        moved = move_cameras(parts.layout, cameras, parts.of_cameras(share) * step.cameras, options)
+    def candidate(turn: _Turn) -> Trial:
+        """The next one, with its camera rounds."""
+        best, share = turn.best, jnp.where(turn.best.accepted, turn.best.share, turn.length)
+        moved = move_cameras(parts.layout, turn.cameras, parts.of_cameras(turn.length) * turn.way[0], options)
         if options.trials > 1:
-            moved = jnp.where(moved[6] * cameras[6] < 0, cameras, moved)
-        trial = settle(moved, points + parts.of_points(share) * step.points, share, repairs, options)
+            moved = jnp.where(moved[6] * cameras[6] < 0, turn.cameras, moved)
+        there = turn.points + parts.of_points(turn.length) * turn.way[1]
+        trial = settle(moved, there, share, best.repairs + 1, options)
         if not options.camera_rounds:
             return trial
-        rounds = jnp.where(share == 1, options.camera_rounds, min(ROUNDS_OF_SHORTER, options.camera_rounds))
-        rounds = jnp.where(wanted, rounds, 0)
-        return lax.while_loop(lambda turn: jnp.any(worth_it(turn)), repair, (trial, rounds))[0]
 
-    if options.trials == 1:
-        return attempt(jnp.ones(cost.shape, bool), one, none)
+        def repair(round_: tuple[Trial, Array]) -> tuple[Trial, Array]:
+            trial, left = round_
+            moved = refine_cameras(parts.layout, trial.cameras, trial.points, options)
+            again = settle(moved, trial.points, trial.share, trial.repairs + 1, settled)
+            return _chosen(parts, worth_it(round_), again, trial), left - 1
+
+        def worth_it(round_: tuple[Trial, Array]) -> Bool[Array, "*parts"]:
+            trial, left = round_
+            lacks = jnp.where(best.accepted, trial.cost >= best.cost, trial.gain < GOOD_GAIN)
+            return (left > 0) & lacks & (trial.cost < HOPELESS * cost) & matters
+
+        whole = ~best.accepted & (turn.length == 1)
+        rounds = jnp.where(whole, options.camera_rounds, min(ROUNDS_OF_OTHERS, options.camera_rounds))
+        rounds = jnp.where(turn.going, rounds, 0)
+        return lax.while_loop(lambda round_: jnp.any(worth_it(round_)), repair, (trial, rounds))[0]
+
+    def turn_over(turn: _Turn) -> _Turn:
+        best, trial = turn.best, candidate(turn)
+        first = trial.accepted & ~best.accepted
+        better = trial.accepted & best.accepted & (trial.cost < best.cost)
+        tried = best._replace(repairs=jnp.where(turn.going, trial.repairs, best.repairs))
+        after = _chosen(parts, turn.going & (better | ~best.accepted), trial, tried)
+        shorter = ~trial.accepted & (turn.length > shortest) & matters
+        if not options.pattern_moves:
+            return turn._replace(best=after, length=SHORTER * turn.length, going=turn.going & shorter)
+        foreseen = (jnp.abs(trial.gain - 1) <= FORESEEN) & (trial.repairs == 0) & (step.damped <= FREE * step.slope)
+        longer = better & (turn.length < longest)
+        goes_on = jnp.where(first, matters & ~foreseen, jnp.where(best.accepted, longer, shorter))
+        news = turn.going & first
+        way = after.cameras - cameras, after.points - points
+        return _Turn(
+            after,
+            jnp.where(parts.of_cameras(after.accepted), after.cameras, cameras),
+            jnp.where(parts.of_points(after.accepted), after.points, points),
+            (
+                jnp.where(parts.of_cameras(news), way[0], turn.way[0]),
+                jnp.where(parts.of_points(news), way[1], turn.way[1]),
+            ),
+            jnp.where(first, 1, jnp.where(best.accepted, 2, SHORTER) * turn.length),
+            turn.going & goes_on,
+        )
+
+    shortest, longest = 1.5 * SHORTER ** (options.trials - 1), 2.0 ** (options.pattern_moves - 1)
+    bad, yes = jnp.full_like(cost, jnp.inf), jnp.ones(cost.shape, bool)
+    nothing = Trial(cameras, points, bad, -one, -bad, ~yes, one, none - 1)
+    start = _Turn(nothing, cameras, points, (step.cameras, step.points), one, yes)
+    if options.trials == 1 and not options.pattern_moves:
+        return candidate(start)
     # the whole step is the first turn of the loop, so that the program has one copy of all this
-    last = 1.5 * SHORTER ** (options.trials - 1)
-
-    def refused(trial: Trial) -> Bool[Array, "*parts"]:
-        return ~trial.accepted & (trial.share > last) & (matters | (trial.share > 1))
-
-    def shorter(trial: Trial) -> Trial:
-        wanted = refused(trial)
-        return _where(parts, wanted, attempt(wanted, SHORTER * trial.share, trial.repairs + 1), trial)
-
-    bad = jnp.full_like(cost, jnp.inf)
-    nothing = Trial(cameras, points, bad, -one, -bad, jnp.zeros(cost.shape, bool), one / SHORTER, none - 1)
-    return lax.while_loop(lambda trial: jnp.any(refused(trial)), shorter, nothing)
+    return lax.while_loop(lambda turn: jnp.any(turn.going), turn_over, start).best
 
 
-def _where(parts: Parts, which: Bool[Array, "*parts"], new: Trial, old: Trial) -> Trial:
+class _Turn(NamedTuple):
+    """What is tried next, by every part: shorter steps until one is accepted, then pattern moves."""
+
+    best: Trial  # the last that was refused or, from the first accepted one on, the cheapest
+    cameras: Float[Array, "9 cameras"]  # from where the next one leads away
+    points: Float[Array, "3 points"]
+    way: tuple[Float[Array, "9 cameras"], Float[Array, "3 points"]]  # the step, or what became of it
+    length: Float[Array, "*parts"]  # of the next one, in ways
+    going: Bool[Array, "*parts"]  # whether there is a next one
+
+
+def _chosen(parts: Parts, which: Bool[Array, "*parts"], new: Trial, old: Trial) -> Trial:
     """The new trial of some parts, the old one of the others."""
-    if not which.shape:
-        return new  # loops run as long as there are some
     facts = [jnp.where(which, *pair) for pair in zip(new[2:], old[2:], strict=True)]
     cameras = jnp.where(parts.of_cameras(which), new.cameras, old.cameras)
     return Trial(cameras, jnp.where(parts.of_points(which), new.points, old.points), *facts)

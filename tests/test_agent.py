@@ -394,6 +394,7 @@ configs = st.builds(
     refine_points=st.integers(0, 5),
     trials=st.integers(1, 6),
     camera_rounds=st.integers(0, 4),
+    pattern_moves=st.integers(0, 4),
     camera_damping=st.floats(1e-6, 1e6),
     lens_step=st.sampled_from(["file", "pixels"]),
     point_starts=st.sampled_from(["step", "rays"]),
@@ -404,7 +405,7 @@ configs = st.builds(
 def test_a_configuration_comes_back_from_its_numbers(config):
     assert config_from(asdict(config)) == config
     made = config.step_options(StepOptions(cg_forcing=0.2))
-    own = "refine_points", "trials", "camera_rounds", "camera_damping", "lens_step", "point_starts"
+    own = "refine_points", "trials", "camera_rounds", "pattern_moves", "camera_damping", "lens_step", "point_starts"
     assert [getattr(made, name) for name in own] == [getattr(config, name) for name in own]
     assert made.cg_forcing == 0.2
 

@@ -172,7 +172,9 @@ def test_scenes_of_a_class_share_random_clusters(method):
 def test_scenes_whose_clusters_have_trials_and_rounds_are_played_as_each_alone():
     """Loops with a verdict per cluster, scenes along another axis: as one scene after the other."""
     bank, damping = tiny_bank(), 1e-6
-    options = StepOptions(linear_solver="decomposed", cluster_cameras=2, refine_points=2, trials=3, camera_rounds=2)
+    options = StepOptions(
+        linear_solver="decomposed", cluster_cameras=2, refine_points=2, trials=3, camera_rounds=2, pattern_moves=2
+    )
     found = play(KIND, bank, make_policy(f"constant:{damping}"), options, 4)
     layout = class_layout(KIND, options)
     iterate = jax.jit(lambda own, state, turn: lm_step(own, state, jnp.asarray(damping), options, 0.0, turn))

@@ -246,7 +246,7 @@ KINDS = {
     "whitened": (support.whitened, StepOptions()),
     "loss": (support.tiny, StepOptions(loss=Loss("huber", 1.7))),
     "identity": (support.tiny, StepOptions(scaling="identity")),
-    "embedded": (support.odd, StepOptions(refine_points=3, camera_rounds=2, trials=3)),
+    "embedded": (support.odd, StepOptions(refine_points=3, camera_rounds=2, trials=3, pattern_moves=2)),
     "fixed intrinsics": (support.tiny, StepOptions(intrinsics="fixed")),
 }
 

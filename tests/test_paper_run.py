@@ -28,6 +28,7 @@ agents:
     - game.agent.refine_points=0
     - game.agent.trials=1
     - game.agent.camera_rounds=0
+    - game.agent.pattern_moves=0
     - sac.width=8
     - sac.batch=16
     - loop.replay_capacity=500

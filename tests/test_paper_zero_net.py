@@ -28,6 +28,7 @@ AGENT = AgentConfig(
     refine_points=0,
     trials=1,
     camera_rounds=0,
+    pattern_moves=0,
 )
 SMALL = ZeroNetConfig(width=8, layers=2, batch=8, updates=30, max_iterations=10, learning_rate=0.03)
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from support import same_bits, start, step
 
-from jaxba import BundleProblem, Layout, LMState, StepOptions, geometry
+from jaxba import BundleProblem, Layout, LMState, StepOptions, geometry, make_policy, solve
 from jaxba.dense import solve_positive
 from jaxba.game.bank import initial_costs
 from jaxba.game.scenes import SceneClass, make_scenes
@@ -23,13 +23,14 @@ from jaxba.linearize import cost, linearize
 from jaxba.parts import Whole
 from jaxba.resect import DAMPINGS, refine_cameras
 from jaxba.schur import solve_step
-from jaxba.trial import GOOD_GAIN, HOPELESS, NEGLIGIBLE, ROUNDS_OF_SHORTER, SHORTER, best_trial
+from jaxba.trial import FORESEEN, FREE, GOOD_GAIN, HOPELESS, NEGLIGIBLE, ROUNDS_OF_OTHERS, SHORTER, best_trial
 
 pytestmark = pytest.mark.step
 
 PLAIN = StepOptions()
 SHORTER_ONLY = StepOptions(trials=4)
-EVERYTHING = StepOptions(refine_points=3, trials=4, camera_rounds=3)
+EVERYTHING = StepOptions(refine_points=3, trials=4, camera_rounds=3, pattern_moves=4)
+MOVES_ONLY = StepOptions(pattern_moves=4)
 
 BOLD = 1e-8
 """A lambda that leaves far starts to Gauss-Newton."""
@@ -301,7 +302,7 @@ def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
         bare = step(layout, before, BOLD, SHORTER_ONLY, min_gain=0.25)[1]
         full = step(layout, before, BOLD, with_rounds, min_gain=0.25)[1]
         shortened = round(float(np.log(full.share) / np.log(SHORTER)))
-        assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_SHORTER)
+        assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_OTHERS)
         assert full.share >= bare.share  # what a round brings in need not be shortened further
         if full.share == bare.share:
             assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-12)
@@ -318,3 +319,61 @@ def test_a_promise_too_small_to_matter_is_tried_once():
         assert (whole.predicted < NEGLIGIBLE * before.cost) == (tries == 1)
         last = step(layout, before, damping, SHORTER_ONLY, min_gain=1e9)[1]
         assert (last.predicted < 0.5 * whole.predicted) == (tries > 1)
+
+
+# Pattern moves
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("damping", [1e-2, 1.0, 1e2])
+def test_a_pattern_move_repeats_the_way_of_the_step_twice_as_far_each_time_while_that_costs_less(seed, damping):
+    """Where damping holds a step back: the end is 1, 2, 4, 8 or 16 ways off, by costs that NumPy evaluates."""
+    problem = turned(seed, 0.2)
+    layout, before = start(problem, PLAIN)
+    once, short = step(layout, before, damping, PLAIN)
+    end, info = step(layout, before, damping, MOVES_ONLY)
+    assert short.accepted
+    way = [np.asarray(new - old) for new, old in zip(once[:2], before[:2], strict=True)]
+
+    def cost_at(times: float) -> float:
+        moved = [np.asarray(old) + times * one for old, one in zip(before[:2], way, strict=True)]
+        return float(cost(layout, *(jnp.asarray(x) for x in moved), PLAIN.loss))
+
+    costs = [cost_at(2.0**k) for k in range(5)]
+    last = next((k for k in range(4) if not costs[k + 1] < costs[k]), 4)
+    held_back = short.damping_share > FREE or abs(short.gain_ratio - 1) > FORESEEN
+    last = last if held_back else 0
+    np.testing.assert_allclose(info.cost, costs[last], rtol=1e-9)
+    tried = min(last + 1, 4) if held_back else 0
+    assert info.repairs == tried
+    for new, old, one in zip(end[:2], before[:2], way, strict=True):
+        np.testing.assert_allclose(new - old, 2.0**last * one, rtol=1e-6, atol=1e-9)
+    assert damping < 1e2 or last > 0  # such steps are far too short
+
+
+def test_a_step_that_did_what_was_promised_is_not_followed():
+    """Newton's, close to the minimum: bit by bit what it is without pattern moves."""
+    problem = turned(1, 1e-3)
+    layout, before = start(problem, PLAIN)
+    free = step(layout, before, BOLD, PLAIN)
+    assert abs(free[1].gain_ratio - 1) < FORESEEN
+    assert same_bits(free, step(layout, before, BOLD, MOVES_ONLY))
+
+
+def test_a_refused_step_is_not_followed():
+    layout, before = start(turned(1, 0.2), PLAIN)
+    _, refused = step(layout, before, 1.0, MOVES_ONLY, min_gain=1e6)
+    assert not refused.accepted
+    assert refused.repairs == 0
+
+
+def test_pattern_moves_make_no_step_worse_and_a_crawl_shorter():
+    """A large lambda throughout, whose steps crawl."""
+    problem = turned(2, 0.2)
+    lowest = solve(problem, "ceres").final_cost
+    plain, moved = (solve(problem, make_policy("constant:1"), options).final_cost for options in (PLAIN, MOVES_ONLY))
+    assert moved - lowest < 0.5 * (plain - lowest)
+    for layout, before in wide():
+        bare, followed = (step(layout, before, 1e-2, options)[1] for options in (PLAIN, MOVES_ONLY))
+        assert followed.accepted == bare.accepted
+        assert followed.cost <= bare.cost * (1 + 1e-12)  # two programs

@@ -15,7 +15,15 @@ from jaxba.game.scenes import SceneClass, Scenes
 
 KIND = SceneClass(4, 12)
 AGENT = AgentConfig(
-    history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0, refine_points=0, trials=1, camera_rounds=0
+    history=2,
+    low=-10.0,
+    high=2.0,
+    first_low=-10.0,
+    descent=50.0,
+    refine_points=0,
+    trials=1,
+    camera_rounds=0,
+    pattern_moves=0,
 )
 RULES = GameConfig(agent=AGENT, max_iterations=4, limit_is_failure=False)
 

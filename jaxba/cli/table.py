@@ -28,6 +28,8 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         refine += f", up to {options.camera_rounds} camera rounds"
     if options.trials > 1:
         refine += f", up to {options.trials} trials"
+    if options.pattern_moves:
+        refine += f", up to {options.pattern_moves} pattern moves"
     if options.lens_step == "pixels":
         refine += ", distortion per pixel"
     if options.remembers:

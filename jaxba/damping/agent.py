@@ -107,6 +107,9 @@ class AgentConfig:
     camera_rounds: int = 3
     """Camera rounds of the step that it drives, see `StepOptions`."""
 
+    pattern_moves: int = 4
+    """Pattern moves of the step that it drives, see `StepOptions`."""
+
     camera_damping: float = 1.0
     """Damping of the cameras relative to that of the points in the step that it drives, see `StepOptions`."""
 
@@ -159,6 +162,7 @@ class AgentConfig:
             refine_points=self.refine_points,
             trials=self.trials,
             camera_rounds=self.camera_rounds,
+            pattern_moves=self.pattern_moves,
             camera_damping=self.camera_damping,
             lens_step=self.lens_step,
             point_starts=self.point_starts,
@@ -183,7 +187,7 @@ class AgentConfig:
         return self.history
 
 
-BEFORE = {"lens_step": "file", "point_starts": "step", "remembered_steps": 0}
+BEFORE = {"lens_step": "file", "point_starts": "step", "remembered_steps": 0, "pattern_moves": 0}
 """What a policy file means that is older than these settings."""
 
 
