@@ -47,3 +47,14 @@ def move_cameras(
         free = near if layout.lenses is None else near & layout.lenses.free[row - 6]
         moved = moved.at[row].set(jnp.where(free, kept, moved[row]))
     return moved
+
+
+def step_between(
+    cameras: Float[Array, "9 cameras"], moved: Float[Array, "9 cameras"], options: StepOptions
+) -> Float[Array, "9 cameras"]:
+    """What `move_cameras` has to add to get from one place to the other, to first order."""
+    change = moved - cameras
+    if options.rotation == "manifold":
+        turn = camera.left_jacobian(cameras[:3])
+        change = change.at[:3].set(jnp.einsum("ijc,jc->ic", turn, change[:3], precision="highest"))
+    return change

@@ -32,7 +32,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.effort import Effort
 from jaxba.linearize import Present
-from jaxba.moves import move_cameras
+from jaxba.moves import move_cameras, step_between
 from jaxba.options import StepOptions
 from jaxba.parts import Parts, Search
 from jaxba.refine import Home
@@ -165,7 +165,7 @@ def best_trial(
         longer = better & (turn.length < longest)
         goes_on = jnp.where(first, matters & ~foreseen, jnp.where(best.accepted, longer, shorter))
         news = turn.going & first
-        way = after.cameras - cameras, after.points - points
+        way = step_between(cameras, after.cameras, options), after.points - points
         return _Turn(
             after,
             jnp.where(parts.of_cameras(after.accepted), after.cameras, cameras),
@@ -194,7 +194,7 @@ class _Turn(NamedTuple):
     best: Trial  # the last that was refused or, from the first accepted one on, the cheapest
     cameras: Float[Array, "9 cameras"]  # from where the next one leads away
     points: Float[Array, "3 points"]
-    way: tuple[Float[Array, "9 cameras"], Float[Array, "3 points"]]  # the step, or what became of it
+    way: tuple[Float[Array, "9 cameras"], Float[Array, "3 points"]]  # the step, or what led to the first accepted one
     length: Float[Array, "*parts"]  # of the next one, in ways
     going: Bool[Array, "*parts"]  # whether there is a next one
 

@@ -12,7 +12,7 @@ from support import same_bits
 
 from jaxba import BundleProblem, StepOptions, build_layout, geometry, solve
 from jaxba.lenses import Lenses
-from jaxba.moves import LARGEST_ZOOM, move_cameras
+from jaxba.moves import LARGEST_ZOOM, move_cameras, step_between
 
 PIXELS = StepOptions(lens_step="pixels")
 FILE = StepOptions()
@@ -44,6 +44,17 @@ def test_all_lens_steps_agree_to_first_order(rotation):
     np.testing.assert_allclose(other_start, start, atol=0)
     far, other_far = (_move(layout, cameras, 0.2 * step, StepOptions(lens_step=how)) for how in ("file", "pixels"))
     assert np.abs(other_far[7:] - far[7:]).max() > 1e-3  # and not to second
+
+
+@pytest.mark.parametrize("rotation", ["angle-axis", "manifold"])
+@pytest.mark.parametrize("lens_step", ["file", "pixels"])
+def test_the_step_between_two_places_is_the_one_that_was_made_to_first_order(rotation, lens_step):
+    cameras, step = random_step(3, 1e-5)
+    cameras[:3] = np.random.default_rng(4).normal(size=cameras[:3].shape)  # turned by a radian or two
+    options = StepOptions(rotation=rotation, lens_step=lens_step)
+    moved = _move(build_layout(support.tiny()), cameras, step, options)
+    found = step_between(jnp.asarray(cameras), moved, options)
+    np.testing.assert_allclose(found, step, rtol=1e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize("growth", [0.25, -0.25])
