@@ -299,8 +299,9 @@ def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
         assert same_bits(parse_solver(f"{method}+learned+refine3").build()[0].layers, expected)
         alone = parse_solver(f"{method}+learned+refine0").build()[0]
         assert same_bits(alone.layers, load_policy(shipped["learned-plain"]).layers)
-    driver = parse_solver("pyceres:dense+learned").build()[0]
+    driver = parse_solver("pyceres:dense+learned+refine0").build()[0]
     assert same_bits(driver.layers, load_policy(shipped["learned-driver"]).layers)
+    assert same_bits(parse_solver("pyceres:dense+learned").build()[0].layers, expected)
 
 
 @pytest.mark.parametrize("name", registry.SHIPPED)
@@ -314,7 +315,7 @@ def test_a_shipped_policy_is_wired_as_the_preset_of_its_files_name(name):
 
 def test_the_policy_that_drives_another_library_damps_cameras_as_points():
     """Which is all that Ceres' one radius can do."""
-    policy, options = parse_solver("pyceres:dense+learned").build()
+    policy, options = parse_solver("pyceres:dense+learned+refine0").build()
     assert policy.config.camera_damping == options.camera_damping == 1
 
 
