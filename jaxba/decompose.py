@@ -62,7 +62,7 @@ class Round(NamedTuple):
     curvature: Float[Array, ""]  # d.H d
     gradient_max: Float[Array, ""]  # before the round
     share: Float[Array, ""]  # of their steps that clusters took, weighted by what each promised at full length
-    repairs: Int[Array, ""]  # camera rounds and further trials of the cluster that took most
+    repairs: Int[Array, ""]  # camera rounds, further trials and pattern moves of the cluster that took most
     accepted: Bool[Array, ""]
 
 

@@ -50,7 +50,7 @@ class StepInfo(NamedTuple):
     forcing: Float[Array, ""]  # term by which conjugate gradients ended; 0 where the step is not inexact by design
     share: Float[Array, ""]  # length of the candidate relative to the whole step, below 1 after further trials
     damping_share: Float[Array, ""]  # share of the step's curvature that is damping's, 0 (Gauss-Newton) to 1
-    repairs: Int[Array, ""]  # camera rounds and further trials after the first candidate
+    repairs: Int[Array, ""]  # camera rounds, further trials and pattern moves after the first candidate
 
 
 class Proposal(NamedTuple):

@@ -84,10 +84,11 @@ def drive_ceres(
         threads: of Ceres.
         callback: called after every iteration; a true return value stops the solve.
         embedded: what surrounds each step, and how it is added to a camera; then jaxba judges it (verdict.py), and the
-            policy sees what it sees of `lm_step`. How a step is solved does not matter.
+            policy sees what it sees of `lm_step`. How a step is solved does not matter, and how many point iterations a
+            policy would have is not asked.
 
     Returns:
-        `total_s` holds Ceres' calls, the policy and `step_facts`, without compilation.
+        `total_s` holds Ceres' calls, the policy and `step_facts` or the verdict, without compilation.
 
     Raises:
         ProblemError: as `Run`.
@@ -134,9 +135,7 @@ def drive_ceres(
 def _iterate(run: Run, options: Any, summaries: list[Any], constant: Observed, mode: str, damping: float) -> StepInfo:
     """One linear solve by one call of Ceres; the parameters change if its step is accepted."""
     before = run.colmap.parameters()
-    options.initial_trust_region_radius = float(np.clip(1 / damping, SMALLEST_RADIUS, LARGEST_RADIUS))
-    summaries.clear()
-    pyceres.solve(options, run.colmap.ceres, pyceres.SolverSummary())
+    _ask(run, options, summaries, damping)
     if len(summaries) < 2:  # the gradient is zero, or the candidate's cost or parameters are those before it
         return _idle(run.cost, damping, *(summary.gradient_max_norm for summary in summaries))
     first, second = summaries
@@ -160,13 +159,18 @@ def _iterate(run: Run, options: Any, summaries: list[Any], constant: Observed, m
     return step._replace(accepted=False, cost=first.cost, step_norm=np.nan, damping_share=REJECTED_SHARE)
 
 
+def _ask(run: Run, options: Any, summaries: list[Any], damping: float) -> None:
+    """One call of Ceres; its callback fills the summaries."""
+    options.initial_trust_region_radius = float(np.clip(1 / damping, SMALLEST_RADIUS, LARGEST_RADIUS))
+    summaries.clear()
+    pyceres.solve(options, run.colmap.ceres, pyceres.SolverSummary())
+
+
 def _judged(run: Run, options: Any, summaries: list[Any], verdict: Verdict, mode: str, damping: float) -> StepInfo:
     """One linear solve by one call of Ceres; what becomes of its step jaxba decides."""
     before = run.colmap.parameters()
-    options.initial_trust_region_radius = float(np.clip(1 / damping, SMALLEST_RADIUS, LARGEST_RADIUS))
-    summaries.clear()
     verdict.forgiving.begin()
-    pyceres.solve(options, run.colmap.ceres, pyceres.SolverSummary())
+    _ask(run, options, summaries, damping)
     if len(summaries) < 2 or not summaries[1].step_is_successful:  # no step could be computed
         return _idle(run.cost, damping, *(summary.gradient_max_norm for summary in summaries[:1]))
     return verdict.settle(before, damping, Told.of(summaries, mode))
