@@ -352,12 +352,17 @@ def test_a_pattern_move_repeats_the_way_of_the_step_twice_as_far_each_time_while
 
 
 def test_a_step_that_did_what_was_promised_is_not_followed():
-    """Newton's, close to the minimum: bit by bit what it is without pattern moves."""
+    """Newton's, close to the minimum: nothing is tried beyond it, and it ends where it does without pattern moves."""
     problem = turned(1, 1e-3)
     layout, before = start(problem, PLAIN)
     free = step(layout, before, BOLD, PLAIN)
     assert abs(free[1].gain_ratio - 1) < FORESEEN
-    assert same_bits(free, step(layout, before, BOLD, MOVES_ONLY))
+    same, info = step(layout, before, BOLD, MOVES_ONLY)
+    assert info.repairs == 0
+    # two programs, which round differently when they are optimised
+    np.testing.assert_allclose(info.cost, free[1].cost, rtol=1e-12)
+    for found, expected in zip(same[:2], free[0][:2], strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_a_refused_step_is_not_followed():
