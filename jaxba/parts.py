@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxba.layout import Layout
 from jaxba.linearize import observation_costs, slot_frames
@@ -25,7 +25,8 @@ class Search(NamedTuple):
     """How far embedded point iterations go."""
 
     iterations: int | Int[Array, ""]
-    both: Bool[Array, ""]  # whether from both places, where there are two (`triangulate.refine_from_starts`)
+    starts: Int[Array, ""]  # from how many places besides (`triangulate.refine_from_starts`)
+    enough: Float[Array, ""]  # decrease of an iteration that is the last one
 
 
 @runtime_checkable
@@ -156,5 +157,5 @@ def _refined(
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     frames = slot_frames(layout, cameras)
     if options.point_starts == "step":
-        return refine_points(layout, frames, points, options.loss, search.iterations, home)
-    return refine_from_starts(layout, frames, points, options.loss, search.iterations, home, search.both)
+        return refine_points(layout, frames, points, options.loss, search.iterations, home, search.enough)
+    return refine_from_starts(layout, frames, points, options.loss, search.iterations, home, *search[1:])

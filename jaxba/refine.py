@@ -50,6 +50,9 @@ it was before. Distances are harmonic means over its cameras; those behind count
 cameras has no limit. The depths of a scene span two decades.
 8 stopped points that should go: kitti00vo ended 3e-4 above the best known cost, 2e-7 with 100."""
 
+LITTLE = 1e-2
+"""Share of the cost below which the decrease of a pass is small."""
+
 
 class Home(NamedTuple):
     """Where points were before the step, and what was visible there."""
@@ -73,6 +76,7 @@ class _Carry(NamedTuple):
     nearness: Float[Array, " points"]  # of the start, see `gone`
     late: Bool[Array, " points"]  # whether it was taken home, and so is a pass behind the others
     passes: Int[Array, ""]
+    settled: Bool[Array, ""]  # whether the last pass brought too little for another one
 
 
 def refine_points(
@@ -82,6 +86,7 @@ def refine_points(
     loss: Loss,
     iterations: int | Int[Array, ""],
     home: Home | None = None,
+    enough: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """Improves every point by `iterations` steps of its own.
 
@@ -94,6 +99,8 @@ def refine_points(
             one more where points are taken home.
         home: a point that lies behind a camera in front of which it was at home, or `FARTHEST` times as far from its
             cameras, starts from there.
+        enough: ends after a step that lowered the cost by no more than this, all points together, nor by more than
+            `LITTLE` of what is left.
 
     Returns:
         Points, and the cost of each point's observations there (pixels squared), never larger than where it
@@ -137,7 +144,10 @@ def refine_points(
             nearness=start,
             late=late,
             passes=carry.passes + 1,
+            settled=carry.settled,
         )
+        lowered = jnp.sum(jnp.where(better, carry.costs - costs, 0))
+        best = best._replace(settled=lowered <= jnp.minimum(enough, LITTLE * jnp.sum(best.costs)))
         best = best._replace(trial=propose(best))
         if home is None:
             return best
@@ -150,8 +160,8 @@ def refine_points(
     first = jnp.full_like(nothing, DAMPING_FACTOR * INITIAL_DAMPING)
     none, zero = jnp.zeros(nothing.shape, bool), jnp.zeros_like(nothing)
     system = jnp.zeros((9, *nothing.shape), points.dtype)
-    carry = _Carry(points, nothing, system, first, points, zero, none, jnp.zeros((), jnp.int32))
-    more = lambda c: c.passes <= iterations + jnp.any(c.late)
+    carry = _Carry(points, nothing, system, first, points, zero, none, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+    more = lambda c: (c.passes <= iterations + jnp.any(c.late)) & ~c.settled
     carry = lax.while_loop(more, body, carry)
     return carry.points, carry.costs
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxba import camera
 from jaxba.blocks3 import cholesky3
@@ -107,9 +107,11 @@ def refine_from_starts(
     loss: Loss,
     iterations: int | Int[Array, ""],
     home: Home,
-    both: Bool[Array, ""],
+    starts: int | Int[Array, ""],
+    enough: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    """As `refine_points`, from the likelier of two starts or from both, of which the cheaper end counts.
+    """As `refine_points`, from where the step took the points, from the likelier of two starts, or from both, of which
+    the cheaper end counts.
 
     A point has several minima along its rays, and the one that it is in need not be the lowest; which one that is shows
     after a few steps of its own only.
@@ -121,14 +123,17 @@ def refine_from_starts(
         loss: robust loss.
         iterations: steps per point and start.
         home: where points were before.
-        both: whether to spend twice as much.
+        starts: 0, 1 or 2: where the step took them, the likelier of that and their rays, or both.
+        enough: see `refine_points`.
     """
-    starts = jnp.stack(better_starts(layout, frames, points, loss, home))
+    # a loop of at most one turn: under vmap a condition would be computed either way
+    places = lambda _, __: jnp.stack(better_starts(layout, frames, points, loss, home))
+    places = lax.fori_loop(0, jnp.minimum(starts, 1), places, jnp.stack([points, points]))
 
     def visit(turn: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
-        found, costs = refine_points(layout, frames, starts[turn], loss, iterations, home)
+        found, costs = refine_points(layout, frames, places[turn], loss, iterations, home, enough)
         lower = costs < best[1]
         return jnp.where(lower, found, best[0]), jnp.where(lower, costs, best[1])
 
     nowhere = jnp.full_like(points[0], jnp.inf)
-    return lax.fori_loop(0, jnp.where(both, 2, 1), visit, (starts[0], nowhere))
+    return lax.fori_loop(0, jnp.maximum(starts, 1), visit, (points, nowhere))

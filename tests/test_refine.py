@@ -18,7 +18,7 @@ from support import bal_file, needs_data, published_loss, same_bits, start, step
 
 from jaxba import BundleProblem, Loss, StepOptions, geometry, read_bal, solve
 from jaxba.linearize import linearize, slot_frames
-from jaxba.refine import FARTHEST, Home, refine_points
+from jaxba.refine import FARTHEST, LITTLE, Home, refine_points
 
 pytestmark = pytest.mark.step
 
@@ -68,6 +68,23 @@ def test_more_iterations_never_cost_more():
         costs = [float(refined(problem, k)[1].cost) for k in (1, 3, TO_THE_END)]
         assert costs[0] >= costs[1] >= costs[2]
         assert geometry.cost(problem) >= costs[0]
+
+
+def test_points_take_no_further_step_after_one_that_brought_no_more_than_enough():
+    layout, state = start(support.tiny())
+    frames, loss = slot_frames(layout, state.cameras), Loss()
+    refine = jax.jit(
+        lambda points, iterations, enough: refine_points(layout, frames, points, loss, iterations, None, enough)
+    )
+    total = lambda iterations, enough=-np.inf: float(np.sum(refine(state.points, iterations, enough)[1]))
+    totals = [total(k) for k in range(5)]
+    brought = -np.diff(totals)
+    assert (brought[:3] > 0).all()
+    assert (np.diff(brought[:3]) < 0).all()
+    for enough in (*brought[:3] * (1 + 1e-6), *brought[:3] * (1 - 1e-6), 1e300):
+        last = next(k for k in range(4) if brought[k] <= min(enough, LITTLE * totals[k + 1]) or k == 3)
+        np.testing.assert_allclose(total(4, enough), totals[last + 1], rtol=1e-12)
+    assert brought[0] > LITTLE * totals[1]  # so that the last of them is not after the first
 
 
 def test_cameras_are_not_touched():

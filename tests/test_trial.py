@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from support import same_bits, start, step
 
-from jaxba import BundleProblem, Layout, LMState, StepOptions, geometry, make_policy, solve
+from jaxba import BundleProblem, Layout, LMState, StepOptions, geometry, lm_step, make_policy, solve, trial
 from jaxba.dense import solve_positive
 from jaxba.game.bank import initial_costs
 from jaxba.game.scenes import SceneClass, make_scenes
@@ -23,7 +23,17 @@ from jaxba.linearize import cost, linearize
 from jaxba.parts import Whole
 from jaxba.resect import DAMPINGS, refine_cameras
 from jaxba.schur import solve_step
-from jaxba.trial import FORESEEN, FREE, GOOD_GAIN, HOPELESS, NEGLIGIBLE, ROUNDS_OF_OTHERS, SHORTER, best_trial
+from jaxba.trial import (
+    FORESEEN,
+    FREE,
+    GOOD_GAIN,
+    HOPELESS,
+    NEGLIGIBLE,
+    ROUNDS_OF_OTHERS,
+    SHORTER,
+    WITHIN_REACH,
+    best_trial,
+)
 
 pytestmark = pytest.mark.step
 
@@ -292,6 +302,31 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
         assert 0 <= mended.repairs <= 3
     assert better >= 1
     assert trusted >= 5
+
+
+def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatch):
+    """What one round and two leave shows who is to have the next; limits in the middle of these, so that some are."""
+    scenes = wide()
+    monkeypatch.setattr(trial, "HOPELESS", np.inf)
+
+    def repaired(rounds: int, *limits: float) -> tuple[np.ndarray, np.ndarray]:
+        monkeypatch.setattr(trial, "WITHIN_REACH", limits)
+        options = StepOptions(camera_rounds=rounds)
+        once = jax.jit(lambda layout, before: lm_step(layout, before, jnp.asarray(BOLD), options)[1])
+        infos = [once(*scene) for scene in scenes]
+        return np.array([info.repairs for info in infos]), np.array([info.gain_ratio for info in infos])
+
+    done, gain = repaired(1, -np.inf, -np.inf)
+    limits: list[float] = []
+    for rounds in (2, 3):
+        lacks = (done == rounds - 1) & (gain < GOOD_GAIN)
+        limits.append(float(np.median(gain[lacks])))
+        going_on = lacks & (gain > limits[-1])
+        assert 0 < going_on.sum() < lacks.sum()
+        expected = done + going_on
+        done, gain = repaired(rounds, *[*limits, -np.inf][:2])
+        np.testing.assert_array_equal(done, expected)
+    assert WITHIN_REACH[0] < WITHIN_REACH[1] < GOOD_GAIN
 
 
 @pytest.mark.fully_compiled

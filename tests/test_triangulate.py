@@ -37,9 +37,9 @@ def _refined(layout, cameras, before, start):
 
 
 @jax.jit
-def _from_starts(layout, cameras, before, points, both):
+def _from_starts(layout, cameras, before, points, starts):
     frames, home = _there(layout, cameras, before)
-    found = refine_from_starts(layout, frames, points, LOSS, 3, home, both)
+    found = refine_from_starts(layout, frames, points, LOSS, 3, home, starts)
     return jnp.concatenate([found[0], found[1][None]])
 
 
@@ -146,7 +146,8 @@ def test_from_both_starts_a_point_ends_at_the_cheaper_end_and_from_one_at_that_o
     home, points = wrong(seed, size)
     args = build_layout(home), np.asarray(home.cameras).T, in_layout(home, home.points), in_layout(home, points)
     apart = [np.asarray(_refined(*args[:3], start)) for start in _starts(*args, LOSS)]
-    one, both = (np.asarray(_from_starts(*args, jnp.asarray(both))) for both in (False, True))
+    none, one, both = (np.asarray(_from_starts(*args, jnp.asarray(starts))) for starts in range(3))
+    np.testing.assert_array_equal(none, np.asarray(_refined(*args[:3], args[3])))
     np.testing.assert_array_equal(one, apart[0])
     second = apart[1][3] < apart[0][3]
     assert (apart[1][3] < apart[0][3] * (1 - 1e-3)).any()
@@ -165,9 +166,24 @@ def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
         once = jax.jit(lambda layout, state: lm_step(layout, state, damping, options)[1])
         info = once(args[0], initial_state(args[0], problem, options))
         assert info.predicted < 1e-3 * info.previous_cost
-        costs[both] = float(np.sum(_from_starts(*args, jnp.asarray(both))[3]))
+        costs[both] = float(np.sum(_from_starts(*args, jnp.asarray(1 + both))[3]))
         np.testing.assert_allclose(info.candidate_cost, costs[both], rtol=1e-6)
     assert costs[True] < costs[False] * (1 - 3e-5)
+
+
+def test_only_the_whole_step_asks_for_the_rays():
+    """Points far away: they start from their rays where the step is whole, not where it is tried again shorter."""
+    start = strayed(1e4)
+    layout = build_layout(start)
+    state = initial_state(layout, start, StepOptions())
+    damping, costs = jnp.asarray(1.0), {}
+    for trials in (1, 2):
+        options = StepOptions(refine_points=3, point_starts="rays", trials=trials)
+        once = jax.jit(lambda layout, state, options=options: lm_step(layout, state, damping, options, jnp.inf)[1])
+        info = once(layout, state)
+        assert not info.accepted
+        costs[trials] = float(info.candidate_cost)
+    assert costs[1] < 0.1 * costs[2]
 
 
 def test_points_that_lie_far_away_come_back_in_four_iterations_where_their_rays_are_asked():

@@ -107,7 +107,7 @@ class AgentConfig:
     camera_rounds: int = 3
     """Camera rounds of the step that it drives, see `StepOptions`."""
 
-    pattern_moves: int = 4
+    pattern_moves: int = 1
     """Pattern moves of the step that it drives, see `StepOptions`."""
 
     camera_damping: float = 1.0
