@@ -281,7 +281,7 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     assert same_bits(policy.layers, load_policy(shipped["learned"]).layers)
     rounds = AGENT.camera_rounds
     own = StepOptions(lens_step="pixels")
-    embedded = {"refine_points": 2, "trials": 3, "camera_rounds": rounds, "pattern_moves": 4, "point_starts": "rays"}
+    embedded = {"refine_points": 2, "trials": 3, "camera_rounds": rounds, "pattern_moves": 1, "point_starts": "rays"}
     assert options == replace(own, **embedded, remembered_steps=3)
     policy, options = parse_solver("learned+refine0").build()
     assert same_bits(policy.layers, load_policy(shipped["learned-plain"]).layers)
@@ -339,7 +339,7 @@ def test_an_older_agent_steps_as_it_was_trained():
     values = asdict(AgentConfig())
     del values["lens_step"], values["point_starts"], values["remembered_steps"], values["pattern_moves"]
     assert settings(config_from(values)) == ("file", "step", 0, 0)
-    assert settings(AgentConfig()) == ("pixels", "rays", 3, 4)
+    assert settings(AgentConfig()) == ("pixels", "rays", 3, 1)
 
 
 @pytest.mark.slow
