@@ -25,7 +25,7 @@ class Search(NamedTuple):
     """How far embedded point iterations go."""
 
     iterations: int | Int[Array, ""]
-    starts: Int[Array, ""]  # from how many places besides (`triangulate.refine_from_starts`)
+    starts: Int[Array, ""]  # whether from rays, and from both places (`triangulate.refine_from_starts`)
     enough: Float[Array, ""]  # decrease of an iteration that is the last one
 
 

@@ -135,19 +135,18 @@ def refine_points(
         better = (costs < carry.costs) & ~gone(nearness, start) & going_on
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
         damping = jnp.where(better, carry.damping / DAMPING_FACTOR, grown)
+        least, lowered = jnp.where(better, costs, carry.costs), jnp.sum(jnp.where(better, carry.costs - costs, 0))
         best = _Carry(
             points=jnp.where(better, carry.trial, carry.points),
-            costs=jnp.where(better, costs, carry.costs),
+            costs=least,
             system=jnp.where(better, jnp.stack(system), carry.system),
             damping=jnp.where(astray, carry.damping, damping),
             trial=carry.trial,
             nearness=start,
             late=late,
             passes=carry.passes + 1,
-            settled=carry.settled,
+            settled=lowered <= jnp.minimum(enough, LITTLE * jnp.sum(least)),
         )
-        lowered = jnp.sum(jnp.where(better, carry.costs - costs, 0))
-        best = best._replace(settled=lowered <= jnp.minimum(enough, LITTLE * jnp.sum(best.costs)))
         best = best._replace(trial=propose(best))
         if home is None:
             return best

@@ -4,7 +4,7 @@ The linear model is wrong far from where it was made, and mostly wrong locally: 
 what they see. Repairing that locally is cheap beside a linear solve, and lets bolder steps pass:
 
 1. `refine_points`: every point re-optimised alone at the new cameras; one that the step sent behind a camera starts
-   from where it was, and so does one that it sent far away.
+   from where it was, and so does one that it sent far away. From their rays they start after the whole step only.
 2. `camera_rounds`: where the step did less than half of what the model promised and is not hopeless, cameras alone,
    then points alone again, a few times over as long as that may still lead to acceptance. A step along a curved
    valley comes back to its floor.
