@@ -28,7 +28,7 @@ from jaxba.dense import factor_panels
 from jaxba.eliminate import CameraSystem, PointSystem
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization
-from jaxba.sums import take_each, take_rows, tree_sum
+from jaxba.sums import as_rows, take_each, take_rows, tree_sum
 
 MODES = 10
 """Seven of a similarity, then focal length, k1 and k2."""
@@ -127,13 +127,13 @@ def _shared_rows(
     moved = [[first[k] * over[i] + second[k] * under[i] for k in range(3)] for i in range(3)]
     lens = [[high[6 + k] * over[i] + low[6 + k] * under[i] for k in range(3)] for i in range(3)]
     columns = [column for i in range(3) for column in moved[i] + lens[i]]
-    sums = apart(lambda rows: tree_sum(rows, clusters.levels), jnp.stack(columns).T, index=clusters.point).T
+    sums = apart(lambda rows: tree_sum(rows, clusters.levels), as_rows(columns), index=clusters.point).T
     x, y, z = take_each(positions, clusters.point)
     rows = []
     for i in range(3):
         p, q, r, *own = sums[6 * i : 6 * i + 6]
         rows += [q * z - r * y, r * x - p * z, p * y - q * x, -p, -q, -r, -(p * x + q * y + r * z), *own]
-    return jnp.stack(rows).T
+    return as_rows(rows)
 
 
 def _clusters(layout: Layout) -> ClusterLayout:

@@ -23,7 +23,7 @@ from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
-from jaxba.sums import outer_sum, point_sum, take, take_each, take_rows, tree_sum
+from jaxba.sums import as_rows, outer_sum, point_sums, take, take_rows, tree_sum
 from jaxba.ties import LensTies
 from jaxba.together import together
 
@@ -76,14 +76,14 @@ def eliminate_points(
     layout: Layout, linear: Linearization, damping: Float[Array, "*points"], options: StepOptions
 ) -> PointSystem:
     """Forms, damps and factors the 3 x 3 block of every point; one lambda for all, or one each."""
-    sums = point_sum(layout, jnp.stack(normal_entries(linear.point_jacobian, linear.residual)))
+    sums = point_sums(layout, normal_entries(linear.point_jacobian, linear.residual))
     matrix, gradient = [sums[k] for k in range(6)], [sums[k] for k in range(6, 9)]
     diagonal = [damping_diagonal(matrix[k], damping, options) for k in (0, 2, 5)]
     for place, extra in zip((0, 2, 5), diagonal, strict=True):
         matrix[place] = matrix[place] + extra
     factor = cholesky3(matrix)
     solved = factor.forward(gradient)
-    at_slot = jnp.stack(take_each(list(factor), layout.slot_point))
+    at_slot = take(jnp.stack(factor), layout.slot_point)
 
     def projected(factor: Array, jacobian: list[list[Array]]) -> list[Array]:
         return [entry for row in jacobian for entry in Cholesky3(*factor).forward(row)]
@@ -107,7 +107,7 @@ def camera_system(
         reduced = linear.residual[k] - sum(points.projected[k][i] * solved[i] for i in range(3))
         rows += [*linear.camera_jacobian[k], linear.residual[k], reduced]
     level, *levels = layout.camera_levels
-    gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 11)
+    gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, 11)
     products = tree_sum(outer_sum(gathered[..., :9], gathered), tuple(levels))
     blocks, gradient, right = products[:, :, :9], products[:, :, 9], -products[:, :, 10]
     rotation = jnp.einsum("cji,cjk,ckl->cil", coordinates.forward, blocks[:, :3, :3], coordinates.forward)
@@ -141,21 +141,21 @@ def apply_reduced(
 ) -> Float[Array, "cameras 9"]:
     """`S x` without forming S: two passes over the observations."""
     inner = project_to_points(layout, linear, points, x)
-    at_slot = jnp.stack(take_each(inner, layout.slot_point))
+    at_slot = take(jnp.stack(inner), layout.slot_point)
 
     def lifted(at_slot: Array, projected: list[list[Array]], first: list[Array], second: list[Array]) -> list[Array]:
         over, under = (sum(row[i] * at_slot[i] for i in range(3)) for row in projected)
         return [first[a] * over + second[a] * under for a in range(9)]
 
-    columns = jnp.stack(together(lifted, at_slot, points.projected, *linear.camera_jacobian))
-    return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(columns.T, layout.camera_levels)
+    rows = as_rows(together(lifted, at_slot, points.projected, *linear.camera_jacobian))
+    return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(rows, layout.camera_levels)
 
 
 def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "places 27"]:
     """`Y = J_c^T Q` in the order of the cameras, the point's index slow and the camera's fast."""
     assert system.rows is not None
     over, under = points.projected
-    projected = take_rows(jnp.stack([*over, *under]).T, layout.camera_levels[0].reshape(-1)).reshape(-1, 2, 3)
+    projected = take_rows(as_rows([*over, *under]), layout.camera_levels[0].reshape(-1)).reshape(-1, 2, 3)
     return outer_sum(projected, system.rows[..., :9].reshape(-1, 2, 9)).reshape(-1, 27)
 
 
@@ -164,20 +164,20 @@ def coupling_rows(linear: Linearization, points: PointSystem) -> Float[Array, "s
     first, second = linear.camera_jacobian
     over, under = points.projected
     columns = [first[a] * over[i] + second[a] * under[i] for i in range(3) for a in range(9)]
-    return jnp.stack(columns).T
+    return as_rows(columns)
 
 
 def project_to_points(
     layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras 9"]
 ) -> list[Array]:
     """`sum Y^T x` over each point's slots."""
-    at_slot = jnp.stack(take_each(x.T, layout.slot_camera))
+    at_slot = take(x.T, layout.slot_camera)
 
     def inner(at_slot: Array, projected: list[list[Array]], jacobian: list[list[Array]]) -> list[Array]:
         over, under = (sum(row[a] * at_slot[a] for a in range(9)) for row in jacobian)
         return [projected[0][i] * over + projected[1][i] * under for i in range(3)]
 
-    return list(point_sum(layout, jnp.stack(together(inner, at_slot, points.projected, linear.camera_jacobian))))
+    return point_sums(layout, together(inner, at_slot, points.projected, linear.camera_jacobian))
 
 
 def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: Coordinates) -> Float[Array, ""]:

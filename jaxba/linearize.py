@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba import camera
+from jaxba.barrier import apart
 from jaxba.layout import Layout
 from jaxba.losses import Loss
 from jaxba.options import Intrinsics
@@ -73,7 +74,8 @@ def cost(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Float[Array, ""]:
     """The objective `1/2 sum rho(|Sigma^(-1/2) r|^2)`, pixels squared (design, section 2)."""
-    return total(observation_costs(layout, cameras, points, loss))
+    # fused with their sum, the costs would go to a library, and slowly
+    return apart(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
 
 
 def point_terms(views: Views, loss: Loss) -> list[Array]:

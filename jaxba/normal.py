@@ -24,7 +24,7 @@ from jaxba.layout import Layout
 from jaxba.linearize import Linearization
 from jaxba.options import StepOptions
 from jaxba.precondition import block_inverse
-from jaxba.sums import point_sum, take_each, tree_sum
+from jaxba.sums import as_rows, point_sums, take_each, tree_sum
 
 
 def image(
@@ -67,10 +67,10 @@ def solve_normal(
     def apply(x: Array) -> Array:
         c, p = part(x)
         moved = image(layout, linear, c, p)
-        pull = lambda rows, count: jnp.stack([rows[0][k] * moved[0] + rows[1][k] * moved[1] for k in range(count)])
-        back = tree_sum(pull(linear.camera_jacobian, 9).T, layout.camera_levels)
+        pull = lambda first, second: [a * moved[0] + b * moved[1] for a, b in zip(first, second, strict=True)]
+        back = tree_sum(as_rows(pull(*linear.camera_jacobian)), layout.camera_levels)
         back = back + jnp.einsum("cab,cb->ca", system.only_damping, c)
-        return join(back, point_sum(layout, pull(linear.point_jacobian, 3)) + point_damping * p)
+        return join(back, jnp.stack(point_sums(layout, pull(*linear.point_jacobian))) + point_damping * p)
 
     def precondition(x: Array) -> Array:
         c, p = part(x)

@@ -19,7 +19,7 @@ from jaxba.eliminate import CameraSystem, PointSystem
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization
 from jaxba.options import StepOptions
-from jaxba.sums import outer_sum, take_rows, tree_sum
+from jaxba.sums import as_rows, outer_sum, take_rows, tree_sum
 
 Operator = Callable[[Array], Array]
 
@@ -73,7 +73,7 @@ def diagonal_blocks(
     first, second = linear.camera_jacobian
     columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
     level, *levels = layout.camera_levels
-    gathered = take_rows(jnp.stack(columns).T, level).reshape(level.shape[0], -1, 9)
+    gathered = take_rows(as_rows(columns), level).reshape(level.shape[0], -1, 9)
     return system.only_damping + tree_sum(outer_sum(gathered, gathered), tuple(levels))
 
 

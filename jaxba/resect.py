@@ -7,11 +7,12 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxba import camera
+from jaxba.barrier import apart
 from jaxba.dense import solve_positive
 from jaxba.layout import Layout
 from jaxba.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
-from jaxba.sums import outer_sum, take_rows, tree_sum
+from jaxba.sums import as_rows, outer_sum, take_rows, tree_sum
 
 DAMPINGS = (1e-6, 1e-2)
 """Relative damping of a camera's step, and of a second one where the first did not help."""
@@ -35,24 +36,27 @@ def refine_cameras(
     linear = with_free_lenses(layout, linear, options.intrinsics, alone=True)
     rows = [entry for k in range(2) for entry in (*linear.camera_jacobian[k], linear.residual[k])]
     level, *levels = layout.camera_levels
-    gathered = take_rows(jnp.stack(rows).T, level).reshape(level.shape[0], -1, 10)
+    gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, 10)
     products = tree_sum(outer_sum(gathered[..., :9], gathered), tuple(levels))
     blocks, gradient = products[:, :, :9], products[:, :, 9]
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
-    own_cost = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
+    # XLA would add up a camera's costs anew for every number that depends on them
+    each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
+    own_cost = lambda costs: apart(each_sum, costs, index=layout.slot_camera)
     before = own_cost(linear.costs)
 
-    def attempt(carry: tuple[Array, Array], damping: Array) -> tuple[tuple[Array, Array], None]:
-        best, done = carry
-        damped = blocks + (damping * diagonal)[:, :, None] * jnp.eye(9, dtype=blocks.dtype)
+    def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        best, done, turn = carry
+        damped = blocks + (dampings[turn] * diagonal)[:, :, None] * jnp.eye(9, dtype=blocks.dtype)
         step = -solve_positive(damped, gradient).T
         # on the manifold, in which the Jacobian is written
         moved = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
         costs = observation_costs(layout, moved, points, options.loss)
         upright = moved[6] * cameras[6] >= 0  # as in trial.py
         better = (own_cost(costs) < before) & ~done & upright
-        return (jnp.where(better, moved, best), done | better), None
+        return jnp.where(better, moved, best), done | better, turn + 1
 
-    # a scan and not two copies: half of it to compile
-    unseen = ~jnp.asarray(layout.camera_seen)
-    return lax.scan(attempt, (cameras, unseen), jnp.asarray(DAMPINGS, cameras.dtype))[0][0]
+    # a loop and not two copies: half of it to compile
+    dampings, unseen = jnp.asarray(DAMPINGS, cameras.dtype), ~jnp.asarray(layout.camera_seen)
+    more = lambda carry: (carry[2] < len(DAMPINGS)) & ~jnp.all(carry[1])
+    return lax.while_loop(more, attempt, (cameras, unseen, jnp.zeros((), jnp.int32)))[0]

@@ -31,7 +31,7 @@ from jaxba.options import StepOptions
 from jaxba.recall import on_manifold, with_remembered
 from jaxba.reduced import solve_reduced
 from jaxba.split import clustered_step
-from jaxba.sums import point_sum, tree_sum
+from jaxba.sums import as_rows, point_sums, tree_sum
 
 
 class Step(NamedTuple):
@@ -131,6 +131,6 @@ def _slope_and_damping(
 def largest_diagonal(layout: Layout, linear: Linearization) -> Float[Array, ""]:
     """Largest diagonal entry of the undamped Hessian, the unit of g2o's first lambda."""
     square = lambda rows: [a * a + b * b for a, b in zip(*rows, strict=True)]
-    by_camera = tree_sum(jnp.stack(square(linear.camera_jacobian)).T, layout.camera_levels)
-    by_point = point_sum(layout, jnp.stack(square(linear.point_jacobian)))
+    by_camera = tree_sum(as_rows(square(linear.camera_jacobian)), layout.camera_levels)
+    by_point = jnp.stack(point_sums(layout, square(linear.point_jacobian)))
     return jnp.maximum(jnp.max(by_camera), jnp.max(by_point))

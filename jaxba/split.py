@@ -30,7 +30,7 @@ from jaxba.options import StepOptions
 from jaxba.partition import Partition
 from jaxba.precondition import block_inverse
 from jaxba.reduced import reduced_blocks
-from jaxba.sums import point_sum, take, take_each, take_rows, tree_sum
+from jaxba.sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
 
 CORRECTED_FROM = 1.0
 """Lambda from which on the copies of a point are made to agree. Source: the authors' code (radius at most 1)."""
@@ -113,8 +113,8 @@ def split_right(
     """Right-hand side of the split system, `-J_c^T (r - Q h)`."""
     inner = [sum(split.projected[k][i] * split.solved[i] for i in range(3)) for k in range(2)]
     first, second = linear.camera_jacobian
-    columns = jnp.stack([first[a] * inner[0] + second[a] * inner[1] for a in range(9)])
-    return tree_sum(columns.T, layout.camera_levels) - system.gradient
+    rows = as_rows([first[a] * inner[0] + second[a] * inner[1] for a in range(9)])
+    return tree_sum(rows, layout.camera_levels) - system.gradient
 
 
 def solve_clusters(
