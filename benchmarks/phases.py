@@ -27,6 +27,7 @@ from jaxba.linearize import cost, linearize, slot_frames
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.refine import refine_points
+from jaxba.resect import refine_cameras
 
 
 def timed(function: Any, *arguments: Any, repeats: int) -> tuple[Any, float, float, float]:
@@ -127,6 +128,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     if count:
         refine = lambda s: refine_points(layout, slot_frames(layout, s.cameras), s.points, plain.loss, count)
         yield phase(f"refine {count}", refine, state)
+        yield phase("refine cameras", lambda la, s: refine_cameras(la, s.cameras, s.points, plain), layout, state)
     yield phase("whole step", lambda la, s: lm.lm_step(la, s, damping, plain), layout, state)
     if count:
         yield phase(f"step, refine {count}", lambda la, s: lm.lm_step(la, s, damping, options), layout, state)
