@@ -123,7 +123,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     yield phase("reduced solve", whole, linear, points, system)
     back = lambda li, po, x: eliminate.back_substitute(layout, li, po, x)
     yield phase("back-substitute", back, linear, points, system.right)
-    yield phase("cost", lambda s: cost(layout, s.cameras, s.points, plain.loss), state)
+    yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), layout, state)
     count = options.refine_points
     if count:
         refine = lambda s: refine_points(layout, slot_frames(layout, s.cameras), s.points, plain.loss, count)
