@@ -22,7 +22,11 @@ def take(values: Array, index: Int[AnyArray, "..."]) -> Array:
 
 
 def take_each(rows: Array | list[Array], index: Int[AnyArray, " n"]) -> list[Array]:
-    """`take` of every row by itself: contiguous vectors, where one gather of all rows would interleave them."""
+    """`take` of every row by itself, as vectors of their own.
+
+    Where they are stored together anyway, `take` of all is the faster: nine components of 250 cameras on 125,000 slots
+    0.37 ms instead of 1.02. Not for the three coordinates of points: point iterations took 1.1 to 1.3 times as long so.
+    """
     return [row.at[index].get(mode="promise_in_bounds") for row in rows]
 
 
