@@ -67,7 +67,7 @@ SMALL_SCENES = ("scene:tiny", "scene:paper")
 """Scenes in which the fixed cost of a layout shows."""
 
 LARGE_ITERATIONS = 30
-"""Limit of Ceres' iterations on them. Under its rule our step took 17 to f*(1 + 1e-3) (docs/game.md)."""
+"""Limit of Ceres' iterations on them. Under its rule our step took 17 to f*(1 + 1e-3) (docs/game-tried.md)."""
 
 MANY_CAMERAS = 500
 """With more, Ceres' dense mode takes minutes an iteration and is left out."""

@@ -5,7 +5,7 @@ A lens stretches what it shows by f, and its distortion, k1 and k2, is told per 
 stays as it is, but for distortion: k1 then has to grow with the square of f, k2 with its fourth power. In the numbers
 of the file such a valley is bent; in f and the distortion per pixel, `k1 / f^2` and `k2 / f^4`, it is straight. Both
 agree to first order, so the linear model is the same, and so is damping, but a long step along such a valley stays on
-its floor. Measured: docs/game.md, "Straighter valleys".
+its floor. Measured: docs/game-tried.md, "Straighter valleys".
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jaxba.options import StepOptions
 
 LARGEST_ZOOM = 0.3
 """Relative change of a focal length beyond which distortions are added as they are: the fourth power of a first-order
-step means nothing there. With 0.1 instead less was gained, no limit at all was as good (docs/game.md)."""
+step means nothing there. With 0.1 instead less was gained, no limit at all was as good (docs/game-tried.md)."""
 
 
 def move_cameras(

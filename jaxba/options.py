@@ -66,7 +66,7 @@ class StepOptions:
 
     camera_damping: float = 1.0
     """Damping of the cameras relative to that of the points, a factor on lambda. 1 is Levenberg-Marquardt as published.
-    Small ones leave it to the points to hold a step back (docs/game.md, "Cameras and points")."""
+    Small ones leave it to the points to hold a step back (docs/game-tried.md, "Cameras and points")."""
 
     rotation: Rotation = "angle-axis"
     """Coordinates of a rotation step: `angle-axis` adds to the three numbers of the file, as Ceres does with

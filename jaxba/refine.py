@@ -11,7 +11,7 @@ was before the step (`Home`).
 
 Nor does it see distance where rays are nearly parallel: one step may take a point a million times as far, where it
 feels nothing any more, or through infinity behind its cameras. So neither the step nor a point's own iterations take
-it more than `FARTHEST` times as far (docs/game.md, "Starts that are far away").
+it more than `FARTHEST` times as far (docs/game-tried.md, "Starts that are far away").
 
 Source: "embedded point iterations", Jeong et al., "Pushing the Envelope of Modern Methods for Bundle
 Adjustment", PAMI 2012; Ceres calls the same idea inner iterations.

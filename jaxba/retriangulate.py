@@ -7,7 +7,7 @@ without another linear solve: given the cameras every point is a problem of thre
 depths. Then the adjustment goes on (alternate.py).
 
 Source of the alternation: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited",
-section 4.4), bundle adjustment and re-triangulation in turns. Measured: docs/game.md, "Cameras and points".
+section 4.4), bundle adjustment and re-triangulation in turns. Measured: docs/game-tried.md, "Cameras and points".
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ POBA_SEED = 38401
 FAR = 10.0
 """Distance of a scene from the origin, in units of its own extent, from which it is moved there to be solved. Turning a
 camera turns it about the origin: damping then holds back what moves the scene least, and digits are lost
-(docs/game.md, "Far from the origin")."""
+(docs/game-tried.md, "Far from the origin")."""
 
 MIN_TRACK = 2
 """A point needs two views to have a position. Source: rootba drops points with fewer."""

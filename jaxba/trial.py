@@ -77,7 +77,7 @@ kitti00vo instead of 22."""
 
 LITTLE_LEFT = 1e-3
 """Promised decrease relative to the cost below which points are refined from both of their starts, which takes as
-long again. In every trial it brought no more (docs/game.md, "From both starts")."""
+long again. In every trial it brought no more (docs/game-tried.md, "From both starts")."""
 
 
 class Trial(NamedTuple):

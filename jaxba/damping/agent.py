@@ -41,7 +41,7 @@ FORCING = (-3.0, -0.3)
 
 IDLE_SHARE = 0.1
 """Share of damping in the curvature of an inexact step, relative to the forcing term, below which a smaller lambda is
-taken to change nothing but the length of conjugate gradients (docs/game.md)."""
+taken to change nothing but the length of conjugate gradients (docs/game-tried.md)."""
 
 LARGEST_ESCALATION = 12.0
 """Decades; more than the whole range of lambda means nothing."""

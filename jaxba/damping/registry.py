@@ -34,7 +34,7 @@ SHIPPED = {
     LEARNED_DRIVER: "driver.safetensors",
 }
 """Their files in `jaxba/policies`, each made by the preset of `jaxba-train` that has its name, `driver` before a rescue
-of the guard changed (docs/game.md)."""
+of the guard changed (docs/game-tried.md)."""
 
 SUFFIX = ".safetensors"
 """Ending by which a name is the path of a policy file."""

@@ -67,7 +67,7 @@ class GameConfig:
 
     repair_cost: float = 0.0
     """Charged by `duration` for each camera round or further trial of a step, relative to a linear solve. By the clock
-    it would be 0.4, but then giving up is cheaper than crossing a valley (docs/game.md)."""
+    it would be 0.4, but then giving up is cheaper than crossing a valley (docs/game-tried.md)."""
 
     scale: float = 0.1
     """Factor on every reward, so that returns stay within a few units."""
