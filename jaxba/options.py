@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import operator
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
+from jaxba.host import LARGEST_COUNT
 from jaxba.losses import Loss
 
 LinearSolver = Literal["explicit", "sparse", "implicit", "power", "normal", "clustered", "decomposed"]
@@ -129,20 +131,19 @@ class StepOptions:
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, not {getattr(self, name)!r}")
         for name, least in (("refine_points", 0), ("camera_rounds", 0), ("pattern_moves", 0), ("trials", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be at least {least}, is {getattr(self, name)}")
+            check_count(name, getattr(self, name), least)
         for name in ("cluster_cameras", "block_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, is {getattr(self, name)}")
+            check_count(name, getattr(self, name), 1)
         for name in ("preconditioner_order", "power_order", "repairs", "remembered_steps"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
+            check_count(name, getattr(self, name), 0)
         if not 0 < self.camera_damping < float("inf"):
             raise ValueError(f"camera_damping must be positive and finite, is {self.camera_damping}")
         if self.intrinsics == "fixed" and self.linear_solver != "explicit":
             raise ValueError(f"fixed intrinsics need the explicit solver, not {self.linear_solver}")
-        if self.cg_max_iterations < 1:
-            raise ValueError(f"cg_max_iterations must be at least 1, is {self.cg_max_iterations}")
+        check_count("cg_max_iterations", self.cg_max_iterations, 1)
+        for name in ("cg_forcing", "cg_tolerance"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
 
     @property
     def forms_reduced_system(self) -> bool:
@@ -183,3 +184,19 @@ class StepOptions:
     def uses_clusters(self) -> bool:
         """Whether the layout must group cameras."""
         return self.linear_solver in ("sparse", "implicit") and self.preconditioner == "two-level"
+
+
+def check_count(name: str, value: Any, least: int) -> None:
+    """Refuses what is no whole number, or one that programs cannot hold.
+
+    Raises:
+        ValueError: naming it.
+    """
+    try:
+        count = operator.index(value)
+    except TypeError:
+        raise ValueError(f"{name} must be a whole number, is {value!r}") from None
+    if count < least:
+        raise ValueError(f"{name} must be at least {least}, is {value}")
+    if count > LARGEST_COUNT:
+        raise ValueError(f"{name} must be at most {LARGEST_COUNT}, is {value}")

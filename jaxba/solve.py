@@ -26,7 +26,7 @@ from jaxba.lm import LMState, initial_state
 from jaxba.loop import Carry, History, solve_loop
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES
-from jaxba.options import REDUCED_SOLVERS, StepOptions
+from jaxba.options import REDUCED_SOLVERS, StepOptions, check_count
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import BundleProblem, ProblemError
 from jaxba.programs import Compilation, Part, Stage, options_of, program, run_alone, stages
@@ -146,9 +146,10 @@ def solve(
         raise ValueError(f"dtype must be one of {', '.join(DTYPES)}, not {dtype!r}")
     if compilation not in get_args(Compilation):
         raise ValueError(f"compilation must be one of {', '.join(get_args(Compilation))}, not {compilation!r}")
-    if max_iterations < 1:
-        raise ValueError(f"max_iterations must be at least 1, is {max_iterations}")
+    check_count("max_iterations", max_iterations, 1)
     policy = make_policy(damping) if isinstance(damping, str) else damping
+    if not isinstance(policy, DampingPolicy):
+        raise ValueError(f"damping must be the name of a policy or a policy, not {damping!r}")
     if options is None:
         options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
     options = make_method(method).options(options)
@@ -157,6 +158,9 @@ def solve(
         capacity, linear_solver = with_padded_solver(capacity_of(problem), options, linear_solver)
     options = choose_linear_solver(problem, options, linear_solver)
     tolerances = tolerances or Tolerances()
+    for name, value in tolerances._asdict().items():
+        if not value >= 0:
+            raise ValueError(f"{name} must not be negative, is {value}")
     if dtype == "mixed":
         if options.linear_solver not in REDUCED_SOLVERS:
             raise ProblemError(

@@ -56,6 +56,12 @@ def test_best_cost_is_the_lowest_accepted_cost_of_any_solver_or_a_known_one():
     assert profile.initial_costs(RECORDS) == {"p": 1000.0}
 
 
+def test_of_a_float32_run_only_the_end_counts_which_is_a_cost_in_float64():
+    rough = replace(make_record("p", "rough", [1000.0, 99.99, 99.98]), dtype="float32", final_cost=100.01)
+    assert profile.best_cost([FAST, rough]) == {"p": 100.0}
+    assert profile.best_cost([FAST, replace(rough, final_cost=99.0)]) == {"p": 99.0}
+
+
 def test_non_finite_costs_are_never_best_and_never_reached():
     broken = make_record("p", "broken", [math.nan, math.nan])
     assert profile.best_cost([broken, FAST]) == {"p": 100.0}

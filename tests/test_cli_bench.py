@@ -312,6 +312,25 @@ def test_two_files_of_one_name_get_two_names(tmp_path, undrawn, capsys):
     assert found == [("tiny", "a"), ("b-tiny", "b")]
 
 
+def test_a_problem_that_is_named_twice_is_one(tmp_path, undrawn, capsys):
+    path = tmp_path / "tiny.txt"
+    write_bal(support.tiny(), path)
+    argv = ["--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
+    assert bench(tmp_path / "run", str(path), str(tmp_path / "." / "tiny.txt"), "scene:tiny", "scene:tiny", *argv) == 0
+    assert [line["family"] for line in lines(tmp_path / "run")] == [tmp_path.name, "scene"]
+
+
+def test_the_ends_of_float32_are_costs_in_float64(tmp_path, undrawn, capsys):
+    write_bal(support.tiny(), tmp_path / "tiny.txt")
+    argv = ["--solvers", "ceres@float32,ceres", "--repeats", "1", "--max-iterations", "3"]
+    assert bench(tmp_path / "run", str(tmp_path / "tiny.txt"), *argv) == 0
+    rough, exact = lines(tmp_path / "run")
+    assert rough["initial_cost"] == pytest.approx(exact["initial_cost"], rel=1e-14)
+    # the same steps but for rounding: their ends lie nearer to each other than float32 adds up
+    assert rough["final_cost"] != rough["trace"][-1]["cost"]
+    assert rough["final_cost"] == pytest.approx(rough["trace"][-1]["cost"], rel=1e-4)
+
+
 def suite(tmp_path: Path, **entries) -> str:
     path = tmp_path / "suite.yaml"
     path.write_text(yaml.safe_dump(entries))
@@ -327,6 +346,8 @@ def test_a_suite_names_problems_by_globs_and_variables(tmp_path, undrawn, capsys
     path = suite(tmp_path, **entries, tolerance=0.01, repeats=1, max_iterations=1)
     assert bench(tmp_path / "run", "--suite", path) == 0
     assert [line["problem"] for line in lines(tmp_path / "run")] == ["one", "two", "tiny"]
+    (tmp_path / "suite.yaml").write_text(yaml.safe_dump(entries) + "tolerance: 1e-2\nrepeats: 1\nmax_iterations: 1\n")
+    assert bench(tmp_path / "run", "--suite", path) == 0
     assert bench(tmp_path / "other", "scene:tiny", "--suite", path, "--solvers", "classic") == 0
     assert [(line["problem"], line["solver"]) for line in lines(tmp_path / "other")] == [("tiny", "classic")]
 

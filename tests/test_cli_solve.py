@@ -7,6 +7,7 @@ import json
 import os
 import re
 import signal
+import stat
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -205,6 +206,20 @@ def test_an_existing_output_is_replaced(tiny, tmp_path, capsys):
     assert read_bal(output).num_cameras == 6
 
 
+def test_a_file_that_is_replaced_keeps_its_permissions_and_a_read_only_one_is_refused(tiny, tmp_path, capsys):
+    output = tmp_path / "out.txt"
+    output.write_text("old")
+    output.chmod(0o600)
+    assert run([str(tiny), "--max-iterations", "1", "--output", str(output)]) == 0
+    assert stat.S_IMODE(output.stat().st_mode) == 0o600
+    output.write_text("old")
+    output.chmod(0o444)
+    capsys.readouterr()
+    status = run([str(tiny), "--max-iterations", "1", "--output", str(output)])
+    check_one_line(status, capsys.readouterr().err)
+    assert output.read_text() == "old"
+
+
 def test_the_input_may_be_the_output(tiny, capsys):
     assert run([str(tiny), "--max-iterations", "1", "--output", str(tiny)]) == 0
     assert geometry.cost(read_bal(tiny)) < geometry.cost(support.tiny())
@@ -281,6 +296,14 @@ def test_a_name_that_stdout_cannot_encode_is_printed_escaped(tmp_path, monkeypat
 def test_outputs_may_be_devices_and_streams(tiny, capfd):
     assert run([str(tiny), "--max-iterations", "1", "--output", "/dev/null", "--log", "/dev/stdout"]) == 0
     assert '"problem"' in capfd.readouterr().out
+
+
+def test_a_solution_on_standard_output_is_alone_there(tiny, tmp_path, capfd):
+    assert run([str(tiny), "--max-iterations", "1", "--output", "/dev/stdout"]) == 0
+    captured = capfd.readouterr()
+    (tmp_path / "out.txt").write_text(captured.out)
+    assert geometry.cost(read_bal(tmp_path / "out.txt")) < geometry.cost(support.tiny())
+    assert "wrote /dev/stdout" in captured.err
 
 
 def test_a_link_into_a_missing_folder_is_refused_before_the_solve(tiny, tmp_path, capsys):

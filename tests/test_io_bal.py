@@ -334,6 +334,15 @@ class TestWriting:
             interrupted()
         assert os.listdir(tmp_path) == []
 
+    @pytest.mark.skipif(not os.path.isdir("/dev/fd"), reason="no names of open streams here")
+    def test_an_open_stream_is_written_from_where_it_stands(self, tmp_path):
+        with open(tmp_path / "all.txt", "wb", buffering=0) as file:
+            file.write(b"before\n")
+            with files.open_output(f"/dev/fd/{file.fileno()}") as stream:
+                stream.write(b"inside\n")
+            file.write(b"after\n")
+        assert (tmp_path / "all.txt").read_bytes() == b"before\ninside\nafter\n"
+
     def test_a_problem_that_could_not_be_read_back_is_not_written(self, tmp_path):
         problem = random_problem(0)
         with pytest.raises(ProblemError, match="not finite"):

@@ -67,6 +67,13 @@ def test_a_policy_comes_back_from_its_file_bit_by_bit(tmp_path_factory, seed, ob
     assert list(path.parent.iterdir()) == [path]  # nothing else is left behind
 
 
+def test_equal_policies_are_equal_files(tmp_path):
+    facts = {name: name.upper() for name in "abcdefgh"}
+    for count in range(4):
+        save_policy(tmp_path / f"{count}.safetensors", random_policy(3), facts)
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+
+
 def test_a_path_is_the_name_of_a_policy(tmp_path):
     path = tmp_path / "mine.safetensors"
     save_policy(path, random_policy(3))

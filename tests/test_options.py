@@ -25,6 +25,10 @@ from jaxba import Loss, StepOptions
         ({"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
         ({"intrinsics": "fixed", "linear_solver": "implicit"}, "fixed intrinsics need the explicit solver"),
         ({"cg_max_iterations": 0}, "cg_max_iterations must be at least 1"),
+        ({"cg_forcing": float("nan")}, "cg_forcing must not be negative, is nan"),
+        ({"cg_tolerance": -1.0}, "cg_tolerance must not be negative, is -1"),
+        ({"refine_points": 2.5}, "refine_points must be a whole number, is 2.5"),
+        ({"refine_points": 2**32}, "refine_points must be at most 2147483647"),
     ],
 )
 def test_an_option_that_makes_no_sense_is_one_clear_line(change, message, unchecked):

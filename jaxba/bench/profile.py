@@ -109,12 +109,18 @@ def best_cost(records: Iterable[Record], known_best: Mapping[str, float] | None 
     """f* of each problem: the lowest accepted cost that any solver reached, NaN if none is finite.
 
     Args:
-        records: every solver counts, converged or not.
+        records: every solver counts, converged or not; of float32 only the ends, which were computed in float64.
         known_best: costs known from elsewhere (pixels squared) for some problems; the lower one is used.
     """
-    costs = [(r.problem, [r.initial_cost, r.final_cost, *(point.cost for point in r.trace)]) for r in records]
+    costs = [(r.problem, [r.initial_cost, lowest_cost(r)]) for r in records]
     known = [(name, [(known_best or {}).get(name, math.nan)]) for name in dict.fromkeys(name for name, _ in costs)]
     return _extreme([*costs, *known], min)
+
+
+def lowest_cost(record: Record) -> float:
+    """The lowest cost that a run may be said to have reached, NaN if none is finite."""
+    trace = [] if record.dtype == "float32" else [point.cost for point in record.trace]
+    return min((cost for cost in (record.final_cost, *trace) if math.isfinite(cost)), default=math.nan)
 
 
 def _extreme(costs: Iterable[tuple[str, Sequence[float]]], choose) -> dict[str, float]:

@@ -57,7 +57,8 @@ def embedded_sources() -> list[Source]:
 
 
 def sources(locations: list[str]) -> list[Source]:
-    """Names for locations, all different; missing files and unknown scenes are refused at once.
+    """Names for locations, all different; missing files and unknown scenes are refused at once. What is named twice is
+    one problem.
 
     A location such as ladybug-49, where no file is called so, is a downloaded problem of BAL.
 
@@ -83,6 +84,8 @@ def sources(locations: list[str]) -> list[Source]:
                 label = _model_name(path)
             # stray bytes of a name have no place in reports and pictures
             label, family = display_name(label), display_name(path.resolve().parent.name)
+        if any(_same(source.location, location) for source in found):
+            continue
         taken = {source.name for source in found}
         if label in taken and f"{family}-{label}" not in taken:
             label = f"{family}-{label}"
@@ -92,6 +95,12 @@ def sources(locations: list[str]) -> list[Source]:
             unique = f"{label}-{count}"
         found.append(Source(unique, family, location))
     return found
+
+
+def _same(one: str, other: str) -> bool:
+    if one.startswith(SCENE_PREFIX) or other.startswith(SCENE_PREFIX):
+        return one == other
+    return Path(one).resolve() == Path(other).resolve()
 
 
 def _model_name(folder: Path) -> str:

@@ -218,7 +218,7 @@ def _cell(runs: Sequence[Record], reaches: dict[str, Reach], f0: float, f_star: 
 
 def _problem(runs: Sequence[Record], f0: float, f_star: float) -> ProblemSummary:
     first = runs[0]
-    holder = [r.solver for r in runs if r.final_cost <= f_star or any(p.cost <= f_star for p in r.trace)]
+    holder = [r.solver for r in runs if profile.lowest_cost(r) <= f_star]
     sizes = (first.cameras, first.points, first.observations)
     return ProblemSummary(first.problem, first.family, *sizes, f0, f_star, holder[0] if holder else "known")
 

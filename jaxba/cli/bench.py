@@ -164,6 +164,14 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
     return common.BAD_INPUT if failures else 0
 
 
+def _number(text: str) -> float | str:
+    """A number where the text is one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
 def _with_suite(args: Arguments) -> Arguments:
     """Fills what the command line leaves open from the suite file."""
     if args.suite is None:
@@ -191,6 +199,8 @@ def _with_suite(args: Arguments) -> Arguments:
     for key, value in suite.items():
         if key not in kinds:
             raise common.UsageError(f"--suite {args.suite}: unknown key {key!r}; known: {', '.join(kinds)}")
+        if key == "tolerance" and isinstance(value, str):  # YAML takes 1e-3, without a point, for text
+            value = _number(value)
         if not isinstance(value, kinds[key]) or isinstance(value, bool):
             raise common.UsageError(f"--suite {args.suite}: {key} is {value!r}, not a {kinds[key][0].__name__}")
         suite[key] = float(value) if key == "tolerance" else value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import sys
 from collections.abc import Callable, Sequence
 from io import TextIOWrapper
@@ -19,6 +20,9 @@ INTERRUPTED = 130
 
 CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable: folder of compiled programs; `off` switches the cache off."""
+
+
+_WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 
 class UsageError(ValueError):
@@ -134,7 +138,8 @@ def check_writable(option: str, path: str | None) -> None:
     """Refuses an output file that could not be written later, before any work is done.
 
     Raises:
-        UsageError: the folder is missing or not writable, or the path is a folder or ends as that of one.
+        UsageError: the folder is missing or not writable, the file is read-only, or the path is a folder or ends as
+            that of one.
     """
     from jaxba.io.files import STREAMS
 
@@ -154,6 +159,8 @@ def check_writable(option: str, path: str | None) -> None:
         raise UsageError(f"{option} {path}: folder {folder} does not exist")
     if not os.access(target.parent, os.W_OK):
         raise UsageError(f"{option} {path}: folder {folder} cannot be written")
+    if target.exists() and not target.stat().st_mode & _WRITABLE:
+        raise UsageError(f"{option} {path}: is a read-only file")
 
 
 def check_folder(option: str, path: str) -> None:

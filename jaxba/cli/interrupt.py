@@ -2,26 +2,83 @@
 
 from __future__ import annotations
 
+import os
 import signal
+import socket
 import sys
+import threading
+import time
+
+PATIENCE_S, PAUSE_S = 1.0, 0.02
+"""Seconds after which a second Ctrl-C ends the process, where Python has not come to hear of it, and how often that is
+looked at. Python hears nothing while a compiled program runs."""
+
+_INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells define it."""
 
 
 class Interrupt:
-    """While `gentle`, the first Ctrl-C only sets `asked`, and the second is real; otherwise every one is real."""
+    """While `gentle`, the first Ctrl-C only sets `asked`, and the second is real; otherwise every one is real.
+
+    Signals are told to a thread as they come (`signal.set_wakeup_fd`), so that the first is answered, and the second
+    ends the process, in the middle of a long program too. What commands write is a whole file or none.
+    """
 
     def __init__(self, unit: str, *, gentle: bool) -> None:
         """`unit`: what is finished first, in a word for the person who pressed the keys."""
         self.unit, self.gentle, self.asked = unit, gentle, False
+        self._came, self._heard, self._raised = 0, 0, False
+        self._untold = [True]
 
     def __enter__(self) -> Interrupt:
+        self._ear, mouth = socket.socketpair()
+        mouth.setblocking(False)
+        self._mouth = mouth
         self._before = signal.signal(signal.SIGINT, self._handle)
+        self._mouth_before = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._raised = True  # nothing is forced any more
+        signal.set_wakeup_fd(self._mouth_before)
         signal.signal(signal.SIGINT, self._before)
+        self._mouth.close()
+        self._thread.join()
+        self._ear.close()
+
+    def _listen(self) -> None:
+        """In the thread: counts signals until the other end is closed."""
+        while numbers := self._ear.recv(1):
+            if numbers[0] != signal.SIGINT:
+                continue
+            self._came += 1
+            if self._came > 1:
+                self._insist()
+            elif self.gentle:
+                self._ask()
+
+    def _insist(self) -> None:
+        for _ in range(round(PATIENCE_S / PAUSE_S)):
+            if self._raised:
+                return
+            time.sleep(PAUSE_S)
+        print("interrupted", file=sys.stderr, flush=True)
+        os._exit(_INTERRUPTED)
 
     def _handle(self, *_: object) -> None:
-        if self.asked or not self.gentle:
+        """In Python's own time; once for several signals that came meanwhile."""
+        self._heard += 1
+        if not self.gentle or max(self._heard, self._came) > 1:
+            self._raised = True
             raise KeyboardInterrupt
+        self._ask()
+
+    def _ask(self) -> None:
         self.asked = True
-        print(f"stopping after this {self.unit}; Ctrl-C again stops at once", file=sys.stderr)
+        try:
+            self._untold.pop()  # one thread gets it
+        except IndexError:
+            return
+        print(f"stopping after this {self.unit}; Ctrl-C again stops at once", file=sys.stderr, flush=True)

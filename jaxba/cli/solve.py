@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,6 +17,9 @@ from jaxba.cli.interrupt import Interrupt
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.options import Intrinsics, LinearSolverChoice, Preconditioner
 from jaxba.programs import Compilation
+
+_STDOUT = 1
+"""File descriptor of standard output."""
 
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
 """What is solved where no problem is named."""
@@ -98,8 +103,8 @@ class Arguments:
     """Residual in pixels where the loss bends."""
 
     output: str | None = None
-    """Write the solution here: BAL format, compressed by its ending, or .ply for a viewer. Of a COLMAP model: a COLMAP
-    model, in a folder of this name, unless it ends in .txt, .bal, .ply, .bz2, .gz or .xz."""
+    """Write the solution here: BAL format, compressed by its ending, or .ply for a viewer; /dev/stdout too. Of a COLMAP
+    model: a COLMAP model, in a folder of this name, unless it ends in .txt, .bal, .ply, .bz2, .gz or .xz."""
 
     log: str | None = None
     """Write a JSON record of the solve here, compressed by its ending."""
@@ -112,7 +117,16 @@ def main() -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Runs the command and returns its exit status: 0 when a solution was found and written, 2 for bad input."""
-    return common.run_command(Arguments, _solve, "Bundle adjustment of one problem.", argv)
+    return common.run_command(Arguments, _run, "Bundle adjustment of one problem.", argv)
+
+
+def _run(args: Arguments) -> int:
+    from jaxba.io.files import stream_number
+
+    if _STDOUT not in [stream_number(path or "") for path in (args.output, args.log)]:
+        return _solve(args)
+    with redirect_stdout(sys.stderr):  # nothing comes between the lines of the file
+        return _solve(args)
 
 
 def _solve(args: Arguments) -> int:
@@ -123,6 +137,8 @@ def _solve(args: Arguments) -> int:
     )
     if args.refine_points is not None and args.refine_points < 0:
         raise common.UsageError(f"--refine-points must not be negative, is {args.refine_points}")
+    if args.refine_points:
+        common.check_positive(refine_points=args.refine_points)
     if args.method != DEFAULT_METHOD and args.linear_solver != "auto":
         raise common.UsageError(f"--linear-solver is for --method lm; {args.method} has its own")
     if args.intrinsics == "fixed" and (args.method != DEFAULT_METHOD or args.linear_solver not in ("auto", "explicit")):
@@ -214,9 +230,8 @@ def _solve(args: Arguments) -> int:
         except OSError as error:
             raise common.UsageError(f"--output {args.output}: {error.strerror or error}") from None
         common.say(f"wrote {args.output}")
-        if model is None and not table.fits_bal(problem):
-            lost = "shared lenses and weights of observations are not in that file, which has no place for them"
-            common.say(f"note: {lost}")
+        if model is None and (lost := table.lost_in_bal(problem)):
+            common.say(f"note: that file has no place for: {lost}")
     if args.log:
         record = record_of(solution, steps, name=args.problem or DEFAULT_SCENE, family="", solver=name)
         with open_output(args.log) as file:

@@ -96,9 +96,15 @@ def _how_compiled(solution: Solution) -> str:
     return f" ({which} with quickly compiled programs, see --compilation)"
 
 
-def fits_bal(problem: BundleProblem) -> bool:
-    """Whether BAL can say all of a problem."""
-    return problem.lenses is None and problem.whitening is None
+def lost_in_bal(problem: BundleProblem) -> str:
+    """What BAL cannot say of a problem, for a person; empty where it can say all of it."""
+    lenses = problem.lenses
+    lost = [
+        (lenses is not None and lenses.shared, "which images share a lens"),
+        (lenses is not None and not np.asarray(lenses.free).all(), "which numbers of a lens stay as they are"),
+        (problem.whitening is not None, "weights of observations"),
+    ]
+    return ", ".join(what for is_lost, what in lost if is_lost)
 
 
 def padding(problem: BundleProblem, solution: Solution) -> str:

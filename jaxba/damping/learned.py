@@ -112,7 +112,7 @@ def save_policy(path: str | Path, policy: Learned, metadata: dict[str, str] | No
         tensors[f"layer{k}.kernel"] = np.asarray(layer.kernel, np.float32)
         tensors[f"layer{k}.bias"] = np.asarray(layer.bias, np.float32)
     facts = {**(metadata or {}), "format": FORMAT, "agent": json.dumps(asdict(policy.config))}
-    target, content = Path(path), save(tensors, facts)
+    target, content = Path(path), _in_order(save(tensors, facts))
     if len(content) > LARGEST_FILE:
         raise PolicyFileError(
             f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy file"
@@ -120,6 +120,17 @@ def save_policy(path: str | Path, policy: Learned, metadata: dict[str, str] | No
     part = target.with_name(target.name + ".part")
     part.write_bytes(content)
     part.replace(target)
+
+
+def _in_order(content: bytes) -> bytes:
+    """The same file with its metadata sorted, which safetensors writes in an order of chance: equal policies are equal
+    bytes then."""
+    size = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + size])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # tensors begin at a multiple of eight bytes
+    return len(text).to_bytes(8, "little") + text + content[8 + size :]
 
 
 def load_policy(path: str | Path) -> Learned:

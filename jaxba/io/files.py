@@ -7,7 +7,9 @@ import gzip
 import lzma
 import os
 import secrets
+import shutil
 import stat
+import sys
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -26,6 +28,8 @@ READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError)
 
 STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")
 """Names of open streams; links to files where a shell redirects them."""
+
+_NUMBERS = {"/dev/stdout": 1, "/dev/stderr": 2}
 
 _MAGIC = {".bz2": b"BZh", ".gz": b"\x1f\x8b", ".xz": b"\xfd7zXZ\0"}
 
@@ -79,7 +83,8 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
     """A stream whose bytes become the file at the end of the block, or not at all; compressed as the name says.
 
     They go to a temporary file in the same folder, which then replaces the target (of a symbolic link, what it points
-    to) and is removed if anything fails. A device or pipe, such as standard output, is written straight away.
+    to, with its permissions) and is removed if anything fails. A device or pipe, such as standard output, is written
+    straight away, an open stream from where it stands.
 
     Raises:
         ProblemError: the file cannot be written.
@@ -89,13 +94,15 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
         target = os.path.realpath(path)
         special = os.path.exists(target) and not stat.S_ISREG(os.stat(target).st_mode)
         if special or os.fspath(path).startswith(STREAMS):
-            with open(path, "wb") as file, _compressor(file, path) as stream:
+            with _open_stream(os.fspath(path)) as file, _compressor(file, path) as stream:
                 yield stream
             return
         temporary = os.path.join(os.path.dirname(target), f".jaxba-{secrets.token_hex(8)}.tmp")
         try:
             with open(temporary, "xb") as file, _compressor(file, path) as stream:
                 yield stream
+            if os.path.exists(target):
+                shutil.copymode(target, temporary)
             os.replace(temporary, target)
         except BaseException:
             with suppress(OSError):
@@ -105,6 +112,22 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
         raise
     except (OSError, ValueError) as error:
         raise ProblemError(f"cannot write {name}: {reason(error)}") from error
+
+
+def stream_number(path: StrPath) -> int | None:
+    """The file descriptor that a name such as `/dev/stdout` stands for; None for every other name."""
+    name = os.fspath(path)
+    number = name.removeprefix("/dev/fd/")
+    return _NUMBERS.get(name, int(number) if number != name and number.isdecimal() else None)
+
+
+def _open_stream(path: str) -> BinaryIO:
+    number = stream_number(path)
+    if number is None:
+        return open(path, "wb")
+    for stream in (sys.stdout, sys.stderr):  # what was said before comes first
+        stream.flush()
+    return os.fdopen(os.dup(number), "wb")  # opened by its name, a redirected file would be written from its start
 
 
 def _blocks(file: BufferedReader, suffix: str, name: str) -> Iterator[bytes]:
