@@ -62,7 +62,7 @@ class Phase(NamedTuple):
     name: str
     least_s: float
     median_s: float
-    floor_s: float  # time that the copy bandwidth needs for inputs and outputs, each moved once
+    floor_s: float  # time that the copy bandwidth needs for inputs and outputs, each moved once, without index arrays
     compile_s: float
 
     def __str__(self) -> str:
@@ -86,52 +86,51 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     done: dict[str, Any] = {}
 
     def phase(name: str, function: Any, *arguments: Any) -> Phase:
-        done[name], least, median, compile_s = timed(function, *arguments, repeats=repeats)
+        """The layout is the first argument, as in a step: index arrays that XLA knows make other programs."""
+        done[name], least, median, compile_s = timed(function, layout, *arguments, repeats=repeats)
         return Phase(name, least, median, (size(arguments) + size(done[name])) / rate, compile_s)
 
     plain = replace(options, refine_points=0)
     state = lm.initial_state(layout, problem, plain)
-    index = (layout.slot_camera, layout.slot_point, layout.slot_mask, layout.pixels)
     damping = jnp.asarray(1e-4)
-    yield phase("linearise", lambda s, _: linearize(layout, s.cameras, s.points, plain.loss), state, index)
+    yield phase("linearise", lambda la, s: linearize(la, s.cameras, s.points, plain.loss), state)
     linear = done["linearise"]
-    yield phase("eliminate", lambda li, d: eliminate.eliminate_points(layout, li, d, plain), linear, damping)
+    yield phase("eliminate", lambda la, li, d: eliminate.eliminate_points(la, li, d, plain), linear, damping)
     points = done["eliminate"]
     turn = eliminate.Coordinates.of(state.cameras, plain)
-    by_camera = lambda li, po: eliminate.camera_system(layout, li, po, turn, damping, plain)
-    yield phase("camera sums", by_camera, linear, points)
+    by_camera = lambda la, li, po, tu: eliminate.camera_system(la, li, po, tu, damping, plain)
+    yield phase("camera sums", by_camera, linear, points, turn)
     system = done["camera sums"]
     if layout.grid is not None:
-        grid = layout.grid
-        yield phase("form", lambda li, po, sy: reduced.dense_system(grid, li, po, sy), linear, points, system)
-        factor = lambda m, x: factor_and_solve(m, x.reshape(-1))
+        yield phase("form", lambda la, li, po, sy: reduced.dense_system(la.grid, li, po, sy), linear, points, system)
+        factor = lambda _, m, x: factor_and_solve(m, x.reshape(-1))
         yield phase("factor", factor, done["form"], system.right)
     elif plain.forms_reduced_system:
-        yield phase("form", lambda li, po, sy: reduced.reduced_blocks(layout, li, po, sy), linear, points, system)
+        yield phase("form", lambda la, li, po, sy: reduced.reduced_blocks(la, li, po, sy), linear, points, system)
         solve = reduced.factor_blocks if plain.linear_solver == "explicit" else reduced.apply_blocks
         name = "factor" if plain.linear_solver == "explicit" else "one product"
-        yield phase(name, lambda b, x: solve(layout, b, x), done["form"], system.right)
+        yield phase(name, lambda la, b, x: solve(la, b, x), done["form"], system.right)
     else:
-        product = lambda li, po, sy, x: eliminate.apply_reduced(layout, li, po, sy, x)
+        product = lambda la, li, po, sy, x: eliminate.apply_reduced(la, li, po, sy, x)
         yield phase("one product", product, linear, points, system, system.right)
     frames = camera.frames(state.cameras)
     anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), state.points)
     if plain.uses_clusters:
-        coarse = lambda li, po, sy, x: coarse_preconditioner(layout, li, po, sy, anchor)(x)
-        yield phase("coarse system", coarse, linear, points, system, system.right)
-    whole = lambda li, po, sy: reduced.solve_reduced(layout, li, po, sy, anchor, plain, plain.cg_forcing)
-    yield phase("reduced solve", whole, linear, points, system)
-    back = lambda li, po, x: eliminate.back_substitute(layout, li, po, x)
+        coarse = lambda la, li, po, sy, an, x: coarse_preconditioner(la, li, po, sy, an)(x)
+        yield phase("coarse system", coarse, linear, points, system, anchor, system.right)
+    whole = lambda la, li, po, sy, an: reduced.solve_reduced(la, li, po, sy, an, plain, plain.cg_forcing)
+    yield phase("reduced solve", whole, linear, points, system, anchor)
+    back = lambda la, li, po, x: eliminate.back_substitute(la, li, po, x)
     yield phase("back-substitute", back, linear, points, system.right)
-    yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), layout, state)
+    yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), state)
     count = options.refine_points
     if count:
-        refine = lambda s: refine_points(layout, slot_frames(layout, s.cameras), s.points, plain.loss, count)
+        refine = lambda la, s: refine_points(la, slot_frames(la, s.cameras), s.points, plain.loss, count)
         yield phase(f"refine {count}", refine, state)
-        yield phase("refine cameras", lambda la, s: refine_cameras(la, s.cameras, s.points, plain), layout, state)
-    yield phase("whole step", lambda la, s: lm.lm_step(la, s, damping, plain), layout, state)
+        yield phase("refine cameras", lambda la, s: refine_cameras(la, s.cameras, s.points, plain), state)
+    yield phase("whole step", lambda la, s: lm.lm_step(la, s, damping, plain), state)
     if count:
-        yield phase(f"step, refine {count}", lambda la, s: lm.lm_step(la, s, damping, options), layout, state)
+        yield phase(f"step, refine {count}", lambda la, s: lm.lm_step(la, s, damping, options), state)
 
 
 def main() -> None:
