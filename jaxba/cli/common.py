@@ -23,6 +23,7 @@ CACHE_VARIABLE = "JAXBA_CACHE"
 
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
+"""Bits of a mode; root may write without any."""
 
 
 class UsageError(ValueError):

@@ -9,12 +9,11 @@ import sys
 import threading
 import time
 
+from jaxba.cli.common import INTERRUPTED
+
 PATIENCE_S, PAUSE_S = 1.0, 0.02
 """Seconds after which a second Ctrl-C ends the process, where Python has not come to hear of it, and how often that is
 looked at. Python hears nothing while a compiled program runs."""
-
-_INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells define it."""
 
 
 class Interrupt:
@@ -65,7 +64,7 @@ class Interrupt:
                 return
             time.sleep(PAUSE_S)
         print("interrupted", file=sys.stderr, flush=True)
-        os._exit(_INTERRUPTED)
+        os._exit(INTERRUPTED)
 
     def _handle(self, *_: object) -> None:
         """In Python's own time; once for several signals that came meanwhile."""
