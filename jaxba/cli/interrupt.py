@@ -11,9 +11,12 @@ import time
 
 from jaxba.cli.common import INTERRUPTED
 
-PATIENCE_S, PAUSE_S = 1.0, 0.02
-"""Seconds after which a second Ctrl-C ends the process, where Python has not come to hear of it, and how often that is
-looked at. Python hears nothing while a compiled program runs."""
+PATIENCE_S = 1.0
+"""Seconds after which a second Ctrl-C ends the process, where Python has not come to hear of it. It hears nothing while
+a compiled program runs."""
+
+_HEARD = 0
+"""What Python tells the thread once a Ctrl-C became an exception; no signal has this number."""
 
 
 class Interrupt:
@@ -26,7 +29,7 @@ class Interrupt:
     def __init__(self, unit: str, *, gentle: bool) -> None:
         """`unit`: what is finished first, in a word for the person who pressed the keys."""
         self.unit, self.gentle, self.asked = unit, gentle, False
-        self._came, self._heard, self._raised = 0, 0, False
+        self._came, self._heard = 0, 0  # signals: told to the thread, and to Python, which takes several for one
         self._untold = [True]
 
     def __enter__(self) -> Interrupt:
@@ -40,7 +43,6 @@ class Interrupt:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._raised = True  # nothing is forced any more
         signal.set_wakeup_fd(self._mouth_before)
         signal.signal(signal.SIGINT, self._before)
         self._mouth.close()
@@ -49,28 +51,30 @@ class Interrupt:
 
     def _listen(self) -> None:
         """In the thread: counts signals until the other end is closed."""
-        while numbers := self._ear.recv(1):
-            if numbers[0] != signal.SIGINT:
-                continue
-            self._came += 1
-            if self._came > 1:
-                self._insist()
-            elif self.gentle:
-                self._ask()
-
-    def _insist(self) -> None:
-        for _ in range(round(PATIENCE_S / PAUSE_S)):
-            if self._raised:
+        deadline = None
+        while True:
+            self._ear.settimeout(None if deadline is None else max(1e-3, deadline - time.monotonic()))
+            try:
+                numbers = self._ear.recv(1)
+            except TimeoutError:
+                print("interrupted", file=sys.stderr, flush=True)
+                os._exit(INTERRUPTED)
+            if not numbers:
                 return
-            time.sleep(PAUSE_S)
-        print("interrupted", file=sys.stderr, flush=True)
-        os._exit(INTERRUPTED)
+            if numbers[0] == _HEARD:
+                deadline = None
+            elif numbers[0] == signal.SIGINT:
+                self._came += 1
+                if self._came > 1:
+                    deadline = deadline or time.monotonic() + PATIENCE_S
+                elif self.gentle:
+                    self._ask()
 
     def _handle(self, *_: object) -> None:
         """In Python's own time; once for several signals that came meanwhile."""
         self._heard += 1
         if not self.gentle or max(self._heard, self._came) > 1:
-            self._raised = True
+            self._mouth.send(bytes([_HEARD]))
             raise KeyboardInterrupt
         self._ask()
 
