@@ -1,11 +1,12 @@
 """The look-ahead oracle on real problems: how many iterations the damping alone could save.
 
-    python -m benchmarks.oracle $JAXBA_DATA/bal/problem-*.txt.bz2 --iterations 40
+    python -m benchmarks.oracle [PROBLEM ...] [--solver learned+refine0] [--iterations 40]
 
-Beam search over lambda, its greedy cousin, `learned` and Ceres' rule, all with the same step: that of `learned`, or
-plain steps with `--plain`. Iterations until the cost is within 1e-3, 1e-4 and 1e-6 of the lowest that any of them, or a
-file of costs given with `--best`, reached; never counts as 100, also where the search was given fewer. An iteration of
-the search takes `width x grid` linear solves and counts as one.
+Beam search over lambda, its greedy cousin, a learned solver and Ceres' rule, all with the learned solver's step, and
+`classic` and `ceres` as published, with plain steps. Iterations until the cost is within 1e-3, 1e-4 and 1e-6 of the
+lowest that any of them, or a file of costs given with `--best`, reached, and until a stop rule fired; never counts as
+100, also where the search was given fewer. The search stops where no state of its beam becomes better by a millionth.
+An iteration of the search takes `width x grid` linear solves and counts as one.
 
 `jaxba/game/oracle.py` does it for scenes, all states of a beam at once in one program. A real problem is too large for
 36 copies side by side, so here they take turns in the solver's own compiled step.
@@ -15,20 +16,22 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import DampingPolicy, LMState, StepOptions, host, initial_state, lm_step, make_policy, read_problem, solve
+from benchmarks.suite import real_problems
+from jaxba import DampingPolicy, LMState, StepOptions, host, initial_state, lm_step, make_policy, solve
+from jaxba.bench.sources import sources
 from jaxba.choose import choose_linear_solver
 from jaxba.cli.common import prepare_process
 from jaxba.damping.learned import Learned
-from jaxba.damping.registry import LEARNED, LEARNED_DRIVER
 from jaxba.game.oracle import GRID, WIDTH
 from jaxba.layout import layout_for
+from jaxba.naming import parse_solver
 from jaxba.problem import BundleProblem
 
 TOLERANCES = (1e-3, 1e-4, 1e-6)
@@ -40,40 +43,50 @@ _step = jax.jit(lm_step, static_argnames=("options",))
 def main() -> None:
     """Prints one Markdown row a problem, and the geometric means."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("problems", type=Path, nargs="+", help="BAL files")
-    parser.add_argument("--plain", action="store_true", help="plain steps, lambda alone, as `learned-driver`")
+    parser.add_argument("problem", nargs="*", help="as for jaxba-bench; all real problems without any")
+    parser.add_argument("--solver", default="learned", help="a learned one, whose step is taken")
     parser.add_argument("--iterations", type=int, default=40, help="of the search")
     parser.add_argument("--best", type=Path, help="best known costs, one `NAME COST` a line")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     prepare_process()
-    policy = make_policy(LEARNED_DRIVER if args.plain else LEARNED)
-    assert isinstance(policy, Learned)
-    options = policy.config.step_options(StepOptions())
+    policy, options = parse_solver(args.solver).build()
+    if not isinstance(policy, Learned):
+        parser.error(f"--solver {args.solver}: not a learned one")
     known = dict(line.split() for line in args.best.read_text().splitlines()) if args.best else {}
-    names = (f"beam of {WIDTH}", "greedy", "learned", "ceres")
+    rules = {
+        args.solver: (policy, options),
+        "ceres, same step": (make_policy("ceres"), options),
+        **{name: (make_policy(name), StepOptions()) for name in ("ceres", "classic")},
+    }
+    names = (f"beam of {WIDTH}", "greedy", *rules)
     print("| problem |" + "".join(f" {name} |" for name in names) + "\n| --- |" + " --- |" * len(names))
     rows = []
-    for path in args.problems:
-        problem = read_problem(path)
+    for source in sources(args.problem or real_problems()):
+        problem = source.read()
         with host.calm_blas():
             runs = [search(problem, options, policy.min_gain, args.iterations, width) for width in (WIDTH, 1)]
-        own = replace(options, camera_damping=1)  # a rule damps as it was published
-        runs += [_rule(problem, policy, options), _rule(problem, make_policy("ceres"), own)]
-        name = path.name.removesuffix(".txt.bz2")
-        best = min(float(known.get(name, np.inf)), *(run[-1] for run in runs))
-        rows.append([[_reached(run, best * (1 + t)) for t in TOLERANCES] for run in runs])
+            runs += [_play(problem, *rule) for rule in rules.values()]
+        best = min(float(known.get(source.name, np.inf)), *(run.costs[-1] for run in runs))
+        rows.append([[*(_reached(run.costs, best * (1 + t)) for t in TOLERANCES), run.stopped] for run in runs])
         cells = (" / ".join("never" if n == LIMIT else str(n) for n in row) for row in rows[-1])
-        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+        print(f"| {source.name} | " + " | ".join(cells) + " |", flush=True)
     means = np.exp(np.log(np.array(rows, float)).mean(axis=0))
     print("| geometric mean | " + " | ".join(" / ".join(f"{x:.2f}" for x in row) for row in means) + " |")
 
 
-def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterations: int, width: int) -> np.ndarray:
-    """Lowest accepted cost after each number of iterations, the start first; pixels squared.
+class Run(NamedTuple):
+    """A solve, or a search."""
 
-    It ends early where no state of the beam became better by a millionth.
-    """
+    costs: np.ndarray
+    """Lowest accepted cost after each number of iterations, the start first; pixels squared."""
+
+    stopped: int
+    """Iterations until a stop rule fired; the limit where none did."""
+
+
+def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterations: int, width: int) -> Run:
+    """Beam search; it ends early where no state of the beam became better by a millionth."""
     options = choose_linear_solver(problem, options, "auto")
     layout = jax.device_put(layout_for(problem, options))
     start = jax.jit(initial_state, static_argnums=(2, 3))(layout, problem, options, jnp.dtype("float64"))
@@ -89,13 +102,14 @@ def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterat
         costs.append(float(beam[0].cost))
         pairs = zip(before, beam, strict=False)
         if len(before) == len(beam) and all(float(new.cost) > float(old.cost) * (1 - 1e-6) for old, new in pairs):
-            break
-    return np.array(costs)
+            return Run(np.array(costs), turn + 1)
+    return Run(np.array(costs), LIMIT)
 
 
-def _rule(problem: BundleProblem, policy: DampingPolicy, options: StepOptions) -> np.ndarray:
+def _play(problem: BundleProblem, policy: DampingPolicy, options: StepOptions) -> Run:
     solution = solve(problem, policy, options, linear_solver="auto", max_iterations=LIMIT)
-    return np.append(solution.initial_cost, solution.history.cost)
+    costs = np.append(solution.initial_cost, solution.history.cost)
+    return Run(costs, solution.iterations if solution.converged else LIMIT)
 
 
 def _reached(costs: np.ndarray, target: float) -> int:
