@@ -152,6 +152,10 @@ def solve(
         raise ValueError(f"damping must be the name of a policy or a policy, not {damping!r}")
     if options is None:
         options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
+    if isinstance(policy, Learned) and options.scaling != StepOptions().scaling:
+        raise ValueError(
+            f"a learned policy knows lambda as a factor on the diagonal, not with scaling {options.scaling!r}"
+        )
     options = make_method(method).options(options)
     capacity = None
     if pad:

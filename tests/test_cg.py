@@ -77,6 +77,20 @@ def test_iterates_are_those_of_jax(kind):
         np.testing.assert_allclose(found.reshape(-1), by_hand(matrix, b, inverse, count)[-1], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["diagonal", "blocks"])
+def test_columns_that_are_divided_by_something_make_the_same_iterates(kind):
+    """DeepLM divides columns by `1 + |J_j|`: with a preconditioner of diagonal blocks that changes no step."""
+    matrix, b = spd(1e3), right()
+    scale = 1 / (1 + np.sqrt(np.diag(matrix)))
+    scaled = matrix * scale * scale[:, None]
+    for count in (1, 3, 8):
+        found = [
+            np.asarray(run(a, rest.reshape(b.shape), PRECONDITIONERS[kind](a), **ALWAYS, max_iterations=count)[0])
+            for a, rest in ((matrix, b.ravel()), (scaled, scale * b.ravel()))
+        ]
+        np.testing.assert_allclose(scale * found[1].ravel(), found[0].ravel(), rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("condition", [1e1, 1e4, 1e8])
 def test_convergence_gives_the_solution_of_numpy(condition):
     matrix, b = spd(condition), right()

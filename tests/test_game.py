@@ -35,8 +35,11 @@ LIMIT = 25
 
 # Scenes
 
+LARGE = pytest.param(SceneClass(40, 400), marks=pytest.mark.slow, id="large")
+"""The largest that issue 3 names; forty of them are 600,000 slots."""
 
-@pytest.mark.parametrize("kind", [KIND, SceneClass(6, 10, "paper")], ids=["wide", "paper"])
+
+@pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper"), LARGE])
 def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
     scenes = make_scenes(kind, jax.random.key(1), 40)
     slots = kind.cameras * (kind.points + 1)
@@ -56,7 +59,7 @@ def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
         assert len({s.sum() for s in seen}) > 5  # sizes differ
 
 
-@pytest.mark.parametrize("kind", [KIND, SceneClass(6, 10, "paper")], ids=["wide", "paper"])
+@pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper"), LARGE])
 def test_the_cost_of_a_start_is_what_numpy_says(kind):
     scenes = make_scenes(kind, jax.random.key(2), 12)
     found = np.asarray(initial_costs(kind, scenes))
@@ -152,6 +155,21 @@ def test_a_scene_is_played_as_it_is_solved_by_every_method(method):
     found = play(KIND, bank, CERES, options, 6)
     for k in (0, 5):
         alone = solve(problem_of(KIND, bank.scenes, k), "ceres", options, max_iterations=6)
+        count = min(4, alone.iterations)
+        np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
+    """Forty cameras and four hundred points, as no preset has them."""
+    kind, options = SceneClass(40, 400), StepOptions(refine_points=3)
+    scenes = make_scenes(kind, jax.random.key(5), 4)
+    costs = initial_costs(kind, scenes)
+    found = play(kind, Bank(scenes, costs, costs, info_of(kind, scenes, costs, 6), costs), CERES, options, 6)
+    whole = [k for k in range(4) if grid(kind, scenes)[k].any()]
+    assert len(whole) >= 2
+    for k in whole[:2]:
+        alone = solve(problem_of(kind, scenes, k), "ceres", options, max_iterations=6)
         count = min(4, alone.iterations)
         np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
 

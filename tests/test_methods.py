@@ -108,8 +108,9 @@ def test_the_split_reduced_system_is_block_diagonal():
 
 
 @pytest.mark.parametrize("damping", [1e-3, 1.0, 30.0])
-def test_repairs_shrink_the_error_by_the_spectral_radius_of_the_jacobi_iteration(damping):
-    """In the norm of B the error falls by at least the spectral radius of `B^-1 (B - S)`, which is below one."""
+def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_iteration(damping):
+    """In the norm of B the error, and in that of B^-1 the residual, falls by at least the spectral radius of
+    `B^-1 (B - S)`, which is below one."""
     problem, options = support.tiny(), replace(CLUSTERED, rotation="manifold")
     layout, linear, points, system, part = systems(problem, options, damping)
     size = system.right.size
@@ -125,11 +126,13 @@ def test_repairs_shrink_the_error_by_the_spectral_radius_of_the_jacobi_iteration
     exact = np.linalg.solve(matrix, np.asarray(system.right).ravel())
     first = clustered_step(layout, linear, points, system, jnp.asarray(damping), part, replace(options, repairs=0))
     error = lambda x: np.linalg.norm(root.T @ (np.asarray(x).ravel() - exact))
-    before = error(first)
-    assert before > 1e-6 * np.linalg.norm(root.T @ exact)
-    for rounds in (1, 2, 4, 8):
-        after = error(repair(layout, linear, points, system, first, rounds))
-        assert after <= radius**rounds * before * (1 + 1e-6) + 1e-9 * before
+    residual = lambda x: np.linalg.norm(np.linalg.solve(root, matrix @ (np.asarray(x).ravel() - exact)))
+    for norm, whole in ((error, np.linalg.norm(root.T @ exact)), (residual, residual(np.zeros(size)))):
+        before = norm(first)
+        assert before > 1e-6 * whole
+        for rounds in (1, 2, 4, 8):
+            after = norm(repair(layout, linear, points, system, first, rounds))
+            assert after <= radius**rounds * before * (1 + 1e-6) + 1e-9 * before
 
 
 def test_agreed_gradients_equal_the_published_projection():
@@ -368,8 +371,10 @@ def test_clusters_of_ddlm_share_no_variable():
 
 
 @pytest.mark.slow
-def test_the_power_series_comes_closer_with_every_order():
-    problem, damping = support.tiny(), 1e-1
+@pytest.mark.parametrize(("damping", "left"), [(1e-4, 0.9), (1e-2, 0.2), (1e-1, 1e-2), (10.0, 1e-9)])
+def test_the_power_series_comes_closer_with_every_order(damping, left):
+    """For every lambda, the sooner the larger it is; what is left of the error after 80 terms."""
+    problem = support.tiny()
     truth = support.dense(problem, StepOptions(), damping)
     errors = []
     for order in (0, 1, 2, 5, 10, 20, 40, 80):
@@ -379,8 +384,8 @@ def test_the_power_series_comes_closer_with_every_order():
         assert info.accepted
         made = support.difference(problem, support.back(problem, before, after), options)
         errors.append(truth.norm(made - truth.step) / truth.norm(truth.step))
-    assert all(late < early for early, late in itertools.pairwise(errors))
-    assert errors[-1] < 1e-2 * errors[0]
+    assert all(late < early or late < 1e-11 for early, late in itertools.pairwise(errors))  # which is rounding
+    assert errors[-1] < left * errors[0]
 
 
 # All of them

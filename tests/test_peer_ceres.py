@@ -53,7 +53,12 @@ SOME = Schedule(values=(1e-3, 1e-2, 1e-1, 1.0))
 
 LADYBUG = "bal/problem-49-7776-pre"
 IN_FRONT = ("bal/problem-21-11315-pre", "bal-converted/sba-54-5207-pre", "bal-converted/kittistereo00s-77-15638-pre")
-"""Real problems without a point behind a camera."""
+"""Real problems without a point behind a camera. Of the fifteen only Ladybug-49 has some."""
+SMALL = tuple(
+    f"bal-converted/{name}"
+    for name in ("balbianello-5-544-pre", "colmap-yding-7-699-post", "sba-7-465-pre", "sba-9-559-pre")
+)
+"""More of them, quickly solved."""
 
 
 def real(name: str) -> BundleProblem:
@@ -485,7 +490,7 @@ def test_real_problems_end_as_with_our_step_where_iterations_are_embedded(name):
 
 @needs_data
 @pytest.mark.slow
-@pytest.mark.parametrize("name", IN_FRONT)
+@pytest.mark.parametrize("name", [*IN_FRONT, *SMALL])
 def test_real_costs_are_ours_at_the_start_and_under_the_same_lambdas(name):
     problem = real(name)
     colmap = ColmapProblem(problem)

@@ -188,6 +188,15 @@ def test_compiles_once() -> None:
     assert int(state.updates) == 3 * 5 * 2
 
 
+def test_a_state_that_was_played_on_is_given_away_and_its_memory_used_again() -> None:
+    state = start(LEARNS, SHORT, toys.ACTION, jax.random.key(0))
+    rows = state.replay.rows
+    place = rows.unsafe_buffer_pointer()
+    after, _ = run_chunk(LEARNS, SHORT, toys.ACTION, state)
+    assert rows.is_deleted()
+    assert after.replay.rows.unsafe_buffer_pointer() == place
+
+
 def test_nothing_leaves_the_device() -> None:
     toy = jax.device_put(toys.ACTION)
     state = start(LEARNS, SHORT, toy, jax.random.key(0))

@@ -459,6 +459,7 @@ def test_the_automatic_choice_of_the_linear_solver_is_told():
         ({"tolerances": Tolerances(gtol=-1.0)}, "gtol must not be negative"),
         ({"damping": None}, "damping must be the name of a policy or a policy, not None"),
         ({"damping": "cerse"}, "unknown damping policy"),
+        ({"damping": "learned", "options": StepOptions(scaling="identity")}, "lambda as a factor on the diagonal"),
         ({"linear_solver": "dense"}, "linear_solver must be one of"),
         ({"linear_solver": "power", "dtype": "mixed"}, "mixed types are for plain LM"),
         ({"method": "stba", "dtype": "mixed"}, "mixed types are for plain LM"),

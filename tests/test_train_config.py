@@ -136,6 +136,11 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("sac.learning_rate=0", "sac.learning_rate must be positive"),
         ("sac.log_std_min=1", "sac.log_std_min must be negative"),
         ("sac.max_grad_norm=-1", "sac.max_grad_norm must be positive or null"),
+        ("bank.refine_points=-1", "bank: refine_points must be at least 0, is -1"),
+        ("bank.warm_share=2", "bank: warm_share must be 0 to 1, is 2"),
+        ("game.tolerance=100", "game: tolerance must be below 1, is 100"),
+        ("game.bonus=-5", "game: bonus must not be negative, is -5"),
+        ("game.shaping=-1", "game: shaping must not be negative, is -1"),
         ("bank.dtype=float16", "bank.dtype must be float64 or float32"),
     ],
 )

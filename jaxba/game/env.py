@@ -91,10 +91,13 @@ class GameConfig:
     def __post_init__(self) -> None:
         if self.reward not in get_args(Reward):
             raise ValueError(f"reward must be one of {', '.join(get_args(Reward))}, not {self.reward!r}")
-        if self.max_iterations < 1 or self.tolerance <= 0 or self.scale <= 0:
+        if not (self.max_iterations >= 1 and self.tolerance > 0 and self.scale > 0):
             raise ValueError("max_iterations, tolerance and scale must be positive")
-        if not self.repair_cost >= 0:
-            raise ValueError(f"repair_cost must not be negative, is {self.repair_cost}")
+        if not self.tolerance < 1:
+            raise ValueError(f"tolerance must be below 1, is {self.tolerance}: starts would be successes")
+        for name in ("bonus", "repair_cost", "shaping"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
 
 
 class Episode(NamedTuple):

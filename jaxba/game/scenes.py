@@ -145,7 +145,7 @@ def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
     uniform = lambda low, high, shape=(): jax.random.uniform(next(keys), shape, minval=low, maxval=high)
     number = jax.random.randint(next(keys), (), 0, len(KINDS))
     cameras = jnp.floor(_log_uniform(next(keys), 4.0, kind.cameras + 1.0)).astype(int)
-    points = jnp.floor(_log_uniform(next(keys), max(10.0, kind.points // 4), kind.points + 1.0)).astype(int)
+    points = jnp.floor(_log_uniform(next(keys), max(10.0, float(kind.points // 4)), kind.points + 1.0)).astype(int)
     used = jnp.arange(kind.cameras) < cameras
 
     center, forward = _path(number, next(keys), kind.cameras)
