@@ -1,0 +1,80 @@
+"""What random clusters cost on the host, beside an iteration of the methods that use them.
+
+    python -m benchmarks.clustering PROBLEM ... [--methods stba,stba:16,ddlm]
+
+A problem draws its clusterings once, when it is loaded, and uses them in turn. So an iteration costs a clustering only
+where there are fewer iterations than clusterings; here the whole price of one, drawn anew for every iteration, is set
+against an iteration. Median of all iterations of a solve under Ceres' rule, which excludes compilation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import statistics
+import time
+
+import jax
+import numpy as np
+
+from jaxba import StepOptions, host, make_method, solve
+from jaxba.bench.sources import sources
+from jaxba.communities import camera_graph, clusterings
+from jaxba.layout import layout_for
+from jaxba.partition import PARTITIONS, SEED
+from jaxba.problem import BundleProblem
+
+ITERATIONS = 8
+
+
+def main() -> None:
+    """Prints a Markdown row for every problem and method."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("problem", nargs="+", help="as for jaxba-bench")
+    parser.add_argument("--methods", default="stba,stba:16,ddlm")
+    args = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    host.keep_memory()
+    print("| problem, method | graph, ms | a clustering, ms | iteration, ms | clustering over iteration | layout, ms |")
+    print("| --- | --: | --: | --: | --: | --: |")
+    for source in sources(args.problem):
+        problem = source.read()
+        for name in args.methods.split(","):
+            options = make_method(name).options(StepOptions())
+            graph, drawing = _clustering_seconds(problem, options.cluster_cameras)
+            with host.calm_blas():
+                iteration = _iteration_seconds(problem, options)
+            started = time.perf_counter()
+            layout_for(problem, options)
+            layout = time.perf_counter() - started
+            cells = (f"{1e3 * graph:.1f}", f"{1e3 * drawing:.1f}", f"{1e3 * iteration:.0f}")
+            share = f"{drawing / iteration:.3f}"
+            print(f"| {source.name}, `{name}` |", " | ".join((*cells, share, f"{1e3 * layout:.0f}")), "|", flush=True)
+
+
+def _clustering_seconds(problem: BundleProblem, largest: int) -> tuple[float, float]:
+    """Seconds for the camera graph, and for one clustering of it."""
+    order = np.lexsort((problem.camera_index, problem.point_index))
+    started = time.perf_counter()
+    graph = camera_graph(
+        problem.camera_index[order], problem.point_index[order], problem.num_cameras, problem.num_points
+    )
+    made = time.perf_counter()
+    drawn = list(itertools.islice(clusterings(graph, largest, np.random.default_rng(SEED)), PARTITIONS))
+    return made - started, (time.perf_counter() - made) / len(drawn)
+
+
+def _iteration_seconds(problem: BundleProblem, options: StepOptions) -> float:
+    stamps = [0.0]
+    solve(
+        problem,
+        "ceres",
+        options,
+        max_iterations=ITERATIONS,
+        callback=lambda record: stamps.append(record.time_s) and False,
+    )
+    return statistics.median(after - before for before, after in itertools.pairwise(stamps))
+
+
+if __name__ == "__main__":
+    main()
