@@ -20,6 +20,7 @@ from typing import Any
 from jaxba.bench import profile
 from jaxba.bench.profile import NEVER, Reach, Target
 from jaxba.bench.records import Record
+from jaxba.bench.virtual import best_reach, rules_of_one_step
 
 YARDSTICKS = ("classic", "ceres")
 """Solvers that every other one is compared with: the paper's yardstick and what people use. Source: design."""
@@ -139,6 +140,8 @@ class Summary:
     solvers: list[SolverSummary]
     cells: list[Cell]
     warnings: list[str]
+    virtual: dict[str, dict[str, TargetSummary]] = field(default_factory=dict)
+    """The virtual best of hand-written rules with one and the same step (virtual.py): by name, then by `Target.key`."""
     facts: dict[str, Any] = field(default_factory=dict)
 
     def cell(self, problem: str, solver: str) -> Cell | None:
@@ -177,6 +180,7 @@ def summarize(
         solvers=[_solver(solver, records, cells, targets, names) for solver in solvers],
         cells=cells,
         warnings=profile.cost_warnings(records) + _coverage_warnings(cells, solvers, names),
+        virtual={best: _virtual(rules, tables, names) for best, rules in rules_of_one_step(solvers).items()},
         facts=dict(facts or {}),
     )
 
@@ -237,7 +241,7 @@ def _solver(
         solver=solver,
         run=len(own),
         total=len(names),
-        targets={t.key: _target(own, t.key, len(names)) for t in targets},
+        targets={t.key: _target([cell.reach[t.key] for cell in own], len(names)) for t in targets},
         against={y: {t.key: _compare(cells, solver, y, t.key, names) for t in targets} for y in yardsticks},
         final_ratio_worst=max(cell.final_ratio for cell in own),
         final_ratio_mean=geometric_mean(cell.final_ratio for cell in own),
@@ -249,8 +253,15 @@ def _solver(
     )
 
 
-def _target(own: Sequence[Cell], key: str, total: int) -> TargetSummary:
-    reaches = [cell.reach[key] for cell in own] + [NEVER] * (total - len(own))
+def _virtual(
+    rules: Sequence[str], tables: Mapping[str, Mapping[str, Mapping[str, Reach]]], names: Sequence[str]
+) -> dict[str, TargetSummary]:
+    best = lambda table, name: best_reach([table[rule][name] for rule in rules if name in table[rule]])
+    return {key: _target([best(table, name) for name in names], len(names)) for key, table in tables.items()}
+
+
+def _target(own: Sequence[Reach], total: int) -> TargetSummary:
+    reaches = [*own, *[NEVER] * (total - len(own))]
     reached = [item for item in reaches if math.isfinite(item.iterations)]
     return TargetSummary(
         reached=len(reached),

@@ -28,6 +28,9 @@ class Table:
     """Columns from the left that hold names."""
 
 
+_VIRTUAL = " Best of the rules: on every problem the hand-written rule with this step that does best there."
+
+
 def number(value: float, digits: int = 3) -> str:
     """A number for people: `digits` significant ones, an infinity as its sign, NaN as a dash."""
     if math.isnan(value):
@@ -56,6 +59,7 @@ def tables(summary: Summary, details: bool = True) -> list[Table]:
 
 
 def _overview(summary: Summary) -> Table:
+    virtual = _VIRTUAL if summary.virtual else ""
     header = ("solver", "converged", "iterations", "capped", "time s", "s / iteration", "final / best worst", "mean")
     rows = []
     for s in summary.solvers:
@@ -66,11 +70,15 @@ def _overview(summary: Summary) -> Table:
         rows.append(
             (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *shares, number(s.compile_s))
         )
+    for name, targets in summary.virtual.items():
+        end = targets["converged"]
+        means = (end.iterations, end.iterations_capped, end.seconds)
+        rows.append((name, f"{end.reached}/{end.total}", *map(number, means), *["-"] * 6))
     note = (
         f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
         "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
         f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): shares of all iterations. "
-        "Seconds per iteration and compilation: medians over problems."
+        f"Seconds per iteration and compilation: medians over problems.{virtual}"
     )
     return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
 
@@ -79,17 +87,19 @@ def _reach_tables(summary: Summary) -> list[Table]:
     targets = [target for target in summary.targets if target.kind != "converged"]
     header = ("solver", *(target.label for target in targets))
     iterations, seconds = [], []
-    for s in summary.solvers:
-        cells = [s.targets[target.key] for target in targets]
+    virtual = _VIRTUAL if summary.virtual else ""
+    found = {**{s.solver: s.targets for s in summary.solvers}, **summary.virtual}
+    for name, by_key in found.items():
+        cells = [by_key[target.key] for target in targets]
         reached = [f"{cell.reached}/{cell.total}" for cell in cells]
         capped = [
             f"{number(c.iterations)} [{number(c.iterations_capped)}] {k}" for c, k in zip(cells, reached, strict=True)
         ]
-        iterations.append((s.solver, *capped))
-        seconds.append((s.solver, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
+        iterations.append((name, *capped))
+        seconds.append((name, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
     note = (
         "Geometric mean over the k of n problems reached (k/n). f*: lowest accepted cost of any solver; "
-        "τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged."
+        f"τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged.{virtual}"
     )
     capped_note = f" In brackets: over all n, unreached ones counting as {profile.ITERATION_LIMIT}."
     return [

@@ -1,0 +1,46 @@
+"""The virtual best: on every problem the hand-written rule that does best there, which nobody knows beforehand.
+
+A yardstick that no single rule reaches (SATzilla's "virtual best solver", Xu et al. 2008): what is left to win by
+choosing lambda, with one and the same step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from jaxba.bench.profile import NEVER, Reach
+from jaxba.damping import is_learned
+from jaxba.methods import DEFAULT_METHOD
+from jaxba.naming import SolverName, parse_solver
+
+
+def rules_of_one_step(solvers: Iterable[str]) -> dict[str, list[str]]:
+    """Hand-written rules that differ in lambda alone, under the name of their virtual best.
+
+    Args:
+        solvers: names; learned policies, peers, other methods than plain LM and unknown names are left out.
+
+    Returns:
+        Two rules or more each.
+    """
+    groups: dict[str, list[str]] = {}
+    for name in solvers:
+        rule = _rule(name)
+        if rule is not None:
+            groups.setdefault(str(rule).removeprefix(rule.policy), []).append(name)
+    return {f"best of {len(rules)} rules{step}": rules for step, rules in groups.items() if len(rules) > 1}
+
+
+def best_reach(reaches: Sequence[Reach]) -> Reach:
+    """The fewest iterations and the least time, each of whoever has it."""
+    counts, times = [r.iterations for r in reaches], [r.seconds for r in reaches]
+    return Reach(min(counts), min(times)) if reaches else NEVER
+
+
+def _rule(name: str) -> SolverName | None:
+    try:
+        parsed = parse_solver(name)
+    except ValueError:
+        return None
+    plain = not parsed.peer and parsed.method == DEFAULT_METHOD
+    return parsed if plain and not is_learned(parsed.policy) else None
