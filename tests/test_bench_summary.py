@@ -75,21 +75,19 @@ def test_comparisons_use_the_problems_that_both_reached(records):
 
 
 def test_the_virtual_best_is_on_every_problem_the_rule_that_does_best_there(records):
-    """classic 16, 4, 25 and ceres 4, 4, never; neither the learned one nor another step takes part."""
-    others = [
-        make_record("a", name, 1) for name in ("ceres+refine3", "stba+classic", "pyceres:dense", "gone.safetensors")
-    ]
-    virtual = summarize([*records, *others]).virtual
-    assert list(virtual) == ["best of 2 rules"]
-    end = virtual["best of 2 rules"]["converged"]
+    """classic 16, 4, 25, ceres 4, 4, never, nielsen 30 on a; neither the learned one nor another step takes part."""
+    rules = [*records, make_record("a", "nielsen", 30)]
+    others = ("ceres+refine3", "stba+classic", "pyceres:dense", "gone.safetensors")
+    virtual = summarize([*rules, *(make_record("a", name, 1) for name in others)]).virtual
+    assert list(virtual) == ["best of 3 rules"]
+    end = virtual["best of 3 rules"]["converged"]
     assert (end.reached, end.total) == (3, 3)
     assert end.iterations == end.iterations_capped == pytest.approx((4 * 4 * 25) ** (1 / 3))
     assert end.seconds == pytest.approx((4 * 4 * 25) ** (1 / 3))
-    steps = [
-        make_record("a", f"{rule}{step}", 3) for rule in ("ceres", "nielsen") for step in ("+refine3", "+embedded")
-    ]
-    assert set(summarize([*records, *steps]).virtual) == {f"best of 2 rules{s}" for s in ("", "+refine3", "+embedded")}
-    assert not summarize([r for r in records if r.solver != "ceres"]).virtual
+    names = [f"{rule}{step}" for rule in ("ceres", "nielsen", "gtsam") for step in ("+refine3", "+embedded")]
+    virtual = summarize([*rules, *(make_record("a", name, 3) for name in names)]).virtual
+    assert set(virtual) == {f"best of 3 rules{step}" for step in ("", "+refine3", "+embedded")}
+    assert not summarize(records).virtual  # two are too few
 
 
 def test_ends_rejections_and_failures(records):

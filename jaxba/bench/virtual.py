@@ -13,6 +13,9 @@ from jaxba.damping import is_learned
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 
+FEWEST = 3
+"""Rules that make a virtual best: of the two yardsticks, which most tables have, one is nearly always the better."""
+
 
 def rules_of_one_step(solvers: Iterable[str]) -> dict[str, list[str]]:
     """Hand-written rules that differ in lambda alone, under the name of their virtual best.
@@ -21,14 +24,14 @@ def rules_of_one_step(solvers: Iterable[str]) -> dict[str, list[str]]:
         solvers: names; learned policies, peers, other methods than plain LM and unknown names are left out.
 
     Returns:
-        Two rules or more each.
+        `FEWEST` rules or more each.
     """
     groups: dict[str, list[str]] = {}
     for name in solvers:
         rule = _rule(name)
         if rule is not None:
             groups.setdefault(str(rule).removeprefix(rule.policy), []).append(name)
-    return {f"best of {len(rules)} rules{step}": rules for step, rules in groups.items() if len(rules) > 1}
+    return {f"best of {len(rules)} rules{step}": rules for step, rules in groups.items() if len(rules) >= FEWEST}
 
 
 def best_reach(reaches: Sequence[Reach]) -> Reach:
