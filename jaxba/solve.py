@@ -153,7 +153,7 @@ def solve(
     if options is None:
         options = policy.config.step_options(StepOptions()) if isinstance(policy, Learned) else StepOptions()
     if isinstance(policy, Learned) and options.scaling != StepOptions().scaling:
-        raise ValueError(
+        raise ProblemError(
             f"a learned policy knows lambda as a factor on the diagonal, not with scaling {options.scaling!r}"
         )
     options = make_method(method).options(options)

@@ -392,7 +392,7 @@ BAD = {
         "--intrinsics",
     ),
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must not be negative"),
-    "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "--scaling identity is for rules"),
+    "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "not with scaling 'identity'"),
     "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be positive"),
     "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be positive"),
     "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),

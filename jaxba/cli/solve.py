@@ -174,10 +174,6 @@ def _solve(args: Arguments) -> int:
     from jaxba.stepwise import IterationRecord
     from jaxba.termination import Tolerances
 
-    if args.scaling == "identity" and is_learned(args.damping):
-        raise common.UsageError(
-            "--scaling identity is for rules; a learned policy knows lambda as a factor on the diagonal"
-        )
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
     name = SolverName(args.damping, refine, args.dtype, args.method)
     policy, options = name.build()
