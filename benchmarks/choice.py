@@ -20,11 +20,11 @@ from scipy.optimize import nnls
 
 import jaxba
 from benchmarks.suite import LARGE_SCENES, real_problems
-from jaxba import host
 from jaxba.bench.sources import sources
 from jaxba.choose import SECONDS, Work, choose, work
 from jaxba.naming import parse_solver
 from jaxba.problem import BundleProblem
+from jaxba.runtime import process
 
 
 class Timed(NamedTuple):
@@ -67,7 +67,7 @@ def main() -> None:
     parser.add_argument("--fit", action="store_true")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    host.keep_memory()
+    process.keep_memory()
     done, losses = [], []
     print("problem: solver measured ms (predicted, with the products counted) ...: loss of auto")
     for source in sources(args.problem or [*real_problems(), *LARGE_SCENES]):
@@ -89,7 +89,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from jaxba.host import calm_blas
+    from jaxba.runtime.process import calm_blas
 
     with calm_blas():
         main()

@@ -17,12 +17,13 @@ import time
 import jax
 import numpy as np
 
-from jaxba import StepOptions, host, make_method, solve
+from jaxba import StepOptions, make_method, solve
 from jaxba.bench.sources import sources
 from jaxba.communities import camera_graph, clusterings
 from jaxba.layout import layout_for
 from jaxba.partition import PARTITIONS, SEED
 from jaxba.problem import BundleProblem
+from jaxba.runtime import process
 
 ITERATIONS = 8
 
@@ -34,7 +35,7 @@ def main() -> None:
     parser.add_argument("--methods", default="stba,stba:16,ddlm")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    host.keep_memory()
+    process.keep_memory()
     print("| problem, method | graph, ms | a clustering, ms | iteration, ms | clustering over iteration | layout, ms |")
     print("| --- | --: | --: | --: | --: | --: |")
     for source in sources(args.problem):
@@ -42,7 +43,7 @@ def main() -> None:
         for name in args.methods.split(","):
             options = make_method(name).options(StepOptions())
             graph, drawing = _clustering_seconds(problem, options.cluster_cameras)
-            with host.calm_blas():
+            with process.calm_blas():
                 iteration = _iteration_seconds(problem, options)
             started = time.perf_counter()
             layout_for(problem, options)

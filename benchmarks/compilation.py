@@ -4,7 +4,7 @@
     python -m benchmarks.compilation PROBLEM ... --whole
 
 PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The constants of
-`jaxba/programs.py` follow from the last columns: after how many observations times iterations, in millions, what the
+`jaxba/runtime/compilation.py` follow from the last columns: after how many observations times iterations, in millions, what the
 better way takes longer to compile has paid. All ways in turns, in one process, without a compilation cache, at the
 start with lambda 1e-4. `--whole` takes the time of `jaxba-solve FILE` from start to end, with `--compilation auto` and
 `full` in turns.
@@ -27,14 +27,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import host, lm
+from jaxba import lm
 from jaxba.bench.sources import sources
 from jaxba.choose import choose_linear_solver
 from jaxba.layout import layout_for
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import parse_solver
-from jaxba.programs import Way, options_of
-from jaxba.together import in_haste
+from jaxba.runtime import process
+from jaxba.runtime.compilation import Way, options_of
+from jaxba.runtime.single_loop import in_haste
 
 LONGEST = 10.0
 """Seconds of repeats of one program."""
@@ -142,13 +143,13 @@ def main() -> None:
             print(line, flush=True)
         print(f"geometric mean of auto/full {np.exp(np.mean(np.log(ratios))):.2f}")
         return
-    host.keep_memory()
+    process.keep_memory()
     print(HEADING)
-    with host.calm_blas():
+    with process.calm_blas():
         for location in args.problem:
             for line in rows(location, args.solver, args.linear_solver, args.repeats):
                 print(line, flush=True)
-            host.release_programs()
+            process.release_programs()
 
 
 if __name__ == "__main__":

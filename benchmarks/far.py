@@ -21,10 +21,11 @@ import numpy as np
 
 from benchmarks.padding import windows
 from benchmarks.suite import real_problems
-from jaxba import DampingPolicy, StepOptions, host, normalize, perturb, solve
+from jaxba import DampingPolicy, StepOptions, normalize, perturb, solve
 from jaxba.bench.sources import sources
 from jaxba.naming import parse_solver
 from jaxba.problem import BundleProblem
+from jaxba.runtime import process
 from jaxba.solve import MAX_ITERATIONS
 from jaxba.transform import drop_invalid
 
@@ -67,7 +68,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="of the perturbed problems")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    host.keep_memory()
+    process.keep_memory()
     solvers = {str(name): name.build() for name in map(parse_solver, args.solvers.split(","))}
     print("| problem |", " | ".join(solvers), "|")
     print("| --- |", " --- |" * len(solvers))

@@ -15,7 +15,6 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxba import host
 from jaxba.cli.common import prepare_process
 from jaxba.damping import DampingPolicy, Schedule, make_policy
 from jaxba.damping.agent import AgentConfig
@@ -27,6 +26,7 @@ from jaxba.game.play import Trajectories, play
 from jaxba.game.task import BANK, read_banks
 from jaxba.naming import parse_solver
 from jaxba.options import StepOptions
+from jaxba.runtime import process
 
 RULES = ("classic", "ceres", "gtsam", "nielsen", "theseus", "gauss-newton", "schedule")
 CONSTANTS = tuple(f"constant:1e{decade}" for decade in (-8, -6, -5, -4, -3, -2))
@@ -51,7 +51,7 @@ def main() -> None:
     prepare_process()
     config = load(str(args.run / "config.yaml"))
     splits = read_banks(args.run / BANK)
-    with host.calm_blas():
+    with process.calm_blas():
         for kind, split in zip(config.bank.classes, splits, strict=True):
             count = min(args.scenes, len(split.held_out.initial_cost))
             bank = sieve(split.held_out, np.arange(count))

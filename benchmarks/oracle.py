@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.suite import real_problems
-from jaxba import DampingPolicy, LMState, StepOptions, host, initial_state, lm_step, make_policy, solve
+from jaxba import DampingPolicy, LMState, StepOptions, initial_state, lm_step, make_policy, solve
 from jaxba.bench.sources import sources
 from jaxba.choose import choose_linear_solver
 from jaxba.cli.common import prepare_process
@@ -33,6 +33,7 @@ from jaxba.game.oracle import GRID, WIDTH
 from jaxba.layout import layout_for
 from jaxba.naming import parse_solver
 from jaxba.problem import BundleProblem
+from jaxba.runtime import process
 
 TOLERANCES = (1e-3, 1e-4, 1e-6)
 LIMIT = 100
@@ -64,7 +65,7 @@ def main() -> None:
     rows = []
     for source in sources(args.problem or real_problems()):
         problem = source.read()
-        with host.calm_blas():
+        with process.calm_blas():
             runs = [search(problem, options, policy.min_gain, args.iterations, width) for width in (WIDTH, 1)]
             runs += [_play(problem, *rule) for rule in rules.values()]
         best = min(float(known.get(source.name, np.inf)), *(run.costs[-1] for run in runs))

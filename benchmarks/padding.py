@@ -17,9 +17,9 @@ import jax
 import numpy as np
 
 import jaxba
-from jaxba import host
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem import BundleProblem
+from jaxba.runtime import process
 from jaxba.scenes import SceneConfig
 
 PROGRAM = "/jax/core/compile/backend_compile_duration"
@@ -77,7 +77,7 @@ def main() -> None:
     parser.add_argument("--damping", default="learned")
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
-    host.keep_memory()
+    process.keep_memory()
     whole = (
         jaxba.read_problem(args.problem)
         if args.problem

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import camera, eliminate, host, lm, reduced
+from jaxba import camera, eliminate, lm, reduced
 from jaxba.bench.sources import sources
 from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.dense import factor_and_solve
@@ -28,6 +28,7 @@ from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.refine import refine_points
 from jaxba.resect import refine_cameras
+from jaxba.runtime import process
 
 
 def timed(function: Any, *arguments: Any, repeats: int) -> tuple[Any, float, float, float]:
@@ -142,7 +143,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=30)
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    host.keep_memory()
+    process.keep_memory()
     problem = sources([args.problem])[0].read()
     options = StepOptions(linear_solver=args.solver, refine_points=args.refine)
     started = time.perf_counter()
@@ -157,5 +158,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with host.calm_blas():
+    with process.calm_blas():
         main()

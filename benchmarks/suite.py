@@ -107,8 +107,8 @@ def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
         ours, linear_solver = _our_iteration(problem, repeats)
         label = f"iteration/{source.name}"
         yield Metric(f"{label}/jaxba ({linear_solver})", ours, "s", "lower")
-        host = _layout_seconds(problem, repeats)
-        yield Metric(f"{label}/layout over an iteration", host / ours, "ratio", "lower", GATE_TOLERANCE, target=1.0)
+        process = _layout_seconds(problem, repeats)
+        yield Metric(f"{label}/layout over an iteration", process / ours, "ratio", "lower", GATE_TOLERANCE, target=1.0)
         if binary is None:
             continue
         with tempfile.TemporaryDirectory() as folder:
@@ -130,8 +130,8 @@ def layout_times(repeats: int) -> Iterator[Metric]:
 
     for source in sources([*real_problems(), *SMALL_SCENES]):
         problem = source.read()
-        ours, host = _our_iteration(problem, repeats)[0], _layout_seconds(problem, repeats)
-        yield Metric(f"layout/{source.name}, over an iteration", host / ours, "ratio", "lower", GATE_TOLERANCE, 1.0)
+        ours, process = _our_iteration(problem, repeats)[0], _layout_seconds(problem, repeats)
+        yield Metric(f"layout/{source.name}, over an iteration", process / ours, "ratio", "lower", GATE_TOLERANCE, 1.0)
 
 
 def _modes(problem: BundleProblem) -> list[str]:
@@ -298,10 +298,10 @@ def main() -> int:
     parser.add_argument("--update-baseline", action="store_true")
     parser.add_argument("--out", default="", help="write the metrics as JSON here")
     args = parser.parse_args()
-    from jaxba import host
     from jaxba.bench.run import machine, threads
+    from jaxba.runtime import process
 
-    host.keep_memory()
+    process.keep_memory()
     solvers = args.solvers.split(",")
     parts = {
         "iteration": lambda: iteration_times(args.repeats, threads()),
@@ -328,7 +328,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    from jaxba.host import calm_blas
+    from jaxba.runtime.process import calm_blas
 
     with calm_blas():
         sys.exit(main())

@@ -15,10 +15,10 @@ import statistics
 import jax
 
 from benchmarks.suite import real_problems
-from jaxba import host
 from jaxba.bench.profile import CONVERGED
 from jaxba.bench.run import RunSettings, plan, run_solver
 from jaxba.bench.sources import sources
+from jaxba.runtime import process
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=1000)
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    host.keep_memory()
+    process.keep_memory()
     settings = RunSettings(max_iterations=args.limit)
     places = sources(args.problem or real_problems())
     solvers = [job.solver for job in plan(places[:1], args.solvers.split(","), repeats=1)]

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy
 from jaxba.loop import History
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem
 from jaxba.retriangulate import Retriangulation, retriangulate
+from jaxba.runtime.compile_clock import CompileClock
 from jaxba.solve import MAX_ITERATIONS, Solution, solve
 from jaxba.stepwise import IterationRecord
 from jaxba.termination import Tolerances

@@ -5,8 +5,8 @@ from __future__ import annotations
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.barrier import apart
 from jaxba.pairs import PairLayout
+from jaxba.runtime.barriers import apart
 from jaxba.sums import outer_sum, take_rows, tree_sum
 
 

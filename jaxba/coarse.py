@@ -21,13 +21,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.barrier import apart
 from jaxba.blocks import dense_blocks, pair_products
 from jaxba.clusters import ClusterLayout
 from jaxba.dense import factor_panels
 from jaxba.eliminate import CameraSystem, PointSystem
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization
+from jaxba.runtime.barriers import apart
 from jaxba.sums import as_rows, take_each, take_rows, tree_sum
 
 MODES = 10

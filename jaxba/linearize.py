@@ -9,11 +9,11 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba import camera
-from jaxba.barrier import apart
 from jaxba.layout import Layout
 from jaxba.losses import Loss
 from jaxba.options import Intrinsics
-from jaxba.programs import traced_once
+from jaxba.runtime.barriers import apart
+from jaxba.runtime.compilation import traced_once
 from jaxba.sums import take, total
 from jaxba.views import Views, view_terms
 

@@ -6,8 +6,8 @@ import operator
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from jaxba.host import LARGEST_COUNT
 from jaxba.losses import Loss
+from jaxba.runtime.process import LARGEST_COUNT
 
 LinearSolver = Literal["explicit", "sparse", "implicit", "power", "normal", "clustered", "decomposed"]
 LinearSolverChoice = Literal["auto", "explicit", "sparse", "implicit", "power"]

@@ -13,12 +13,12 @@ from jax import Array, lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
-from jaxba.barrier import materialized
 from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.eliminate import CameraSystem, PointSystem
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization
 from jaxba.options import StepOptions
+from jaxba.runtime.barriers import materialized
 from jaxba.sums import as_rows, outer_sum, take_rows, tree_sum
 
 Operator = Callable[[Array], Array]

@@ -19,7 +19,6 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.band import band_factor, band_factor_and_solve
-from jaxba.barrier import apart
 from jaxba.blocks import dense_blocks, pair_products
 from jaxba.capacitance import capacitance_solve
 from jaxba.cg import conjugate_gradients
@@ -32,6 +31,7 @@ from jaxba.linearize import Linearization
 from jaxba.options import StepOptions
 from jaxba.precondition import block_inverse, preconditioner, series
 from jaxba.problem import AnyArray
+from jaxba.runtime.barriers import apart
 from jaxba.sums import take_rows, tree_sum
 from jaxba.ties import solve_tied
 

@@ -7,11 +7,11 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from jaxba import camera
-from jaxba.barrier import apart
 from jaxba.dense import solve_positive
 from jaxba.layout import Layout
 from jaxba.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
+from jaxba.runtime.barriers import apart
 from jaxba.sums import as_rows, outer_sum, take_rows, tree_sum
 
 DAMPINGS = (1e-6, 1e-2)

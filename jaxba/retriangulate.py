@@ -21,15 +21,16 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxba import geometry, host
+from jaxba import geometry
 from jaxba.layout import Layout, build_layout
 from jaxba.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.lm import initial_state
 from jaxba.losses import Loss
 from jaxba.options import StepOptions
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.programs import program, run_alone, stages, way_after
 from jaxba.refine import refine_points
+from jaxba.runtime import process
+from jaxba.runtime.compilation import program, run_alone, stages, way_after
 from jaxba.solve import explain_start
 from jaxba.triangulate import midpoints
 from jaxba.views import Views, point_passes
@@ -96,7 +97,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Raises:
         ProblemError: the cost is not finite.
     """
-    with jax.enable_x64(True), host.calm_blas():
+    with jax.enable_x64(True), process.calm_blas():
         layout = build_layout(problem, pairs=False, grid=False)
         order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
         real = order < problem.num_points  # the layout has an empty point besides
@@ -108,7 +109,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         search = program(_search, "loss", way=way)
         given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss())
         found = jax.device_get(run_alone(search, *given))
-        host.release_programs()  # many problems in one process would end it
+        process.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem))
     points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real

@@ -17,9 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import geometry, host
+from jaxba import geometry
 from jaxba.choose import choose_linear_solver
-from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, Learned, make_policy
 from jaxba.layout import Layout, layout_for
 from jaxba.lm import LMState, initial_state
@@ -29,7 +28,9 @@ from jaxba.naming import DTYPES
 from jaxba.options import REDUCED_SOLVERS, StepOptions, check_count
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import BundleProblem, ProblemError
-from jaxba.programs import Compilation, Part, Stage, options_of, program, run_alone, stages
+from jaxba.runtime import process
+from jaxba.runtime.compilation import Compilation, Part, Stage, options_of, program, run_alone, stages
+from jaxba.runtime.compile_clock import CompileClock
 from jaxba.stepwise import IterationRecord, run_stepwise
 from jaxba.termination import Termination, Tolerances
 from jaxba.transform import far_middle, shift
@@ -127,7 +128,7 @@ def solve(
             `quick`: compiled in a third of the time, iterations take two to six times as long. `auto`: quick or, with
             more observations, in half of the time and nearly as fast, and optimised after as many iterations as pay
             for it; the end of one solve comes soonest. They differ by rounding. On a GPU all are `full`. See
-            programs.py.
+            runtime/compilation.py.
 
     A scene far from the origin for its size, as georeferenced ones are, is moved there to be solved, and back
     (`transform.FAR`).
@@ -171,7 +172,7 @@ def solve(
                 f"mixed types are for plain LM solved by {', '.join(REDUCED_SOLVERS)}; others have float64 or float32"
             )
         options, dtype = replace(options, algebra="mixed"), "float64"
-    with jax.enable_x64(dtype == "float64"), host.calm_blas():
+    with jax.enable_x64(dtype == "float64"), process.calm_blas():
         started = time.perf_counter()
         middle = far_middle(problem)
         here = problem if middle is None else shift(problem, -middle)
@@ -191,7 +192,7 @@ def solve(
             layout, state, policy, tolerances, options, max_iterations
         )
         if clock.seconds + compile_s > 0:
-            host.release_programs()  # many problems in one process would end it
+            process.release_programs()  # many problems in one process would end it
         count = int(final.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
         found = write_back(here, layout, final.state, options)

@@ -20,7 +20,6 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.barrier import after
 from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.dense import MIN_UNKNOWNS, factor_and_solve
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, damping_diagonal
@@ -30,6 +29,7 @@ from jaxba.options import StepOptions
 from jaxba.partition import Partition
 from jaxba.precondition import block_inverse
 from jaxba.reduced import reduced_blocks
+from jaxba.runtime.barriers import after
 from jaxba.sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
 
 CORRECTED_FROM = 1.0

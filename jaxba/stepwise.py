@@ -1,7 +1,7 @@
 """The loop of a solve step by step, for whoever watches it or is in a hurry.
 
 The same iteration as in loop.py, run from Python: every record carries the wall-clock time at which it was finished,
-and quickly compiled programs may give way to optimised ones (programs.py). An iteration is three programs (the linear
+and quickly compiled programs may give way to optimised ones (runtime/compilation.py). An iteration is three programs (the linear
 solve, the verdict on the step, the policy), so that they compile beside each other and each only as well as it pays.
 """
 
@@ -17,13 +17,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, decides_effort, effort_of
 from jaxba.layout import Layout, turns_of
 from jaxba.lm import LMState, StepInfo, judge, lm_step, propose
 from jaxba.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.options import StepOptions
-from jaxba.programs import REPAIR, CompiledTogether, Stage, Way, program, way_after
+from jaxba.runtime.compilation import REPAIR, CompiledTogether, Stage, Way, program, way_after
+from jaxba.runtime.compile_clock import CompileClock
 from jaxba.termination import Termination, Tolerances
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from jaxba.layout import Layout
 from jaxba.problem import AnyArray
-from jaxba.together import in_haste, sum_each
+from jaxba.runtime.single_loop import in_haste, sum_each
 
 
 def take(values: Array, index: Int[AnyArray, "..."]) -> Array:

@@ -75,12 +75,12 @@ def _machine() -> str:
 def few_programs():
     """Many modules compile more programs than one process may map. Inside a module they stay, as far as they may, so
     that its tests can count them."""
-    from jaxba import host  # not before `pytest_configure` has prepared what its classes are registered with
+    from jaxba.runtime import process  # not before `pytest_configure` has prepared what its classes are registered with
 
-    share, host.MAPPINGS_SHARE = host.MAPPINGS_SHARE, 0.8
+    share, process.MAPPINGS_SHARE = process.MAPPINGS_SHARE, 0.8
     yield
-    host.MAPPINGS_SHARE = share
-    host.release_programs()
+    process.MAPPINGS_SHARE = share
+    process.release_programs()
 
 
 @pytest.fixture

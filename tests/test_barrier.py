@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba.barrier import apart, materialized
+from jaxba.runtime.barriers import apart, materialized
 
 
 def rows(dtype=np.float64) -> np.ndarray:

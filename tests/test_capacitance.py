@@ -12,7 +12,7 @@ from jaxba import StepOptions, build_layout, initial_state, like, lm_step, rando
 from jaxba.capacitance import capacitance_solve
 from jaxba.density import has_few_points
 from jaxba.eliminate import CameraSystem
-from jaxba.host import calm_blas
+from jaxba.runtime.process import calm_blas
 
 CAMERAS, COLUMNS = 4, 6
 

@@ -20,11 +20,11 @@ from scipy.spatial.transform import Rotation
 from jaxba import BundleProblem, Loss, StepOptions, camera, clusters, initial_state
 from jaxba.coarse import MODES, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.eliminate import Coordinates, camera_system, eliminate_points
-from jaxba.host import calm_blas
 from jaxba.layout import layout_for
 from jaxba.linearize import linearize
 from jaxba.precondition import diagonal_blocks, preconditioner
 from jaxba.reduced import apply_reduced
+from jaxba.runtime.process import calm_blas
 
 MANIFOLD = StepOptions(linear_solver="implicit", rotation="manifold")
 

@@ -9,7 +9,7 @@ import pytest
 
 from jaxba import dense
 from jaxba.dense import MIN_UNKNOWNS, PANEL, Panels, factor_and_solve, factor_panels
-from jaxba.host import calm_blas
+from jaxba.runtime.process import calm_blas
 
 solve = jax.jit(factor_and_solve)
 

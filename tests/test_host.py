@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxba
-from jaxba import host
+from jaxba.runtime import process
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells the mappings of a process")
 
@@ -27,26 +27,26 @@ def test_programs_are_dropped_near_the_limit_and_only_there():
         return 2 * x
 
     twice(jnp.ones(3))
-    assert not host.release_programs(share=1.0)
+    assert not process.release_programs(share=1.0)
     assert twice._cache_size() == 1
-    assert host.release_programs(share=0.0)
+    assert process.release_programs(share=0.0)
     assert twice._cache_size() == 0
     assert twice(jnp.ones(3))[0] == 2
 
 
 @linux
 def test_dropping_programs_gives_their_mappings_back():
-    host.release_programs(share=0.0)
+    process.release_programs(share=0.0)
     before = mappings()
     jaxba.solve(jaxba.random_scene(jaxba.like("tiny"), 0), "ceres", max_iterations=1)  # some 500
     during = mappings()
-    assert host.release_programs(share=0.0)
+    assert process.release_programs(share=0.0)
     assert mappings() - before < 0.5 * (during - before)
 
 
 def test_a_solve_that_compiled_looks_after_the_mappings_of_its_process(monkeypatch):
     problem, called = jaxba.random_scene(jaxba.like("tiny"), 0), []
-    monkeypatch.setattr(host, "release_programs", lambda: called.append(1))
+    monkeypatch.setattr(process, "release_programs", lambda: called.append(1))
     jax.clear_caches()
     jaxba.solve(problem, "ceres", max_iterations=2)
     assert len(called) == 1

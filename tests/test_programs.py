@@ -12,12 +12,24 @@ import pytest
 import support
 from jax import monitoring
 
-from jaxba import SceneConfig, Termination, programs, random_scene, solve, solve_and_retriangulate
+from jaxba import SceneConfig, Termination, random_scene, solve, solve_and_retriangulate
 from jaxba.cli.solve import run
 from jaxba.io import write_problem
 from jaxba.lm import judge, lm_step, propose
 from jaxba.options import StepOptions
-from jaxba.programs import PAYS, CompiledTogether, Part, Program, Stage, Way, options_of, program, stages, way_after
+from jaxba.runtime import compilation
+from jaxba.runtime.compilation import (
+    PAYS,
+    CompiledTogether,
+    Part,
+    Program,
+    Stage,
+    Way,
+    options_of,
+    program,
+    stages,
+    way_after,
+)
 
 pytestmark = pytest.mark.step
 
@@ -47,7 +59,7 @@ def test_a_program_gives_way_to_a_better_one_when_it_was_run_often_enough():
 
 @on_a_cpu
 def test_this_jaxlib_knows_both_hasty_ways():
-    assert {way: options_of(way) for way in ("quick", "brisk")} == programs.HASTE
+    assert {way: options_of(way) for way in ("quick", "brisk")} == compilation.HASTE
     assert options_of("full") is None
 
 
@@ -223,7 +235,7 @@ def test_iterations_of_solves_in_turns_are_added():
 
 
 def test_where_the_options_are_unknown_programs_are_optimised(monkeypatch):
-    monkeypatch.setitem(programs.HASTE, "quick", {"xla_no_such_option": True})
+    monkeypatch.setitem(compilation.HASTE, "quick", {"xla_no_such_option": True})
     assert options_of.__wrapped__("quick") is None
 
 

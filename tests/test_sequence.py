@@ -11,8 +11,8 @@ import support
 from support import start, step
 
 from jaxba import BundleProblem, StepOptions
-from jaxba.host import calm_blas
 from jaxba.layout import layout_for
+from jaxba.runtime.process import calm_blas
 from jaxba.scenes import SceneConfig, random_scene
 
 EXACT = StepOptions()

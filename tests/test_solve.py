@@ -250,7 +250,7 @@ def test_a_callback_that_returns_true_stops_the_solve():
 @pytest.mark.parametrize("callback", [None, lambda record: None])
 def test_a_solve_ends_at_the_first_cost_that_is_good_enough(callback, monkeypatch):
     """And another target compiles nothing."""
-    monkeypatch.setattr("jaxba.host.release_programs", lambda: False)
+    monkeypatch.setattr("jaxba.runtime.process.release_programs", lambda: False)
     costs = stepwise(support.tiny()).history.cost
     # other programs sum in another order
     targets = (0.5 * (costs[0] + costs[1]), costs[2] * (1 + 1e-12))

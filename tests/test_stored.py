@@ -18,12 +18,13 @@ import support
 from jax.experimental.compilation_cache import compilation_cache
 from test_programs import Compilations
 
-from jaxba import make_policy, programs, solve, stored
+from jaxba import make_policy, solve
 from jaxba.io import write_problem
 from jaxba.lm import judge
 from jaxba.options import StepOptions
-from jaxba.programs import CompiledTogether, Stage, program, run_alone
 from jaxba.retriangulate import retriangulate
+from jaxba.runtime import compilation, executable_cache
+from jaxba.runtime.compilation import CompiledTogether, Stage, program, run_alone
 
 pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="tried on a CPU alone")
 
@@ -33,9 +34,9 @@ def folder(tmp_path):
     """Where programs are kept, and not in JAX's cache."""
     cache = jax.config.values["jax_compilation_cache_dir"]
     use_cache_of_jax(None)
-    programs.keep_in(tmp_path)
+    compilation.keep_in(tmp_path)
     yield tmp_path
-    programs.keep_in(None)
+    compilation.keep_in(None)
     use_cache_of_jax(cache)
 
 
@@ -48,11 +49,11 @@ def use_cache_of_jax(folder):
 def forget():
     """What a new process does not know."""
     jax.clear_caches()
-    stored._load.cache_clear()
+    executable_cache._load.cache_clear()
 
 
 def kept(folder):
-    return sorted(folder.glob(f"*{stored.ENDING}"))
+    return sorted(folder.glob(f"*{executable_cache.ENDING}"))
 
 
 def double(x, power):
@@ -165,7 +166,7 @@ def test_a_damaged_file_costs_a_compilation_and_is_mended(content, folder):
 
 
 def test_another_question_is_another_program(folder, monkeypatch):
-    store = stored.Store(folder)
+    store = executable_cache.Store(folder)
     x = jnp.arange(3.0)
     place = functools.partial(store.place, double, {"power": 1}, (x,))
     layout, _ = support.start(support.tiny())
@@ -190,10 +191,10 @@ def test_another_question_is_another_program(folder, monkeypatch):
         patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
         others.append(place())
     with monkeypatch.context() as patch:
-        patch.setattr(stored, "_source", lambda: "another version of this package")
-        others.append(stored.Store(folder).place(double, {"power": 1}, (x,)))
+        patch.setattr(executable_cache, "_source", lambda: "another version of this package")
+        others.append(executable_cache.Store(folder).place(double, {"power": 1}, (x,)))
     with monkeypatch.context() as patch:
-        patch.setattr(stored, "_machine", lambda: "another machine")
+        patch.setattr(executable_cache, "_machine", lambda: "another machine")
         others.append(place())
     assert len({place(), *others}) == 1 + len(others)
     assert place() == store.place(double, {"power": 1}, (jax.ShapeDtypeStruct((3,), x.dtype),))
@@ -214,7 +215,7 @@ def test_another_question_is_another_program(folder, monkeypatch):
     ids=["builtin", "lambda", "class", "inside", "tree", "in a tree", "function", "nameless"],
 )
 def test_what_is_somebody_elses_is_not_kept(function, static, argument, folder):
-    assert stored.Store(folder).place(function, static, (argument,)) is None
+    assert executable_cache.Store(folder).place(function, static, (argument,)) is None
 
 
 def test_two_rules_of_a_user_are_not_mistaken_for_each_other(folder):
@@ -282,7 +283,7 @@ def test_both_ways_of_compiling_are_kept(folder, monkeypatch):
 
 
 def test_a_folder_that_is_gone_costs_time_and_nothing_else(tmp_path):
-    programs.keep_in(tmp_path / "gone")
+    compilation.keep_in(tmp_path / "gone")
     np.testing.assert_array_equal(call(jnp.arange(3.0)), [0, 2, 4])
 
 
@@ -299,7 +300,7 @@ def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
             os.utime(file, (0, os.stat(file).st_mtime - 100))
     oldest = min(kept(folder), key=lambda file: file.stat().st_mtime)
     size = max(file.stat().st_size for file in kept(folder))
-    monkeypatch.setattr(stored, "LIMIT", 3 * size)
+    monkeypatch.setattr(executable_cache, "LIMIT", 3 * size)
     forget()
     call(jnp.arange(3.0), 0)  # the oldest, used again
     assert oldest.stat().st_mtime == max(file.stat().st_mtime for file in kept(folder))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba.together import in_haste, together
+from jaxba.runtime.single_loop import in_haste, together
 
 
 def vectors(pair, scale, mask):

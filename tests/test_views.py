@@ -16,7 +16,7 @@ from jaxba.layout import Layout
 from jaxba.linearize import point_terms, slot_frames
 from jaxba.padding import capacity_of
 from jaxba.refine import refine_points
-from jaxba.together import in_haste
+from jaxba.runtime.single_loop import in_haste
 from jaxba.views import point_passes
 
 pytestmark = pytest.mark.step

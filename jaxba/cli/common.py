@@ -52,7 +52,7 @@ def run_command(
         except (ProblemError, UsageError, PolicyFileError, *names) as error:
             return complain(str(error))
         except Exception as error:
-            from jaxba.host import out_of_memory
+            from jaxba.runtime.process import out_of_memory
 
             if not out_of_memory(error):
                 raise
@@ -101,12 +101,12 @@ def prepare_process(*, untraced: bool = False) -> None:
     """Settings for speed: memory is kept, compiled programs are cached.
 
     Args:
-        untraced: whether programs are found without tracing them (`jaxba/stored.py`), for a command that runs few
+        untraced: whether programs are found without tracing them (`jaxba/runtime/executable_cache.py`), for a command that runs few
             programs, all of them through `programs.CompiledTogether`; else by their text, in JAX's cache.
     """
-    from jaxba import host
+    from jaxba.runtime import process
 
-    host.keep_memory()
+    process.keep_memory()
     use_compilation_cache(untraced)
 
 
@@ -117,8 +117,8 @@ def use_compilation_cache(untraced: bool = False) -> None:
     """
     import jax
 
-    from jaxba import programs
     from jaxba.data.places import user_cache
+    from jaxba.runtime import compilation
 
     choice = os.environ.get(CACHE_VARIABLE, "")
     if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):
@@ -129,7 +129,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
     except OSError:
         return  # a home that cannot be written costs time, nothing else
     if untraced:
-        programs.keep_in(folder)
+        compilation.keep_in(folder)
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
@@ -185,7 +185,7 @@ def check_positive(**values: Any) -> None:
     Raises:
         UsageError: naming the option.
     """
-    from jaxba.host import LARGEST_COUNT
+    from jaxba.runtime.process import LARGEST_COUNT
 
     for name, value in values.items():
         option = "--" + name.replace("_", "-")

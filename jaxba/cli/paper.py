@@ -112,14 +112,14 @@ def _open(folder: Path, config: Any) -> None:
 def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any) -> int:
     import jax
 
-    from jaxba import host
     from jaxba.paper.pieces import PIECES
     from jaxba.paper.report import write
     from jaxba.paper.workshop import Workshop
+    from jaxba.runtime import process
 
     jax.config.update("jax_enable_x64", True)  # the game counts in float64, the networks in float32
     status = 0
-    with host.calm_blas():
+    with process.calm_blas():
         shop = Workshop(config, folder, lambda words: console.print(f"  {words}"))
         seconds = _read_times(folder)
         wanted = [piece for name, piece in PIECES.items() if not args.only or name in args.only]

@@ -16,7 +16,7 @@ from jaxba.cli import common
 from jaxba.cli.interrupt import Interrupt
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.options import Intrinsics, LinearSolverChoice, Preconditioner
-from jaxba.programs import Compilation
+from jaxba.runtime.compilation import Compilation
 
 _STDOUT = 1
 """File descriptor of standard output."""

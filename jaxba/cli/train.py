@@ -55,9 +55,9 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _train(args: Arguments) -> int:
     import jax
 
-    from jaxba import host
     from jaxba.game import bank, task, train
     from jaxba.game import config as configs
+    from jaxba.runtime import process
 
     jax.config.update("jax_enable_x64", True)  # the game counts in float64, the agent's networks in float32
     overrides = tuple(item for group in args.overrides for item in group)
@@ -70,7 +70,7 @@ def _train(args: Arguments) -> int:
         raise common.UsageError(str(error)) from None
     common.prepare_process()
     console = _console()
-    with host.calm_blas(), Interrupt("chunk", gentle=False) as interrupt, _Progress(console, config) as progress:
+    with process.calm_blas(), Interrupt("chunk", gentle=False) as interrupt, _Progress(console, config) as progress:
         try:
             work = task.build(config, folder, progress.stage)
             progress.rules = work.rules

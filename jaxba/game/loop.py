@@ -21,7 +21,7 @@ from jaxba.game import sac as agent
 from jaxba.game.protocol import Environment, Step
 from jaxba.game.replay import Replay, Transition
 from jaxba.game.sac import Learner, SacConfig
-from jaxba.host import LARGEST_COUNT
+from jaxba.runtime.process import LARGEST_COUNT
 
 TRACES: collections.Counter[str] = collections.Counter()
 """How often each compiled function was traced in this process; a test holds it at one per configuration."""

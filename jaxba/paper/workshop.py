@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxba import host
 from jaxba.bench import profile
 from jaxba.bench.records import Record
 from jaxba.bench.run import record_of
@@ -29,6 +28,7 @@ from jaxba.paper.rows import NEAR, Row
 from jaxba.paper.schedule import LENGTH
 from jaxba.paper.store import Play, Store
 from jaxba.problem import BundleProblem, ProblemError
+from jaxba.runtime import process
 from jaxba.solve import solve
 from jaxba.stepwise import IterationRecord
 
@@ -139,7 +139,7 @@ class Workshop:
         for seed in method.numbers:
             if self.store.play(TEST, method.name, seed):
                 continue
-            host.release_programs()
+            process.release_programs()
             policy, options = method.build(seed)
             settings = agents.train_config(self.config, agents.OURS, 0)
             options = replace(options, intrinsics=settings.bank.intrinsics)

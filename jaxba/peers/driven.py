@@ -16,8 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import host
-from jaxba.clock import CompileClock
 from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm import StepInfo
 from jaxba.loop import after_step
@@ -27,6 +25,8 @@ from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import Observed, observed, step_facts
 from jaxba.peers.verdict import Told, Verdict
 from jaxba.problem import BundleProblem
+from jaxba.runtime import process
+from jaxba.runtime.compile_clock import CompileClock
 from jaxba.solve import MAX_ITERATIONS, Solution
 from jaxba.termination import Termination, Tolerances
 
@@ -102,7 +102,7 @@ def drive_ceres(
     last = _Last()
     options.callbacks = [last]
     options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
-    with jax.enable_x64(True), host.calm_blas(), CompileClock() as clock:
+    with jax.enable_x64(True), process.calm_blas(), CompileClock() as clock:
         started = time.perf_counter()
         state, damping = _init(policy, _problem_info(problem, run.initial_cost, max_iterations))
         # everything is compiled before the clock starts

@@ -22,8 +22,8 @@ from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
 
 import jax
 
-from jaxba.stored import Store, Stored, compiled_here
-from jaxba.together import in_haste
+from jaxba.runtime.executable_cache import Store, Stored, compiled_here
+from jaxba.runtime.single_loop import in_haste
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

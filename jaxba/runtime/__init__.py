@@ -1,0 +1,1 @@
+"""Everything that is about XLA or the operating system, and nothing else."""
