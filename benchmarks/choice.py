@@ -23,7 +23,7 @@ from benchmarks.suite import LARGE_SCENES, real_problems
 from jaxba.bench.sources import sources
 from jaxba.choose import SECONDS, Work, choose, work
 from jaxba.naming import parse_solver
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
 
 

@@ -22,7 +22,7 @@ from jaxba.bench.sources import sources
 from jaxba.communities import camera_graph, clusterings
 from jaxba.layout import layout_for
 from jaxba.partition import PARTITIONS, SEED
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
 
 ITERATIONS = 8

@@ -25,7 +25,7 @@ from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.play import Trajectories, play
 from jaxba.game.task import BANK, read_banks
 from jaxba.naming import parse_solver
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 
 RULES = ("classic", "ceres", "gtsam", "nielsen", "theseus", "gauss-newton", "schedule")

@@ -20,7 +20,7 @@ import time
 import numpy as np
 
 from jaxba.io import read_problem, write_problem
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 
 
 def synthetic(cameras: int, points: int, observations: int) -> BundleProblem:

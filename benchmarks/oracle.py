@@ -32,7 +32,7 @@ from jaxba.damping.learned import Learned
 from jaxba.game.oracle import GRID, WIDTH
 from jaxba.layout import layout_for
 from jaxba.naming import parse_solver
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
 
 TOLERANCES = (1e-3, 1e-4, 1e-6)

@@ -18,7 +18,7 @@ import numpy as np
 
 import jaxba
 from jaxba.paper.subproblem import sub_problem
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
 from jaxba.scenes import SceneConfig
 

@@ -26,7 +26,7 @@ from benchmarks import peers
 from benchmarks.metrics import Metric, read_baseline, regressions, to_json, to_text, write_baseline
 
 if TYPE_CHECKING:
-    from jaxba.problem import BundleProblem
+    from jaxba.problem.bundle_problem import BundleProblem
 
 HERE = Path(__file__).parent
 BASELINE = HERE / "baseline.json"
@@ -213,8 +213,8 @@ def time_to_tolerance(
 def _solved(problem: BundleProblem, name: str, goal: float = -math.inf) -> tuple[float, float]:
     """Final cost, in float64 by NumPy, and seconds of a solve in one program that ends at the goal."""
     import jaxba
-    from jaxba import geometry
     from jaxba.naming import parse_solver
+    from jaxba.problem import geometry
 
     solver = parse_solver(name)
     policy, options = solver.build()

@@ -23,19 +23,19 @@ from jaxba.io import (
     write_problem,
 )
 from jaxba.layout import Layout, build_layout
-from jaxba.lenses import Lenses
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.loop import History, solve_loop
-from jaxba.losses import Loss
 from jaxba.methods import METHODS, Method, make_method
-from jaxba.options import StepOptions
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.intrinsics import Lenses
+from jaxba.problem.losses import Loss
+from jaxba.problem.options import StepOptions
+from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
 from jaxba.retriangulate import Retriangulation, retriangulate
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
 from jaxba.solve import Solution, solve
 from jaxba.stepwise import IterationRecord
 from jaxba.termination import Termination, Tolerances
-from jaxba.transform import drop_invalid, normalize, perturb, poba_start
 
 __version__ = "0.1.0"
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from jaxba.damping import DampingPolicy
 from jaxba.loop import History
-from jaxba.options import StepOptions
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.options import StepOptions
 from jaxba.retriangulate import Retriangulation, retriangulate
 from jaxba.runtime.compile_clock import CompileClock
 from jaxba.solve import MAX_ITERATIONS, Solution, solve

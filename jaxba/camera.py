@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.problem import AnyArray
+from jaxba.problem.bundle_problem import AnyArray
 from jaxba.runtime.barriers import materialized
 
 SMALL_ANGLE_SQUARED = 1e-6

@@ -13,9 +13,9 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from jaxba.density import has_dense_shape, has_small_capacitance
-from jaxba.options import REDUCED_SOLVERS, LinearSolver, LinearSolverChoice, StepOptions
 from jaxba.ordering import camera_order, is_banded
-from jaxba.problem import CAMERA_SIZE, BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemError
+from jaxba.problem.options import REDUCED_SOLVERS, LinearSolver, LinearSolverChoice, StepOptions
 
 
 class Work(NamedTuple):

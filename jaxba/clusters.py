@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 
 from jaxba.pairs import PairLayout, pair_layout
-from jaxba.problem import AnyArray
+from jaxba.problem.bundle_problem import AnyArray
 from jaxba.trees import fitting_width, sorted_by, sum_tree
 
 CLUSTER_CAMERAS = 8

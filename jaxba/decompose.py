@@ -33,9 +33,9 @@ from jaxba.eliminate import (
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, linearize, point_terms, slot_frames
 from jaxba.normal import image
-from jaxba.options import StepOptions
 from jaxba.partition import Partition
 from jaxba.parts import Clusters
+from jaxba.problem.options import StepOptions
 from jaxba.refine import Home, refine_points
 from jaxba.schur import Step
 from jaxba.split import solve_clusters

@@ -22,7 +22,7 @@ from jaxba import camera
 from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
-from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
+from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.single_loop import together
 from jaxba.sums import as_rows, outer_sum, point_sums, take, take_rows, tree_sum
 from jaxba.ties import LensTies

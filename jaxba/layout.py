@@ -20,11 +20,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.clusters import ClusterLayout, cluster_layout
 from jaxba.density import is_dense
-from jaxba.options import StepOptions
 from jaxba.padding import Capacity, room_for
 from jaxba.pairs import PairLayout, pair_layout
 from jaxba.partition import Partition, partition_layout
-from jaxba.problem import AnyArray, BundleProblem
+from jaxba.problem.bundle_problem import AnyArray, BundleProblem
+from jaxba.problem.options import StepOptions
 from jaxba.slots import Bucket, bucket_slots, padded_slots
 from jaxba.ties import LensTies, lens_ties
 from jaxba.trees import sorted_by, sum_tree, with_spare_row

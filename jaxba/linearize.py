@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from jaxba import camera
 from jaxba.layout import Layout
-from jaxba.losses import Loss
-from jaxba.options import Intrinsics
+from jaxba.problem.losses import Loss
+from jaxba.problem.options import Intrinsics
 from jaxba.runtime.barriers import apart
 from jaxba.runtime.compilation import traced_once
 from jaxba.sums import take, total

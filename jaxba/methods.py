@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 MethodName = Literal["lm", "stba", "deeplm", "ddlm", "poba"]
 

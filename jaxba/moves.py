@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxba import camera
 from jaxba.layout import Layout
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 LARGEST_ZOOM = 0.3
 """Relative change of a focal length beyond which distortions are added as they are: the fourth power of a first-order

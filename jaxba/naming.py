@@ -12,7 +12,7 @@ from jaxba.damping import DampingPolicy, Learned, is_learned, make_policy
 from jaxba.damping.agent import AgentConfig
 from jaxba.damping.registry import LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
 from jaxba.methods import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 DTYPES = ("float64", "float32", "mixed")
 """Known floating point types; the first is understood where none is named."""

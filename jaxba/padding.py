@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.options import REDUCED_SOLVERS, StepOptions
-from jaxba.problem import CAMERA_SIZE, POINT_SIZE, BundleProblem
+from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem
+from jaxba.problem.options import REDUCED_SOLVERS, StepOptions
 from jaxba.trees import Room
 
 LEAST_CAMERAS = 8
@@ -74,7 +74,7 @@ def capacity_of(problem: BundleProblem) -> Capacity | None:
     cells: 20 windows of 20 cameras of kitti00vo fall into 2 of them, with free points and pairs into 5.
 
     Returns:
-        None for problems with lenses (lenses.py), or with more than `MAX_CAMERAS`, `MAX_OBSERVATIONS` (points count
+        None for problems with lenses (problem/intrinsics.py), or with more than `MAX_CAMERAS`, `MAX_OBSERVATIONS` (points count
         too) or `MAX_PAIRS`.
     """
     if problem.lenses is not None or problem.num_cameras > MAX_CAMERAS:

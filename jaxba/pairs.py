@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 
 from jaxba.ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.padding import Capacity, room_for
-from jaxba.problem import AnyArray
+from jaxba.problem.bundle_problem import AnyArray
 from jaxba.trees import TREE_WIDTH, Room, chunks_at_most, sorted_by, sum_tree
 
 PAIR_CHUNKS = (4, 8)

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Int
 from jaxba.clusters import cluster_members
 from jaxba.communities import camera_graph, clusterings
 from jaxba.pairs import PairLayout
-from jaxba.problem import AnyArray
+from jaxba.problem.bundle_problem import AnyArray
 from jaxba.trees import TREE_WIDTH, sum_tree
 
 PARTITIONS = 16

@@ -17,7 +17,7 @@ from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.eliminate import CameraSystem, PointSystem
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 from jaxba.runtime.barriers import materialized
 from jaxba.sums import as_rows, outer_sum, take_rows, tree_sum
 

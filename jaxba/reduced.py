@@ -28,9 +28,9 @@ from jaxba.density import has_few_points
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
 from jaxba.layout import Layout, PairLayout
 from jaxba.linearize import Linearization
-from jaxba.options import StepOptions
 from jaxba.precondition import block_inverse, preconditioner, series
-from jaxba.problem import AnyArray
+from jaxba.problem.bundle_problem import AnyArray
+from jaxba.problem.options import StepOptions
 from jaxba.runtime.barriers import apart
 from jaxba.sums import take_rows, tree_sum
 from jaxba.ties import solve_tied

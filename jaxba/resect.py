@@ -10,7 +10,7 @@ from jaxba import camera
 from jaxba.dense import solve_positive
 from jaxba.layout import Layout
 from jaxba.linearize import linearize, observation_costs, with_free_lenses
-from jaxba.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
+from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.barriers import apart
 from jaxba.sums import as_rows, outer_sum, take_rows, tree_sum
 

@@ -21,13 +21,13 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxba import geometry
 from jaxba.layout import Layout, build_layout
 from jaxba.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.lm import initial_state
-from jaxba.losses import Loss
-from jaxba.options import StepOptions
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.losses import Loss
+from jaxba.problem.options import StepOptions
 from jaxba.refine import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import program, run_alone, stages, way_after

@@ -27,7 +27,7 @@ from jaxba.eliminate import (
 from jaxba.layout import Layout, partition_of
 from jaxba.linearize import Linearization
 from jaxba.normal import image, solve_normal
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 from jaxba.recall import on_manifold, with_remembered
 from jaxba.reduced import solve_reduced
 from jaxba.split import clustered_step

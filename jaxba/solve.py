@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import geometry
 from jaxba.choose import choose_linear_solver
 from jaxba.damping import DampingPolicy, Learned, make_policy
 from jaxba.layout import Layout, layout_for
@@ -25,15 +24,16 @@ from jaxba.lm import LMState, initial_state
 from jaxba.loop import Carry, History, solve_loop
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES
-from jaxba.options import REDUCED_SOLVERS, StepOptions, check_count
 from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.options import REDUCED_SOLVERS, StepOptions, check_count
+from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Compilation, Part, Stage, options_of, program, run_alone, stages
 from jaxba.runtime.compile_clock import CompileClock
 from jaxba.stepwise import IterationRecord, run_stepwise
 from jaxba.termination import Termination, Tolerances
-from jaxba.transform import far_middle, shift
 
 MAX_ITERATIONS = 100
 """Iterations after which a solve has failed. Source: the paper."""

@@ -25,9 +25,9 @@ from jaxba.dense import MIN_UNKNOWNS, factor_and_solve
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, damping_diagonal
 from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
-from jaxba.options import StepOptions
 from jaxba.partition import Partition
 from jaxba.precondition import block_inverse
+from jaxba.problem.options import StepOptions
 from jaxba.reduced import reduced_blocks
 from jaxba.runtime.barriers import after
 from jaxba.sums import as_rows, point_sum, take, take_each, take_rows, tree_sum

@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.layout import Layout
-from jaxba.problem import AnyArray
+from jaxba.problem.bundle_problem import AnyArray
 from jaxba.runtime.single_loop import in_haste, sum_each
 
 

@@ -34,8 +34,8 @@ from jaxtyping import Bool, Float, Int
 from jaxba.effort import Effort
 from jaxba.linearize import Present
 from jaxba.moves import move_cameras, step_between
-from jaxba.options import StepOptions
 from jaxba.parts import Parts, Search
+from jaxba.problem.options import StepOptions
 from jaxba.refine import Home
 from jaxba.resect import refine_cameras
 from jaxba.schur import Step

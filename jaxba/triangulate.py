@@ -13,7 +13,7 @@ from jaxba import camera
 from jaxba.blocks3 import cholesky3
 from jaxba.layout import Layout
 from jaxba.linearize import slot_costs, view_residuals
-from jaxba.losses import Loss
+from jaxba.problem.losses import Loss
 from jaxba.refine import Home, gone, refine_points
 from jaxba.sums import take_each
 from jaxba.views import Views, point_passes

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from jaxba import camera
 from jaxba.layout import Layout
-from jaxba.problem import AnyArray
+from jaxba.problem.bundle_problem import AnyArray
 from jaxba.runtime.barriers import materialized
 from jaxba.runtime.single_loop import in_haste, together
 from jaxba.sums import point_sums, take_each

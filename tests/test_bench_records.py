@@ -6,7 +6,7 @@ import math
 import pytest
 
 from jaxba.bench.records import Record, TracePoint, append_record, read_records, record_from_json, record_to_json
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 CONTRACT_KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),

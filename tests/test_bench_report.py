@@ -13,7 +13,7 @@ from jaxba.bench import plots
 from jaxba.bench.profile import Target
 from jaxba.bench.records import Record, TracePoint
 from jaxba.bench.report import file_names, run_facts, write_all
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxba import camera, geometry
+from jaxba import camera
+from jaxba.problem import geometry
 
 THRESHOLD = np.sqrt(camera.SMALL_ANGLE_SQUARED)
 ANGLES = [0.0, 1e-160, 1e-12, 1e-8, 1e-4, *(THRESHOLD * np.array([0.5, 1 - 1e-9, 1.0, 1 + 1e-9, 2.0])), 0.03, 0.5, 1.0]

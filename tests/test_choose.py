@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxba import BundleProblem, ProblemError, build_layout
 from jaxba.choose import choose_linear_solver, count_pairs, predict
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 from jaxba.scenes import SceneConfig, random_scene
 
 SEQUENCE = SceneConfig(

@@ -14,10 +14,11 @@ import support
 import yaml
 
 import jaxba
-from jaxba import geometry, write_bal
+from jaxba import write_bal
 from jaxba.bench import report
 from jaxba.bench import run as bench_run
 from jaxba.cli.bench import run
+from jaxba.problem import geometry
 
 KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 import support
 
-from jaxba import StepOptions, geometry, read_bal, solve, write_bal
+from jaxba import StepOptions, read_bal, solve, write_bal
 from jaxba.bench.records import record_from_json
 from jaxba.cli import table
 from jaxba.cli.solve import run
+from jaxba.problem import geometry
 
 RECORD_KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),

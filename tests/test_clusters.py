@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from jaxba import BundleProblem, Layout, build_layout, clusters
 from jaxba.clusters import CLUSTER_CAMERAS, ClusterLayout, agglomerate, shared_points
 from jaxba.layout import layout_for
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 sizes = st.tuples(st.integers(1, 30), st.integers(1, 25), st.integers(0, 10**6))  # cameras, points, seed
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from support import same_bits
 from tiny_game import AGENT, KIND, RULES, grid, problem_of, tiny_bank, tiny_game
 
-from jaxba import StepOptions, geometry, make_method, make_policy, solve
+from jaxba import StepOptions, make_method, make_policy, solve
 from jaxba.damping.agent import begin, damping_of, observe
 from jaxba.damping.learned import Layer, Learned
 from jaxba.game.bank import Bank, info_of, initial_costs, reach, sieve
@@ -29,6 +29,7 @@ from jaxba.game.scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.layout import partition_of
 from jaxba.lm import LMState, lm_step
+from jaxba.problem import geometry
 
 LIMIT = 25
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from support import DATA, needs_data, start
 
-from jaxba import StepOptions, Termination, geometry, read_problem, solve
+from jaxba import StepOptions, Termination, read_problem, solve
+from jaxba.problem import geometry
 
 pytestmark = [needs_data, pytest.mark.slow]
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from jaxba.io import files, read_bal, read_problem, text, write_bal, write_problem
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA is not set")

@@ -13,7 +13,7 @@ import pytest
 import support
 
 from jaxba.io import files, read_bundler, read_problem, write_problem
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA is not set")

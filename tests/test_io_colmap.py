@@ -14,13 +14,22 @@ import pytest
 import support
 from support import DATA, needs_data
 
-from jaxba import BundleProblem, ProblemError, StepOptions, geometry, read_colmap, read_problem, solve, write_colmap
+from jaxba import (
+    BundleProblem,
+    ProblemError,
+    StepOptions,
+    read_colmap,
+    read_problem,
+    solve,
+    write_colmap,
+)
 from jaxba.bench.records import read_records
 from jaxba.bench.sources import sources
 from jaxba.cli.bench import run as run_bench
 from jaxba.cli.solve import run
 from jaxba.io import colmap
 from jaxba.io.colmap import MODELS
+from jaxba.problem import geometry
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
 

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jaxba.io import files, read_problem, write_problem
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 BAL = b"2 3 4\n0 0 1.5 -2.5\n1 0 3.25 4e0\n0 1 -5 6\n1 2 .5 7.\n" + b"".join(b"%d.25\n" % i for i in range(27))
 CAMERAS = (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxba.io import write_ply, write_problem
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 
 def make_problem(num_cameras: int = 6, num_points: int = 30) -> BundleProblem:

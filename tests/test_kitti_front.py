@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from kitti_scene import OTHER, SMALL, Camera, cv2, render, textures, write_sequence
 
-from jaxba import BundleProblem, geometry, read_bal
+from jaxba import BundleProblem, read_bal
 from jaxba.cli.kitti import run
 from jaxba.cli.solve import run as solve
 from jaxba.io import write_problem
 from jaxba.kitti import front, klt
 from jaxba.kitti.features import KeyPoints, detect, essential, match
 from jaxba.kitti.sequence import Calibration, image_reader, read_sequence
+from jaxba.problem import geometry
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")

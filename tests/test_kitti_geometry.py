@@ -7,7 +7,6 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxba import geometry
 from jaxba.kitti import keyframes
 from jaxba.kitti.assemble import assemble, poses_of_cameras, windows
 from jaxba.kitti.odometry import Odometry, visual_odometry
@@ -15,7 +14,8 @@ from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.starts import drift
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate, triangulate_robustly
-from jaxba.problem import ProblemError
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import ProblemError
 
 CALIBRATION = Calibration(700.0, 650.0, 600.0, 180.0)
 NEARLY_ALL = Filters(angle=1e-3)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxba.kitti.sequence import Calibration, poses_of, read_calibration, read_poses, read_sequence
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.kitti import trajectory
 from jaxba.kitti.trajectory import absolute_errors, align, relative_errors, segment_errors, umeyama
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 
 def wander(count: int, seed: int, step: float = 1.0) -> np.ndarray:

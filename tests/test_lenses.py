@@ -20,7 +20,6 @@ from jaxba import (
     SceneConfig,
     StepOptions,
     build_layout,
-    geometry,
     lm_step,
     random_scene,
     random_scene_with_truth,
@@ -30,6 +29,7 @@ from jaxba.cli import table
 from jaxba.cli.solve import run
 from jaxba.layout import layout_for
 from jaxba.paper.subproblem import sub_problem
+from jaxba.problem import geometry
 
 INDEX = np.array([0, 1, 0, 2, 1, 0])
 FREE = np.array([[1, 1, 0], [1, 1, 1], [0, 0, 0]], bool)

@@ -11,7 +11,7 @@ import pytest
 from support import published_loss
 
 from jaxba import Loss
-from jaxba.losses import NAMES
+from jaxba.problem.losses import NAMES
 
 SQUARES = np.concatenate([[0.0, 1e-300, 1e-12], np.geomspace(1e-6, 1e8, 200), [0.25, 1.0, 4.0, 6.25]])
 """Squared residuals from zero to outliers, and exactly where a loss of scale 0.5, 1, 2 or 2.5 bends."""

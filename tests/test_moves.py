@@ -10,9 +10,10 @@ import support
 from scipy.spatial.transform import Rotation
 from support import same_bits
 
-from jaxba import BundleProblem, StepOptions, build_layout, geometry, solve
-from jaxba.lenses import Lenses
+from jaxba import BundleProblem, StepOptions, build_layout, solve
 from jaxba.moves import LARGEST_ZOOM, move_cameras, step_between
+from jaxba.problem import geometry
+from jaxba.problem.intrinsics import Lenses
 
 PIXELS = StepOptions(lens_step="pixels")
 FILE = StepOptions()

@@ -25,7 +25,6 @@ from jaxba import (
     StepOptions,
     Termination,
     Tolerances,
-    geometry,
     make_policy,
     read_problem,
     solve,
@@ -34,6 +33,7 @@ from jaxba.bench import report
 from jaxba.bench.records import read_records
 from jaxba.cli.bench import run as run_bench
 from jaxba.naming import parse_solver
+from jaxba.problem import geometry
 from jaxba.runtime.compile_clock import CompileClock
 
 pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")

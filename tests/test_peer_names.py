@@ -13,7 +13,7 @@ from jaxba.bench.sources import sources
 from jaxba.cli.bench import run
 from jaxba.damping import Learned, UnknownPolicyError
 from jaxba.naming import PEERS, SolverName, SolverNameError, parse_solver
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,8 @@ import pytest
 import support
 
 import jaxba
-from jaxba import StepOptions, build_layout, geometry, initial_state, like, lm_step, random_scene
+from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene
+from jaxba.problem import geometry
 from jaxba.sums import total
 
 

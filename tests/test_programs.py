@@ -16,7 +16,7 @@ from jaxba import SceneConfig, Termination, random_scene, solve, solve_and_retri
 from jaxba.cli.solve import run
 from jaxba.io import write_problem
 from jaxba.lm import judge, lm_step, propose
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 from jaxba.runtime import compilation
 from jaxba.runtime.compilation import (
     PAYS,

@@ -19,11 +19,11 @@ from jaxba import (
     StepOptions,
     Termination,
     Tolerances,
-    geometry,
     retriangulate,
     solve,
     solve_and_retriangulate,
 )
+from jaxba.problem import geometry
 
 TIGHT = Tolerances(ftol=1e-12)
 

@@ -12,8 +12,8 @@ from scipy.optimize import least_squares
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxba.geometry import camera_centers, cost, depths, project, residuals
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import camera_centers, cost, depths, project, residuals
 from jaxba.scenes import LIKE, SceneConfig, like, random_scene, random_scene_with_truth
 from jaxba.scenes.tracks import track_lengths
 

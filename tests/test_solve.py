@@ -21,13 +21,13 @@ from jaxba import (
     StepOptions,
     Termination,
     Tolerances,
-    geometry,
     like,
     make_policy,
     random_scene_with_truth,
     solve,
     solve_loop,
 )
+from jaxba.problem import geometry
 
 pytestmark = pytest.mark.step
 

@@ -21,7 +21,7 @@ from test_programs import Compilations
 from jaxba import make_policy, solve
 from jaxba.io import write_problem
 from jaxba.lm import judge
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 from jaxba.retriangulate import retriangulate
 from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import CompiledTogether, Stage, program, run_alone

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import step_info
 
-from jaxba import Termination, Tolerances, geometry, solve
+from jaxba import Termination, Tolerances, solve
+from jaxba.problem import geometry
 from jaxba.termination import HIDDEN_DECREASE, converged_in_cost, lost_in_rounding, termination_of
 
 LIMIT = 30

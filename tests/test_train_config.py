@@ -12,7 +12,7 @@ from jaxba.game import config, settings
 from jaxba.game.config import SettingsError, TrainConfig, load, to_yaml
 from jaxba.game.sac import SacConfig
 from jaxba.game.scenes import SceneClass
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 REPOSITORY = Path(__file__).parent.parent
 

@@ -10,10 +10,11 @@ import pytest
 import support
 from scipy.spatial.transform import Rotation
 
-from jaxba import geometry, solve
-from jaxba.geometry import angle_axis, camera_centers, cost, depths, project, residuals, rotation_matrices
-from jaxba.problem import BundleProblem, ProblemError
-from jaxba.transform import FAR, drop_invalid, far_middle, normalize, perturb, poba_start, shift
+from jaxba import solve
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import angle_axis, camera_centers, cost, depths, project, residuals, rotation_matrices
+from jaxba.problem.preprocess import FAR, drop_invalid, far_middle, normalize, perturb, poba_start, shift
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")

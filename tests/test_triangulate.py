@@ -11,8 +11,18 @@ import pytest
 from scipy.optimize import brentq
 from test_retriangulate import solved, strayed, thrown
 
-from jaxba import BundleProblem, Loss, StepOptions, build_layout, geometry, initial_state, lm_step, solve, trial
+from jaxba import (
+    BundleProblem,
+    Loss,
+    StepOptions,
+    build_layout,
+    initial_state,
+    lm_step,
+    solve,
+    trial,
+)
 from jaxba.linearize import linearize, slot_frames
+from jaxba.problem import geometry
 from jaxba.refine import Home, refine_points
 from jaxba.triangulate import better_starts, midpoints, refine_from_starts
 

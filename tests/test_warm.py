@@ -8,9 +8,10 @@ import pytest
 from support import same_bits
 from tiny_game import KIND, problem_of, tiny_bank
 
-from jaxba import StepOptions, geometry
+from jaxba import StepOptions
 from jaxba.game.bank import BankConfig, draft, make_banks
 from jaxba.game.warm import warm_starts
+from jaxba.problem import geometry
 
 OPTIONS = StepOptions()
 

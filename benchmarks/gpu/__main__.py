@@ -24,7 +24,7 @@ from benchmarks.phases import HEADING, bandwidth, measure, timed
 from jaxba.bench.sources import sources
 from jaxba.choose import choose
 from jaxba.layout import layout_for
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 PROBLEMS = "scene:ladybug-49,scene:random-150,scene:ladybug-1197,scene:venice-1778"
 """Built-in scenes, since the machine with the GPU need not have any data."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 _log = logging.getLogger(__name__)
 

@@ -15,7 +15,6 @@ from typing import Any
 import jax
 
 import jaxba
-from jaxba import geometry
 from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.bench.summary import write_text
@@ -23,7 +22,8 @@ from jaxba.damping.registry import SUFFIX
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 from jaxba.peers import require
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.process import out_of_memory
 from jaxba.solve import MAX_ITERATIONS, Solution, solve
 from jaxba.stepwise import IterationRecord

@@ -9,7 +9,7 @@ from pathlib import Path
 from jaxba.data.places import resolve
 from jaxba.io import is_colmap, read_problem
 from jaxba.io.files import display_name
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, like, random_scene
 
 SCENE_PREFIX = "scene:"

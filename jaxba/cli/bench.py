@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import tyro
 
 from jaxba.cli import common
-from jaxba.options import LinearSolverChoice
+from jaxba.problem.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "learned,classic,ceres,ceres+refine3,ceres+embedded"
 """The shipped policy, both yardsticks, and the better of them with the policy's embedded iterations."""

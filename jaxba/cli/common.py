@@ -44,7 +44,7 @@ def run_command(
         from jaxba.damping.registry import UnknownPolicyError
         from jaxba.methods import UnknownMethodError
         from jaxba.naming import SolverNameError
-        from jaxba.problem import ProblemError
+        from jaxba.problem.bundle_problem import ProblemError
 
         names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
         try:

@@ -235,10 +235,10 @@ def _write(part: Any, path: str, sequence: Any, args: Arguments) -> str:
 def _build_table(parts: list[Any], built: Any, poses: Any) -> Any:
     import numpy as np
 
-    from jaxba import geometry
     from jaxba.kitti.assemble import poses_of_cameras
     from jaxba.kitti.evaluate import score
-    from jaxba.problem import ProblemError
+    from jaxba.problem import geometry
+    from jaxba.problem.bundle_problem import ProblemError
 
     kept = len(built.whole.frames)
     title = f"{built.frames} frames, {kept} key-frames, {built.tracks} tracks"

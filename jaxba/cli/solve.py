@@ -15,7 +15,7 @@ import tyro
 from jaxba.cli import common
 from jaxba.cli.interrupt import Interrupt
 from jaxba.methods import DEFAULT_METHOD
-from jaxba.options import Intrinsics, LinearSolverChoice, Preconditioner
+from jaxba.problem.options import Intrinsics, LinearSolverChoice, Preconditioner
 from jaxba.runtime.compilation import Compilation
 
 _STDOUT = 1
@@ -144,7 +144,7 @@ def _solve(args: Arguments) -> int:
     if args.intrinsics == "fixed" and (args.method != DEFAULT_METHOD or args.linear_solver not in ("auto", "explicit")):
         raise common.UsageError("--intrinsics fixed needs --method lm and the explicit linear solver")
     from jaxba.io import check_output
-    from jaxba.losses import Loss
+    from jaxba.problem.losses import Loss
 
     try:
         loss = Loss(args.loss, args.loss_scale)

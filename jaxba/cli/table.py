@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxba import geometry
 from jaxba.methods import DEFAULT_METHOD
-from jaxba.options import StepOptions
 from jaxba.padding import capacity_of
-from jaxba.problem import BundleProblem
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.options import StepOptions
 from jaxba.retriangulate import Retriangulation
 from jaxba.solve import Solution
 from jaxba.stepwise import IterationRecord

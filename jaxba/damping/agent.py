@@ -19,7 +19,7 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.damping.rules import LARGEST, Ceres
 from jaxba.effort import Effort
 from jaxba.lm import StepInfo
-from jaxba.options import LensStep, PointStarts, StepOptions
+from jaxba.problem.options import LensStep, PointStarts, StepOptions
 from jaxba.trial import SHORTER
 
 Observation = Literal["scale-free", "paper", "released-code", "duration"]

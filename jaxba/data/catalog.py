@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxba.data.problems import PROBLEMS
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any, cast
 
 from jaxba.data.catalog import Entry
 from jaxba.io.files import open_input, reason
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 try:
     import pooch

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jaxba.data.catalog import Entry, find
 from jaxba.data.problems import PROBLEMS
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 FOLDER_VARIABLE = "JAXBA_BAL"
 """Environment variable: folder of downloaded problems, instead of `bal` in the user's cache folder."""

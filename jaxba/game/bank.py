@@ -24,8 +24,8 @@ from jaxba.game.scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.game.warm import warm_starts
 from jaxba.linearize import cost
-from jaxba.losses import Loss
-from jaxba.options import Intrinsics, StepOptions
+from jaxba.problem.losses import Loss
+from jaxba.problem.options import Intrinsics, StepOptions
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose best cost counts, each with point iterations."""

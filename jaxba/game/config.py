@@ -23,7 +23,7 @@ from jaxba.game.loop import LoopConfig
 from jaxba.game.sac import SacConfig
 from jaxba.game.settings import SettingsError
 from jaxba.methods import DEFAULT_METHOD, MethodName, make_method
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 METADATA_BYTES = 1 << 14
 """Left for what a policy file says about itself: the configuration in 3 kB."""

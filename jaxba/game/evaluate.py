@@ -12,7 +12,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.game.bank import Bank, reach
 from jaxba.game.play import Trajectories, play
 from jaxba.game.scenes import SceneClass
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 
 class Score(NamedTuple):

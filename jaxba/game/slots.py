@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 
 from jaxba.game.scenes import SceneClass
 from jaxba.layout import Layout, build_layout
-from jaxba.options import StepOptions
-from jaxba.problem import AnyArray, BundleProblem
+from jaxba.problem.bundle_problem import AnyArray, BundleProblem
+from jaxba.problem.options import StepOptions
 
 
 def class_layout(kind: SceneClass, options: StepOptions) -> Layout:

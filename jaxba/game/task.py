@@ -26,7 +26,7 @@ from jaxba.game.play import Trajectories
 from jaxba.game.sac import Learner
 from jaxba.game.train import TrainError
 from jaxba.methods import DEFAULT_METHOD, make_method
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 BANK = "bank.npz"
 RULES = "rules.npz"

@@ -19,7 +19,7 @@ from jaxba.game.play import step_groups
 from jaxba.game.scenes import SceneClass, Scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.lm import LMState, begin_at, lm_step
-from jaxba.options import StepOptions
+from jaxba.problem.options import StepOptions
 
 ITERATIONS = 10
 """Most iterations that a warm start has behind it; their number is uniform from one on."""

@@ -10,7 +10,7 @@ from jaxba.io.bundler import read_bundler
 from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
 from jaxba.io.files import StrPath, display_name, strip_compression
 from jaxba.io.ply import write_ply
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 __all__ = [
     "check_output",

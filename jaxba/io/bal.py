@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxba.io.files import StrPath, display_name, open_input, open_output
 from jaxba.io.text import NumberReader
-from jaxba.problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
 
 MAX_COUNT = 2**31 - 1
 """Largest count in a header: indices are int32."""

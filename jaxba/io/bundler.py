@@ -13,10 +13,10 @@ from itertools import chain
 
 import numpy as np
 
-from jaxba.geometry import angle_axis
 from jaxba.io.files import READ_ERRORS, StrPath, display_name, open_input, reason
 from jaxba.io.text import NumberReader
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import angle_axis
 
 HEADER = b"# Bundle file v0.3"
 """First line of every file of this version."""

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.geometry import COLMAP_FLIP, bal_rotations, colmap_quaternions
 from jaxba.io.files import StrPath, display_name, reason
-from jaxba.lenses import LENS_SIZE, Lenses
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations, colmap_quaternions
+from jaxba.problem.intrinsics import LENS_SIZE, Lenses
 
 MODELS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),

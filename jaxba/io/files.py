@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from io import BufferedReader
 from typing import IO, Any, BinaryIO, TypeAlias
 
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 StrPath: TypeAlias = str | os.PathLike[str]
 

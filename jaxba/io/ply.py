@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxba.geometry import camera_centers
 from jaxba.io.files import StrPath, open_output
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import camera_centers
 
 POINT_COLOUR = (192, 192, 192)
 """Grey, seen on black and on white."""

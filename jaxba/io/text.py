@@ -10,7 +10,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from jaxba.io.files import READ_ERRORS, reason
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 MAX_WORD_BYTES = 1 << 16
 """A longer run of bytes without whitespace at the end of a block ends the reading. No number needs more than about

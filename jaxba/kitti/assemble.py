@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.geometry import COLMAP_FLIP, angle_axis, camera_centers, rotation_matrices
 from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.tracks import Tracks
 from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate_robustly
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, camera_centers, rotation_matrices
 
 FLIP = np.diag(COLMAP_FLIP)
 """From axes x right, y down, z forward (KITTI, as COLMAP) to x right, y up, z backward (BAL)."""

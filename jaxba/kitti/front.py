@@ -15,7 +15,7 @@ from jaxba.kitti.opencv import cv2
 from jaxba.kitti.sequence import Sequence, image_reader, spare_bits, stamp
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.kitti.work import Work, digest
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 Report = Callable[[str, int, int], None]
 """Told what is being done, how much of it is done, and how much there is."""

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.tracks import Tracks
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 PARALLAX = 10.0
 """Median parallax in pixels at which `auto` takes a frame. VINS-Mono (Qin et al. 2018) takes 10 at 460 pixels focal

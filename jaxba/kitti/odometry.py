@@ -23,7 +23,7 @@ from jaxba.kitti.opencv import cv2
 from jaxba.kitti.sequence import Calibration
 from jaxba.kitti.tracks import Tracks
 from jaxba.kitti.triangulate import Filters, Sightings, Triangulated, Views, triangulate
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 BOOTSTRAP_ANGLE = 2.0
 """Median angle in degrees between the rays of the first two views' points that is enough."""

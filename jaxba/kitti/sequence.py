@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.io.files import StrPath, display_name, reason
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 CALIBRATION_FILES = ("calib.txt", "K.txt")
 """Looked for in this order: the development kit's lines `P0: 12 numbers`, or a bare 3 x 3 matrix."""

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 
 def drift(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 Poses = Float[np.ndarray, "poses 3 4"]
 

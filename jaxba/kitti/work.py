@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 
 from jaxba.io.files import display_name, open_output, reason
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 Result = TypeVar("Result", bound=tuple)
 

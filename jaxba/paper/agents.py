@@ -18,9 +18,9 @@ from jaxba.game import task, train
 from jaxba.game.bank import Bank, Split, sieve
 from jaxba.game.config import TrainConfig
 from jaxba.game.env import Game, make_game
-from jaxba.options import StepOptions
 from jaxba.paper.config import PAPER_STATE, PaperConfig
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.options import StepOptions
 
 POLICY = "policy.safetensors"
 SCENES = "scenes"

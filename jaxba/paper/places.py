@@ -12,7 +12,7 @@ from jaxba.bench.sources import Source
 from jaxba.data.places import resolve
 from jaxba.paper.config import FamilyConfig, RealConfig
 from jaxba.paper.subproblem import Cut
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 DATA_VARIABLE = "JAXBA_DATA"
 """Environment variable: folder of real problems."""

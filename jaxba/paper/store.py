@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxba.bench.records import Record, append_record, read_records
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 SOLVES, PLAYS = "solves.jsonl", "plays.jsonl"
 

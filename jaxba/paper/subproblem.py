@@ -10,8 +10,8 @@ from jaxtyping import Int
 from scipy.sparse import csr_matrix
 
 from jaxba.bench.sources import Source
-from jaxba.problem import BundleProblem, ProblemError
-from jaxba.transform import MIN_TRACK
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.preprocess import MIN_TRACK
 
 
 def sub_problem(

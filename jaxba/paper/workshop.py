@@ -20,14 +20,14 @@ from jaxba.game.bank import Bank, reach
 from jaxba.game.play import play
 from jaxba.methods import make_method
 from jaxba.naming import SolverName, parse_solver
-from jaxba.options import StepOptions
 from jaxba.paper import agents, rows, zero_net
 from jaxba.paper.agents import Agent
 from jaxba.paper.config import PaperConfig
 from jaxba.paper.rows import NEAR, Row
 from jaxba.paper.schedule import LENGTH
 from jaxba.paper.store import Play, Store
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.solve import solve
 from jaxba.stepwise import IterationRecord

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from jaxba import geometry
 from jaxba.lm import StepInfo
 from jaxba.loop import History
 from jaxba.naming import INNER
 from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
 from jaxba.peers.colmap_problem import ColmapProblem
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.solve import MAX_ITERATIONS, Solution, explain_start
 from jaxba.stepwise import IterationRecord
 from jaxba.termination import Termination, Tolerances

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba import geometry
-from jaxba.geometry import COLMAP_FLIP as FLIP
-from jaxba.geometry import bal_rotations, colmap_quaternions
 from jaxba.peers.colmap import LENS_SIZE, PRINCIPAL_POINT, SMALLEST_DEPTH, AnySide, pose_manifold, pyceres, reprojection
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import COLMAP_FLIP as FLIP
+from jaxba.problem.geometry import bal_rotations, colmap_quaternions
 
 
 class ColmapProblem:

@@ -19,12 +19,12 @@ import numpy as np
 from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm import StepInfo
 from jaxba.loop import after_step
-from jaxba.options import StepOptions
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import Observed, observed, step_facts
 from jaxba.peers.verdict import Told, Verdict
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.runtime.compile_clock import CompileClock
 from jaxba.solve import MAX_ITERATIONS, Solution

@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba.peers.colmap import SMALLEST_DEPTH
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 
 
 class Observed(NamedTuple):

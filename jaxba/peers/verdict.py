@@ -17,16 +17,16 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.geometry import COLMAP_FLIP as FLIP
 from jaxba.layout import Layout, layout_for
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, Proposal, StepInfo, initial_state, judge
 from jaxba.normal import image
-from jaxba.options import StepOptions
 from jaxba.peers.ceres import Run, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import half_turn
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.geometry import COLMAP_FLIP as FLIP
+from jaxba.problem.options import StepOptions
 from jaxba.schur import Step
 from jaxba.solve import write_back
 

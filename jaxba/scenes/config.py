@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
 
 Trajectory = Literal["forward", "lateral", "orbit", "photos"]
 """How the cameras stand to each other; see `SceneConfig.trajectory`."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxba.geometry import angle_axis, camera_centers, depths, project, rotation_matrices, translations
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import angle_axis, camera_centers, depths, project, rotation_matrices, translations
 from jaxba.scenes.config import SceneConfig, check
 from jaxba.scenes.tracks import track_lengths
 from jaxba.scenes.trajectory import Path, make_path, true_cameras

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.geometry import angle_axis, rotation_matrices, translations
-from jaxba.problem import CAMERA_SIZE
+from jaxba.problem.bundle_problem import CAMERA_SIZE
+from jaxba.problem.geometry import angle_axis, rotation_matrices, translations
 from jaxba.scenes.config import SceneConfig
 
 CORNER_SHARE = 0.4

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.geometry import rotation_matrices
-from jaxba.problem import ProblemError
+from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.geometry import rotation_matrices
 from jaxba.scenes.config import VIEW_MARGIN, SceneConfig
 from jaxba.scenes.tracks import MIN_LENGTH
 from jaxba.scenes.trajectory import Path

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from jaxba.damping import Schedule
-from jaxba.options import StepOptions
 from jaxba.paper import agents, claims
 from jaxba.paper.markdown import Section, disagreements
 from jaxba.paper.pieces import base
@@ -13,6 +12,7 @@ from jaxba.paper.pieces.base import Piece
 from jaxba.paper.rows import Row
 from jaxba.paper.schedule import average_schedule
 from jaxba.paper.workshop import Method, Workshop, named
+from jaxba.problem.options import StepOptions
 
 AVERAGE = "schedule-of-our-agent"
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from jaxba.bench.sources import Source
 from jaxba.bench.tables import number
 from jaxba.damping import DampingPolicy
-from jaxba.options import StepOptions
 from jaxba.paper import agents, claims
 from jaxba.paper.markdown import Line, Section, disagreements, lines_table
 from jaxba.paper.pieces import base
 from jaxba.paper.pieces.base import Piece
 from jaxba.paper.workshop import Method, Workshop, named
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.options import StepOptions
 from jaxba.scenes import SceneConfig, random_scene
 
 PAPER_SIZE = 5

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.geometry import camera_centers, depths, rotation_matrices, translations
-from jaxba.problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import camera_centers, depths, rotation_matrices, translations
 
 POBA_SIZE = 100.0
 """Size of a normalised scene. Source: Ceres `BALProblem::Normalize`, kept by rootba and PoBA."""

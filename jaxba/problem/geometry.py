@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 
 Array = np.ndarray | jax.Array
 """What a problem may hold; every result here is a NumPy array."""

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.lenses import AnyArray, Lenses, checked_lenses
+from jaxba.problem.intrinsics import AnyArray, Lenses, checked_lenses
 
 CAMERA_SIZE = 9
 """Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""

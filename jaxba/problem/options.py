@@ -6,7 +6,7 @@ import operator
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
-from jaxba.losses import Loss
+from jaxba.problem.losses import Loss
 from jaxba.runtime.process import LARGEST_COUNT
 
 LinearSolver = Literal["explicit", "sparse", "implicit", "power", "normal", "clustered", "decomposed"]
