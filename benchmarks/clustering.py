@@ -19,11 +19,11 @@ import numpy as np
 
 from jaxba import StepOptions, make_method, solve
 from jaxba.bench.sources import sources
-from jaxba.communities import camera_graph, clusterings
-from jaxba.layout import layout_for
-from jaxba.partition import PARTITIONS, SEED
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
+from jaxba.structure.layout import layout_for
+from jaxba.structure.louvain import camera_graph, clusterings
+from jaxba.structure.random_partitions import PARTITIONS, SEED
 
 ITERATIONS = 8
 

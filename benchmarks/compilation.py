@@ -30,12 +30,12 @@ import numpy as np
 from jaxba import lm
 from jaxba.bench.sources import sources
 from jaxba.choose import choose_linear_solver
-from jaxba.layout import layout_for
 from jaxba.methods import DEFAULT_METHOD
 from jaxba.naming import parse_solver
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Way, options_of
 from jaxba.runtime.single_loop import in_haste
+from jaxba.structure.layout import layout_for
 
 LONGEST = 10.0
 """Seconds of repeats of one program."""

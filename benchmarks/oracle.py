@@ -30,10 +30,10 @@ from jaxba.choose import choose_linear_solver
 from jaxba.cli.common import prepare_process
 from jaxba.damping.learned import Learned
 from jaxba.game.oracle import GRID, WIDTH
-from jaxba.layout import layout_for
 from jaxba.naming import parse_solver
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
+from jaxba.structure.layout import layout_for
 
 TOLERANCES = (1e-3, 1e-4, 1e-6)
 LIMIT = 100

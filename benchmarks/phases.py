@@ -22,13 +22,13 @@ from jaxba import camera, eliminate, lm, reduced
 from jaxba.bench.sources import sources
 from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.dense import factor_and_solve
-from jaxba.layout import Layout, layout_for
 from jaxba.linearize import cost, linearize, slot_frames
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.refine import refine_points
 from jaxba.resect import refine_cameras
 from jaxba.runtime import process
+from jaxba.structure.layout import Layout, layout_for
 
 
 def timed(function: Any, *arguments: Any, repeats: int) -> tuple[Any, float, float, float]:

@@ -160,7 +160,7 @@ def _layout_seconds(problem: BundleProblem, repeats: int) -> float:
     """Median time on the host to sort the observations for the solver that `auto` takes."""
     from jaxba import StepOptions
     from jaxba.choose import choose_linear_solver
-    from jaxba.layout import layout_for
+    from jaxba.structure.layout import layout_for
 
     options = choose_linear_solver(problem, StepOptions(), "auto")
     times = []

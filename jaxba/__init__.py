@@ -22,7 +22,6 @@ from jaxba.io import (
     write_ply,
     write_problem,
 )
-from jaxba.layout import Layout, build_layout
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.loop import History, solve_loop
 from jaxba.methods import METHODS, Method, make_method
@@ -35,6 +34,7 @@ from jaxba.retriangulate import Retriangulation, retriangulate
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
 from jaxba.solve import Solution, solve
 from jaxba.stepwise import IterationRecord
+from jaxba.structure.layout import Layout, build_layout
 from jaxba.termination import Termination, Tolerances
 
 __version__ = "0.1.0"

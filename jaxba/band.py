@@ -15,8 +15,8 @@ from jax import Array, lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
-from jaxba.ordering import Band
-from jaxba.sums import take_rows
+from jaxba.structure.camera_ordering import Band
+from jaxba.structure.segment_sums import take_rows
 
 
 def band_rows(band: Band, blocks: Float[Array, "blocks 9 9"]) -> Float[Array, "tiles rows columns"]:

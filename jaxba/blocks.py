@@ -5,9 +5,9 @@ from __future__ import annotations
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.pairs import PairLayout
 from jaxba.runtime.barriers import apart
-from jaxba.sums import outer_sum, take_rows, tree_sum
+from jaxba.structure.covisibility import PairLayout
+from jaxba.structure.segment_sums import outer_sum, take_rows, tree_sum
 
 
 def pair_products(

@@ -12,10 +12,10 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from jaxba.density import has_dense_shape, has_small_capacitance
-from jaxba.ordering import camera_order, is_banded
 from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemError
 from jaxba.problem.options import REDUCED_SOLVERS, LinearSolver, LinearSolverChoice, StepOptions
+from jaxba.structure.camera_ordering import camera_order, is_banded
+from jaxba.structure.density import has_dense_shape, has_small_capacitance
 
 
 class Work(NamedTuple):
@@ -31,7 +31,7 @@ class Work(NamedTuple):
     """Forming the blocks: a pair of observations of one point."""
 
     dense_product: float = 0.0
-    """A multiplication and addition where the system is formed as one dense product (density.py)."""
+    """A multiplication and addition where the system is formed as one dense product (structure/density.py)."""
 
     square: float = 0.0
     """The square of the unknowns of a dense factorisation: what is written, and what one core does."""
@@ -81,7 +81,7 @@ INEXACT_ITERATIONS = 1.2
 bulani1, bulani2, bulani4 and the rules ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
 
 TIED_COPIES = 5
-"""The reduced camera system, its mirror image, the tied one, that scaled, its factor (ties.py, dense.py)."""
+"""The reduced camera system, its mirror image, the tied one, that scaled, its factor (structure/shared_intrinsics.py, dense.py)."""
 
 DENSE_COPIES = 4
 """The reduced camera system, its blocks' copy, its mirror image, its factor (blocks.py, dense.py)."""

@@ -22,13 +22,13 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.blocks import dense_blocks, pair_products
-from jaxba.clusters import ClusterLayout
 from jaxba.dense import factor_panels
 from jaxba.eliminate import CameraSystem, PointSystem
-from jaxba.layout import Layout
 from jaxba.linearize import Linearization
 from jaxba.runtime.barriers import apart
-from jaxba.sums import as_rows, take_each, take_rows, tree_sum
+from jaxba.structure.camera_clusters import ClusterLayout
+from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
 
 MODES = 10
 """Seven of a similarity, then focal length, k1 and k2."""

@@ -30,16 +30,16 @@ from jaxba.eliminate import (
     eliminate_points,
     largest_gradient,
 )
-from jaxba.layout import Layout
 from jaxba.linearize import Linearization, linearize, point_terms, slot_frames
 from jaxba.normal import image
-from jaxba.partition import Partition
 from jaxba.parts import Clusters
 from jaxba.problem.options import StepOptions
 from jaxba.refine import Home, refine_points
 from jaxba.schur import Step
 from jaxba.split import solve_clusters
-from jaxba.sums import take, total
+from jaxba.structure.layout import Layout
+from jaxba.structure.random_partitions import Partition
+from jaxba.structure.segment_sums import take, total
 from jaxba.trial import NEGLIGIBLE, best_trial
 from jaxba.views import point_passes, view_terms
 

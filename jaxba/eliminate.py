@@ -20,12 +20,12 @@ from jaxtyping import Float
 
 from jaxba import camera
 from jaxba.blocks3 import Cholesky3, cholesky3
-from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.single_loop import together
-from jaxba.sums import as_rows, outer_sum, point_sums, take, take_rows, tree_sum
-from jaxba.ties import LensTies
+from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_rows, tree_sum
+from jaxba.structure.shared_intrinsics import LensTies
 
 
 class Coordinates(NamedTuple):

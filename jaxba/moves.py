@@ -15,8 +15,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba import camera
-from jaxba.layout import Layout
 from jaxba.problem.options import StepOptions
+from jaxba.structure.layout import Layout
 
 LARGEST_ZOOM = 0.3
 """Relative change of a focal length beyond which distortions are added as they are: the fourth power of a first-order

@@ -20,11 +20,11 @@ from jaxtyping import Float, Int
 
 from jaxba.cg import conjugate_gradients
 from jaxba.eliminate import CameraSystem, PointSystem
-from jaxba.layout import Layout
 from jaxba.linearize import Linearization
 from jaxba.precondition import block_inverse
 from jaxba.problem.options import StepOptions
-from jaxba.sums import as_rows, point_sums, take_each, tree_sum
+from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import as_rows, point_sums, take_each, tree_sum
 
 
 def image(

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.layout import Layout
 from jaxba.linearize import observation_costs, slot_frames
-from jaxba.partition import Partition
 from jaxba.problem.options import StepOptions
 from jaxba.refine import Home, refine_points
-from jaxba.sums import point_sum, take, total, tree_sum
+from jaxba.structure.layout import Layout
+from jaxba.structure.random_partitions import Partition
+from jaxba.structure.segment_sums import point_sum, take, total, tree_sum
 from jaxba.triangulate import refine_from_starts
 
 

@@ -15,11 +15,11 @@ from jaxtyping import Float
 
 from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.eliminate import CameraSystem, PointSystem
-from jaxba.layout import Layout
 from jaxba.linearize import Linearization
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.barriers import materialized
-from jaxba.sums import as_rows, outer_sum, take_rows, tree_sum
+from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
 Operator = Callable[[Array], Array]
 

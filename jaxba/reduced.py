@@ -24,16 +24,16 @@ from jaxba.capacitance import capacitance_solve
 from jaxba.cg import conjugate_gradients
 from jaxba.coarse import Anchor
 from jaxba.dense import factor_and_solve, factor_panels
-from jaxba.density import has_few_points
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
-from jaxba.layout import Layout, PairLayout
 from jaxba.linearize import Linearization
 from jaxba.precondition import block_inverse, preconditioner, series
 from jaxba.problem.bundle_problem import AnyArray
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.barriers import apart
-from jaxba.sums import take_rows, tree_sum
-from jaxba.ties import solve_tied
+from jaxba.structure.density import has_few_points
+from jaxba.structure.layout import Layout, PairLayout
+from jaxba.structure.segment_sums import take_rows, tree_sum
+from jaxba.structure.shared_intrinsics import solve_tied
 
 SINGLE_LIFT = 64.0
 """Rounding units added to the scaled diagonal of a system formed in float32, which may have lost its sign."""

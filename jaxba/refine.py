@@ -27,11 +27,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba import camera
 from jaxba.blocks3 import Cholesky3, cholesky3
-from jaxba.layout import Layout
 from jaxba.linearize import point_terms
 from jaxba.problem.losses import Loss
 from jaxba.runtime.single_loop import together
-from jaxba.sums import point_sum
+from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import point_sum
 from jaxba.views import Views, point_passes
 
 INITIAL_DAMPING = 1e-6

@@ -8,11 +8,11 @@ from jaxtyping import Float
 
 from jaxba import camera
 from jaxba.dense import solve_positive
-from jaxba.layout import Layout
 from jaxba.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.barriers import apart
-from jaxba.sums import as_rows, outer_sum, take_rows, tree_sum
+from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
 DAMPINGS = (1e-6, 1e-2)
 """Relative damping of a camera's step, and of a second one where the first did not help."""

@@ -21,7 +21,6 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxba.layout import Layout, build_layout
 from jaxba.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.lm import initial_state
 from jaxba.problem import geometry
@@ -32,6 +31,7 @@ from jaxba.refine import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import program, run_alone, stages, way_after
 from jaxba.solve import explain_start
+from jaxba.structure.layout import Layout, build_layout
 from jaxba.triangulate import midpoints
 from jaxba.views import Views, point_passes
 

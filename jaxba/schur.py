@@ -24,14 +24,14 @@ from jaxba.eliminate import (
     eliminate_points,
     largest_gradient,
 )
-from jaxba.layout import Layout, partition_of
 from jaxba.linearize import Linearization
 from jaxba.normal import image, solve_normal
 from jaxba.problem.options import StepOptions
 from jaxba.recall import on_manifold, with_remembered
 from jaxba.reduced import solve_reduced
 from jaxba.split import clustered_step
-from jaxba.sums import as_rows, point_sums, tree_sum
+from jaxba.structure.layout import Layout, partition_of
+from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 
 
 class Step(NamedTuple):

@@ -19,12 +19,10 @@ import numpy as np
 
 from jaxba.choose import choose_linear_solver
 from jaxba.damping import DampingPolicy, Learned, make_policy
-from jaxba.layout import Layout, layout_for
 from jaxba.lm import LMState, initial_state
 from jaxba.loop import Carry, History, solve_loop
 from jaxba.methods import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES
-from jaxba.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import REDUCED_SOLVERS, StepOptions, check_count
@@ -33,6 +31,8 @@ from jaxba.runtime import process
 from jaxba.runtime.compilation import Compilation, Part, Stage, options_of, program, run_alone, stages
 from jaxba.runtime.compile_clock import CompileClock
 from jaxba.stepwise import IterationRecord, run_stepwise
+from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 from jaxba.termination import Termination, Tolerances
 
 MAX_ITERATIONS = 100
@@ -123,7 +123,7 @@ def solve(
         pad: rounds sizes up to a coarse grid, so that similar problems share one compiled program, also through a
             persistent compilation cache; results differ by rounding alone. For many small problems with the explicit
             solver, which `auto` then means. Other solvers and larger problems are left as they are:
-            `Solution.capacity` is None then. See padding.py.
+            `Solution.capacity` is None then. See structure/padding.py.
         compilation: `full`: all optimisation, for many solves of a shape and for whoever takes the time of iterations.
             `quick`: compiled in a third of the time, iterations take two to six times as long. `auto`: quick or, with
             more observations, in half of the time and nearly as fast, and optimised after as many iterations as pay

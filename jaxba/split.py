@@ -8,7 +8,7 @@ Lambda damps cameras (times `camera_damping`), points and copies. Large ones mak
 steepest-descent step; `agreed_gradient` mends that.
 
 Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", sections 3 and 4,
-and the authors' code. Clusters: partition.py.
+and the authors' code. Clusters: structure/random_partitions.py.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from jaxtyping import Float
 from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.dense import MIN_UNKNOWNS, factor_and_solve
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, damping_diagonal
-from jaxba.layout import Layout
 from jaxba.linearize import Linearization, normal_entries
-from jaxba.partition import Partition
 from jaxba.precondition import block_inverse
 from jaxba.problem.options import StepOptions
 from jaxba.reduced import reduced_blocks
 from jaxba.runtime.barriers import after
-from jaxba.sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
+from jaxba.structure.layout import Layout
+from jaxba.structure.random_partitions import Partition
+from jaxba.structure.segment_sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
 
 CORRECTED_FROM = 1.0
 """Lambda from which on the copies of a point are made to agree. Source: the authors' code (radius at most 1)."""

@@ -11,11 +11,11 @@ from jaxtyping import Float, Int
 
 from jaxba import camera
 from jaxba.blocks3 import cholesky3
-from jaxba.layout import Layout
 from jaxba.linearize import slot_costs, view_residuals
 from jaxba.problem.losses import Loss
 from jaxba.refine import Home, gone, refine_points
-from jaxba.sums import take_each
+from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import take_each
 from jaxba.views import Views, point_passes
 
 UNDISTORTIONS = 10

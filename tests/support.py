@@ -19,9 +19,9 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
 from jaxba import BundleProblem, LMState, StepOptions, initial_state, like, lm_step, random_scene
-from jaxba.layout import Layout, layout_for
 from jaxba.lm import StepInfo
-from jaxba.sums import point_sum, point_sums, tree_sum
+from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.segment_sums import point_sum, point_sums, tree_sum
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from jaxba.band import band_factor, band_factor_and_solve, band_rows
-from jaxba.ordering import TILE_CAMERAS, Band, band_of
 from jaxba.runtime.process import calm_blas
+from jaxba.structure.camera_ordering import TILE_CAMERAS, Band, band_of
 
 solve = jax.jit(band_factor_and_solve)
 

@@ -10,9 +10,9 @@ import support
 
 from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene, reduced
 from jaxba.capacitance import capacitance_solve
-from jaxba.density import has_few_points
 from jaxba.eliminate import CameraSystem
 from jaxba.runtime.process import calm_blas
+from jaxba.structure.density import has_few_points
 
 CAMERAS, COLUMNS = 4, 6
 

@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 
-from jaxba import BundleProblem, Layout, build_layout, clusters
-from jaxba.clusters import CLUSTER_CAMERAS, ClusterLayout, agglomerate, shared_points
-from jaxba.layout import layout_for
+from jaxba import BundleProblem, Layout, build_layout
 from jaxba.problem.options import StepOptions
+from jaxba.structure import camera_clusters
+from jaxba.structure.camera_clusters import CLUSTER_CAMERAS, ClusterLayout, agglomerate, shared_points
+from jaxba.structure.layout import layout_for
 
 sizes = st.tuples(st.integers(1, 30), st.integers(1, 25), st.integers(0, 10**6))  # cameras, points, seed
 
@@ -67,7 +68,7 @@ def test_shared_points_are_those_that_two_cameras_both_see(size):
 def test_with_too_many_pairs_a_sample_of_the_points_is_counted(monkeypatch):
     """Every fourth point instead of all: a quarter of what each two share, since here all see all."""
     camera, point = np.tile(np.arange(5), 400), np.repeat(np.arange(400), 5)
-    monkeypatch.setattr(clusters, "MAX_PRODUCTS", 400 * 25 / 4)
+    monkeypatch.setattr(camera_clusters, "MAX_PRODUCTS", 400 * 25 / 4)
     found, _ = shared_points(camera, point, 5, 400)
     assert np.array_equal(found.toarray(), 100 * (1 - np.eye(5)))
 
@@ -151,7 +152,7 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
     """Random whole numbers as weights: a slot that is missing, doubled or in the wrong place changes a sum."""
     problem = problem_of(*size, duplicates=duplicates)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(clusters, "CLUSTER_CAMERAS", cluster_cameras)
+        patch.setattr(camera_clusters, "CLUSTER_CAMERAS", cluster_cameras)
         layout = build_layout(problem, clusters=True)
     found, cameras = clusters_of(layout), problem.num_cameras
     count = len(found.members)
@@ -185,7 +186,7 @@ def test_every_coarse_slot_sums_exactly_one_clusters_views_of_one_point(cluster_
 
 
 def test_there_are_never_more_clusters_than_the_limit(monkeypatch):
-    monkeypatch.setattr(clusters, "MAX_CLUSTERS", 2)
+    monkeypatch.setattr(camera_clusters, "MAX_CLUSTERS", 2)
     found = clusters_of(build_layout(problem_of(30, 25, 0), clusters=True))
     assert len(found.members) == 2
 

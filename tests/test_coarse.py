@@ -17,14 +17,15 @@ import support
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from jaxba import BundleProblem, Loss, StepOptions, camera, clusters, initial_state
+from jaxba import BundleProblem, Loss, StepOptions, camera, initial_state
 from jaxba.coarse import MODES, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.eliminate import Coordinates, camera_system, eliminate_points
-from jaxba.layout import layout_for
 from jaxba.linearize import linearize
 from jaxba.precondition import diagonal_blocks, preconditioner
 from jaxba.reduced import apply_reduced
 from jaxba.runtime.process import calm_blas
+from jaxba.structure import camera_clusters
+from jaxba.structure.layout import layout_for
 
 MANIFOLD = StepOptions(linear_solver="implicit", rotation="manifold")
 
@@ -137,7 +138,7 @@ def make(name: str, more: float = 0.0) -> Case:
     cluster_cameras, problem, options, damping = CASES[name]
     problem = problem()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(clusters, "CLUSTER_CAMERAS", cluster_cameras)
+        patch.setattr(camera_clusters, "CLUSTER_CAMERAS", cluster_cameras)
         layout = layout_for(problem, options)
     assert layout.clusters is not None
     added = np.zeros((problem.num_cameras, 9, 9))

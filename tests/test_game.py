@@ -27,9 +27,9 @@ from jaxba.game.play import Trajectories, play
 from jaxba.game.protocol import Environment
 from jaxba.game.scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.layout import partition_of
 from jaxba.lm import LMState, lm_step
 from jaxba.problem import geometry
+from jaxba.structure.layout import partition_of
 
 LIMIT = 25
 

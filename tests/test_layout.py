@@ -12,10 +12,11 @@ import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxba import BundleProblem, Layout, build_layout, pairs
-from jaxba.layout import CAMERA_CHUNK
-from jaxba.slots import MAX_PADDING, TILE, TILED_POINTS
-from jaxba.trees import TREE_WIDTH, fitting_width, sum_tree, with_spare_row
+from jaxba import BundleProblem, Layout, build_layout
+from jaxba.structure import covisibility
+from jaxba.structure.layout import CAMERA_CHUNK
+from jaxba.structure.sum_trees import TREE_WIDTH, fitting_width, sum_tree, with_spare_row
+from jaxba.structure.track_buckets import MAX_PADDING, TILE, TILED_POINTS
 
 # Problems from track lengths
 
@@ -235,10 +236,10 @@ def test_a_camera_with_thousands_of_observations_is_summed_in_chunks():
 
 def blocks_by_layout(layout: Layout, weights: np.ndarray) -> np.ndarray:
     """Sum over the listed pairs of the product of their slots' weights, per block of the lower triangle."""
-    pairs = layout.pairs
+    covisibility = layout.pairs
     weights = support.by_camera(layout, np.where(layout.slot_mask, weights, 0))
-    chunks = (weights[pairs.left] * weights[pairs.right]).sum(axis=-1)
-    return sum_by_levels(support.batch_sums(pairs, chunks), pairs.levels)[np.asarray(pairs.table)]
+    chunks = (weights[covisibility.left] * weights[covisibility.right]).sum(axis=-1)
+    return sum_by_levels(support.batch_sums(covisibility, chunks), covisibility.levels)[np.asarray(covisibility.table)]
 
 
 def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.ndarray) -> np.ndarray:
@@ -260,7 +261,7 @@ def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.nd
     st.integers(1, 25),
     st.integers(0, 6),
     st.sampled_from([2, 7, 2048]),
-    st.sampled_from([0, pairs.MOST_COUNTED]),
+    st.sampled_from([0, covisibility.MOST_COUNTED]),
 )
 def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates, batch, counted):
     """Random whole numbers as weights: a pair that is missing, doubled or in the wrong block changes a sum."""
@@ -268,8 +269,8 @@ def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points,
     tracks = np.append(1, rng.integers(0, cameras + 1, points))
     problem = problem_of(tracks, cameras, seed, duplicates)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pairs, "PAIR_BATCH", batch)
-        patch.setattr(pairs, "MOST_COUNTED", counted)
+        patch.setattr(covisibility, "PAIR_BATCH", batch)
+        patch.setattr(covisibility, "MOST_COUNTED", counted)
         layout = build_layout(problem, grid=False)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))
@@ -286,11 +287,11 @@ def test_the_number_of_pairs_is_that_of_the_track_lengths():
 
 def test_diagonal_blocks_know_their_camera_and_the_others_know_they_have_none():
     problem = support.odd()
-    pairs = build_layout(problem, grid=False).pairs
+    covisibility = build_layout(problem, grid=False).pairs
     cameras = problem.num_cameras
-    assert np.array_equal(np.asarray(pairs.block_camera)[np.diagonal(pairs.table)], np.arange(cameras))
+    assert np.array_equal(np.asarray(covisibility.block_camera)[np.diagonal(covisibility.table)], np.arange(cameras))
     row, column = np.tril_indices(cameras, -1)
-    assert (np.asarray(pairs.block_camera)[np.asarray(pairs.table)[row, column]] == cameras).all()
+    assert (np.asarray(covisibility.block_camera)[np.asarray(covisibility.table)[row, column]] == cameras).all()
 
 
 def test_pairs_are_listed_only_on_demand():

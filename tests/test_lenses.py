@@ -27,9 +27,9 @@ from jaxba import (
 )
 from jaxba.cli import table
 from jaxba.cli.solve import run
-from jaxba.layout import layout_for
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem import geometry
+from jaxba.structure.layout import layout_for
 
 INDEX = np.array([0, 1, 0, 2, 1, 0])
 FREE = np.array([[1, 1, 0], [1, 1, 1], [0, 0, 0]], bool)

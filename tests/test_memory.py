@@ -8,7 +8,7 @@ import pytest
 
 from jaxba import StepOptions, initial_state, like, lm_step, random_scene
 from jaxba.choose import BYTES_PER_OBSERVATION
-from jaxba.layout import layout_for
+from jaxba.structure.layout import layout_for
 
 
 def bytes_per_observation(problem, options, dtype):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxba.ordering import MAX_BAND_SHARE, MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
+from jaxba.structure.camera_ordering import MAX_BAND_SHARE, MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 
 graphs = st.tuples(st.integers(1, 40), st.sampled_from([0.0, 0.05, 0.2, 1.0]), st.integers(0, 10**6))
 

@@ -20,13 +20,15 @@ from jaxba import (
     Tolerances,
     build_layout,
     initial_state,
-    pairs,
     random_scene,
     solve,
     solve_loop,
 )
-from jaxba.layout import layout_for
-from jaxba.padding import (
+from jaxba.paper.subproblem import sub_problem
+from jaxba.scenes import SceneConfig
+from jaxba.structure import covisibility
+from jaxba.structure.layout import layout_for
+from jaxba.structure.padding import (
     LEAST_OBSERVATIONS,
     LEAST_PAIRS,
     LEAST_TRACK,
@@ -36,10 +38,8 @@ from jaxba.padding import (
     capacity_of,
     padded_parameters,
 )
-from jaxba.paper.subproblem import sub_problem
-from jaxba.scenes import SceneConfig
-from jaxba.sums import point_sum
-from jaxba.trees import Room, sum_tree
+from jaxba.structure.segment_sums import point_sum
+from jaxba.structure.sum_trees import Room, sum_tree
 
 SMALL = Capacity(cameras=8, points=64, observations=512, pairs=4096)
 
@@ -139,7 +139,7 @@ def test_a_padded_layout_holds_every_observation_once_and_sums_it_right(seed, ca
     rng = np.random.default_rng(seed)
     problem = problem_of(np.append(1, rng.integers(0, cameras + 1, points)), cameras, seed, duplicates)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pairs, "PAIR_BATCH", batch)
+        patch.setattr(covisibility, "PAIR_BATCH", batch)
         layout = build_layout(problem, grid=False, capacity=SMALL)
     assert rows_of(layout) == rows_of_problem(problem)
     empty = ~np.asarray(layout.slot_mask)
@@ -167,7 +167,7 @@ def test_shapes_follow_from_the_capacity_alone(one, other, grid, batch):
         if grid:  # every camera sees every point, and there are no cameras to pad
             cameras, tracks = 8, np.full(len(tracks), 8)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pairs, "PAIR_BATCH", batch)
+            patch.setattr(covisibility, "PAIR_BATCH", batch)
             made.append(build_layout(problem_of(tracks, cameras, seed), grid=grid, capacity=SMALL))
     assert shapes(made[0]) == shapes(made[1])
     assert (made[0].grid is not None) == grid

@@ -15,10 +15,10 @@ from scipy.sparse.csgraph import connected_components
 from support import bal_file, needs_data
 
 from jaxba import BundleProblem, StepOptions, read_bal
-from jaxba.communities import camera_graph, cluster, clusterings
-from jaxba.layout import build_layout, layout_for, partition_of
-from jaxba.partition import PARTITIONS
-from jaxba.sums import tree_sum
+from jaxba.structure.layout import build_layout, layout_for, partition_of
+from jaxba.structure.louvain import camera_graph, cluster, clusterings
+from jaxba.structure.random_partitions import PARTITIONS
+from jaxba.structure.segment_sums import tree_sum
 
 
 def observed(cameras: int, points: int, seed: int, share: float = 0.3) -> BundleProblem:

@@ -11,7 +11,7 @@ import support
 import jaxba
 from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene
 from jaxba.problem import geometry
-from jaxba.sums import total
+from jaxba.structure.segment_sums import total
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ import support
 from support import start, step
 
 from jaxba import BundleProblem, StepOptions
-from jaxba.layout import layout_for
 from jaxba.runtime.process import calm_blas
 from jaxba.scenes import SceneConfig, random_scene
+from jaxba.structure.layout import layout_for
 
 EXACT = StepOptions()
 TO_THE_END = StepOptions(linear_solver="implicit", cg_forcing=0.0, cg_tolerance=1e-12, cg_max_iterations=3000)

@@ -23,8 +23,8 @@ import jaxba
 from benchmarks.phases import HEADING, bandwidth, measure, timed
 from jaxba.bench.sources import sources
 from jaxba.choose import choose
-from jaxba.layout import layout_for
 from jaxba.problem.options import StepOptions
+from jaxba.structure.layout import layout_for
 
 PROBLEMS = "scene:ladybug-49,scene:random-150,scene:ladybug-1197,scene:venice-1778"
 """Built-in scenes, since the machine with the GPU need not have any data."""

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from jaxba.methods import DEFAULT_METHOD
-from jaxba.padding import capacity_of
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.retriangulate import Retriangulation
 from jaxba.solve import Solution
 from jaxba.stepwise import IterationRecord
+from jaxba.structure.padding import capacity_of
 
 _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"
 

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.game.scenes import SceneClass
-from jaxba.layout import Layout, build_layout
 from jaxba.problem.bundle_problem import AnyArray, BundleProblem
 from jaxba.problem.options import StepOptions
+from jaxba.structure.layout import Layout, build_layout
 
 
 def class_layout(kind: SceneClass, options: StepOptions) -> Layout:

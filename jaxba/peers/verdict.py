@@ -17,7 +17,6 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.layout import Layout, layout_for
 from jaxba.linearize import linearize
 from jaxba.lm import LMState, Proposal, StepInfo, initial_state, judge
 from jaxba.normal import image
@@ -29,6 +28,7 @@ from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import StepOptions
 from jaxba.schur import Step
 from jaxba.solve import write_back
+from jaxba.structure.layout import Layout, layout_for
 
 FORGIVEN = 1e200
 """Cost that falls off with a step, pixels squared: more than any candidate costs that could be of use."""

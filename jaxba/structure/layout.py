@@ -5,7 +5,7 @@ up to `t` observations owns `t x n` slots, so the sum over a point's observation
 `t`. Sums over a camera, or over a block of the reduced camera system, are trees: rows are gathered in
 chunks of fixed width that belong to one target, summed densely, and the partial sums again, until one row
 a target is left. Nothing is ever scattered. Padding points at a slot without observation, whose values are
-exactly zero. Where sizes are padded (padding.py) there are no buckets, and sums over points are trees too.
+exactly zero. Where sizes are padded (structure/padding.py) there are no buckets, and sums over points are trees too.
 
 Everything is made once per problem on the host with vectorised NumPy.
 """
@@ -18,16 +18,16 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.clusters import ClusterLayout, cluster_layout
-from jaxba.density import is_dense
-from jaxba.padding import Capacity, room_for
-from jaxba.pairs import PairLayout, pair_layout
-from jaxba.partition import Partition, partition_layout
 from jaxba.problem.bundle_problem import AnyArray, BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.slots import Bucket, bucket_slots, padded_slots
-from jaxba.ties import LensTies, lens_ties
-from jaxba.trees import sorted_by, sum_tree, with_spare_row
+from jaxba.structure.camera_clusters import ClusterLayout, cluster_layout
+from jaxba.structure.covisibility import PairLayout, pair_layout
+from jaxba.structure.density import is_dense
+from jaxba.structure.padding import Capacity, room_for
+from jaxba.structure.random_partitions import Partition, partition_layout
+from jaxba.structure.shared_intrinsics import LensTies, lens_ties
+from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
+from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
@@ -55,7 +55,7 @@ class Layout:
     """Problem index of the points of each bucket; padding repeats an index out of range."""
 
     point_levels: tuple[Int[AnyArray, "_ _"], ...] | None
-    """Tree from slots to points where sizes are padded (padding.py); buckets are summed as they stand."""
+    """Tree from slots to points where sizes are padded (structure/padding.py); buckets are summed as they stand."""
 
     camera_levels: tuple[Int[AnyArray, "_ _"], ...]
     """Tree from slots to cameras. The rows of its first level, one after the other, are the *order of the cameras*; an

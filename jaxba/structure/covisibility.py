@@ -1,6 +1,6 @@
 """Which pairs of observations multiply into which block of the reduced camera system.
 
-Observations are named by their place in the order of the cameras (layout.py): a block reads two short stretches of
+Observations are named by their place in the order of the cameras (structure/layout.py): a block reads two short stretches of
 memory then, where its observations would be scattered over all slots.
 """
 
@@ -13,10 +13,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxba.ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
-from jaxba.padding import Capacity, room_for
 from jaxba.problem.bundle_problem import AnyArray
-from jaxba.trees import TREE_WIDTH, Room, chunks_at_most, sorted_by, sum_tree
+from jaxba.structure.camera_ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
+from jaxba.structure.padding import Capacity, room_for
+from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, sorted_by, sum_tree
 
 PAIR_CHUNKS = (4, 8)
 """Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Int
 from scipy.sparse import csr_matrix
 
-from jaxba.clusters import shared_points
+from jaxba.structure.camera_clusters import shared_points
 
 TEMPERATURE = 10.0
 """Inverse temperature of the choice; larger is greedier. Source: the authors' code."""

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.padding import Capacity, room_for
-from jaxba.trees import TREE_WIDTH, sum_tree
+from jaxba.structure.padding import Capacity, room_for
+from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
 
 MAX_PADDING = 0.10
 """Largest share of slots that may be empty (design, section 3); one point of padding is there besides."""

@@ -7,7 +7,7 @@ sums, and its cameras and points never move.
 
 Up to half of the slots are waste, which makes an iteration up to twice as long or a little more. That is a good bargain
 while a solve is quicker than a compilation, so larger problems are left as they are (`capacity_of`). Few points lose
-more: with their padding they are too many for a matrix of their own size (`density.py`).
+more: with their padding they are too many for a matrix of their own size (`structure/density.py`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxtyping import Int
 
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem
 from jaxba.problem.options import REDUCED_SOLVERS, StepOptions
-from jaxba.trees import Room
+from jaxba.structure.sum_trees import Room
 
 LEAST_CAMERAS = 8
 """Smallest number of cameras."""
@@ -83,7 +83,7 @@ def capacity_of(problem: BundleProblem) -> Capacity | None:
         return None
     camera, point = np.asarray(problem.camera_index, np.int64), np.asarray(problem.point_index)
     tracks = np.bincount(point).astype(np.int64)
-    # a camera that sees a point twice: both orders of the two are listed (pairs.py)
+    # a camera that sees a point twice: both orders of the two are listed (structure/covisibility.py)
     _, times = np.unique(point * problem.num_cameras + camera, return_counts=True)
     pairs = int(np.sum(tracks * (tracks + 1) // 2) + np.sum(times * (times - 1) // 2))
     if pairs > MAX_PAIRS:
