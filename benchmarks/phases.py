@@ -18,11 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import camera, eliminate, lm, reduced
+from jaxba import eliminate, lm, reduced
 from jaxba.bench.sources import sources
 from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.dense import factor_and_solve
-from jaxba.linearize import cost, linearize, slot_frames
+from jaxba.model import camera
+from jaxba.model.linearize import cost, linearize, slot_frames
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.refine import refine_points

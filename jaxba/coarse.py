@@ -24,7 +24,7 @@ from jaxtyping import Float
 from jaxba.blocks import dense_blocks, pair_products
 from jaxba.dense import factor_panels
 from jaxba.eliminate import CameraSystem, PointSystem
-from jaxba.linearize import Linearization
+from jaxba.model.linearize import Linearization
 from jaxba.runtime.barriers import apart
 from jaxba.structure.camera_clusters import ClusterLayout
 from jaxba.structure.layout import Layout

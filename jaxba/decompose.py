@@ -30,7 +30,8 @@ from jaxba.eliminate import (
     eliminate_points,
     largest_gradient,
 )
-from jaxba.linearize import Linearization, linearize, point_terms, slot_frames
+from jaxba.model.linearize import Linearization, linearize, point_terms, slot_frames
+from jaxba.model.observations import point_passes, view_terms
 from jaxba.normal import image
 from jaxba.parts import Clusters
 from jaxba.problem.options import StepOptions
@@ -41,7 +42,6 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import take, total
 from jaxba.trial import NEGLIGIBLE, best_trial
-from jaxba.views import point_passes, view_terms
 
 LOCAL_FACTOR = 4.0
 """Factor on a cluster's own lambda after its step failed."""

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba import camera
 from jaxba.blocks3 import Cholesky3, cholesky3
-from jaxba.linearize import Linearization, normal_entries
+from jaxba.model import camera
+from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.single_loop import together
 from jaxba.structure.layout import Layout

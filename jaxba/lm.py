@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.decompose import Round, decomposed_round
 from jaxba.effort import Effort
-from jaxba.linearize import Present, cost, linearize, with_free_lenses
+from jaxba.model.linearize import Present, cost, linearize, with_free_lenses
 from jaxba.parts import Whole
 from jaxba.problem.bundle_problem import AnyArray, BundleProblem
 from jaxba.problem.options import StepOptions

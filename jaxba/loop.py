@@ -11,8 +11,8 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
-from jaxba.linearize import linearize, with_free_lenses
 from jaxba.lm import LMState, StepInfo, lm_step
+from jaxba.model.linearize import linearize, with_free_lenses
 from jaxba.problem.bundle_problem import AnyArray
 from jaxba.problem.options import StepOptions
 from jaxba.schur import largest_diagonal

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba import camera
+from jaxba.model import camera
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout
 

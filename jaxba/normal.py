@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 
 from jaxba.cg import conjugate_gradients
 from jaxba.eliminate import CameraSystem, PointSystem
-from jaxba.linearize import Linearization
+from jaxba.model.linearize import Linearization
 from jaxba.precondition import block_inverse
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.linearize import observation_costs, slot_frames
+from jaxba.model.linearize import observation_costs, slot_frames
 from jaxba.problem.options import StepOptions
 from jaxba.refine import Home, refine_points
 from jaxba.structure.layout import Layout

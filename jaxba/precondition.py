@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxba.coarse import Anchor, coarse_preconditioner
 from jaxba.eliminate import CameraSystem, PointSystem
-from jaxba.linearize import Linearization
+from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.barriers import materialized
 from jaxba.structure.layout import Layout

@@ -23,8 +23,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba import camera
 from jaxba.dense import solve_positive
+from jaxba.model import camera
 
 RIDGE = 64.0
 """Rounding units added to the scaled Gram matrix, whose steps may be nearly parallel."""

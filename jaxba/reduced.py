@@ -25,7 +25,7 @@ from jaxba.cg import conjugate_gradients
 from jaxba.coarse import Anchor
 from jaxba.dense import factor_and_solve, factor_panels
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
-from jaxba.linearize import Linearization
+from jaxba.model.linearize import Linearization
 from jaxba.precondition import block_inverse, preconditioner, series
 from jaxba.problem.bundle_problem import AnyArray
 from jaxba.problem.options import StepOptions

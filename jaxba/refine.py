@@ -25,14 +25,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba import camera
 from jaxba.blocks3 import Cholesky3, cholesky3
-from jaxba.linearize import point_terms
+from jaxba.model import camera
+from jaxba.model.linearize import point_terms
+from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
 from jaxba.runtime.single_loop import together
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sum
-from jaxba.views import Views, point_passes
 
 INITIAL_DAMPING = 1e-6
 """Relative damping of a point's first step: plain Gauss-Newton but for parallel rays."""

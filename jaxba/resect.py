@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba import camera
 from jaxba.dense import solve_positive
-from jaxba.linearize import linearize, observation_costs, with_free_lenses
+from jaxba.model import camera
+from jaxba.model.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.barriers import apart
 from jaxba.structure.layout import Layout

@@ -21,8 +21,9 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxba.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.lm import initial_state
+from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
+from jaxba.model.observations import Views, point_passes
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.losses import Loss
@@ -33,7 +34,6 @@ from jaxba.runtime.compilation import program, run_alone, stages, way_after
 from jaxba.solve import explain_start
 from jaxba.structure.layout import Layout, build_layout
 from jaxba.triangulate import midpoints
-from jaxba.views import Views, point_passes
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
 """Where to start from besides the midpoint of the rays: multiples of a point's distance from the first camera that sees

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba import camera
 from jaxba.coarse import Anchor
 from jaxba.effort import Effort
 from jaxba.eliminate import (
@@ -24,7 +23,8 @@ from jaxba.eliminate import (
     eliminate_points,
     largest_gradient,
 )
-from jaxba.linearize import Linearization
+from jaxba.model import camera
+from jaxba.model.linearize import Linearization
 from jaxba.normal import image, solve_normal
 from jaxba.problem.options import StepOptions
 from jaxba.recall import on_manifold, with_remembered

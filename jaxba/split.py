@@ -23,7 +23,7 @@ from jaxtyping import Float
 from jaxba.blocks3 import Cholesky3, cholesky3
 from jaxba.dense import MIN_UNKNOWNS, factor_and_solve
 from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, damping_diagonal
-from jaxba.linearize import Linearization, normal_entries
+from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.precondition import block_inverse
 from jaxba.problem.options import StepOptions
 from jaxba.reduced import reduced_blocks

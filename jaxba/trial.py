@@ -32,7 +32,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.effort import Effort
-from jaxba.linearize import Present
+from jaxba.model.linearize import Present
 from jaxba.moves import move_cameras, step_between
 from jaxba.parts import Parts, Search
 from jaxba.problem.options import StepOptions

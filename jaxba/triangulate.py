@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxba import camera
 from jaxba.blocks3 import cholesky3
-from jaxba.linearize import slot_costs, view_residuals
+from jaxba.model import camera
+from jaxba.model.linearize import slot_costs, view_residuals
+from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
 from jaxba.refine import Home, gone, refine_points
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
-from jaxba.views import Views, point_passes
 
 UNDISTORTIONS = 10
 """Fixed-point iterations that turn a pixel into a ray; what they leave open the point's own steps make good ..."""

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from jaxba import camera
+from jaxba.model import camera
 from jaxba.problem import geometry
 
 THRESHOLD = np.sqrt(camera.SMALL_ANGLE_SQUARED)

@@ -17,10 +17,11 @@ import support
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from jaxba import BundleProblem, Loss, StepOptions, camera, initial_state
+from jaxba import BundleProblem, Loss, StepOptions, initial_state
 from jaxba.coarse import MODES, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.eliminate import Coordinates, camera_system, eliminate_points
-from jaxba.linearize import linearize
+from jaxba.model import camera
+from jaxba.model.linearize import linearize
 from jaxba.precondition import diagonal_blocks, preconditioner
 from jaxba.reduced import apply_reduced
 from jaxba.runtime.process import calm_blas

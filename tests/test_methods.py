@@ -19,8 +19,8 @@ from test_step import DAMPINGS, check_step
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
 from jaxba.decompose import LEAST_SHARE, decomposed_round
 from jaxba.eliminate import Coordinates, apply_reduced, camera_system, eliminate_points
-from jaxba.linearize import linearize
 from jaxba.methods import UnknownMethodError
+from jaxba.model.linearize import linearize
 from jaxba.runtime.compile_clock import CompileClock
 from jaxba.schur import solve_step
 from jaxba.split import agreed_gradient, clustered_step, eliminate_copies, repair, solve_clusters, split_right

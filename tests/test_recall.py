@@ -12,7 +12,8 @@ import support
 from support import start, step
 from test_cg import PRECONDITIONERS, SIZE, by_hand, right, spd
 
-from jaxba import LMState, StepOptions, camera, make_policy, random_scene, solve
+from jaxba import LMState, StepOptions, make_policy, random_scene, solve
+from jaxba.model import camera
 from jaxba.recall import on_manifold, with_remembered
 from jaxba.scenes import SceneConfig
 

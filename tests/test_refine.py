@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from support import bal_file, needs_data, published_loss, same_bits, start, step
 
 from jaxba import BundleProblem, Loss, StepOptions, read_bal, solve
-from jaxba.linearize import linearize, slot_frames
+from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
 from jaxba.refine import FARTHEST, LITTLE, Home, refine_points
 

@@ -19,7 +19,7 @@ from jaxba.dense import solve_positive
 from jaxba.game.bank import initial_costs
 from jaxba.game.scenes import SceneClass, make_scenes
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.linearize import cost, linearize
+from jaxba.model.linearize import cost, linearize
 from jaxba.parts import Whole
 from jaxba.problem import geometry
 from jaxba.resect import DAMPINGS, refine_cameras

@@ -21,7 +21,7 @@ from jaxba import (
     solve,
     trial,
 )
-from jaxba.linearize import linearize, slot_frames
+from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
 from jaxba.refine import Home, refine_points
 from jaxba.triangulate import better_starts, midpoints, refine_from_starts

@@ -23,7 +23,7 @@ from jaxba.game.play import Trajectories, play
 from jaxba.game.scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.game.warm import warm_starts
-from jaxba.linearize import cost
+from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, StepOptions
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba import camera
+from jaxba.model import camera
 
 SceneFamily = Literal["wide", "paper"]
 """`wide`: every motion, depth, noise and start below. `paper`: 10 cameras that see 10 points, all of them."""

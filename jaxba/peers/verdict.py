@@ -17,8 +17,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.linearize import linearize
 from jaxba.lm import LMState, Proposal, StepInfo, initial_state, judge
+from jaxba.model.linearize import linearize
 from jaxba.normal import image
 from jaxba.peers.ceres import Run, step_of
 from jaxba.peers.colmap import pyceres

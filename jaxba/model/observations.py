@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxba import camera
+from jaxba.model import camera
 from jaxba.problem.bundle_problem import AnyArray
 from jaxba.runtime.barriers import materialized
 from jaxba.runtime.single_loop import in_haste, together

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba import camera
+from jaxba.model import camera
+from jaxba.model.observations import Views, view_terms
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
 from jaxba.runtime.barriers import apart
 from jaxba.runtime.compilation import traced_once
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take, total
-from jaxba.views import Views, view_terms
 
 
 class Present(NamedTuple):

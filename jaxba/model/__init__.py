@@ -1,0 +1,1 @@
+"""The camera model: residuals, cost and Jacobians of all observations."""
