@@ -18,10 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import eliminate, lm, reduced
+from jaxba import lm
 from jaxba.bench.sources import sources
-from jaxba.coarse import Anchor, coarse_preconditioner
-from jaxba.dense import factor_and_solve
+from jaxba.linear import reduced_system, schur
+from jaxba.linear.cholesky import factor_and_solve
+from jaxba.linear.two_level import Anchor, coarse_preconditioner
 from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, slot_frames
 from jaxba.problem.bundle_problem import BundleProblem
@@ -97,32 +98,36 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     damping = jnp.asarray(1e-4)
     yield phase("linearise", lambda la, s: linearize(la, s.cameras, s.points, plain.loss), state)
     linear = done["linearise"]
-    yield phase("eliminate", lambda la, li, d: eliminate.eliminate_points(la, li, d, plain), linear, damping)
+    yield phase("eliminate", lambda la, li, d: schur.eliminate_points(la, li, d, plain), linear, damping)
     points = done["eliminate"]
-    turn = eliminate.Coordinates.of(state.cameras, plain)
-    by_camera = lambda la, li, po, tu: eliminate.camera_system(la, li, po, tu, damping, plain)
+    turn = schur.Coordinates.of(state.cameras, plain)
+    by_camera = lambda la, li, po, tu: schur.camera_system(la, li, po, tu, damping, plain)
     yield phase("camera sums", by_camera, linear, points, turn)
     system = done["camera sums"]
     if layout.grid is not None:
-        yield phase("form", lambda la, li, po, sy: reduced.dense_system(la.grid, li, po, sy), linear, points, system)
+        yield phase(
+            "form", lambda la, li, po, sy: reduced_system.dense_system(la.grid, li, po, sy), linear, points, system
+        )
         factor = lambda _, m, x: factor_and_solve(m, x.reshape(-1))
         yield phase("factor", factor, done["form"], system.right)
     elif plain.forms_reduced_system:
-        yield phase("form", lambda la, li, po, sy: reduced.reduced_blocks(la, li, po, sy), linear, points, system)
-        solve = reduced.factor_blocks if plain.linear_solver == "explicit" else reduced.apply_blocks
+        yield phase(
+            "form", lambda la, li, po, sy: reduced_system.reduced_blocks(la, li, po, sy), linear, points, system
+        )
+        solve = reduced_system.factor_blocks if plain.linear_solver == "explicit" else reduced_system.apply_blocks
         name = "factor" if plain.linear_solver == "explicit" else "one product"
         yield phase(name, lambda la, b, x: solve(la, b, x), done["form"], system.right)
     else:
-        product = lambda la, li, po, sy, x: eliminate.apply_reduced(la, li, po, sy, x)
+        product = lambda la, li, po, sy, x: schur.apply_reduced(la, li, po, sy, x)
         yield phase("one product", product, linear, points, system, system.right)
     frames = camera.frames(state.cameras)
     anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), state.points)
     if plain.uses_clusters:
         coarse = lambda la, li, po, sy, an, x: coarse_preconditioner(la, li, po, sy, an)(x)
         yield phase("coarse system", coarse, linear, points, system, anchor, system.right)
-    whole = lambda la, li, po, sy, an: reduced.solve_reduced(la, li, po, sy, an, plain, plain.cg_forcing)
+    whole = lambda la, li, po, sy, an: reduced_system.solve_reduced(la, li, po, sy, an, plain, plain.cg_forcing)
     yield phase("reduced solve", whole, linear, points, system, anchor)
-    back = lambda la, li, po, x: eliminate.back_substitute(la, li, po, x)
+    back = lambda la, li, po, x: schur.back_substitute(la, li, po, x)
     yield phase("back-substitute", back, linear, points, system.right)
     yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), state)
     count = options.refine_points

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.blocks3 import cholesky3
-from jaxba.eliminate import (
+from jaxba.linear.cholesky3 import cholesky3
+from jaxba.linear.schur import (
     Coordinates,
     back_substitute,
     camera_system,

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.cg import conjugate_gradients
-from jaxba.eliminate import CameraSystem, PointSystem
+from jaxba.linear.conjugate_gradients import conjugate_gradients
+from jaxba.linear.preconditioners import block_inverse
+from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.model.linearize import Linearization
-from jaxba.precondition import block_inverse
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, point_sums, take_each, tree_sum

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.dense import solve_positive
+from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
 
 RIDGE = 64.0

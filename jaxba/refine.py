@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.blocks3 import Cholesky3, cholesky3
+from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import point_terms
 from jaxba.model.observations import Views, point_passes

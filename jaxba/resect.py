@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.dense import solve_positive
+from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
 from jaxba.model.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions

@@ -1,6 +1,6 @@
 """One damped step: eliminate the points, solve for the cameras, carry back to the points.
 
-The step solves `(H + D) d = -g`. Elimination: eliminate.py; solvers of the reduced camera system: reduced.py.
+The step solves `(H + D) d = -g`. Elimination: linear/schur.py; solvers of the reduced camera system: linear/reduced_system.py.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.coarse import Anchor
 from jaxba.effort import Effort
-from jaxba.eliminate import (
+from jaxba.linear.reduced_system import solve_reduced
+from jaxba.linear.schur import (
     CameraSystem,
     Coordinates,
     PointSystem,
@@ -23,12 +23,12 @@ from jaxba.eliminate import (
     eliminate_points,
     largest_gradient,
 )
+from jaxba.linear.two_level import Anchor
 from jaxba.model import camera
 from jaxba.model.linearize import Linearization
 from jaxba.normal import image, solve_normal
 from jaxba.problem.options import StepOptions
 from jaxba.recall import on_manifold, with_remembered
-from jaxba.reduced import solve_reduced
 from jaxba.split import clustered_step
 from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum

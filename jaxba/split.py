@@ -20,13 +20,13 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.blocks3 import Cholesky3, cholesky3
-from jaxba.dense import MIN_UNKNOWNS, factor_and_solve
-from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, damping_diagonal
+from jaxba.linear.cholesky import MIN_UNKNOWNS, factor_and_solve
+from jaxba.linear.cholesky3 import Cholesky3, cholesky3
+from jaxba.linear.preconditioners import block_inverse
+from jaxba.linear.reduced_system import reduced_blocks
+from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, damping_diagonal
 from jaxba.model.linearize import Linearization, normal_entries
-from jaxba.precondition import block_inverse
 from jaxba.problem.options import StepOptions
-from jaxba.reduced import reduced_blocks
 from jaxba.runtime.barriers import after
 from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition

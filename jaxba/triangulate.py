@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxba.blocks3 import cholesky3
+from jaxba.linear.cholesky3 import cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import slot_costs, view_residuals
 from jaxba.model.observations import Views, point_passes

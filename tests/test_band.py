@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba.band import band_factor, band_factor_and_solve, band_rows
+from jaxba.linear.band_cholesky import band_factor, band_factor_and_solve, band_rows
 from jaxba.runtime.process import calm_blas
 from jaxba.structure.camera_ordering import TILE_CAMERAS, Band, band_of
 

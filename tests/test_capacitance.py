@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import support
 
-from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene, reduced
-from jaxba.capacitance import capacitance_solve
-from jaxba.eliminate import CameraSystem
+from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene
+from jaxba.linear import reduced_system
+from jaxba.linear.schur import CameraSystem
+from jaxba.linear.woodbury import capacitance_solve
 from jaxba.runtime.process import calm_blas
 from jaxba.structure.density import has_few_points
 
@@ -134,7 +135,7 @@ def test_a_step_by_way_of_the_points_is_the_step_by_way_of_the_cameras(monkeypat
     assert has_few_points(*layout.grid.shape)
     before = initial_state(layout, problem, StepOptions())
     one = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
-    monkeypatch.setattr(reduced, "has_few_points", lambda points, cameras: False)
+    monkeypatch.setattr(reduced_system, "has_few_points", lambda points, cameras: False)
     other = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
     moved = lambda after: jax.tree.leaves(jax.tree.map(lambda a, b: np.asarray(a - b), after, before))
     for found, truth in zip(moved(one), moved(other), strict=True):

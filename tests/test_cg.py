@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba.cg import conjugate_gradients
+from jaxba.linear.conjugate_gradients import conjugate_gradients
 
 SIZE = 24
 ALWAYS = {"forcing": 0.0, "tolerance": 0.0}

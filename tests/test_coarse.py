@@ -18,12 +18,12 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from jaxba import BundleProblem, Loss, StepOptions, initial_state
-from jaxba.coarse import MODES, Anchor, camera_modes, cluster_sum, coarse_system
-from jaxba.eliminate import Coordinates, camera_system, eliminate_points
+from jaxba.linear.preconditioners import diagonal_blocks, preconditioner
+from jaxba.linear.reduced_system import apply_reduced
+from jaxba.linear.schur import Coordinates, camera_system, eliminate_points
+from jaxba.linear.two_level import MODES, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.model import camera
 from jaxba.model.linearize import linearize
-from jaxba.precondition import diagonal_blocks, preconditioner
-from jaxba.reduced import apply_reduced
 from jaxba.runtime.process import calm_blas
 from jaxba.structure import camera_clusters
 from jaxba.structure.layout import layout_for

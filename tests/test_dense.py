@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba import dense
-from jaxba.dense import MIN_UNKNOWNS, PANEL, Panels, factor_and_solve, factor_panels
+from jaxba.linear import cholesky
+from jaxba.linear.cholesky import MIN_UNKNOWNS, PANEL, Panels, factor_and_solve, factor_panels
 from jaxba.runtime.process import calm_blas
 
 solve = jax.jit(factor_and_solve)
@@ -100,8 +100,8 @@ def test_panels_multiply_back_to_the_matrix(n):
 @pytest.mark.parametrize(("n", "sizes"), [(32, [8, 8, 8, 8]), (33, [9, 9, 9, 6]), (41, [11, 11, 11, 8])])
 def test_large_systems_get_wider_panels_instead_of_more(monkeypatch, n, sizes):
     """As with more than 24 panels of 128, at the size of a test."""
-    monkeypatch.setattr(dense, "PANEL", 8)
-    monkeypatch.setattr(dense, "MAX_PANELS", 4)
+    monkeypatch.setattr(cholesky, "PANEL", 8)
+    monkeypatch.setattr(cholesky, "MAX_PANELS", 4)
     matrix, right = spd(n, condition=100), np.random.default_rng(1).normal(size=n)
     panels, found = jax.jit(lambda a, b: ((p := factor_panels(a)), p.solve(b)))(matrix, right)
     assert [len(inverse) for inverse in panels.inverses] == sizes

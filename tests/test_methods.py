@@ -18,7 +18,7 @@ from test_step import DAMPINGS, check_step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
 from jaxba.decompose import LEAST_SHARE, decomposed_round
-from jaxba.eliminate import Coordinates, apply_reduced, camera_system, eliminate_points
+from jaxba.linear.schur import Coordinates, apply_reduced, camera_system, eliminate_points
 from jaxba.methods import UnknownMethodError
 from jaxba.model.linearize import linearize
 from jaxba.runtime.compile_clock import CompileClock

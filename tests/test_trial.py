@@ -15,10 +15,10 @@ from scipy.optimize import least_squares
 from support import same_bits, start, step
 
 from jaxba import BundleProblem, Layout, LMState, StepOptions, lm_step, make_policy, solve, trial
-from jaxba.dense import solve_positive
 from jaxba.game.bank import initial_costs
 from jaxba.game.scenes import SceneClass, make_scenes
 from jaxba.game.slots import class_layout, with_scene
+from jaxba.linear.cholesky import solve_positive
 from jaxba.model.linearize import cost, linearize
 from jaxba.parts import Whole
 from jaxba.problem import geometry

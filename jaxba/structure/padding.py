@@ -35,7 +35,7 @@ LEAST_PAIRS = 4
 """Pairs per slot for which there is room anyway: 20 cameras of kitti00vo have 3.4 per observation."""
 
 MAX_CAMERAS = 128
-"""More cameras are not padded: a dense system of 1350 unknowns takes 11 ms to factor (dense.py), and long sequences are
+"""More cameras are not padded: a dense system of 1350 unknowns takes 11 ms to factor (linear/cholesky.py), and long sequences are
 better factored as bands."""
 
 MAX_OBSERVATIONS = 1 << 17

@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.dense import factor_and_solve
+from jaxba.linear.cholesky import factor_and_solve
 from jaxba.problem.intrinsics import LENS_SIZE, AnyArray, Lenses
 
 POSE_SIZE = 6

@@ -19,8 +19,8 @@ from jax import Array
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
-from jaxba.dense import factor_and_solve
-from jaxba.eliminate import CameraSystem
+from jaxba.linear.cholesky import factor_and_solve
+from jaxba.linear.schur import CameraSystem
 
 
 def capacitance_solve(wide: Float[Array, "unknowns columns"], system: CameraSystem) -> Float[Array, "cameras 9"]:

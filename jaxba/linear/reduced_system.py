@@ -18,15 +18,15 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxba.band import band_factor, band_factor_and_solve
-from jaxba.blocks import dense_blocks, pair_products
-from jaxba.capacitance import capacitance_solve
-from jaxba.cg import conjugate_gradients
-from jaxba.coarse import Anchor
-from jaxba.dense import factor_and_solve, factor_panels
-from jaxba.eliminate import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
+from jaxba.linear.band_cholesky import band_factor, band_factor_and_solve
+from jaxba.linear.blocks import dense_blocks, pair_products
+from jaxba.linear.cholesky import factor_and_solve, factor_panels
+from jaxba.linear.conjugate_gradients import conjugate_gradients
+from jaxba.linear.preconditioners import block_inverse, preconditioner, series
+from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
+from jaxba.linear.two_level import Anchor
+from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
-from jaxba.precondition import block_inverse, preconditioner, series
 from jaxba.problem.bundle_problem import AnyArray
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.barriers import apart

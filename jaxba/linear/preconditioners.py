@@ -1,7 +1,7 @@
 """Preconditioners of the reduced camera system.
 
 Source: Agarwal et al. 2010 (block diagonals), Weber et al. 2023 (power series, Ceres calls it SPSE); two levels:
-coarse.py.
+linear/two_level.py.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from jax import Array, lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
-from jaxba.coarse import Anchor, coarse_preconditioner
-from jaxba.eliminate import CameraSystem, PointSystem
+from jaxba.linear.schur import CameraSystem, PointSystem
+from jaxba.linear.two_level import Anchor, coarse_preconditioner
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.barriers import materialized

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.blocks3 import Cholesky3, cholesky3
+from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.blocks import dense_blocks, pair_products
-from jaxba.dense import factor_panels
-from jaxba.eliminate import CameraSystem, PointSystem
+from jaxba.linear.blocks import dense_blocks, pair_products
+from jaxba.linear.cholesky import factor_panels
+from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.model.linearize import Linearization
 from jaxba.runtime.barriers import apart
 from jaxba.structure.camera_clusters import ClusterLayout

@@ -1,0 +1,1 @@
+"""The damped linear system: Schur complement, factorisations, conjugate gradients, preconditioners."""
