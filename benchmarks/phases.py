@@ -27,8 +27,8 @@ from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, slot_frames
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.refine import refine_points
-from jaxba.resect import refine_cameras
+from jaxba.refinement.cameras import refine_cameras
+from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
 from jaxba.structure.layout import Layout, layout_for
 

@@ -2,7 +2,7 @@
 
 One round: points that several clusters see stand still, so that clusters share neither a variable nor a residual. Each
 takes a damped step of its own cameras and of the points that it alone sees, with the embedded iterations, camera rounds
-and trials of any other step (`trial.py`), and keeps it only if its own cost falls. Then cameras stand still and every
+and trials of any other step (`refinement/trial.py`), and keeps it only if its own cost falls. Then cameras stand still and every
 separator takes a damped step of its own, or embedded iterations, kept under the same condition. The cost of the whole
 can only fall. The next round draws other clusters.
 
@@ -33,15 +33,15 @@ from jaxba.linear.schur import (
 from jaxba.model.linearize import Linearization, linearize, point_terms, slot_frames
 from jaxba.model.observations import point_passes, view_terms
 from jaxba.normal import image
-from jaxba.parts import Clusters
 from jaxba.problem.options import StepOptions
-from jaxba.refine import Home, refine_points
+from jaxba.refinement.points import Home, refine_points
+from jaxba.refinement.subproblems import Clusters
+from jaxba.refinement.trial import NEGLIGIBLE, best_trial
 from jaxba.schur import Step
 from jaxba.split import solve_clusters
 from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import take, total
-from jaxba.trial import NEGLIGIBLE, best_trial
 
 LOCAL_FACTOR = 4.0
 """Factor on a cluster's own lambda after its step failed."""

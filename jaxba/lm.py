@@ -16,12 +16,12 @@ from jaxtyping import Bool, Float, Int
 from jaxba.decompose import Round, decomposed_round
 from jaxba.effort import Effort
 from jaxba.model.linearize import Present, cost, linearize, with_free_lenses
-from jaxba.parts import Whole
 from jaxba.problem.bundle_problem import AnyArray, BundleProblem
 from jaxba.problem.options import StepOptions
+from jaxba.refinement.subproblems import Whole
+from jaxba.refinement.trial import Trial, best_trial
 from jaxba.schur import Step, solve_step
 from jaxba.structure.layout import Layout, partition_of
-from jaxba.trial import Trial, best_trial
 
 
 class LMState(NamedTuple):

@@ -28,12 +28,12 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
-from jaxba.refine import refine_points
+from jaxba.refinement.midpoints import midpoints
+from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import program, run_alone, stages, way_after
 from jaxba.solve import explain_start
 from jaxba.structure.layout import Layout, build_layout
-from jaxba.triangulate import midpoints
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
 """Where to start from besides the midpoint of the rays: multiples of a point's distance from the first camera that sees

@@ -39,7 +39,7 @@ class Step(NamedTuple):
 
     cameras: Float[Array, "9 cameras"]  # in the coordinates of the options
     points: Float[Array, "3 points"]
-    # of the whole, or of every part that is judged by itself (parts.py):
+    # of the whole, or of every part that is judged by itself (refinement/subproblems.py):
     slope: Float[Array, "*parts"]  # -g.d = d.(H + D) d, pixels^2
     damped: Float[Array, "*parts"]  # d.D d, pixels^2; of a step that solves no system, what -g.d exceeds d.H d by
     gradient_max: Float[Array, ""]  # largest entry of the gradient before the step

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from support import same_bits
 
 from jaxba import BundleProblem, StepOptions, build_layout, solve
-from jaxba.moves import LARGEST_ZOOM, move_cameras, step_between
 from jaxba.problem import geometry
 from jaxba.problem.intrinsics import Lenses
+from jaxba.refinement.retraction import LARGEST_ZOOM, move_cameras, step_between
 
 PIXELS = StepOptions(lens_step="pixels")
 FILE = StepOptions()

@@ -19,7 +19,7 @@ from support import bal_file, needs_data, published_loss, same_bits, start, step
 from jaxba import BundleProblem, Loss, StepOptions, read_bal, solve
 from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
-from jaxba.refine import FARTHEST, LITTLE, Home, refine_points
+from jaxba.refinement.points import FARTHEST, LITTLE, Home, refine_points
 
 pytestmark = pytest.mark.step
 

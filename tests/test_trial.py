@@ -14,17 +14,17 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from support import same_bits, start, step
 
-from jaxba import BundleProblem, Layout, LMState, StepOptions, lm_step, make_policy, solve, trial
+from jaxba import BundleProblem, Layout, LMState, StepOptions, lm_step, make_policy, solve
 from jaxba.game.bank import initial_costs
 from jaxba.game.scenes import SceneClass, make_scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.linear.cholesky import solve_positive
 from jaxba.model.linearize import cost, linearize
-from jaxba.parts import Whole
 from jaxba.problem import geometry
-from jaxba.resect import DAMPINGS, refine_cameras
-from jaxba.schur import solve_step
-from jaxba.trial import (
+from jaxba.refinement import trial
+from jaxba.refinement.cameras import DAMPINGS, refine_cameras
+from jaxba.refinement.subproblems import Whole
+from jaxba.refinement.trial import (
     FORESEEN,
     FREE,
     GOOD_GAIN,
@@ -35,6 +35,7 @@ from jaxba.trial import (
     WITHIN_REACH,
     best_trial,
 )
+from jaxba.schur import solve_step
 
 pytestmark = pytest.mark.step
 

@@ -11,20 +11,12 @@ import pytest
 from scipy.optimize import brentq
 from test_retriangulate import solved, strayed, thrown
 
-from jaxba import (
-    BundleProblem,
-    Loss,
-    StepOptions,
-    build_layout,
-    initial_state,
-    lm_step,
-    solve,
-    trial,
-)
+from jaxba import BundleProblem, Loss, StepOptions, build_layout, initial_state, lm_step, solve
 from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
-from jaxba.refine import Home, refine_points
-from jaxba.triangulate import better_starts, midpoints, refine_from_starts
+from jaxba.refinement import trial
+from jaxba.refinement.midpoints import better_starts, midpoints, refine_from_starts
+from jaxba.refinement.points import Home, refine_points
 
 LOSS = Loss()
 

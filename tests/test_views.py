@@ -14,7 +14,7 @@ from support import published_loss, start
 from jaxba import BundleProblem, Loss, StepOptions, build_layout, initial_state
 from jaxba.model.linearize import point_terms, slot_frames
 from jaxba.model.observations import point_passes
-from jaxba.refine import refine_points
+from jaxba.refinement.points import refine_points
 from jaxba.runtime.single_loop import in_haste
 from jaxba.structure.layout import Layout
 from jaxba.structure.padding import capacity_of

@@ -20,7 +20,7 @@ from jaxba.damping.rules import LARGEST, Ceres
 from jaxba.effort import Effort
 from jaxba.lm import StepInfo
 from jaxba.problem.options import LensStep, PointStarts, StepOptions
-from jaxba.trial import SHORTER
+from jaxba.refinement.trial import SHORTER
 
 Observation = Literal["scale-free", "paper", "released-code", "duration"]
 ActionMode = Literal["absolute", "relative"]

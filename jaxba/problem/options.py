@@ -76,25 +76,25 @@ class StepOptions:
 
     lens_step: LensStep = "file"
     """Coordinates in which a lens step is added: `file` adds to f, k1 and k2, as Ceres does with a BAL camera; `pixels`
-    to f and the distortion per pixel, which a zoom leaves alone (moves.py). They agree to first order."""
+    to f and the distortion per pixel, which a zoom leaves alone (refinement/retraction.py). They agree to first order."""
 
     refine_points: int = 0
     """Embedded point iterations after each camera step."""
 
     point_starts: PointStarts = "step"
     """Where embedded point iterations start: where the `step` took a point, or from the `rays` of its pixels, if that
-    is cheaper; at last from both (triangulate.py)."""
+    is cheaper; at last from both (refinement/midpoints.py)."""
 
     trials: int = 1
-    """How often a step is tried before it is rejected, each time a quarter as long; see `trial.py`."""
+    """How often a step is tried before it is rejected, each time a quarter as long; see `refinement/trial.py`."""
 
     camera_rounds: int = 0
     """Rounds in which first every camera, then every point is re-optimised alone, where a step did much less than the
-    linear model promised; one at most for a shortened candidate; see `trial.py`."""
+    linear model promised; one at most for a shortened candidate; see `refinement/trial.py`."""
 
     pattern_moves: int = 0
     """How often at most the way of an accepted step is repeated, each time twice as far, where the linear model did not
-    foresee what it did; see `trial.py`."""
+    foresee what it did; see `refinement/trial.py`."""
 
     intrinsics: Intrinsics = "free"
     """Whether focal lengths and distortions are optimised, as in BAL, or stay: the seed paper optimises poses and

@@ -14,11 +14,11 @@ from jaxtyping import Float, Int
 
 from jaxba.model.linearize import observation_costs, slot_frames
 from jaxba.problem.options import StepOptions
-from jaxba.refine import Home, refine_points
+from jaxba.refinement.midpoints import refine_from_starts
+from jaxba.refinement.points import Home, refine_points
 from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import point_sum, take, total, tree_sum
-from jaxba.triangulate import refine_from_starts
 
 
 class Search(NamedTuple):

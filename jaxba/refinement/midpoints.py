@@ -14,7 +14,7 @@ from jaxba.model import camera
 from jaxba.model.linearize import slot_costs, view_residuals
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
-from jaxba.refine import Home, gone, refine_points
+from jaxba.refinement.points import Home, gone, refine_points
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 

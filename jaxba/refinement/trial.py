@@ -16,7 +16,7 @@ what they see. Repairing that locally is cheap beside a linear solve, and lets b
    and one round of 2, as long as that costs less.
 
 None of it takes another linear solve, so it is all one iteration (design, section 2). Where a problem falls into parts
-that are judged by themselves (`parts.py`), each has its own share, rounds and verdict. Source: 1 is Jeong et al. 2012,
+that are judged by themselves (`refinement/subproblems.py`), each has its own share, rounds and verdict. Source: 1 is Jeong et al. 2012,
 "embedded point iterations", and Ceres' inner iterations; 2 is resection and intersection (Chen, Chen, Wang 2019,
 "Bundle adjustment revisited"), here as a repair of second-order steps; 3 is a backtracking line search; 4 is the
 pattern move of direct search (Hooke, Jeeves 1961, "Direct search solution of numerical and statistical problems").
@@ -33,11 +33,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.effort import Effort
 from jaxba.model.linearize import Present
-from jaxba.moves import move_cameras, step_between
-from jaxba.parts import Parts, Search
 from jaxba.problem.options import StepOptions
-from jaxba.refine import Home
-from jaxba.resect import refine_cameras
+from jaxba.refinement.cameras import refine_cameras
+from jaxba.refinement.points import Home
+from jaxba.refinement.retraction import move_cameras, step_between
+from jaxba.refinement.subproblems import Parts, Search
 from jaxba.schur import Step
 
 SHORTER = 0.25

@@ -1,0 +1,1 @@
+"""Around a step: points and cameras re-optimised alone, backtracking, pattern moves, acceptance."""
