@@ -30,7 +30,7 @@ import numpy as np
 from jaxba import lm
 from jaxba.bench.sources import sources
 from jaxba.choose import choose_linear_solver
-from jaxba.methods import DEFAULT_METHOD
+from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.naming import parse_solver
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Way, options_of

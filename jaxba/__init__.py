@@ -24,7 +24,7 @@ from jaxba.io import (
 )
 from jaxba.lm import LMState, StepInfo, initial_state, lm_step
 from jaxba.loop import History, solve_loop
-from jaxba.methods import METHODS, Method, make_method
+from jaxba.methods.registry import METHODS, Method, make_method
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss

@@ -217,7 +217,7 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_so
         problem: decides `auto`.
         options: of the step.
         linear_solver: a name, `auto`, or None to keep what the options say. A method that is a linear solver itself
-            (methods.py) has no choice to make: `auto` keeps it. Fixed intrinsics leave the explicit one.
+            (methods/registry.py) has no choice to make: `auto` keeps it. Fixed intrinsics leave the explicit one.
 
     Raises:
         ValueError: such a method, and another solver asked for by name.

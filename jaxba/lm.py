@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.decompose import Round, decomposed_round
 from jaxba.effort import Effort
+from jaxba.methods.ddlm import Round, decomposed_round
 from jaxba.model.linearize import Present, cost, linearize, with_free_lenses
 from jaxba.problem.bundle_problem import AnyArray, BundleProblem
 from jaxba.problem.options import StepOptions

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from jaxba.damping import DampingPolicy, Learned, is_learned, make_policy
 from jaxba.damping.agent import AgentConfig
 from jaxba.damping.registry import LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
-from jaxba.methods import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
+from jaxba.methods.registry import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
 from jaxba.problem.options import StepOptions
 
 DTYPES = ("float64", "float32", "mixed")

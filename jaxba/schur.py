@@ -24,12 +24,12 @@ from jaxba.linear.schur import (
     largest_gradient,
 )
 from jaxba.linear.two_level import Anchor
+from jaxba.methods.deeplm import image, solve_normal
+from jaxba.methods.stba import clustered_step
+from jaxba.methods.subspace import on_manifold, with_remembered
 from jaxba.model import camera
 from jaxba.model.linearize import Linearization
-from jaxba.normal import image, solve_normal
 from jaxba.problem.options import StepOptions
-from jaxba.recall import on_manifold, with_remembered
-from jaxba.split import clustered_step
 from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 

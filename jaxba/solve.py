@@ -21,7 +21,7 @@ from jaxba.choose import choose_linear_solver
 from jaxba.damping import DampingPolicy, Learned, make_policy
 from jaxba.lm import LMState, initial_state
 from jaxba.loop import Carry, History, solve_loop
-from jaxba.methods import DEFAULT_METHOD, make_method
+from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError

@@ -17,13 +17,20 @@ from support import bal_file, needs_data, paper, start, step
 from test_step import DAMPINGS, check_step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
-from jaxba.decompose import LEAST_SHARE, decomposed_round
 from jaxba.linear.schur import Coordinates, apply_reduced, camera_system, eliminate_points
-from jaxba.methods import UnknownMethodError
+from jaxba.methods.ddlm import LEAST_SHARE, decomposed_round
+from jaxba.methods.registry import UnknownMethodError
+from jaxba.methods.stba import (
+    agreed_gradient,
+    clustered_step,
+    eliminate_copies,
+    repair,
+    solve_clusters,
+    split_right,
+)
 from jaxba.model.linearize import linearize
 from jaxba.runtime.compile_clock import CompileClock
 from jaxba.schur import solve_step
-from jaxba.split import agreed_gradient, clustered_step, eliminate_copies, repair, solve_clusters, split_right
 from jaxba.structure.layout import partition_of
 from jaxba.termination import converged_in_cost
 
@@ -291,11 +298,11 @@ def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
 
 def test_clusters_of_ddlm_that_cannot_be_factored_have_no_gain_while_separators_move(monkeypatch):
     """A gain of 0 / 0 would become the next lambda."""
-    from jaxba import decompose
+    from jaxba.methods import ddlm
 
     options = replace(DECOMPOSED, refine_points=3)
     layout, state = start(support.tiny(), options)
-    monkeypatch.setattr(decompose, "solve_clusters", lambda *arguments: jnp.full_like(arguments[4], jnp.nan))
+    monkeypatch.setattr(ddlm, "solve_clusters", lambda *arguments: jnp.full_like(arguments[4], jnp.nan))
     part = partition_of(layout).at(0)
     found = jax.jit(lambda state: decomposed_round(layout, *state[:3], jnp.asarray(1e-3), part, options, 0.0))(state)
     assert found.accepted
@@ -307,19 +314,19 @@ def test_clusters_of_ddlm_that_cannot_be_factored_have_no_gain_while_separators_
 @pytest.mark.slow
 def test_a_cluster_of_ddlm_that_cannot_be_factored_leaves_the_others_alone(monkeypatch):
     """Also that of camera 0, which owns the empty slots that padding reads."""
-    from jaxba import decompose
+    from jaxba.methods import ddlm
 
     options = replace(DECOMPOSED, **EMBEDDED)
     layout, state = start(support.tiny(), options)
     part = partition_of(layout).at(0)
     label = np.asarray(part.label)
     expected = _round(layout, state, jnp.asarray(1e-3), part, options)
-    solve_all = decompose.solve_clusters
+    solve_all = ddlm.solve_clusters
 
     def fail(*arguments):
         return jnp.where((label == label[0])[:, None], jnp.nan, solve_all(*arguments))
 
-    monkeypatch.setattr(decompose, "solve_clusters", fail)
+    monkeypatch.setattr(ddlm, "solve_clusters", fail)
     found = jax.jit(lambda state: decomposed_round(layout, *state[:3], jnp.asarray(1e-3), part, options, 0.0))(state)
     mine, others = label == label[0], label != label[0]
     assert others.any()

@@ -13,8 +13,8 @@ from support import start, step
 from test_cg import PRECONDITIONERS, SIZE, by_hand, right, spd
 
 from jaxba import LMState, StepOptions, make_policy, random_scene, solve
+from jaxba.methods.subspace import on_manifold, with_remembered
 from jaxba.model import camera
-from jaxba.recall import on_manifold, with_remembered
 from jaxba.scenes import SceneConfig
 
 SERIES = StepOptions(linear_solver="power", power_order=3, remembered_steps=2)

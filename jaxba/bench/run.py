@@ -19,7 +19,7 @@ from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.bench.summary import write_text
 from jaxba.damping.registry import SUFFIX
-from jaxba.methods import DEFAULT_METHOD
+from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 from jaxba.peers import require
 from jaxba.problem import geometry

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from jaxba.bench.profile import NEVER, Reach
 from jaxba.damping import is_learned
-from jaxba.methods import DEFAULT_METHOD
+from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 
 FEWEST = 3

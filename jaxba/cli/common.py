@@ -42,7 +42,7 @@ def run_command(
         parsed = tyro.cli(arguments, args=argv, description=description)
         from jaxba.damping.learned import PolicyFileError
         from jaxba.damping.registry import UnknownPolicyError
-        from jaxba.methods import UnknownMethodError
+        from jaxba.methods.registry import UnknownMethodError
         from jaxba.naming import SolverNameError
         from jaxba.problem.bundle_problem import ProblemError
 

@@ -14,7 +14,7 @@ import tyro
 
 from jaxba.cli import common
 from jaxba.cli.interrupt import Interrupt
-from jaxba.methods import DEFAULT_METHOD
+from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.options import Intrinsics, LinearSolverChoice, Preconditioner
 from jaxba.runtime.compilation import Compilation
 

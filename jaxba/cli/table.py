@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxba.methods import DEFAULT_METHOD
+from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions

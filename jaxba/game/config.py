@@ -22,7 +22,7 @@ from jaxba.game.env import GameConfig
 from jaxba.game.loop import LoopConfig
 from jaxba.game.sac import SacConfig
 from jaxba.game.settings import SettingsError
-from jaxba.methods import DEFAULT_METHOD, MethodName, make_method
+from jaxba.methods.registry import DEFAULT_METHOD, MethodName, make_method
 from jaxba.problem.options import StepOptions
 
 METADATA_BYTES = 1 << 14
@@ -57,7 +57,7 @@ class TrainConfig:
     """Environments of each class of scenes."""
 
     method: MethodName = "lm"
-    """How a step is made (jaxba/methods.py). Best costs and the selection of scenes are those of plain LM."""
+    """How a step is made (jaxba/methods/registry.py). Best costs and the selection of scenes are those of plain LM."""
 
     cluster_cameras: int = 4
     """Cameras of a cluster at most, for methods with clusters: scenes are too small for those of real problems."""

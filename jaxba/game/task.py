@@ -25,7 +25,7 @@ from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
 from jaxba.game.play import Trajectories
 from jaxba.game.sac import Learner
 from jaxba.game.train import TrainError
-from jaxba.methods import DEFAULT_METHOD, make_method
+from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.problem.options import StepOptions
 
 BANK = "bank.npz"

@@ -18,7 +18,7 @@ from jaxba.bench.sources import Source
 from jaxba.damping import DampingPolicy
 from jaxba.game.bank import Bank, reach
 from jaxba.game.play import play
-from jaxba.methods import make_method
+from jaxba.methods.registry import make_method
 from jaxba.naming import SolverName, parse_solver
 from jaxba.paper import agents, rows, zero_net
 from jaxba.paper.agents import Agent

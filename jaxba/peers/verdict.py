@@ -18,8 +18,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.lm import LMState, Proposal, StepInfo, initial_state, judge
+from jaxba.methods.deeplm import image
 from jaxba.model.linearize import linearize
-from jaxba.normal import image
 from jaxba.peers.ceres import Run, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import half_turn

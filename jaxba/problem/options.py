@@ -36,8 +36,8 @@ class StepOptions:
     linear_solver: LinearSolver = "explicit"
     """`explicit`: form the reduced camera system and factor it. `sparse`: form its blocks, conjugate gradients.
     `implicit`: conjugate gradients without forming it. `power`: a power series, without forming it. `normal`: conjugate
-    gradients on all variables (normal.py). `clustered`: clusters of cameras, then repairs (split.py). `decomposed`:
-    clusters that are optimised beside each other (decompose.py). The last four are methods (methods.py)."""
+    gradients on all variables (methods/deeplm.py). `clustered`: clusters of cameras, then repairs (methods/stba.py). `decomposed`:
+    clusters that are optimised beside each other (methods/ddlm.py). The last four are methods (methods/registry.py)."""
 
     preconditioner: Preconditioner = "two-level"
     """Of conjugate gradients. `schur-jacobi`: the block diagonal of the reduced system. `two-level`: the same and a
@@ -57,7 +57,7 @@ class StepOptions:
 
     remembered_steps: int = 0
     """Camera steps of earlier iterations in whose span that of a power series, or of conjugate gradients on all
-    variables, is made the best one (recall.py). Other solvers were found to have no use for them."""
+    variables, is made the best one (methods/subspace.py). Other solvers were found to have no use for them."""
 
     block_steps: int = 1
     """Steps of each cluster in a round of domain decomposition; one, so that a round is one linear solve."""

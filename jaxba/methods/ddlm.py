@@ -30,15 +30,15 @@ from jaxba.linear.schur import (
     eliminate_points,
     largest_gradient,
 )
+from jaxba.methods.deeplm import image
+from jaxba.methods.stba import solve_clusters
 from jaxba.model.linearize import Linearization, linearize, point_terms, slot_frames
 from jaxba.model.observations import point_passes, view_terms
-from jaxba.normal import image
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.points import Home, refine_points
 from jaxba.refinement.subproblems import Clusters
 from jaxba.refinement.trial import NEGLIGIBLE, best_trial
 from jaxba.schur import Step
-from jaxba.split import solve_clusters
 from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import take, total
