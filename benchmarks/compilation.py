@@ -27,9 +27,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import lm
 from jaxba.bench.sources import sources
 from jaxba.choose import choose_linear_solver
+from jaxba.lm import step
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.naming import parse_solver
 from jaxba.runtime import process
@@ -77,17 +77,17 @@ def rows(location: str, solver: str, linear_solver: str, repeats: int) -> Iterat
     with jax.enable_x64(name.dtype == "float64"):
         dtype = jnp.dtype(name.dtype)
         layout = jax.device_put(layout_for(problem, options))
-        state = jax.jit(lm.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
+        state = jax.jit(step.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
         given = (layout, state, jnp.asarray(1e-4, dtype))
         parts: dict[str, tuple[Any, tuple[Any, ...]]] = {
-            "round": (lambda la, s, d: lm.lm_step(la, s, d, options), given)
+            "round": (lambda la, s, d: step.lm_step(la, s, d, options), given)
         }
         if options.in_two:
-            propose = lambda la, s, d: lm.propose(la, s, d, options)
+            propose = lambda la, s, d: step.propose(la, s, d, options)
             proposal = jax.jit(lambda *given: propose(*given))(*given)  # not the program that is timed
             parts = {
                 "propose": (propose, given),
-                "judge": (lambda la, s, d, p: lm.judge(la, s, d, p, options), (*given, proposal)),
+                "judge": (lambda la, s, d, p: step.judge(la, s, d, p, options), (*given, proposal)),
             }
         for part, (function, arguments) in parts.items():
             measured = {way: measure(function, arguments, way, repeats) for way in WAYS}

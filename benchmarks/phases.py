@@ -18,11 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba import lm
 from jaxba.bench.sources import sources
 from jaxba.linear import reduced_system, schur
 from jaxba.linear.cholesky import factor_and_solve
 from jaxba.linear.two_level import Anchor, coarse_preconditioner
+from jaxba.lm import step
 from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, slot_frames
 from jaxba.problem.bundle_problem import BundleProblem
@@ -94,7 +94,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
         return Phase(name, least, median, (size(arguments) + size(done[name])) / rate, compile_s)
 
     plain = replace(options, refine_points=0)
-    state = lm.initial_state(layout, problem, plain)
+    state = step.initial_state(layout, problem, plain)
     damping = jnp.asarray(1e-4)
     yield phase("linearise", lambda la, s: linearize(la, s.cameras, s.points, plain.loss), state)
     linear = done["linearise"]
@@ -135,9 +135,9 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
         refine = lambda la, s: refine_points(la, slot_frames(la, s.cameras), s.points, plain.loss, count)
         yield phase(f"refine {count}", refine, state)
         yield phase("refine cameras", lambda la, s: refine_cameras(la, s.cameras, s.points, plain), state)
-    yield phase("whole step", lambda la, s: lm.lm_step(la, s, damping, plain), state)
+    yield phase("whole step", lambda la, s: step.lm_step(la, s, damping, plain), state)
     if count:
-        yield phase(f"step, refine {count}", lambda la, s: lm.lm_step(la, s, damping, options), state)
+        yield phase(f"step, refine {count}", lambda la, s: step.lm_step(la, s, damping, options), state)
 
 
 def main() -> None:

@@ -22,7 +22,8 @@ from jaxba.io import (
     write_ply,
     write_problem,
 )
-from jaxba.lm import LMState, StepInfo, initial_state, lm_step
+from jaxba.lm.step import LMState, StepInfo, initial_state, lm_step
+from jaxba.lm.termination import Termination, Tolerances
 from jaxba.loop import History, solve_loop
 from jaxba.methods.registry import METHODS, Method, make_method
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -35,7 +36,6 @@ from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_trut
 from jaxba.solve import Solution, solve
 from jaxba.stepwise import IterationRecord
 from jaxba.structure.layout import Layout, build_layout
-from jaxba.termination import Termination, Tolerances
 
 __version__ = "0.1.0"
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxba.damping import DampingPolicy
+from jaxba.lm.termination import Tolerances
 from jaxba.loop import History
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
@@ -21,7 +22,6 @@ from jaxba.retriangulate import Retriangulation, retriangulate
 from jaxba.runtime.compile_clock import CompileClock
 from jaxba.solve import MAX_ITERATIONS, Solution, solve
 from jaxba.stepwise import IterationRecord
-from jaxba.termination import Tolerances
 
 MAX_ROUNDS = 5
 """Searches at most. Source: COLMAP, ba_global_max_refinements."""

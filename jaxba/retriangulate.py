@@ -21,7 +21,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float
 
-from jaxba.lm import initial_state
+from jaxba.lm.step import initial_state
 from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem import geometry

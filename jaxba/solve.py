@@ -19,7 +19,8 @@ import numpy as np
 
 from jaxba.choose import choose_linear_solver
 from jaxba.damping import DampingPolicy, Learned, make_policy
-from jaxba.lm import LMState, initial_state
+from jaxba.lm.step import LMState, initial_state
+from jaxba.lm.termination import Termination, Tolerances
 from jaxba.loop import Carry, History, solve_loop
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.naming import DTYPES
@@ -33,7 +34,6 @@ from jaxba.runtime.compile_clock import CompileClock
 from jaxba.stepwise import IterationRecord, run_stepwise
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
-from jaxba.termination import Termination, Tolerances
 
 MAX_ITERATIONS = 100
 """Iterations after which a solve has failed. Source: the paper."""

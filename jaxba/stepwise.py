@@ -18,13 +18,13 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy, decides_effort, effort_of
-from jaxba.lm import LMState, StepInfo, judge, lm_step, propose
+from jaxba.lm.step import LMState, StepInfo, judge, lm_step, propose
+from jaxba.lm.termination import Termination, Tolerances
 from jaxba.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.compilation import REPAIR, CompiledTogether, Stage, Way, program, way_after
 from jaxba.runtime.compile_clock import CompileClock
 from jaxba.structure.layout import Layout, turns_of
-from jaxba.termination import Termination, Tolerances
 
 
 class IterationRecord(NamedTuple):

@@ -27,7 +27,7 @@ from jaxba.game.play import Trajectories, play
 from jaxba.game.protocol import Environment
 from jaxba.game.scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.lm import LMState, lm_step
+from jaxba.lm.step import LMState, lm_step
 from jaxba.problem import geometry
 from jaxba.structure.layout import partition_of
 

@@ -18,6 +18,8 @@ from test_step import DAMPINGS, check_step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
 from jaxba.linear.schur import Coordinates, apply_reduced, camera_system, eliminate_points
+from jaxba.lm.damped_step import solve_step
+from jaxba.lm.termination import converged_in_cost
 from jaxba.methods.ddlm import LEAST_SHARE, decomposed_round
 from jaxba.methods.registry import UnknownMethodError
 from jaxba.methods.stba import (
@@ -30,9 +32,7 @@ from jaxba.methods.stba import (
 )
 from jaxba.model.linearize import linearize
 from jaxba.runtime.compile_clock import CompileClock
-from jaxba.schur import solve_step
 from jaxba.structure.layout import partition_of
-from jaxba.termination import converged_in_cost
 
 CLUSTERED = StepOptions(linear_solver="clustered", cluster_cameras=2)
 DECOMPOSED = StepOptions(linear_solver="decomposed", cluster_cameras=2)

@@ -15,7 +15,7 @@ from jax import monitoring
 from jaxba import SceneConfig, Termination, random_scene, solve, solve_and_retriangulate
 from jaxba.cli.solve import run
 from jaxba.io import write_problem
-from jaxba.lm import judge, lm_step, propose
+from jaxba.lm.step import judge, lm_step, propose
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import compilation
 from jaxba.runtime.compilation import (

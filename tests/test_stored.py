@@ -20,7 +20,7 @@ from test_programs import Compilations
 
 from jaxba import make_policy, solve
 from jaxba.io import write_problem
-from jaxba.lm import judge
+from jaxba.lm.step import judge
 from jaxba.problem.options import StepOptions
 from jaxba.retriangulate import retriangulate
 from jaxba.runtime import compilation, executable_cache

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from support import step_info
 
 from jaxba import Termination, Tolerances, solve
+from jaxba.lm.termination import HIDDEN_DECREASE, converged_in_cost, lost_in_rounding, termination_of
 from jaxba.problem import geometry
-from jaxba.termination import HIDDEN_DECREASE, converged_in_cost, lost_in_rounding, termination_of
 
 LIMIT = 30
 

@@ -19,6 +19,7 @@ from jaxba.game.bank import initial_costs
 from jaxba.game.scenes import SceneClass, make_scenes
 from jaxba.game.slots import class_layout, with_scene
 from jaxba.linear.cholesky import solve_positive
+from jaxba.lm.damped_step import solve_step
 from jaxba.model.linearize import cost, linearize
 from jaxba.problem import geometry
 from jaxba.refinement import trial
@@ -35,7 +36,6 @@ from jaxba.refinement.trial import (
     WITHIN_REACH,
     best_trial,
 )
-from jaxba.schur import solve_step
 
 pytestmark = pytest.mark.step
 

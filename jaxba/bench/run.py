@@ -19,6 +19,7 @@ from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.bench.summary import write_text
 from jaxba.damping.registry import SUFFIX
+from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.naming import SolverName, parse_solver
 from jaxba.peers import require
@@ -27,7 +28,6 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.process import out_of_memory
 from jaxba.solve import MAX_ITERATIONS, Solution, solve
 from jaxba.stepwise import IterationRecord
-from jaxba.termination import Tolerances
 
 try:
     import fcntl

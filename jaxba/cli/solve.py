@@ -168,11 +168,11 @@ def _solve(args: Arguments) -> int:
     from jaxba.data.places import resolve
     from jaxba.io import read_problem, write_colmap, write_problem
     from jaxba.io.files import open_output
+    from jaxba.lm.termination import Tolerances
     from jaxba.naming import SolverName
     from jaxba.retriangulate import Retriangulation
     from jaxba.solve import solve
     from jaxba.stepwise import IterationRecord
-    from jaxba.termination import Tolerances
 
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
     name = SolverName(args.damping, refine, args.dtype, args.method)

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.policy import ProblemInfo
 from jaxba.damping.rules import LARGEST, Ceres
-from jaxba.effort import Effort
-from jaxba.lm import StepInfo
+from jaxba.lm.effort import Effort
+from jaxba.lm.step import StepInfo
 from jaxba.problem.options import LensStep, PointStarts, StepOptions
 from jaxba.refinement.trial import SHORTER
 

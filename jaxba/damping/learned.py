@@ -19,8 +19,8 @@ from jaxtyping import Float
 
 from jaxba.damping.agent import AgentConfig, Memory, begin, config_from, damping_of, observe, record, with_effort
 from jaxba.damping.policy import ProblemInfo
-from jaxba.effort import Effort
-from jaxba.lm import StepInfo
+from jaxba.lm.effort import Effort
+from jaxba.lm.step import StepInfo
 from jaxba.problem.bundle_problem import AnyArray
 
 FORMAT = "jaxba-policy-1"

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.effort import Effort
-from jaxba.lm import StepInfo
+from jaxba.lm.effort import Effort
+from jaxba.lm.step import StepInfo
 
 
 class ProblemInfo(NamedTuple):

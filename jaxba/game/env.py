@@ -30,7 +30,7 @@ from jaxba.game.play import step_groups
 from jaxba.game.protocol import Step
 from jaxba.game.scenes import SceneClass
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.lm import LMState, StepInfo, begin_at, lm_step
+from jaxba.lm.step import LMState, StepInfo, begin_at, lm_step
 from jaxba.problem.options import StepOptions
 
 Reward = Literal["duration", "constant", "reduction", "reversed"]

@@ -21,7 +21,7 @@ from jaxba.game.bank import Bank
 from jaxba.game.play import Trajectories, step_groups
 from jaxba.game.scenes import SceneClass
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.lm import LMState, StepInfo, begin_at, lm_step
+from jaxba.lm.step import LMState, StepInfo, begin_at, lm_step
 from jaxba.problem.options import StepOptions
 
 GRID = tuple(10.0**decade for decade in (-8, -7, -6, -5, -4, -3, -2, -1, 0))

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from jaxba.game.play import step_groups
 from jaxba.game.scenes import SceneClass, Scenes
 from jaxba.game.slots import class_layout, with_scene
-from jaxba.lm import LMState, begin_at, lm_step
+from jaxba.lm.step import LMState, begin_at, lm_step
 from jaxba.problem.options import StepOptions
 
 ITERATIONS = 10

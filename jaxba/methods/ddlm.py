@@ -30,6 +30,7 @@ from jaxba.linear.schur import (
     eliminate_points,
     largest_gradient,
 )
+from jaxba.lm.damped_step import Step
 from jaxba.methods.deeplm import image
 from jaxba.methods.stba import solve_clusters
 from jaxba.model.linearize import Linearization, linearize, point_terms, slot_frames
@@ -38,7 +39,6 @@ from jaxba.problem.options import StepOptions
 from jaxba.refinement.points import Home, refine_points
 from jaxba.refinement.subproblems import Clusters
 from jaxba.refinement.trial import NEGLIGIBLE, best_trial
-from jaxba.schur import Step
 from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import take, total

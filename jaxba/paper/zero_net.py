@@ -28,9 +28,9 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.game.bank import Bank
 from jaxba.game.env import Episode, Game
 from jaxba.game.play import step_groups
-from jaxba.lm import StepInfo
+from jaxba.lm.step import StepInfo
+from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
-from jaxba.termination import Tolerances, converged_in_cost
 
 STEEPEST = 1.0
 """Largest slope of a cost's decimal logarithm in the action that a scene may contribute, so that one diverging step

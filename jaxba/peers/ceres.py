@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from jaxba.lm import StepInfo
+from jaxba.lm.step import StepInfo
+from jaxba.lm.termination import Termination, Tolerances
 from jaxba.loop import History
 from jaxba.naming import INNER
 from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
@@ -22,7 +23,6 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.solve import MAX_ITERATIONS, Solution, explain_start
 from jaxba.stepwise import IterationRecord
-from jaxba.termination import Termination, Tolerances
 
 _log = logging.getLogger(__name__)
 

@@ -17,7 +17,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.lm import LMState, Proposal, StepInfo, initial_state, judge
+from jaxba.lm.damped_step import Step
+from jaxba.lm.step import LMState, Proposal, StepInfo, initial_state, judge
 from jaxba.methods.deeplm import image
 from jaxba.model.linearize import linearize
 from jaxba.peers.ceres import Run, step_of
@@ -26,7 +27,6 @@ from jaxba.peers.model import half_turn
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import StepOptions
-from jaxba.schur import Step
 from jaxba.solve import write_back
 from jaxba.structure.layout import Layout, layout_for
 

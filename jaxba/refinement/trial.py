@@ -31,14 +31,14 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.effort import Effort
+from jaxba.lm.damped_step import Step
+from jaxba.lm.effort import Effort
 from jaxba.model.linearize import Present
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.points import Home
 from jaxba.refinement.retraction import move_cameras, step_between
 from jaxba.refinement.subproblems import Parts, Search
-from jaxba.schur import Step
 
 SHORTER = 0.25
 """Factor on the length of a step that was refused. Measured with 4 trials on Ladybug-49 under lambda 1e-6."""

@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.effort import Effort
 from jaxba.linear.reduced_system import solve_reduced
 from jaxba.linear.schur import (
     CameraSystem,
@@ -24,6 +23,7 @@ from jaxba.linear.schur import (
     largest_gradient,
 )
 from jaxba.linear.two_level import Anchor
+from jaxba.lm.effort import Effort
 from jaxba.methods.deeplm import image, solve_normal
 from jaxba.methods.stba import clustered_step
 from jaxba.methods.subspace import on_manifold, with_remembered

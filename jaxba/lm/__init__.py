@@ -1,0 +1,1 @@
+"""One Levenberg-Marquardt iteration, the records it keeps and the tests that end a solve."""
