@@ -1,4 +1,4 @@
-"""What the cost model of `choose.py` predicts, beside what the linear solvers take.
+"""What the cost model of `solver/cost_model.py` predicts, beside what the linear solvers take.
 
     python -m benchmarks.choice [PROBLEM ...] [--damping ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
 
@@ -21,10 +21,10 @@ from scipy.optimize import nnls
 import jaxba
 from benchmarks.suite import LARGE_SCENES, real_problems
 from jaxba.bench.sources import sources
-from jaxba.choose import SECONDS, Work, choose, work
-from jaxba.naming import parse_solver
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
+from jaxba.solver.cost_model import SECONDS, Work, choose, work
+from jaxba.solver.names import parse_solver
 
 
 class Timed(NamedTuple):

@@ -28,13 +28,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.bench.sources import sources
-from jaxba.choose import choose_linear_solver
 from jaxba.lm import step
 from jaxba.methods.registry import DEFAULT_METHOD
-from jaxba.naming import parse_solver
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Way, options_of
 from jaxba.runtime.single_loop import in_haste
+from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.names import parse_solver
 from jaxba.structure.layout import layout_for
 
 LONGEST = 10.0

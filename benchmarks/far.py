@@ -23,11 +23,11 @@ from benchmarks.padding import windows
 from benchmarks.suite import real_problems
 from jaxba import DampingPolicy, StepOptions, normalize, perturb, solve
 from jaxba.bench.sources import sources
-from jaxba.naming import parse_solver
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.preprocess import drop_invalid
 from jaxba.runtime import process
-from jaxba.solve import MAX_ITERATIONS
+from jaxba.solver.names import parse_solver
+from jaxba.solver.solve import MAX_ITERATIONS
 
 WINDOWS = (("kitti00vo", 14, 16), ("kittistereo00s", 6, 16), ("bulani1", 6, 14))
 """A part of a problem's name, how many windows it is cut into, and how many cameras a window has."""

@@ -24,9 +24,9 @@ from jaxba.game.evaluate import Score, score
 from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.play import Trajectories, play
 from jaxba.game.task import BANK, read_banks
-from jaxba.naming import parse_solver
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
+from jaxba.solver.names import parse_solver
 
 RULES = ("classic", "ceres", "gtsam", "nielsen", "theseus", "gauss-newton", "schedule")
 CONSTANTS = tuple(f"constant:1e{decade}" for decade in (-8, -6, -5, -4, -3, -2))

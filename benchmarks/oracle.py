@@ -26,13 +26,13 @@ import numpy as np
 from benchmarks.suite import real_problems
 from jaxba import DampingPolicy, LMState, StepOptions, initial_state, lm_step, make_policy, solve
 from jaxba.bench.sources import sources
-from jaxba.choose import choose_linear_solver
 from jaxba.cli.common import prepare_process
 from jaxba.damping.learned import Learned
 from jaxba.game.oracle import GRID, WIDTH
-from jaxba.naming import parse_solver
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
+from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.names import parse_solver
 from jaxba.structure.layout import layout_for
 
 TOLERANCES = (1e-3, 1e-4, 1e-6)

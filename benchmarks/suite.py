@@ -159,7 +159,7 @@ def _our_iteration(problem, repeats: int) -> tuple[float, str]:
 def _layout_seconds(problem: BundleProblem, repeats: int) -> float:
     """Median time on the host to sort the observations for the solver that `auto` takes."""
     from jaxba import StepOptions
-    from jaxba.choose import choose_linear_solver
+    from jaxba.solver.cost_model import choose_linear_solver
     from jaxba.structure.layout import layout_for
 
     options = choose_linear_solver(problem, StepOptions(), "auto")
@@ -213,8 +213,8 @@ def time_to_tolerance(
 def _solved(problem: BundleProblem, name: str, goal: float = -math.inf) -> tuple[float, float]:
     """Final cost, in float64 by NumPy, and seconds of a solve in one program that ends at the goal."""
     import jaxba
-    from jaxba.naming import parse_solver
     from jaxba.problem import geometry
+    from jaxba.solver.names import parse_solver
 
     solver = parse_solver(name)
     policy, options = solver.build()

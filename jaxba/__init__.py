@@ -1,6 +1,5 @@
 """Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or written."""
 
-from jaxba.alternate import solve_and_retriangulate
 from jaxba.damping import (
     POLICIES,
     Ceres,
@@ -24,17 +23,18 @@ from jaxba.io import (
 )
 from jaxba.lm.step import LMState, StepInfo, initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.loop import History, solve_loop
 from jaxba.methods.registry import METHODS, Method, make_method
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
-from jaxba.retriangulate import Retriangulation, retriangulate
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
-from jaxba.solve import Solution, solve
-from jaxba.stepwise import IterationRecord
+from jaxba.solver.alternation import solve_and_retriangulate
+from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.loop import History, solve_loop
+from jaxba.solver.retriangulate import Retriangulation, retriangulate
+from jaxba.solver.solve import Solution, solve
 from jaxba.structure.layout import Layout, build_layout
 
 __version__ = "0.1.0"

@@ -94,7 +94,7 @@ def test_converging_after_the_limit_is_a_failure():
 
 
 def test_the_solver_and_the_benchmark_agree_about_what_is_converged():
-    from jaxba.solve import Termination  # here, so that the pure functions are tested without the solver
+    from jaxba.solver.solve import Termination  # here, so that the pure functions are tested without the solver
 
     for reason in Termination:
         assert profile.converged(replace(FAST, termination=reason.name.lower())) == reason.converged

@@ -13,9 +13,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxba import BundleProblem, ProblemError, build_layout
-from jaxba.choose import choose_linear_solver, count_pairs, predict
 from jaxba.problem.options import StepOptions
 from jaxba.scenes import SceneConfig, random_scene
+from jaxba.solver.cost_model import choose_linear_solver, count_pairs, predict
 
 SEQUENCE = SceneConfig(
     cameras=300, points=6000, observations=24000, max_depth=10.0, gap_share=0.0, trajectory="lateral"
@@ -78,7 +78,7 @@ def test_the_counted_reach_is_that_of_the_layout():
 def test_what_is_not_counted_is_bounded_from_above(monkeypatch, limit):
     problem = random_scene(SEQUENCE, 0)
     exact = count_pairs(problem)
-    monkeypatch.setattr("jaxba.choose." + limit, 10)
+    monkeypatch.setattr("jaxba.solver.cost_model." + limit, 10)
     bound = count_pairs(problem)
     assert bound.pairs == exact.pairs
     assert exact.blocks < bound.blocks <= 300 * 301 // 2
@@ -142,7 +142,7 @@ def test_a_factorisation_beyond_the_machine_is_refused_where_there_is_no_choice(
 
 def test_a_solver_without_the_memory_for_it_is_not_chosen(monkeypatch):
     problem = random_scene(SEQUENCE, 0)
-    monkeypatch.setattr("jaxba.choose.MAX_BYTES", 1e6)
+    monkeypatch.setattr("jaxba.solver.cost_model.MAX_BYTES", 1e6)
     costs = predict(problem)
     assert costs.explicit == costs.sparse == np.inf
     assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "implicit"

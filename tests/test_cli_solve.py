@@ -321,7 +321,7 @@ def test_not_enough_memory_is_one_line(tiny, capsys, monkeypatch):
     def solve(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr(sys.modules["jaxba.solve"], "solve", solve)
+    monkeypatch.setattr(sys.modules["jaxba.solver.solve"], "solve", solve)
     assert run([str(tiny)]) == 2
     assert capsys.readouterr().err == "error: not enough memory\n"
 

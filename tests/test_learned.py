@@ -33,7 +33,7 @@ from jaxba.damping.learned import (
 )
 from jaxba.game import sac
 from jaxba.game.config import load
-from jaxba.naming import SolverName, parse_solver
+from jaxba.solver.names import SolverName, parse_solver
 
 AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0)
 

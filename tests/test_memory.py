@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxba import StepOptions, initial_state, like, lm_step, random_scene
-from jaxba.choose import BYTES_PER_OBSERVATION
+from jaxba.solver.cost_model import BYTES_PER_OBSERVATION
 from jaxba.structure.layout import layout_for
 
 

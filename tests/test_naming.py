@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from jaxba import POLICIES
 from jaxba.damping import UnknownPolicyError
-from jaxba.naming import DTYPES, SolverName, SolverNameError, parse_solver
+from jaxba.solver.names import DTYPES, SolverName, SolverNameError, parse_solver
 
 names = st.builds(
     SolverName,

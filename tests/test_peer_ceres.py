@@ -32,9 +32,9 @@ from jaxba import (
 from jaxba.bench import report
 from jaxba.bench.records import read_records
 from jaxba.cli.bench import run as run_bench
-from jaxba.naming import parse_solver
 from jaxba.problem import geometry
 from jaxba.runtime.compile_clock import CompileClock
+from jaxba.solver.names import parse_solver
 
 pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")
 pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")

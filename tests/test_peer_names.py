@@ -12,8 +12,8 @@ from jaxba.bench import run as bench_run
 from jaxba.bench.sources import sources
 from jaxba.cli.bench import run
 from jaxba.damping import Learned, UnknownPolicyError
-from jaxba.naming import PEERS, SolverName, SolverNameError, parse_solver
 from jaxba.problem.options import StepOptions
+from jaxba.solver.names import PEERS, SolverName, SolverNameError, parse_solver
 
 
 @pytest.mark.parametrize(

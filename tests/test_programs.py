@@ -95,7 +95,7 @@ def test_a_quickly_compiled_solve_is_the_same_solve(how):
 @pytest.mark.parametrize("how", [{}, {"linear_solver": "implicit"}, {"method": "ddlm"}, {"method": "stba"}], ids=str)
 def test_a_briskly_compiled_solve_is_the_same_solve(how, monkeypatch):
     full = solve(support.tiny(), "learned", **how, max_iterations=8, callback=lambda record: None)
-    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "stages", lambda part, _: (Stage("brisk", 100),))
+    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("brisk", 100),))
     brisk = solve(support.tiny(), "learned", **how, max_iterations=8, compilation="auto")
     assert (full.quick_iterations, brisk.quick_iterations) == (0, brisk.iterations)
     assert (brisk.iterations, brisk.accepted, brisk.termination) == (full.iterations, full.accepted, full.termination)
@@ -198,7 +198,7 @@ def test_the_optimised_program_takes_over_without_a_trace(watched, monkeypatch):
     full = solve(support.tiny(), "ceres")
     assert full.iterations > 2
     before = {"factored": (Stage("quick", 1),), "judge": (Stage("quick", 1), Stage("brisk", 1))}
-    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "stages", lambda part, _: before[part])
+    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: before[part])
     records = []
     callback = records.append if watched else None
     mixed = solve(support.tiny(), "ceres", compilation="auto", callback=callback)
@@ -253,6 +253,6 @@ def test_the_command_says_where_iterations_were_slow_by_design(tmp_path, capsys,
     assert " (all with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out
     assert run([*fast, "--compilation", "full"]) == 0
     assert "quickly" not in capsys.readouterr().out
-    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "stages", lambda part, _: (Stage("quick", 1),))
+    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("quick", 1),))
     assert run(fast) == 0
     assert " (1 of them with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out

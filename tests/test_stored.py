@@ -22,9 +22,9 @@ from jaxba import make_policy, solve
 from jaxba.io import write_problem
 from jaxba.lm.step import judge
 from jaxba.problem.options import StepOptions
-from jaxba.retriangulate import retriangulate
 from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import CompiledTogether, Stage, program, run_alone
+from jaxba.solver.retriangulate import retriangulate
 
 pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="tried on a CPU alone")
 
@@ -270,7 +270,7 @@ def test_what_jax_has_read_from_its_cache_is_not_written(folder, tmp_path):
 
 
 def test_both_ways_of_compiling_are_kept(folder, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("jaxba.solve"), "stages", lambda part, _: (Stage("quick", 1),))
+    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("quick", 1),))
     once = lambda: solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
     first = once()
     assert first.quick_iterations == 1

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import jaxba
 from benchmarks.phases import HEADING, bandwidth, measure, timed
 from jaxba.bench.sources import sources
-from jaxba.choose import choose
 from jaxba.problem.options import StepOptions
+from jaxba.solver.cost_model import choose
 from jaxba.structure.layout import layout_for
 
 PROBLEMS = "scene:ladybug-49,scene:random-150,scene:ladybug-1197,scene:venice-1778"

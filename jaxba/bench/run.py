@@ -21,13 +21,13 @@ from jaxba.bench.summary import write_text
 from jaxba.damping.registry import SUFFIX
 from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
-from jaxba.naming import SolverName, parse_solver
 from jaxba.peers import require
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.process import out_of_memory
-from jaxba.solve import MAX_ITERATIONS, Solution, solve
-from jaxba.stepwise import IterationRecord
+from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.names import SolverName, parse_solver
+from jaxba.solver.solve import MAX_ITERATIONS, Solution, solve
 
 try:
     import fcntl

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from jaxba.bench.profile import NEVER, Reach
 from jaxba.damping import is_learned
 from jaxba.methods.registry import DEFAULT_METHOD
-from jaxba.naming import SolverName, parse_solver
+from jaxba.solver.names import SolverName, parse_solver
 
 FEWEST = 3
 """Rules that make a virtual best: of the two yardsticks, which most tables have, one is nearly always the better."""

@@ -43,8 +43,8 @@ def run_command(
         from jaxba.damping.learned import PolicyFileError
         from jaxba.damping.registry import UnknownPolicyError
         from jaxba.methods.registry import UnknownMethodError
-        from jaxba.naming import SolverNameError
         from jaxba.problem.bundle_problem import ProblemError
+        from jaxba.solver.names import SolverNameError
 
         names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
         try:

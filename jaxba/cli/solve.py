@@ -159,7 +159,6 @@ def _solve(args: Arguments) -> int:
     common.check_writable("--log", args.log)
     if args.output and args.log and Path(args.output).resolve() == Path(args.log).resolve():
         raise common.UsageError(f"--output and --log name the same file, {args.output}")
-    from jaxba.alternate import solve_and_retriangulate
     from jaxba.bench.records import record_to_json
     from jaxba.bench.run import record_of
     from jaxba.bench.sources import embedded_sources
@@ -169,10 +168,11 @@ def _solve(args: Arguments) -> int:
     from jaxba.io import read_problem, write_colmap, write_problem
     from jaxba.io.files import open_output
     from jaxba.lm.termination import Tolerances
-    from jaxba.naming import SolverName
-    from jaxba.retriangulate import Retriangulation
-    from jaxba.solve import solve
-    from jaxba.stepwise import IterationRecord
+    from jaxba.solver.alternation import solve_and_retriangulate
+    from jaxba.solver.callback_loop import IterationRecord
+    from jaxba.solver.names import SolverName
+    from jaxba.solver.retriangulate import Retriangulation
+    from jaxba.solver.solve import solve
 
     refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
     name = SolverName(args.damping, refine, args.dtype, args.method)

@@ -11,9 +11,9 @@ from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.retriangulate import Retriangulation
-from jaxba.solve import Solution
-from jaxba.stepwise import IterationRecord
+from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.retriangulate import Retriangulation
+from jaxba.solver.solve import Solution
 from jaxba.structure.padding import capacity_of
 
 _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      lambda    ls_iter  iter_time  total_time"

@@ -26,7 +26,7 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
 LEARNED, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-plain", "learned-driver"
 """The shipped policies, each where it is the best: for a step with embedded iterations; for lambda alone
 (`learned+refine0`); and for lambda alone where another library makes the step and damps all variables alike. In the
-name of a solver `learned` means the one that fits (naming.py)."""
+name of a solver `learned` means the one that fits (solver/names.py)."""
 
 SHIPPED = {
     LEARNED: "default.safetensors",

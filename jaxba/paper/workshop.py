@@ -19,7 +19,6 @@ from jaxba.damping import DampingPolicy
 from jaxba.game.bank import Bank, reach
 from jaxba.game.play import play
 from jaxba.methods.registry import make_method
-from jaxba.naming import SolverName, parse_solver
 from jaxba.paper import agents, rows, zero_net
 from jaxba.paper.agents import Agent
 from jaxba.paper.config import PaperConfig
@@ -29,8 +28,9 @@ from jaxba.paper.store import Play, Store
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
-from jaxba.solve import solve
-from jaxba.stepwise import IterationRecord
+from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.names import SolverName, parse_solver
+from jaxba.solver.solve import solve
 
 LIMIT = profile.ITERATION_LIMIT
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from jaxba.naming import SolverName, SolverNameError
+from jaxba.solver.names import SolverName, SolverNameError
 
 NEEDS = {"pyceres": ("ceres", ("pyceres", "pycolmap"))}
 """By the peer's name: the extra that brings it, and the packages of that extra."""

@@ -15,14 +15,14 @@ from jaxtyping import Bool
 
 from jaxba.lm.step import StepInfo
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.loop import History
-from jaxba.naming import INNER
 from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
 from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.solve import MAX_ITERATIONS, Solution, explain_start
-from jaxba.stepwise import IterationRecord
+from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.loop import History
+from jaxba.solver.names import INNER
+from jaxba.solver.solve import MAX_ITERATIONS, Solution, explain_start
 
 _log = logging.getLogger(__name__)
 

@@ -27,7 +27,7 @@ from jaxba.peers.model import half_turn
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import StepOptions
-from jaxba.solve import write_back
+from jaxba.solver.solve import write_back
 from jaxba.structure.layout import Layout, layout_for
 
 FORGIVEN = 1e200

@@ -1,7 +1,7 @@
 """The whole solve: iterate the step under a damping policy until it converges.
 
-Without a callback the loop is one compiled program (loop.py). With one, or where compilation is in a hurry, the same
-iteration runs step by step from Python (stepwise.py).
+Without a callback the loop is one compiled program (solver/loop.py). With one, or where compilation is in a hurry, the same
+iteration runs step by step from Python (solver/callback_loop.py).
 """
 
 from __future__ import annotations
@@ -17,13 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba.choose import choose_linear_solver
 from jaxba.damping import DampingPolicy, Learned, make_policy
 from jaxba.lm.step import LMState, initial_state
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.loop import Carry, History, solve_loop
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
-from jaxba.naming import DTYPES
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import REDUCED_SOLVERS, StepOptions, check_count
@@ -31,7 +28,10 @@ from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Compilation, Part, Stage, options_of, program, run_alone, stages
 from jaxba.runtime.compile_clock import CompileClock
-from jaxba.stepwise import IterationRecord, run_stepwise
+from jaxba.solver.callback_loop import IterationRecord, run_stepwise
+from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.loop import Carry, History, solve_loop
+from jaxba.solver.names import DTYPES
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 
@@ -78,7 +78,7 @@ class Solution:
     """Seconds for compilation; nearly zero when an executable was at hand."""
 
     total_s: float
-    """Seconds for the iterations, and for searches between them (alternate.py)."""
+    """Seconds for the iterations, and for searches between them (solver/alternation.py)."""
 
     capacity: Capacity | None = None
     """Sizes to which the problem was padded; None where it was not."""
@@ -113,7 +113,7 @@ def solve(
         damping: a policy, or the name of one (`jaxba.make_policy`).
         options: how a step is made; if left out, as a learned policy was trained (`AgentConfig.step_options`).
         method: how a step is made (`jaxba.METHODS`); fixes the options that make it.
-        linear_solver: overrides that of the options; `auto` asks the cost model in choose.py.
+        linear_solver: overrides that of the options; `auto` asks the cost model in solver/cost_model.py.
         max_iterations: limit of linear solves.
         tolerances: convergence tests.
         dtype: `float64` or `float32`, the type of all arithmetic; `mixed` is float64 with the reduced camera system

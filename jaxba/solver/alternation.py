@@ -15,13 +15,13 @@ import numpy as np
 
 from jaxba.damping import DampingPolicy
 from jaxba.lm.termination import Tolerances
-from jaxba.loop import History
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.retriangulate import Retriangulation, retriangulate
 from jaxba.runtime.compile_clock import CompileClock
-from jaxba.solve import MAX_ITERATIONS, Solution, solve
-from jaxba.stepwise import IterationRecord
+from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.loop import History
+from jaxba.solver.retriangulate import Retriangulation, retriangulate
+from jaxba.solver.solve import MAX_ITERATIONS, Solution, solve
 
 MAX_ROUNDS = 5
 """Searches at most. Source: COLMAP, ba_global_max_refinements."""

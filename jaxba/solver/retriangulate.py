@@ -4,7 +4,7 @@ Bundle adjustment moves every point downhill from where it is. A point that a bo
 took into a valley of its own stays there: behind its cameras, far beyond what it shows, or at a depth where two wrong
 rays nearly meet. After convergence such points are what is left of the cost that can still be had, and it can be had
 without another linear solve: given the cameras every point is a problem of three unknowns, which is solved from several
-depths. Then the adjustment goes on (alternate.py).
+depths. Then the adjustment goes on (solver/alternation.py).
 
 Source of the alternation: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited",
 section 4.4), bundle adjustment and re-triangulation in turns. Measured: docs/game-tried.md, "Cameras and points".
@@ -32,7 +32,7 @@ from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import program, run_alone, stages, way_after
-from jaxba.solve import explain_start
+from jaxba.solver.solve import explain_start
 from jaxba.structure.layout import Layout, build_layout
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)

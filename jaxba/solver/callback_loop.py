@@ -1,6 +1,6 @@
 """The loop of a solve step by step, for whoever watches it or is in a hurry.
 
-The same iteration as in loop.py, run from Python: every record carries the wall-clock time at which it was finished,
+The same iteration as in solver/loop.py, run from Python: every record carries the wall-clock time at which it was finished,
 and quickly compiled programs may give way to optimised ones (runtime/compilation.py). An iteration is three programs (the linear
 solve, the verdict on the step, the policy), so that they compile beside each other and each only as well as it pays.
 """
@@ -20,10 +20,10 @@ from jaxtyping import Float
 from jaxba.damping import DampingPolicy, decides_effort, effort_of
 from jaxba.lm.step import LMState, StepInfo, judge, lm_step, propose
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.compilation import REPAIR, CompiledTogether, Stage, Way, program, way_after
 from jaxba.runtime.compile_clock import CompileClock
+from jaxba.solver.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.structure.layout import Layout, turns_of
 
 
