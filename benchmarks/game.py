@@ -18,11 +18,11 @@ import numpy as np
 from jaxba.cli.common import prepare_process
 from jaxba.damping import DampingPolicy, Schedule, make_policy
 from jaxba.damping.agent import AgentConfig
-from jaxba.game.bank import sieve
 from jaxba.game.config import load
 from jaxba.game.evaluate import Score, score
 from jaxba.game.oracle import WIDTH, oracle
-from jaxba.game.play import Trajectories, play
+from jaxba.game.rollout import Trajectories, play
+from jaxba.game.scene_bank import sieve
 from jaxba.game.task import BANK, read_banks
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process

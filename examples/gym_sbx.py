@@ -25,10 +25,10 @@ except ModuleNotFoundError:
 
 from jaxba import StepOptions
 from jaxba.damping.agent import AgentConfig
-from jaxba.game.bank import BankConfig, make_banks
 from jaxba.game.env import GameConfig, make_game
 from jaxba.game.gym import GymVectorGame
-from jaxba.game.scenes import SceneClass
+from jaxba.game.random_scenes import SceneClass
+from jaxba.game.scene_bank import BankConfig, make_banks
 
 
 class ForStableBaselines(VecEnv):

@@ -14,9 +14,9 @@ from safetensors import safe_open
 
 from jaxba.cli.train import run
 from jaxba.damping.learned import load_policy
-from jaxba.game import metrics, play, task
-from jaxba.game.bank import TooFewScenes
+from jaxba.game import metrics, rollout, task
 from jaxba.game.config import load
+from jaxba.game.scene_bank import TooFewScenes
 
 TINY = [
     *("chunks=4", "evaluate_every=2", "checkpoint_every=1", "envs=[8]"),
@@ -32,7 +32,7 @@ CLOCKS = ("wall_s", "chunk_s", "steps_per_s", "updates_per_s", "cpu_per_wall", "
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """Few lanes and rules, since every rule is a program of its own."""
-    monkeypatch.setattr(play, "LANES", play.GROUP)
+    monkeypatch.setattr(rollout, "LANES", rollout.GROUP)
     monkeypatch.setattr(task, "YARDSTICKS", ("ceres",))
 
 
@@ -41,7 +41,7 @@ def scenes(tmp_path_factory) -> Path:
     """A folder whose run was interrupted after the first chunk."""
     folder = tmp_path_factory.mktemp("train") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(play, "LANES", play.GROUP)
+        patch.setattr(rollout, "LANES", rollout.GROUP)
         patch.setattr(task, "YARDSTICKS", ("ceres",))
         interrupt_at(1, patch)
         assert run([*COMMAND, "--out", str(folder)]) == 130
@@ -57,7 +57,7 @@ def folder(scenes, tmp_path) -> Path:
 def finished(scenes, tmp_path_factory) -> Path:
     folder = Path(shutil.copytree(scenes, tmp_path_factory.mktemp("done") / "run"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(play, "LANES", play.GROUP)
+        patch.setattr(rollout, "LANES", rollout.GROUP)
         patch.setattr(task, "YARDSTICKS", ("ceres",))
         assert run(["--out", str(folder), "--resume"]) == 0
     return folder

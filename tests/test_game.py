@@ -20,13 +20,13 @@ from tiny_game import AGENT, KIND, RULES, grid, problem_of, tiny_bank, tiny_game
 from jaxba import StepOptions, make_method, make_policy, solve
 from jaxba.damping.agent import begin, damping_of, observe
 from jaxba.damping.learned import Layer, Learned
-from jaxba.game.bank import Bank, info_of, initial_costs, reach, sieve
 from jaxba.game.env import POINT_ITERATION_COST, SHAPING_FLOOR, Game, GameConfig
 from jaxba.game.evaluate import evaluate, play_all, score, scores
-from jaxba.game.play import Trajectories, play
 from jaxba.game.protocol import Environment
-from jaxba.game.scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
-from jaxba.game.slots import class_layout, with_scene
+from jaxba.game.random_scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
+from jaxba.game.rollout import Trajectories, play
+from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, sieve
+from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.step import LMState, lm_step
 from jaxba.problem import geometry
 from jaxba.structure.layout import partition_of
@@ -227,7 +227,7 @@ def test_costs_start_at_the_start_never_rise_and_stay_after_the_end():
 
 def test_lanes_do_not_mix_scenes(monkeypatch):
     """The scenes in another order, and in fewer lanes than scenes, so that lanes are used again."""
-    from jaxba.game import play as module
+    from jaxba.game import rollout as module
 
     bank = tiny_bank()
     order = np.random.default_rng(0).permutation(len(bank.initial_cost))

@@ -9,8 +9,8 @@ from support import paper
 
 from jaxba import StepOptions, solve
 from jaxba.game import settings
-from jaxba.game.bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, make_banks
-from jaxba.game.scenes import SceneClass
+from jaxba.game.random_scenes import SceneClass
+from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, make_banks
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
 from jaxba.paper.pieces.small import SmallScene
@@ -53,7 +53,7 @@ def split() -> Split:
     kind = SceneClass(4, 12, "paper")
     made = BankConfig(classes=(kind,), scenes=(60,), refine_points=0, intrinsics="fixed")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxba.game.bank.PORTFOLIO", ("ceres",))
+        patch.setattr("jaxba.game.scene_bank.PORTFOLIO", ("ceres",))
         return make_banks(made, jax.random.key(0), made.options, 40)[0]
 
 

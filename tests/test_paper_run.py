@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from jaxba.cli.paper import run
-from jaxba.game import bank, play
+from jaxba.game import rollout, scene_bank
 from jaxba.paper.pieces import PIECES
 from jaxba.paper.store import PLAYS
 
@@ -67,8 +67,8 @@ def finished(settings, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("paper") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("JAXBA_DATA", raising=False)
-        patch.setattr(play, "LANES", play.GROUP)
-        patch.setattr(bank, "PORTFOLIO", ("ceres",))  # every rule is a program of its own
+        patch.setattr(rollout, "LANES", rollout.GROUP)
+        patch.setattr(scene_bank, "PORTFOLIO", ("ceres",))  # every rule is a program of its own
         assert run(command(settings, folder)) == 0
     return folder
 
@@ -107,7 +107,7 @@ def test_a_second_call_does_no_work(finished, settings, capsys):
 
 @pytest.mark.parametrize("lost", [0, 2])
 def test_a_record_that_is_lost_is_the_only_one_made_again(finished, settings, capsys, lost, monkeypatch):
-    monkeypatch.setattr(play, "LANES", play.GROUP)
+    monkeypatch.setattr(rollout, "LANES", rollout.GROUP)
     lines = (finished / PLAYS).read_text().splitlines(keepends=True)
     (finished / PLAYS).write_text("".join(line for k, line in enumerate(lines) if k != lost))
     assert run(command(settings, finished)) == 0

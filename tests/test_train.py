@@ -14,12 +14,12 @@ import toys
 
 from jaxba.damping import ProblemInfo
 from jaxba.game import checkpoint, metrics, task, train
-from jaxba.game.bank import Bank, Split
 from jaxba.game.checkpoint import CheckpointError
 from jaxba.game.config import TrainConfig, load
 from jaxba.game.loop import LoopConfig
+from jaxba.game.random_scenes import Scenes
 from jaxba.game.sac import SacConfig
-from jaxba.game.scenes import Scenes
+from jaxba.game.scene_bank import Bank, Split
 from jaxba.game.train import Best, Hooks, Outcome, TrainError, prepare_folder
 
 CONFIG = TrainConfig(

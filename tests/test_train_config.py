@@ -10,8 +10,8 @@ import pytest
 from jaxba.damping.agent import AgentConfig
 from jaxba.game import config, settings
 from jaxba.game.config import SettingsError, TrainConfig, load, to_yaml
+from jaxba.game.random_scenes import SceneClass
 from jaxba.game.sac import SacConfig
-from jaxba.game.scenes import SceneClass
 from jaxba.problem.options import StepOptions
 
 REPOSITORY = Path(__file__).parent.parent

@@ -15,9 +15,9 @@ from scipy.optimize import least_squares
 from support import same_bits, start, step
 
 from jaxba import BundleProblem, Layout, LMState, StepOptions, lm_step, make_policy, solve
-from jaxba.game.bank import initial_costs
-from jaxba.game.scenes import SceneClass, make_scenes
-from jaxba.game.slots import class_layout, with_scene
+from jaxba.game.random_scenes import SceneClass, make_scenes
+from jaxba.game.scene_bank import initial_costs
+from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.linear.cholesky import solve_positive
 from jaxba.lm.damped_step import solve_step
 from jaxba.model.linearize import cost, linearize

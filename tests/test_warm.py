@@ -9,8 +9,8 @@ from support import same_bits
 from tiny_game import KIND, problem_of, tiny_bank
 
 from jaxba import StepOptions
-from jaxba.game.bank import BankConfig, draft, make_banks
-from jaxba.game.warm import warm_starts
+from jaxba.game.scene_bank import BankConfig, draft, make_banks
+from jaxba.game.warm_starts import warm_starts
 from jaxba.problem import geometry
 
 OPTIONS = StepOptions()
@@ -60,7 +60,7 @@ def test_a_share_that_is_none_is_refused(share):
 
 @pytest.mark.slow
 def test_the_share_of_the_settings_reaches_the_bank(monkeypatch):
-    monkeypatch.setattr("jaxba.game.bank.PORTFOLIO", ("ceres",))
+    monkeypatch.setattr("jaxba.game.scene_bank.PORTFOLIO", ("ceres",))
     banks = [BankConfig((KIND,), (60,), 0, share) for share in (0.0, 1.0)]
     made = [make_banks(bank, jax.random.key(0), OPTIONS, 40)[0].train for bank in banks]
     cold, warm = (np.median(np.asarray(bank.initial_cost / bank.best_cost)) for bank in made)

@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxba import BundleProblem, StepOptions
 from jaxba.damping.agent import AgentConfig
-from jaxba.game.bank import Bank, draft, sieve
 from jaxba.game.env import Game, GameConfig, make_game
-from jaxba.game.scenes import SceneClass, Scenes
+from jaxba.game.random_scenes import SceneClass, Scenes
+from jaxba.game.scene_bank import Bank, draft, sieve
 
 KIND = SceneClass(4, 12)
 AGENT = AgentConfig(

@@ -55,8 +55,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _train(args: Arguments) -> int:
     import jax
 
-    from jaxba.game import bank, task, train
     from jaxba.game import config as configs
+    from jaxba.game import scene_bank, task, train
     from jaxba.runtime import process
 
     jax.config.update("jax_enable_x64", True)  # the game counts in float64, the agent's networks in float32
@@ -86,7 +86,7 @@ def _train(args: Arguments) -> int:
         except KeyboardInterrupt:
             console.print(f"interrupted; go on from the last checkpoint with {_again(folder)}")
             return common.INTERRUPTED
-        except (train.TrainError, configs.SettingsError, bank.TooFewScenes) as error:
+        except (train.TrainError, configs.SettingsError, scene_bank.TooFewScenes) as error:
             raise common.UsageError(str(error)) from None
         except OSError as error:
             raise common.UsageError(
@@ -141,7 +141,7 @@ def _finish(folder: Path, work: Any, best: Any, console: Any, progress: _Progres
     progress.stage("comparing with the rules")
     scores = work.compare(best.actor)
     progress.__exit__()
-    count = sum(len(bank.initial_cost) for bank in work.held_out)
+    count = sum(len(scene_bank.initial_cost) for scene_bank in work.held_out)
     console.print(_table(scores, work.config.game.tolerance, count))
     console.print(f"best: agent {best.seed + 1} after chunk {best.chunk}")
     console.print(f"wrote {', '.join(str(file) for file in files)}")

@@ -17,10 +17,10 @@ from typing import Any
 from jaxba.damping.agent import AgentConfig, EffortMode
 from jaxba.damping.learned import LARGEST_FILE
 from jaxba.game import settings
-from jaxba.game.bank import BankConfig
 from jaxba.game.env import GameConfig
 from jaxba.game.loop import LoopConfig
 from jaxba.game.sac import SacConfig
+from jaxba.game.scene_bank import BankConfig
 from jaxba.game.settings import SettingsError
 from jaxba.methods.registry import DEFAULT_METHOD, MethodName, make_method
 from jaxba.problem.options import StepOptions

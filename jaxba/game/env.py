@@ -25,11 +25,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.agent import AgentConfig, Memory, action_of, begin, damping_of, observe, record, with_effort
 from jaxba.damping.rules import Ceres
-from jaxba.game.bank import Bank
-from jaxba.game.play import step_groups
 from jaxba.game.protocol import Step
-from jaxba.game.scenes import SceneClass
-from jaxba.game.slots import class_layout, with_scene
+from jaxba.game.random_scenes import SceneClass
+from jaxba.game.rollout import step_groups
+from jaxba.game.scene_bank import Bank
+from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.step import LMState, StepInfo, begin_at, lm_step
 from jaxba.problem.options import StepOptions
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy
-from jaxba.game.bank import Bank, reach
-from jaxba.game.play import Trajectories, play
-from jaxba.game.scenes import SceneClass
+from jaxba.game.random_scenes import SceneClass
+from jaxba.game.rollout import Trajectories, play
+from jaxba.game.scene_bank import Bank, reach
 from jaxba.problem.options import StepOptions
 
 

@@ -17,10 +17,10 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.game.bank import Bank
-from jaxba.game.play import Trajectories, step_groups
-from jaxba.game.scenes import SceneClass
-from jaxba.game.slots import class_layout, with_scene
+from jaxba.game.random_scenes import SceneClass
+from jaxba.game.rollout import Trajectories, step_groups
+from jaxba.game.scene_bank import Bank
+from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.step import LMState, StepInfo, begin_at, lm_step
 from jaxba.problem.options import StepOptions
 

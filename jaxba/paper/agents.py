@@ -15,9 +15,9 @@ import numpy as np
 from jaxba.damping import Learned, load_policy, save_policy
 from jaxba.game import config as train_configs
 from jaxba.game import task, train
-from jaxba.game.bank import Bank, Split, sieve
 from jaxba.game.config import TrainConfig
 from jaxba.game.env import Game, make_game
+from jaxba.game.scene_bank import Bank, Split, sieve
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions

@@ -16,8 +16,8 @@ from jaxba.bench.records import Record
 from jaxba.bench.run import record_of
 from jaxba.bench.sources import Source
 from jaxba.damping import DampingPolicy
-from jaxba.game.bank import Bank, reach
-from jaxba.game.play import play
+from jaxba.game.rollout import play
+from jaxba.game.scene_bank import Bank, reach
 from jaxba.methods.registry import make_method
 from jaxba.paper import agents, rows, zero_net
 from jaxba.paper.agents import Agent

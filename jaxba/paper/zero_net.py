@@ -25,9 +25,9 @@ from jaxtyping import Float
 from jaxba.damping.agent import AgentConfig, Memory, StepFacts, begin, damping_of, record
 from jaxba.damping.learned import Layer
 from jaxba.damping.policy import ProblemInfo
-from jaxba.game.bank import Bank
 from jaxba.game.env import Episode, Game
-from jaxba.game.play import step_groups
+from jaxba.game.rollout import step_groups
+from jaxba.game.scene_bank import Bank
 from jaxba.lm.step import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba.game.scenes import SceneClass
+from jaxba.game.random_scenes import SceneClass
 from jaxba.problem.bundle_problem import AnyArray, BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout, build_layout

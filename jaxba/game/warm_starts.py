@@ -15,9 +15,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.game.play import step_groups
-from jaxba.game.scenes import SceneClass, Scenes
-from jaxba.game.slots import class_layout, with_scene
+from jaxba.game.random_scenes import SceneClass, Scenes
+from jaxba.game.rollout import step_groups
+from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.step import LMState, begin_at, lm_step
 from jaxba.problem.options import StepOptions
 

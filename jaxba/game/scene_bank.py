@@ -19,10 +19,10 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import ProblemInfo, make_policy
-from jaxba.game.play import Trajectories, play
-from jaxba.game.scenes import SceneClass, Scenes, make_scenes
-from jaxba.game.slots import class_layout, with_scene
-from jaxba.game.warm import warm_starts
+from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
+from jaxba.game.rollout import Trajectories, play
+from jaxba.game.scene_layout import class_layout, with_scene
+from jaxba.game.warm_starts import warm_starts
 from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, StepOptions

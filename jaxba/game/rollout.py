@@ -17,8 +17,8 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import DampingPolicy, effort_of
-from jaxba.game.scenes import SceneClass
-from jaxba.game.slots import class_layout, with_scene
+from jaxba.game.random_scenes import SceneClass
+from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.step import LMState, StepInfo, begin_at, lm_step
 from jaxba.lm.termination import converged_in_cost
 from jaxba.problem.options import StepOptions
