@@ -18,15 +18,15 @@ import numpy as np
 from jaxba.cli.common import prepare_process
 from jaxba.damping import DampingPolicy, Schedule, make_policy
 from jaxba.damping.agent import AgentConfig
-from jaxba.game.config import load
 from jaxba.game.evaluate import Score, score
 from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import sieve
-from jaxba.game.task import BANK, read_banks
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.solver.names import parse_solver
+from jaxba.training.config import load
+from jaxba.training.task import BANK, read_banks
 
 RULES = ("classic", "ceres", "gtsam", "nielsen", "theseus", "gauss-newton", "schedule")
 CONSTANTS = tuple(f"constant:1e{decade}" for decade in (-8, -6, -5, -4, -3, -2))

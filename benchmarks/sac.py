@@ -28,9 +28,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from benchmarks.metrics import Metric, to_json, to_text
-from jaxba.game.loop import LoopConfig, run_chunk, start
 from jaxba.game.protocol import Step
-from jaxba.game.sac import SacConfig
+from jaxba.training.sac import SacConfig
+from jaxba.training.train_loop import LoopConfig, run_chunk, start
 
 VARIABLE = "JAXBA_SBX"
 """Environment variable with the path of a Python that has sbx-rl."""

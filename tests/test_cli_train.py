@@ -14,9 +14,10 @@ from safetensors import safe_open
 
 from jaxba.cli.train import run
 from jaxba.damping.learned import load_policy
-from jaxba.game import metrics, rollout, task
-from jaxba.game.config import load
+from jaxba.game import rollout
 from jaxba.game.scene_bank import TooFewScenes
+from jaxba.training import log, task
+from jaxba.training.config import load
 
 TINY = [
     *("chunks=4", "evaluate_every=2", "checkpoint_every=1", "envs=[8]"),
@@ -65,7 +66,7 @@ def finished(scenes, tmp_path_factory) -> Path:
 
 def interrupt_at(chunk: int, patch: pytest.MonkeyPatch, times: int = 1) -> None:
     """Presses Ctrl-C while a chunk is being written down."""
-    write = metrics.Log.write
+    write = log.Log.write
 
     def pressed(self, row):
         done = write(self, row)
@@ -74,7 +75,7 @@ def interrupt_at(chunk: int, patch: pytest.MonkeyPatch, times: int = 1) -> None:
                 os.kill(os.getpid(), signal.SIGINT)
         return done
 
-    patch.setattr(metrics.Log, "write", pressed)
+    patch.setattr(log.Log, "write", pressed)
 
 
 def error_of(capsys, *argv: str) -> str:
@@ -96,14 +97,14 @@ def test_a_run_leaves_policy_curve_log_and_configuration(finished):
         *("policy.safetensors", "curve.png", "curve.svg"),
     }
     assert load(str(finished / "config.yaml")) == load("fast", TINY)
-    assert [row["chunk"] for row in metrics.read(finished)] == [1, 2, 3, 4]
-    assert metrics.read(finished)[1]["episode/ceres"] > 0
+    assert [row["chunk"] for row in log.read(finished)] == [1, 2, 3, 4]
+    assert log.read(finished)[1]["episode/ceres"] > 0
 
 
 def test_the_policy_file_is_the_best_policy_and_says_where_it_comes_from(finished):
     policy = load_policy(finished / "policy.safetensors")
     assert policy.config == load("fast", TINY).game.agent
-    scored = [row for row in metrics.read(finished) if "held_out/score" in row]
+    scored = [row for row in log.read(finished) if "held_out/score" in row]
     best = min(scored, key=lambda row: row["held_out/score"])
     with safe_open(finished / "policy.safetensors", framework="numpy") as file:
         facts = file.metadata()
@@ -134,7 +135,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(folder, capsys, monkeypatch):
     captured = capsys.readouterr()
     assert f"interrupted and saved; go on with jaxba-train --out {folder} --resume" in captured.out
     assert "stopping after this chunk" in captured.err
-    assert [row["chunk"] for row in metrics.read(folder)] == [1, 2, 3]
+    assert [row["chunk"] for row in log.read(folder)] == [1, 2, 3]
     assert signal.getsignal(signal.SIGINT) is before
 
 
@@ -145,7 +146,7 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(folder, finished, caps
     assert "go on from the last checkpoint" in capsys.readouterr().out
     assert run(["--out", str(folder), "--resume"]) == 0
     plain = lambda row: {k: v for k, v in row.items() if k not in CLOCKS}
-    assert list(map(plain, metrics.read(folder))) == list(map(plain, metrics.read(finished)))
+    assert list(map(plain, log.read(folder))) == list(map(plain, log.read(finished)))
     ours, theirs = (load_policy(place / "policy.safetensors") for place in (folder, finished))
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -17,10 +17,10 @@ from jaxba import Ceres, Safeguard, Schedule, StepOptions, lm_step, solve
 from jaxba.damping import effort_of
 from jaxba.damping.agent import FORCING, AgentConfig, begin, observe, with_effort
 from jaxba.damping.learned import Layer, Learned, PolicyFileError, load_policy, save_policy
-from jaxba.game import config as configs
 from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
-from jaxba.game.settings import SettingsError
 from jaxba.lm.effort import Effort
+from jaxba.training import config as configs
+from jaxba.training.settings import SettingsError
 
 POINTS = replace(AGENT, effort="points", refine_points=3)
 BOTH = replace(POINTS, effort="points+forcing")

@@ -31,9 +31,9 @@ from jaxba.damping.learned import (
     load_policy,
     save_policy,
 )
-from jaxba.game import sac
-from jaxba.game.config import load
 from jaxba.solver.names import SolverName, parse_solver
+from jaxba.training import sac
+from jaxba.training.config import load
 
 AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.0)
 

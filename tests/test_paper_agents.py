@@ -8,12 +8,12 @@ import pytest
 from support import paper
 
 from jaxba import StepOptions, solve
-from jaxba.game import settings
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, make_banks
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
 from jaxba.paper.pieces.small import SmallScene
+from jaxba.training import settings
 
 CONFIG = config.load("fast")
 

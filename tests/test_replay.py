@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba.game import replay
-from jaxba.game.replay import Transition
+from jaxba.training import replay
+from jaxba.training.replay import Transition
 
 FEATURES, ACTIONS = 3, 2
 

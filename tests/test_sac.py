@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from jaxba.game import networks, sac
-from jaxba.game.replay import Transition
-from jaxba.game.sac import Learner, SacConfig
+from jaxba.training import networks, sac
+from jaxba.training.replay import Transition
+from jaxba.training.sac import Learner, SacConfig
 
 FEATURES, ACTIONS = 3, 2
 SMALL = SacConfig(width=8, layers=1, batch=32, gamma=0.5, learning_rate=1e-5, reward_scale=0.5, initial_value=-4.0)

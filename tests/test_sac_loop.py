@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import toys
 
-from jaxba.game import loop as training
-from jaxba.game import sac
-from jaxba.game.loop import TRACES, LoopConfig, LoopState, run_chunk, start
-from jaxba.game.sac import SacConfig
+from jaxba.training import sac
+from jaxba.training import train_loop as training
+from jaxba.training.sac import SacConfig
+from jaxba.training.train_loop import TRACES, LoopConfig, LoopState, run_chunk, start
 
 GAMMA = 0.8
 TWIN = SacConfig(

@@ -13,14 +13,14 @@ import pytest
 import toys
 
 from jaxba.damping import ProblemInfo
-from jaxba.game import checkpoint, metrics, task, train
-from jaxba.game.checkpoint import CheckpointError
-from jaxba.game.config import TrainConfig, load
-from jaxba.game.loop import LoopConfig
 from jaxba.game.random_scenes import Scenes
-from jaxba.game.sac import SacConfig
 from jaxba.game.scene_bank import Bank, Split
-from jaxba.game.train import Best, Hooks, Outcome, TrainError, prepare_folder
+from jaxba.training import checkpoint, driver, log, task
+from jaxba.training.checkpoint import CheckpointError
+from jaxba.training.config import TrainConfig, load
+from jaxba.training.driver import Best, Hooks, Outcome, TrainError, prepare_folder
+from jaxba.training.sac import SacConfig
+from jaxba.training.train_loop import LoopConfig
 
 CONFIG = TrainConfig(
     chunks=6,
@@ -43,14 +43,14 @@ def evaluate(learner) -> dict[str, float]:
 
 def run(folder: Path, config: TrainConfig = CONFIG, resume: bool = False, **hooks) -> Outcome:
     config = prepare_folder(folder, None if resume else config, resume)
-    return train.train(config, toys.SEEN, evaluate, folder, Hooks(**hooks))
+    return driver.train(config, toys.SEEN, evaluate, folder, Hooks(**hooks))
 
 
 def kill_after(chunks: int):
     """A hook that ends everything once so many rows are written."""
-    rows: list[metrics.Row] = []
+    rows: list[log.Row] = []
 
-    def hook(row: metrics.Row) -> None:
+    def hook(row: log.Row) -> None:
         rows.append(row)
         if len(rows) == chunks:
             raise Killed
@@ -64,7 +64,7 @@ def stop_after(chunks: int):
 
 
 def rows(folder: Path) -> list[dict]:
-    return [{k: v for k, v in row.items() if k not in CLOCKS} for row in metrics.read(folder)]
+    return [{k: v for k, v in row.items() if k not in CLOCKS} for row in log.read(folder)]
 
 
 def same(one: Outcome, other: Outcome) -> None:
@@ -90,7 +90,7 @@ def whole(tmp_path_factory) -> tuple[Path, Outcome]:
 
 
 def test_every_chunk_has_its_row(whole):
-    found = metrics.read(whole[0])
+    found = log.read(whole[0])
     assert [(row["seed"], row["chunk"]) for row in found] == [(0, k) for k in range(1, 7)]
     assert [row["env_steps"] for row in found] == [16 + 40 * k for k in range(1, 7)]
     assert [row["updates"] for row in found] == [5 * k for k in range(1, 7)]
@@ -103,17 +103,17 @@ def test_every_chunk_has_its_row(whole):
 
 
 def test_numbers_that_are_not_finite_are_null(whole):
-    text = (whole[0] / metrics.FILE).read_text()
+    text = (whole[0] / log.FILE).read_text()
     assert "NaN" not in text
-    assert metrics.read(whole[0])[1]["held_out/p90"] is None
+    assert log.read(whole[0])[1]["held_out/p90"] is None
 
 
 def test_tensorboard_has_files(whole):
-    assert list((whole[0] / metrics.BOARD / "seed0").glob("events.out.tfevents.*"))
+    assert list((whole[0] / log.BOARD / "seed0").glob("events.out.tfevents.*"))
 
 
 def test_the_best_policy_is_that_of_the_lowest_held_out_score(whole):
-    scores = {row["chunk"]: row["held_out/score"] for row in metrics.read(whole[0]) if "held_out/score" in row}
+    scores = {row["chunk"]: row["held_out/score"] for row in log.read(whole[0]) if "held_out/score" in row}
     best = whole[1].best
     assert best is not None
     assert best.chunk == min(scores, key=scores.__getitem__)
@@ -123,8 +123,8 @@ def test_the_best_policy_is_that_of_the_lowest_held_out_score(whole):
 
 def test_the_last_chunk_is_evaluated_and_saved_even_off_the_beat(tmp_path):
     run(tmp_path / "run", dataclasses.replace(CONFIG, chunks=3))
-    assert [row["chunk"] for row in metrics.read(tmp_path / "run") if "held_out/score" in row] == [2, 3]
-    assert checkpoint.steps(tmp_path / "run" / train.CHECKPOINTS) == [2, 3]
+    assert [row["chunk"] for row in log.read(tmp_path / "run") if "held_out/score" in row] == [2, 3]
+    assert checkpoint.steps(tmp_path / "run" / driver.CHECKPOINTS) == [2, 3]
 
 
 # Going on
@@ -135,7 +135,7 @@ def test_a_killed_run_goes_on_bit_for_bit(chunks, whole, tmp_path):
     folder = tmp_path / "run"
     with pytest.raises(Killed):
         run(folder, row=kill_after(chunks))
-    with (folder / metrics.FILE).open("a") as file:
+    with (folder / log.FILE).open("a") as file:
         file.write('{"seed": 0, "chu')
     assert len(rows(folder)) == chunks
     same(run(folder, resume=True), whole[1])
@@ -156,7 +156,7 @@ def test_a_run_that_is_asked_to_stop_saves_and_goes_on_bit_for_bit(whole, tmp_pa
     folder = tmp_path / "run"
     outcome = run(folder, stop=stop_after(3))
     assert not outcome.finished
-    assert checkpoint.steps(folder / train.CHECKPOINTS)[-1] == 3
+    assert checkpoint.steps(folder / driver.CHECKPOINTS)[-1] == 3
     outcome = run(folder, resume=True)
     assert outcome.finished
     same(outcome, whole[1])
@@ -174,7 +174,7 @@ def test_a_run_may_be_made_longer(whole, tmp_path):
     run(folder, dataclasses.replace(CONFIG, chunks=2))
     config = prepare_folder(folder, None, True, ("chunks=6",))
     assert config == CONFIG
-    same(train.train(config, toys.SEEN, evaluate, folder), whole[1])
+    same(driver.train(config, toys.SEEN, evaluate, folder), whole[1])
     assert rows(folder) == rows(whole[0])
 
 
@@ -185,7 +185,7 @@ def test_a_run_made_shorter_ends_with_an_evaluation_of_what_it_has(chunks, tmp_p
     assert not run(tmp_path, stop=lambda: next(asked)).finished
     shorter = dataclasses.replace(CONFIG, chunks=chunks)
     handed: list[Best] = []
-    found = train.train(shorter, toys.SEEN, evaluate, tmp_path, Hooks(best=handed.append))
+    found = driver.train(shorter, toys.SEEN, evaluate, tmp_path, Hooks(best=handed.append))
     assert found.finished
     assert found.best is not None
     last = evaluate(found.state.learner)["score"]
@@ -211,7 +211,7 @@ def test_several_agents_follow_each_other_also_after_a_kill(whole, tmp_path):
 
 
 def test_only_the_last_checkpoints_stay(whole):
-    folder = whole[0] / train.CHECKPOINTS
+    folder = whole[0] / driver.CHECKPOINTS
     assert sorted(item.name for item in folder.iterdir()) == ["step_4", "step_6"]
 
 
@@ -243,7 +243,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
 def test_a_run_that_never_came_to_anything_is_no_obstacle(tmp_path):
     prepare_folder(tmp_path / "run", CONFIG, False)
     prepare_folder(tmp_path / "run", dataclasses.replace(CONFIG, seed=1), False)
-    assert load(str(tmp_path / "run" / train.CONFIG)).seed == 1
+    assert load(str(tmp_path / "run" / driver.CONFIG)).seed == 1
 
 
 @pytest.mark.parametrize("name", ["[x]", "a*", "what?"])
@@ -281,7 +281,7 @@ def test_losses_that_are_no_numbers_end_the_run_before_they_are_saved(tmp_path):
     config = dataclasses.replace(CONFIG, sac=dataclasses.replace(CONFIG.sac, learning_rate=1e30))
     with pytest.raises(TrainError, match="the losses are not finite any more"):
         run(tmp_path / "run", config)
-    assert checkpoint.steps(tmp_path / "run" / train.CHECKPOINTS) == []
+    assert checkpoint.steps(tmp_path / "run" / driver.CHECKPOINTS) == []
 
 
 # Checkpoints and banks
@@ -326,7 +326,7 @@ def test_a_checkpoint_of_something_else_is_refused(change, message):
 def test_a_broken_checkpoint_is_refused_in_one_line(tmp_path):
     folder = tmp_path / "run"
     run(folder, stop=stop_after(1))
-    for path in (folder / train.CHECKPOINTS).rglob("*"):
+    for path in (folder / driver.CHECKPOINTS).rglob("*"):
         if path.is_file():
             path.write_bytes(b"")
     with pytest.raises(TrainError, match=r"^the last checkpoint does not fit: [^\n]*$"):
@@ -364,5 +364,5 @@ def test_banks_survive_their_file(tmp_path):
 
 
 def test_the_log_is_json(whole):
-    for line in (whole[0] / metrics.FILE).read_text().splitlines():
+    for line in (whole[0] / log.FILE).read_text().splitlines():
         json.loads(line)

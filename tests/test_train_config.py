@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from jaxba.damping.agent import AgentConfig
-from jaxba.game import config, settings
-from jaxba.game.config import SettingsError, TrainConfig, load, to_yaml
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.sac import SacConfig
 from jaxba.problem.options import StepOptions
+from jaxba.training import config, settings
+from jaxba.training.config import SettingsError, TrainConfig, load, to_yaml
+from jaxba.training.sac import SacConfig
 
 REPOSITORY = Path(__file__).parent.parent
 

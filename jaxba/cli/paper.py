@@ -55,9 +55,9 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _paper(args: Arguments) -> int:
     from rich.console import Console
 
-    from jaxba.game.settings import SettingsError
     from jaxba.paper import config as configs
     from jaxba.paper.pieces import PIECES
+    from jaxba.training.settings import SettingsError
 
     console = Console(soft_wrap=True, highlight=False)
     if args.list:
@@ -90,8 +90,8 @@ def _open(folder: Path, config: Any) -> None:
         UsageError: it holds a run with other settings, or cannot be written.
     """
     from jaxba.bench.summary import write_text
-    from jaxba.game import settings
     from jaxba.paper import config as configs
+    from jaxba.training import settings
 
     path = folder / configs.CONFIG
     try:

@@ -55,9 +55,10 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _train(args: Arguments) -> int:
     import jax
 
-    from jaxba.game import config as configs
-    from jaxba.game import scene_bank, task, train
+    from jaxba.game import scene_bank
     from jaxba.runtime import process
+    from jaxba.training import config as configs
+    from jaxba.training import driver, task
 
     jax.config.update("jax_enable_x64", True)  # the game counts in float64, the agent's networks in float32
     overrides = tuple(item for group in args.overrides for item in group)
@@ -65,8 +66,8 @@ def _train(args: Arguments) -> int:
     folder = Path(args.out or Path("runs") / Path(name).stem)
     try:
         config = None if args.resume and args.config is None else configs.load(name, overrides)
-        config = train.prepare_folder(folder, config, args.resume, overrides)
-    except (configs.SettingsError, train.TrainError) as error:
+        config = driver.prepare_folder(folder, config, args.resume, overrides)
+    except (configs.SettingsError, driver.TrainError) as error:
         raise common.UsageError(str(error)) from None
     common.prepare_process()
     console = _console()
@@ -76,17 +77,17 @@ def _train(args: Arguments) -> int:
             progress.rules = work.rules
             interrupt.gentle = True
 
-            def keep(best: train.Best) -> None:
+            def keep(best: driver.Best) -> None:
                 _write_policy(folder, config, work, best)
                 progress.best = best
 
-            hooks = train.Hooks(progress.stage, progress.row, keep, lambda: interrupt.asked)
-            outcome = train.train(config, work.game, work.evaluate, folder, hooks)
+            hooks = driver.Hooks(progress.stage, progress.row, keep, lambda: interrupt.asked)
+            outcome = driver.train(config, work.game, work.evaluate, folder, hooks)
             interrupt.gentle = False
         except KeyboardInterrupt:
             console.print(f"interrupted; go on from the last checkpoint with {_again(folder)}")
             return common.INTERRUPTED
-        except (train.TrainError, configs.SettingsError, scene_bank.TooFewScenes) as error:
+        except (driver.TrainError, configs.SettingsError, scene_bank.TooFewScenes) as error:
             raise common.UsageError(str(error)) from None
         except OSError as error:
             raise common.UsageError(
@@ -117,7 +118,7 @@ def _again(folder: Path) -> str:
 def _write_policy(folder: Path, config: Any, work: Any, best: Any) -> None:
     from jaxba import __version__
     from jaxba.damping.learned import save_policy
-    from jaxba.game.config import to_yaml
+    from jaxba.training.config import to_yaml
 
     facts = {
         "jaxba": __version__,
@@ -132,11 +133,11 @@ def _write_policy(folder: Path, config: Any, work: Any, best: Any) -> None:
 def _finish(folder: Path, work: Any, best: Any, console: Any, progress: _Progress) -> int:
     """Policy file, curve and table."""
     from jaxba.bench.plots import save_figure
-    from jaxba.game import curve, metrics
+    from jaxba.training import log, plots
 
     _write_policy(folder, work.config, work, best)
     rules = {name: {**score._asdict(), "score": score.mean} for name, score in work.rules.items()}
-    figure = curve.plot_curve(metrics.read(folder), rules, work.config.game.tolerance)
+    figure = plots.plot_curve(log.read(folder), rules, work.config.game.tolerance)
     files = [folder / POLICY, *save_figure(figure, folder / CURVE)]
     progress.stage("comparing with the rules")
     scores = work.compare(best.actor)

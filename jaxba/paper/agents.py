@@ -13,14 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from jaxba.damping import Learned, load_policy, save_policy
-from jaxba.game import config as train_configs
-from jaxba.game import task, train
-from jaxba.game.config import TrainConfig
 from jaxba.game.env import Game, make_game
 from jaxba.game.scene_bank import Bank, Split, sieve
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions
+from jaxba.training import config as train_configs
+from jaxba.training import driver, task
+from jaxba.training.config import TrainConfig
 
 POLICY = "policy.safetensors"
 SCENES = "scenes"
@@ -89,20 +89,20 @@ def trained(
     if (own / POLICY).is_file():
         return load_policy(own / POLICY), False
     wanted = train_config(config, agent, seed)
-    begun = (own / train.CONFIG).is_file()
+    begun = (own / driver.CONFIG).is_file()
     try:
-        settings = train.prepare_folder(own, wanted, resume=begun)
+        settings = driver.prepare_folder(own, wanted, resume=begun)
         _share(config, folder, own, say)
         work = task.build(settings, own)
         played = game(config, agent, settings, scenes(config, folder, say)[0])
         note = lambda row: say(f"{agent.name} {seed + 1}: {row['chunk']} of {settings.chunks} parts")
-        outcome = train.train(settings, played, work.evaluate, own, train.Hooks(row=note))
-    except (train.TrainError, train_configs.SettingsError) as error:
+        outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(row=note))
+    except (driver.TrainError, train_configs.SettingsError) as error:
         raise ProblemError(str(error)) from None
     if outcome.best is None:
         raise AssertionError("a finished training has been evaluated")
     save_policy(own / POLICY, work.policy(outcome.best.actor), {"config": train_configs.to_yaml(settings)})
-    shutil.rmtree(own / train.CHECKPOINTS, ignore_errors=True)
+    shutil.rmtree(own / driver.CHECKPOINTS, ignore_errors=True)
     (own / task.BANK).unlink(missing_ok=True)
     return load_policy(own / POLICY), True
 

@@ -10,8 +10,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from jaxba.game import settings
-from jaxba.game.settings import SettingsError
+from jaxba.training import settings
+from jaxba.training.settings import SettingsError
 
 CONFIG = "config.yaml"
 """Settings of a run, in its folder."""

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxba.game import checkpoint, settings
-from jaxba.game.config import TrainConfig, load, to_yaml
-from jaxba.game.loop import LoopState, run_chunk, start
-from jaxba.game.metrics import Log, Row
-from jaxba.game.sac import Learner
+from jaxba.training import checkpoint, settings
+from jaxba.training.config import TrainConfig, load, to_yaml
+from jaxba.training.log import Log, Row
+from jaxba.training.sac import Learner
+from jaxba.training.train_loop import LoopState, run_chunk, start
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"

@@ -17,16 +17,16 @@ import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
 from jaxba.damping.learned import Learned, learned_from
-from jaxba.game import checkpoint
-from jaxba.game.config import TrainConfig
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
 from jaxba.game.rollout import Trajectories
-from jaxba.game.sac import Learner
 from jaxba.game.scene_bank import Bank, Split, make_banks
-from jaxba.game.train import TrainError
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.problem.options import StepOptions
+from jaxba.training import checkpoint
+from jaxba.training.config import TrainConfig
+from jaxba.training.driver import TrainError
+from jaxba.training.sac import Learner
 
 BANK = "bank.npz"
 RULES = "rules.npz"

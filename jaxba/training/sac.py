@@ -28,8 +28,8 @@ import optax
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.game import networks
-from jaxba.game.replay import Transition
+from jaxba.training import networks
+from jaxba.training.replay import Transition
 
 
 @dataclass(frozen=True)

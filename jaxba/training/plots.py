@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jaxba.bench.plots import COLOURS, LINES, MARKERS
-from jaxba.game.metrics import Row
+from jaxba.training.log import Row
 
 SHOWN = {"score": "mean iterations", "p90": "90th percentile of the iterations", "failures": "share of failures (%)"}
 """Panels: fields of a held-out score and their labels."""

@@ -16,14 +16,14 @@ from typing import Any
 
 from jaxba.damping.agent import AgentConfig, EffortMode
 from jaxba.damping.learned import LARGEST_FILE
-from jaxba.game import settings
 from jaxba.game.env import GameConfig
-from jaxba.game.loop import LoopConfig
-from jaxba.game.sac import SacConfig
 from jaxba.game.scene_bank import BankConfig
-from jaxba.game.settings import SettingsError
 from jaxba.methods.registry import DEFAULT_METHOD, MethodName, make_method
 from jaxba.problem.options import StepOptions
+from jaxba.training import settings
+from jaxba.training.sac import SacConfig
+from jaxba.training.settings import SettingsError
+from jaxba.training.train_loop import LoopConfig
 
 METADATA_BYTES = 1 << 14
 """Left for what a policy file says about itself: the configuration in 3 kB."""
