@@ -19,9 +19,9 @@ pytest.importorskip("pooch", reason="the extra `data` is not installed")
 
 from jaxba import read_bal
 from jaxba.cli.data import run
-from jaxba.data import download, transfer
-from jaxba.data.catalog import Entry, find
-from jaxba.data.download import DownloadError, UnreachableError, fetch, partial_path
+from jaxba.datasets.bal import download, transfer
+from jaxba.datasets.bal.catalog import Entry, find
+from jaxba.datasets.bal.download import DownloadError, UnreachableError, fetch, partial_path
 
 
 def packed(cameras: int, points: int, seed: int = 0) -> bytes:

@@ -14,8 +14,8 @@ import yaml
 from jaxba import ProblemError, write_bal
 from jaxba.bench.sources import sources
 from jaxba.cli import bench, data, solve
-from jaxba.data.catalog import ENTRIES, find, select
-from jaxba.data.places import data_folder, local_path, resolve
+from jaxba.datasets.bal.catalog import ENTRIES, find, select
+from jaxba.datasets.bal.places import data_folder, local_path, resolve
 from jaxba.scenes.config import LIKE
 
 
@@ -162,9 +162,9 @@ def test_list_of_some_names(folder, capsys):
 def test_download_without_names_and_without_pooch_are_one_line(folder, capsys, monkeypatch):
     assert data.run(["download"]) == 2
     check_one_line(capsys.readouterr().err, "name a problem or a family")
-    for module in ("jaxba.data.download", "jaxba.data.transfer"):
+    for module in ("jaxba.datasets.bal.download", "jaxba.datasets.bal.transfer"):
         monkeypatch.delitem(sys.modules, module, raising=False)
-    monkeypatch.delattr(sys.modules["jaxba.data"], "download", raising=False)
+    monkeypatch.delattr(sys.modules["jaxba.datasets.bal"], "download", raising=False)
     monkeypatch.setitem(sys.modules, "pooch", None)
     assert data.run(["download", "ladybug-49"]) == 2
     check_one_line(capsys.readouterr().err, "pip install jaxba[data]")

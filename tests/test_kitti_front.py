@@ -15,10 +15,10 @@ from kitti_scene import OTHER, SMALL, Camera, cv2, render, textures, write_seque
 from jaxba import BundleProblem, read_bal
 from jaxba.cli.kitti import run
 from jaxba.cli.solve import run as solve
+from jaxba.datasets.kitti import front, klt
+from jaxba.datasets.kitti.features import KeyPoints, detect, essential, match
+from jaxba.datasets.kitti.sequence import Calibration, image_reader, read_sequence
 from jaxba.io import write_problem
-from jaxba.kitti import front, klt
-from jaxba.kitti.features import KeyPoints, detect, essential, match
-from jaxba.kitti.sequence import Calibration, image_reader, read_sequence
 from jaxba.problem import geometry
 
 DATA = os.environ.get("JAXBA_DATA")

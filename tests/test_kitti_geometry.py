@@ -7,13 +7,13 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxba.kitti import keyframes
-from jaxba.kitti.assemble import assemble, poses_of_cameras, windows
-from jaxba.kitti.odometry import Odometry, visual_odometry
-from jaxba.kitti.sequence import Calibration
-from jaxba.kitti.starts import drift
-from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
-from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate, triangulate_robustly
+from jaxba.datasets.kitti import keyframes
+from jaxba.datasets.kitti.assemble import assemble, poses_of_cameras, windows
+from jaxba.datasets.kitti.odometry import Odometry, visual_odometry
+from jaxba.datasets.kitti.sequence import Calibration
+from jaxba.datasets.kitti.starts import drift
+from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
+from jaxba.datasets.kitti.triangulate import Filters, Sightings, Views, triangulate, triangulate_robustly
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 

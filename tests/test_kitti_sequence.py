@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxba.kitti.sequence import Calibration, poses_of, read_calibration, read_poses, read_sequence
+from jaxba.datasets.kitti.sequence import Calibration, poses_of, read_calibration, read_poses, read_sequence
 from jaxba.problem.bundle_problem import ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")

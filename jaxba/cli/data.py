@@ -72,7 +72,7 @@ def _data(args: Arguments) -> int:
         return _download(args.command)
     if isinstance(args.command, List):
         return _list(args.command)
-    from jaxba.data.places import local_path
+    from jaxba.datasets.bal.places import local_path
 
     print(local_path(args.command.name))
     return 0
@@ -82,8 +82,8 @@ def _list(args: List) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from jaxba.data.catalog import ENTRIES, select
-    from jaxba.data.places import data_folder, stored
+    from jaxba.datasets.bal.catalog import ENTRIES, select
+    from jaxba.datasets.bal.places import data_folder, stored
 
     console = Console()
     if not console.is_terminal:
@@ -104,14 +104,14 @@ def _download(args: Download) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
-    from jaxba.data.catalog import select
-    from jaxba.data.places import data_folder
+    from jaxba.datasets.bal.catalog import select
+    from jaxba.datasets.bal.places import data_folder
 
     if not args.names:
         raise common.UsageError("name a problem or a family; jaxba-data list shows them")
     entries, folder = select(args.names), data_folder()
     try:
-        from jaxba.data import download
+        from jaxba.datasets.bal import download
     except ImportError as error:
         raise common.UsageError(str(error)) from None
     console = Console(soft_wrap=True, highlight=False)

@@ -151,14 +151,14 @@ def _build(args: Arguments) -> int:
     if stem.suffix.lower() in (".ply", ".out"):
         raise common.UsageError(f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
     try:
-        from jaxba.kitti import opencv  # noqa: F401 - says what to install
+        from jaxba.datasets.kitti import opencv  # noqa: F401 - says what to install
     except ImportError as error:
         raise common.UsageError(str(error)) from None
-    from jaxba.kitti.build import BuildOptions, build
-    from jaxba.kitti.front import FrontOptions
-    from jaxba.kitti.sequence import poses_of, read_poses, read_sequence
-    from jaxba.kitti.triangulate import Filters
-    from jaxba.kitti.work import Work
+    from jaxba.datasets.kitti.build import BuildOptions, build
+    from jaxba.datasets.kitti.front import FrontOptions
+    from jaxba.datasets.kitti.sequence import poses_of, read_poses, read_sequence
+    from jaxba.datasets.kitti.triangulate import Filters
+    from jaxba.datasets.kitti.work import Work
 
     sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
     poses = None
@@ -199,8 +199,8 @@ def _build(args: Arguments) -> int:
 
 def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
     """Problems to be written, and where."""
+    from jaxba.datasets.kitti.assemble import windows
     from jaxba.io.files import strip_compression
-    from jaxba.kitti.assemble import windows
 
     if args.window is None:
         return [(built.whole, args.out)]
@@ -214,10 +214,10 @@ def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
 def _write(part: Any, path: str, sequence: Any, args: Arguments) -> str:
     """The side file, then the problem: who finds a problem finds its frames."""
     from jaxba import __version__
+    from jaxba.datasets.kitti.assemble import side_facts
+    from jaxba.datasets.kitti.evaluate import write_side
+    from jaxba.datasets.kitti.opencv import cv2
     from jaxba.io import write_problem
-    from jaxba.kitti.assemble import side_facts
-    from jaxba.kitti.evaluate import write_side
-    from jaxba.kitti.opencv import cv2
 
     times = None if sequence.times is None else dict(zip(sequence.numbers, sequence.times.tolist(), strict=True))
     facts = side_facts(
@@ -235,8 +235,8 @@ def _write(part: Any, path: str, sequence: Any, args: Arguments) -> str:
 def _build_table(parts: list[Any], built: Any, poses: Any) -> Any:
     import numpy as np
 
-    from jaxba.kitti.assemble import poses_of_cameras
-    from jaxba.kitti.evaluate import score
+    from jaxba.datasets.kitti.assemble import poses_of_cameras
+    from jaxba.datasets.kitti.evaluate import score
     from jaxba.problem import geometry
     from jaxba.problem.bundle_problem import ProblemError
 
@@ -262,7 +262,7 @@ def _evaluate(args: EvaluateArguments) -> int:
         raise common.UsageError("--lengths must be positive")
     from jaxba.bench.plots import save_figure
     from jaxba.bench.summary import write_text
-    from jaxba.kitti import evaluate, plots
+    from jaxba.datasets.kitti import evaluate, plots
 
     side = evaluate.read_side(args.problem)
     truth = None if args.poses is None else evaluate.truth_of(side, args.poses)
@@ -293,7 +293,7 @@ def _caption(result: Any) -> str:
 
 
 def _evaluate_table(results: list[Any], truth: Any) -> Any:
-    from jaxba.kitti.trajectory import path_length
+    from jaxba.datasets.kitti.trajectory import path_length
 
     title = f"{len(results[0].poses)} key-frames"
     if truth is None:

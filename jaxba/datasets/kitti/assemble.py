@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.kitti.sequence import Calibration
-from jaxba.kitti.tracks import Tracks
-from jaxba.kitti.triangulate import Filters, Sightings, Views, triangulate_robustly
+from jaxba.datasets.kitti.sequence import Calibration
+from jaxba.datasets.kitti.tracks import Tracks
+from jaxba.datasets.kitti.triangulate import Filters, Sightings, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, camera_centers, rotation_matrices
 

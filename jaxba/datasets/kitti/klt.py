@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.kitti.features import epipolar_inliers
-from jaxba.kitti.opencv import cv2
-from jaxba.kitti.sequence import Calibration
+from jaxba.datasets.kitti.features import epipolar_inliers
+from jaxba.datasets.kitti.opencv import cv2
+from jaxba.datasets.kitti.sequence import Calibration
 
 WINDOW = 21
 """Side of the window that is followed, pixels. Source: OpenCV's default."""

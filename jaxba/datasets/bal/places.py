@@ -6,8 +6,8 @@ import os
 import re
 from pathlib import Path
 
-from jaxba.data.catalog import Entry, find
-from jaxba.data.problems import PROBLEMS
+from jaxba.datasets.bal.catalog import Entry, find
+from jaxba.datasets.bal.problems import PROBLEMS
 from jaxba.problem.bundle_problem import ProblemError
 
 FOLDER_VARIABLE = "JAXBA_BAL"

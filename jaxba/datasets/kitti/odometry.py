@@ -16,13 +16,13 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxba.kitti.features import essential
-from jaxba.kitti.front import MIN_MATCHES
-from jaxba.kitti.keyframes import parallax, turn
-from jaxba.kitti.opencv import cv2
-from jaxba.kitti.sequence import Calibration
-from jaxba.kitti.tracks import Tracks
-from jaxba.kitti.triangulate import Filters, Sightings, Triangulated, Views, triangulate
+from jaxba.datasets.kitti.features import essential
+from jaxba.datasets.kitti.front import MIN_MATCHES
+from jaxba.datasets.kitti.keyframes import parallax, turn
+from jaxba.datasets.kitti.opencv import cv2
+from jaxba.datasets.kitti.sequence import Calibration
+from jaxba.datasets.kitti.tracks import Tracks
+from jaxba.datasets.kitti.triangulate import Filters, Sightings, Triangulated, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError
 
 BOOTSTRAP_ANGLE = 2.0

@@ -282,7 +282,7 @@ def spare_bits(sequence: Sequence) -> int:
 
 def _decode(path: Path) -> np.ndarray:
     """Grey image of a file, shape (height, width), uint8 or uint16."""
-    from jaxba.kitti.opencv import cv2
+    from jaxba.datasets.kitti.opencv import cv2
 
     try:
         data = path.read_bytes()

@@ -12,14 +12,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-from jaxba.data.catalog import Entry
+from jaxba.datasets.bal.catalog import Entry
 from jaxba.io.files import open_input, reason
 from jaxba.problem.bundle_problem import ProblemError
 
 try:
     import pooch
 
-    from jaxba.data.transfer import DownloadError, Report, UnreachableError, download_rest
+    from jaxba.datasets.bal.transfer import DownloadError, Report, UnreachableError, download_rest
 except ModuleNotFoundError:
     raise ImportError("this needs pooch: pip install jaxba[data]") from None
 try:

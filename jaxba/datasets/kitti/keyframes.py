@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.kitti.sequence import Calibration
-from jaxba.kitti.tracks import Tracks
+from jaxba.datasets.kitti.sequence import Calibration
+from jaxba.datasets.kitti.tracks import Tracks
 from jaxba.problem.bundle_problem import ProblemError
 
 PARALLAX = 10.0

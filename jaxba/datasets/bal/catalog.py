@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from jaxba.data.problems import PROBLEMS
+from jaxba.datasets.bal.problems import PROBLEMS
 from jaxba.problem.bundle_problem import ProblemError
 
 

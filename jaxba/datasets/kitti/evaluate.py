@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxba.datasets.kitti import trajectory
+from jaxba.datasets.kitti.assemble import poses_of_cameras
+from jaxba.datasets.kitti.sequence import Calibration, poses_of, read_poses
 from jaxba.io import read_problem
 from jaxba.io.files import StrPath, display_name, open_output, reason, strip_compression
-from jaxba.kitti import trajectory
-from jaxba.kitti.assemble import poses_of_cameras
-from jaxba.kitti.sequence import Calibration, poses_of, read_poses
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxba.kitti.features import Features, KeyPoints, Verified, detect, epipolar_inliers, match
-from jaxba.kitti.klt import Followed, follow, start
-from jaxba.kitti.opencv import cv2
-from jaxba.kitti.sequence import Sequence, image_reader, spare_bits, stamp
-from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
-from jaxba.kitti.work import Work, digest
+from jaxba.datasets.kitti.features import Features, KeyPoints, Verified, detect, epipolar_inliers, match
+from jaxba.datasets.kitti.klt import Followed, follow, start
+from jaxba.datasets.kitti.opencv import cv2
+from jaxba.datasets.kitti.sequence import Sequence, image_reader, spare_bits, stamp
+from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
+from jaxba.datasets.kitti.work import Work, digest
 from jaxba.problem.bundle_problem import ProblemError
 
 Report = Callable[[str, int, int], None]
