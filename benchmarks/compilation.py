@@ -4,10 +4,10 @@
     python -m benchmarks.compilation PROBLEM ... --whole
 
 PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The constants of
-`jaxba/runtime/compilation.py` follow from the last columns: after how many observations times iterations, in millions, what the
-better way takes longer to compile has paid. All ways in turns, in one process, without a compilation cache, at the
-start with lambda 1e-4. `--whole` takes the time of `jaxba-solve FILE` from start to end, with `--compilation auto` and
-`full` in turns.
+`jaxba/runtime/compilation.py` follow from the last columns: after how many observations times iterations, in millions,
+what the better way takes longer to compile has paid. All ways in turns, in one process, without a compilation cache, at
+the start with lambda 1e-4. `--whole` takes the time of `jaxba-solve FILE` from start to end, with `--compilation auto`
+and `full` in turns.
 """
 
 from __future__ import annotations

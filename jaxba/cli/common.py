@@ -101,7 +101,8 @@ def prepare_process(*, untraced: bool = False) -> None:
     """Settings for speed: memory is kept, compiled programs are cached.
 
     Args:
-        untraced: whether programs are found without tracing them (`jaxba/runtime/executable_cache.py`), for a command that runs few
+        untraced: whether programs are found without tracing them (`jaxba/runtime/executable_cache.py`), for a command
+        that runs few
             programs, all of them through `programs.CompiledTogether`; else by their text, in JAX's cache.
     """
     from jaxba.runtime import process

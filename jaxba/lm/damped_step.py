@@ -1,6 +1,7 @@
 """One damped step: eliminate the points, solve for the cameras, carry back to the points.
 
-The step solves `(H + D) d = -g`. Elimination: linear/schur.py; solvers of the reduced camera system: linear/reduced_system.py.
+The step solves `(H + D) d = -g`. Elimination: linear/schur.py; solvers of the reduced camera system:
+linear/reduced_system.py.
 """
 
 from __future__ import annotations

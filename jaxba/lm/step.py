@@ -1,8 +1,9 @@
 """The Levenberg-Marquardt step: the one piece that solver, game and benchmark share.
 
-`lm_step` is pure: `propose`, a linear solve, and `judge`, the verdict on what it proposes (solver/callback_loop.py compiles them as
-two programs). It compiles once per problem shape and `StepOptions`, runs under `vmap`, and never branches in Python on
-a value: a failed factorisation or an overflow is a candidate with a non-finite cost, and that is a rejected step.
+`lm_step` is pure: `propose`, a linear solve, and `judge`, the verdict on what it proposes (solver/callback_loop.py
+compiles them as two programs). It compiles once per problem shape and `StepOptions`, runs under `vmap`, and never
+branches in Python on a value: a failed factorisation or an overflow is a candidate with a non-finite cost, and that is
+a rejected step.
 """
 
 from __future__ import annotations

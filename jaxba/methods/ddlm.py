@@ -2,9 +2,9 @@
 
 One round: points that several clusters see stand still, so that clusters share neither a variable nor a residual. Each
 takes a damped step of its own cameras and of the points that it alone sees, with the embedded iterations, camera rounds
-and trials of any other step (`refinement/trial.py`), and keeps it only if its own cost falls. Then cameras stand still and every
-separator takes a damped step of its own, or embedded iterations, kept under the same condition. The cost of the whole
-can only fall. The next round draws other clusters.
+and trials of any other step (`refinement/trial.py`), and keeps it only if its own cost falls. Then cameras stand still
+and every separator takes a damped step of its own, or embedded iterations, kept under the same condition. The cost of
+the whole can only fall. The next round draws other clusters.
 
 Lambda is one number a round, for clusters and separators. With `block_steps` above one, a cluster that fails multiplies
 it for itself.

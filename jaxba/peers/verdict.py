@@ -1,4 +1,4 @@
-"""jaxba's verdict on a step of Ceres: the embedded iterations of `refinement/trial.py` around what another library has computed.
+"""jaxba's verdict on a step of Ceres: the embedded iterations around what another library has computed.
 
 Ceres makes the step, and never judges it: its problem has one more error (`Forgiving`), which no parameter moves, large
 before a step and zero after it, so that any candidate is taken. What becomes of it, `lm.judge` decides as for jaxba's

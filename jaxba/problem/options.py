@@ -36,8 +36,9 @@ class StepOptions:
     linear_solver: LinearSolver = "explicit"
     """`explicit`: form the reduced camera system and factor it. `sparse`: form its blocks, conjugate gradients.
     `implicit`: conjugate gradients without forming it. `power`: a power series, without forming it. `normal`: conjugate
-    gradients on all variables (methods/deeplm.py). `clustered`: clusters of cameras, then repairs (methods/stba.py). `decomposed`:
-    clusters that are optimised beside each other (methods/ddlm.py). The last four are methods (methods/registry.py)."""
+    gradients on all variables (methods/deeplm.py). `clustered`: clusters of cameras, then repairs (methods/stba.py).
+    `decomposed`: clusters that are optimised beside each other (methods/ddlm.py). The last four are methods
+    (methods/registry.py)."""
 
     preconditioner: Preconditioner = "two-level"
     """Of conjugate gradients. `schur-jacobi`: the block diagonal of the reduced system. `two-level`: the same and a
@@ -76,7 +77,8 @@ class StepOptions:
 
     lens_step: LensStep = "file"
     """Coordinates in which a lens step is added: `file` adds to f, k1 and k2, as Ceres does with a BAL camera; `pixels`
-    to f and the distortion per pixel, which a zoom leaves alone (refinement/retraction.py). They agree to first order."""
+    to f and the distortion per pixel, which a zoom leaves alone
+    (refinement/retraction.py). They agree to first order."""
 
     refine_points: int = 0
     """Embedded point iterations after each camera step."""

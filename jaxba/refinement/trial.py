@@ -16,10 +16,11 @@ what they see. Repairing that locally is cheap beside a linear solve, and lets b
    and one round of 2, as long as that costs less.
 
 None of it takes another linear solve, so it is all one iteration (design, section 2). Where a problem falls into parts
-that are judged by themselves (`refinement/subproblems.py`), each has its own share, rounds and verdict. Source: 1 is Jeong et al. 2012,
-"embedded point iterations", and Ceres' inner iterations; 2 is resection and intersection (Chen, Chen, Wang 2019,
-"Bundle adjustment revisited"), here as a repair of second-order steps; 3 is a backtracking line search; 4 is the
-pattern move of direct search (Hooke, Jeeves 1961, "Direct search solution of numerical and statistical problems").
+that are judged by themselves (`refinement/subproblems.py`), each has its own share, rounds and verdict. Source: 1 is
+Jeong et al. 2012, "embedded point iterations", and Ceres' inner iterations; 2 is resection and intersection (Chen,
+Chen, Wang 2019, "Bundle adjustment revisited"), here as a repair of second-order steps; 3 is a backtracking line
+search; 4 is the pattern move of direct search (Hooke, Jeeves 1961, "Direct search solution of numerical and statistical
+problems").
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 in_haste = jax.make_user_context(False)
-"""Whether what is traced is to be compiled quickly (runtime/compilation.py). Without LLVM's optimisation a loop does all of its
+"""Whether what is traced is to be compiled quickly (compilation.py). Without LLVM's optimisation a loop does all of its
 work, the half that is zero too, and what is written out takes longer to compile: there every vector has its own."""
 
 

@@ -1,8 +1,9 @@
 """The loop of a solve step by step, for whoever watches it or is in a hurry.
 
-The same iteration as in solver/loop.py, run from Python: every record carries the wall-clock time at which it was finished,
-and quickly compiled programs may give way to optimised ones (runtime/compilation.py). An iteration is three programs (the linear
-solve, the verdict on the step, the policy), so that they compile beside each other and each only as well as it pays.
+The same iteration as in solver/loop.py, run from Python: every record carries the wall-clock time at which it was
+finished, and quickly compiled programs may give way to optimised ones (runtime/compilation.py). An iteration is three
+programs (the linear solve, the verdict on the step, the policy), so that they compile beside each other and each only
+as well as it pays.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ INEXACT_ITERATIONS = 1.2
 bulani1, bulani2, bulani4 and the rules ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
 
 TIED_COPIES = 5
-"""The reduced camera system, its mirror image, the tied one, that scaled, its factor (structure/shared_intrinsics.py, linear/cholesky.py)."""
+"""The reduced camera system, its mirror image, the tied one, that scaled, its factor."""
 
 DENSE_COPIES = 4
 """The reduced camera system, its blocks' copy, its mirror image, its factor (linear/blocks.py, linear/cholesky.py)."""

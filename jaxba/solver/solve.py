@@ -1,7 +1,7 @@
 """The whole solve: iterate the step under a damping policy until it converges.
 
-Without a callback the loop is one compiled program (solver/loop.py). With one, or where compilation is in a hurry, the same
-iteration runs step by step from Python (solver/callback_loop.py).
+Without a callback the loop is one compiled program (solver/loop.py). With one, or where compilation is in a hurry, the
+same iteration runs step by step from Python (solver/callback_loop.py).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Which pairs of observations multiply into which block of the reduced camera system.
 
-Observations are named by their place in the order of the cameras (structure/layout.py): a block reads two short stretches of
-memory then, where its observations would be scattered over all slots.
+Observations are named by their place in the order of the cameras (structure/layout.py): a block reads two short
+stretches of memory then, where its observations would be scattered over all slots.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ LEAST_PAIRS = 4
 """Pairs per slot for which there is room anyway: 20 cameras of kitti00vo have 3.4 per observation."""
 
 MAX_CAMERAS = 128
-"""More cameras are not padded: a dense system of 1350 unknowns takes 11 ms to factor (linear/cholesky.py), and long sequences are
+"""More cameras are not padded: a dense system of 1350 unknowns takes 11 ms to factor, and long sequences are
 better factored as bands."""
 
 MAX_OBSERVATIONS = 1 << 17
@@ -74,8 +74,8 @@ def capacity_of(problem: BundleProblem) -> Capacity | None:
     cells: 20 windows of 20 cameras of kitti00vo fall into 2 of them, with free points and pairs into 5.
 
     Returns:
-        None for problems with lenses (problem/intrinsics.py), or with more than `MAX_CAMERAS`, `MAX_OBSERVATIONS` (points count
-        too) or `MAX_PAIRS`.
+        None for problems with lenses (problem/intrinsics.py), or with more than `MAX_CAMERAS`, `MAX_OBSERVATIONS`
+        (points count too) or `MAX_PAIRS`.
     """
     if problem.lenses is not None or problem.num_cameras > MAX_CAMERAS:
         return None

@@ -14,7 +14,7 @@ from jaxba.training import config, settings
 from jaxba.training.config import SettingsError, TrainConfig, load, to_yaml
 from jaxba.training.sac import SacConfig
 
-REPOSITORY = Path(__file__).parent.parent
+REPOSITORY = Path(__file__).parents[2]
 
 
 def written(folder: Path, text: str) -> str:
