@@ -186,7 +186,7 @@ def check_positive(**values: Any) -> None:
     Raises:
         UsageError: naming the option.
     """
-    from jaxba.runtime.process import LARGEST_COUNT
+    from jaxba.typing import LARGEST_COUNT
 
     for name, value in values.items():
         option = "--" + name.replace("_", "-")

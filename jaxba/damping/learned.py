@@ -21,7 +21,7 @@ from jaxba.damping.agent import AgentConfig, Memory, begin, config_from, damping
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.effort import Effort
 from jaxba.lm.step import StepInfo
-from jaxba.problem.bundle_problem import AnyArray
+from jaxba.typing import AnyArray
 
 FORMAT = "jaxba-policy-1"
 """Kind and version of a policy file, in its metadata."""

@@ -27,13 +27,13 @@ from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, couplin
 from jaxba.linear.two_level import Anchor
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.barriers import apart
 from jaxba.structure.density import has_few_points
 from jaxba.structure.layout import Layout, PairLayout
 from jaxba.structure.segment_sums import take_rows, tree_sum
 from jaxba.structure.shared_intrinsics import solve_tied
+from jaxba.typing import AnyArray
 
 SINGLE_LIFT = 64.0
 """Rounding units added to the scaled diagonal of a system formed in float32, which may have lost its sign."""

@@ -18,11 +18,12 @@ from jaxba.lm.damped_step import Step, solve_step
 from jaxba.lm.effort import Effort
 from jaxba.methods.ddlm import Round, decomposed_round
 from jaxba.model.linearize import Present, cost, linearize, with_free_lenses
-from jaxba.problem.bundle_problem import AnyArray, BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.subproblems import Whole
 from jaxba.refinement.trial import Trial, best_trial
 from jaxba.structure.layout import Layout, partition_of
+from jaxba.typing import AnyArray
 
 
 class LMState(NamedTuple):

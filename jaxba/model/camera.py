@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.runtime.barriers import materialized
+from jaxba.typing import AnyArray
 
 SMALL_ANGLE_SQUARED = 1e-6
 """Below this squared angle (radians^2) the series of sin and cos is used; its error is under 1e-20."""

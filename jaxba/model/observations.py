@@ -10,11 +10,11 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba.model import camera
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.runtime.barriers import materialized
 from jaxba.runtime.single_loop import in_haste, together
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sums, take_each
+from jaxba.typing import AnyArray
 
 
 class Views(NamedTuple):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from jaxba.problem.losses import Loss
-from jaxba.runtime.process import LARGEST_COUNT
+from jaxba.typing import LARGEST_COUNT
 
 LinearSolver = Literal["explicit", "sparse", "implicit", "power", "normal", "clustered", "decomposed"]
 LinearSolverChoice = Literal["auto", "explicit", "sparse", "implicit", "power"]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxba.problem.bundle_problem import AnyArray
+from jaxba.typing import AnyArray
 
 
 def materialized(rows: Float[Array, "k n"]) -> Float[Array, "k n"]:

@@ -15,9 +15,6 @@ _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
 """Parameter numbers of glibc's mallopt (malloc.h)."""
 
 
-LARGEST_COUNT = 2**31 - 1
-"""Programs count in 32 bits."""
-
 MAPPINGS_SHARE = 0.4
 """One problem under sixteen solvers took a tenth of the limit."""
 

@@ -15,10 +15,10 @@ from jaxba.lm.damped_step import largest_diagonal
 from jaxba.lm.step import LMState, StepInfo, lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, with_free_lenses
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout, turns_of
 from jaxba.structure.segment_sums import point_sum
+from jaxba.typing import AnyArray
 
 
 class History(NamedTuple):

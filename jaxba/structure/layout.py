@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.problem.bundle_problem import AnyArray, BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.structure.camera_clusters import ClusterLayout, cluster_layout
 from jaxba.structure.covisibility import PairLayout, pair_layout
@@ -28,6 +28,7 @@ from jaxba.structure.random_partitions import Partition, partition_layout
 from jaxba.structure.shared_intrinsics import LensTies, lens_ties
 from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
+from jaxba.typing import AnyArray
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""

@@ -11,9 +11,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.runtime.single_loop import in_haste, sum_each
 from jaxba.structure.layout import Layout
+from jaxba.typing import AnyArray
 
 
 def take(values: Array, index: Int[AnyArray, "..."]) -> Array:

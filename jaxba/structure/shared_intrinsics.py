@@ -16,7 +16,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.linear.cholesky import factor_and_solve
-from jaxba.problem.intrinsics import LENS_SIZE, AnyArray, Lenses
+from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.typing import AnyArray
 
 POSE_SIZE = 6
 """Unknowns of a camera that are its own: rotation and translation. Those of the lens follow."""

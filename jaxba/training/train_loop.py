@@ -17,11 +17,11 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.game.protocol import Environment, Step
-from jaxba.runtime.process import LARGEST_COUNT
 from jaxba.training import replay as ring
 from jaxba.training import sac as agent
 from jaxba.training.replay import Replay, Transition
 from jaxba.training.sac import Learner, SacConfig
+from jaxba.typing import LARGEST_COUNT
 
 TRACES: collections.Counter[str] = collections.Counter()
 """How often each compiled function was traced in this process; a test holds it at one per configuration."""
