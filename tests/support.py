@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
 from jaxba import BundleProblem, LMState, StepOptions, initial_state, like, lm_step, random_scene
-from jaxba.lm.step import StepInfo
+from jaxba.lm.records import StepInfo
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.segment_sums import point_sum, point_sums, tree_sum
 

@@ -42,7 +42,7 @@ HASTE: dict[Way, dict[str, bool | int]] = {
 }
 """XLA's options. Without the older emitters a level alone saves half as much."""
 
-Part = Literal["factored", "iterated", "judge", "round"]
+Part = Literal["factored", "iterated", "try_step", "round"]
 """What is compiled by itself: a linear solve by factorisation or by an iteration, the verdict on its step, or a round
 of domain decomposition."""
 
@@ -72,7 +72,7 @@ class Pays(NamedTuple):
 PAYS: dict[Part, Pays] = {
     "factored": Pays(typical=5, quick=220_000, brisk=4_000_000),
     "iterated": Pays(typical=8, quick=1_000_000, brisk=15_000_000),
-    "judge": Pays(typical=80, quick=7_000_000, brisk=30_000_000),
+    "try_step": Pays(typical=80, quick=7_000_000, brisk=30_000_000),
     "round": Pays(typical=8, quick=1_600_000, brisk=8_000_000),
 }
 

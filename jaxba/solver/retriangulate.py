@@ -32,7 +32,7 @@ from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import program, run_alone, stages, way_after
-from jaxba.solver.solve import explain_start
+from jaxba.solver.prepare import explain_start
 from jaxba.structure.layout import Layout, build_layout
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
@@ -105,7 +105,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
-        way = way_after(VERDICTS, stages("judge", problem.num_observations))
+        way = way_after(VERDICTS, stages("try_step", problem.num_observations))
         search = program(_search, "loss", way=way)
         given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss())
         found = jax.device_get(run_alone(search, *given))

@@ -18,7 +18,7 @@ from jaxba.damping import effort_of
 from jaxba.damping.agent import FORCING, AgentConfig, begin, observe, with_effort
 from jaxba.damping.learned import Layer, Learned, PolicyFileError, load_policy, save_policy
 from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
-from jaxba.lm.effort import Effort
+from jaxba.linear.step import Effort
 from jaxba.training import config as configs
 from jaxba.training.settings import SettingsError
 

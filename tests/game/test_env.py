@@ -27,7 +27,8 @@ from jaxba.game.random_scenes import MIN_VIEWS, SceneClass, _angle_axis, make_sc
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, sieve
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.step import LMState, lm_step
+from jaxba.lm.records import LMState
+from jaxba.lm.step import lm_step
 from jaxba.problem import geometry
 from jaxba.structure.layout import partition_of
 

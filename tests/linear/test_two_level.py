@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from jaxba import BundleProblem, Loss, StepOptions, initial_state
 from jaxba.linear.preconditioners import diagonal_blocks, preconditioner
 from jaxba.linear.reduced_system import apply_reduced
-from jaxba.linear.schur import Coordinates, camera_system, eliminate_points
+from jaxba.linear.schur import RotationCoordinates, camera_system, eliminate_points
 from jaxba.linear.two_level import MODES, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.model import camera
 from jaxba.model.linearize import linearize
@@ -104,7 +104,7 @@ def everything(layout, problem, damping, more, options: StepOptions):
     state = initial_state(layout, problem, options, jnp.float64)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     points = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, points, Coordinates.of(state.cameras, options), damping, options)
+    system = camera_system(layout, linear, points, RotationCoordinates.of(state.cameras, options), damping, options)
     system = system._replace(blocks=system.blocks + more)
     frames = camera.frames(state.cameras)
     anchor = Anchor(frames.rotation, frames.translation, state.points)

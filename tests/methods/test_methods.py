@@ -17,7 +17,7 @@ from support import bal_file, needs_data, paper, start, step
 from test_step import DAMPINGS, check_step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
-from jaxba.linear.schur import Coordinates, apply_reduced, camera_system, eliminate_points
+from jaxba.linear.schur import RotationCoordinates, apply_reduced, camera_system, eliminate_points
 from jaxba.lm.damped_step import solve_step
 from jaxba.lm.termination import converged_in_cost
 from jaxba.methods.ddlm import LEAST_SHARE, decomposed_round
@@ -59,7 +59,7 @@ def systems(problem: BundleProblem, options: StepOptions, damping: float, turn: 
 def _systems(layout, state, damping, options):
     linear = linearize(layout, state.cameras, state.points, options.loss)
     points = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, points, Coordinates.of(state.cameras, options), damping, options)
+    system = camera_system(layout, linear, points, RotationCoordinates.of(state.cameras, options), damping, options)
     return linear, points, system
 
 

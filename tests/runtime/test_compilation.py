@@ -15,7 +15,7 @@ from jax import monitoring
 from jaxba import SceneConfig, Termination, random_scene, solve, solve_and_retriangulate
 from jaxba.cli.solve import run
 from jaxba.io import write_problem
-from jaxba.lm.step import judge, lm_step, propose
+from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import compilation
 from jaxba.runtime.compilation import (
@@ -131,8 +131,8 @@ def test_every_program_is_compiled_once_before_the_first_iteration(how):
         solved = solve(problem, "learned", **how, max_iterations=4, callback=watch)
     assert solved.iterations == 4
     assert late == [len(seen.names)] * 4
-    step = ["lm_step"] if how.get("method") == "ddlm" else ["judge", "propose"]
-    assert sorted(name for name in seen.names if name in ("lm_step", "judge", "propose")) == step
+    step = ["lm_step"] if how.get("method") == "ddlm" else ["try_step", "propose"]
+    assert sorted(name for name in seen.names if name in ("lm_step", "try_step", "propose")) == step
     assert seen.names.count("_advance_and_tell") == 1
 
 
@@ -142,7 +142,7 @@ def test_the_two_parts_are_the_step():
     options = StepOptions(refine_points=3, camera_rounds=3, trials=4)
     damping = jax.numpy.asarray(1e-6)
     proposal = jax.jit(propose, static_argnums=3)(layout, state, damping, options)
-    parts = jax.jit(judge, static_argnums=4)(layout, state, damping, proposal, options)
+    parts = jax.jit(try_step, static_argnums=4)(layout, state, damping, proposal, options)
     whole = jax.jit(lm_step, static_argnums=3)(layout, state, damping, options)
     assert whole[1].accepted
     for part, one in zip(jax.tree.leaves(parts), jax.tree.leaves(whole), strict=True):
@@ -197,7 +197,7 @@ def test_nothing_more_is_compiled_after_an_error():
 def test_the_optimised_program_takes_over_without_a_trace(watched, monkeypatch):
     full = solve(support.tiny(), "ceres")
     assert full.iterations > 2
-    before = {"factored": (Stage("quick", 1),), "judge": (Stage("quick", 1), Stage("brisk", 1))}
+    before = {"factored": (Stage("quick", 1),), "try_step": (Stage("quick", 1), Stage("brisk", 1))}
     monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: before[part])
     records = []
     callback = records.append if watched else None
