@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 import support
 from jax.experimental.compilation_cache import compilation_cache
+from support import solve
 from test_programs import Compilations
 
-from jaxba import make_policy, solve
+from jaxba import make_policy
 from jaxba.io import write_problem
 from jaxba.lm.step import try_step
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import CompiledTogether, Stage, program, run_alone
 from jaxba.solver.retriangulate import retriangulate
@@ -187,7 +188,7 @@ def test_another_question_is_another_program(folder, monkeypatch):
         *(store.place(double, {}, (tree,)) for tree in (layout, fewer, learned, stricter)),
         store.place(double, {"power": 2}, (x,)),
         store.place(double, {"power": StepOptions()}, (x,)),
-        store.place(double, {"power": StepOptions(trials=2)}, (x,)),
+        store.place(double, {"power": StepOptions(refinement=Refinement(trials=2))}, (x,)),
         store.place(double, {"power": 1}, (x.astype(jnp.float32),)),
         store.place(double, {"power": 1}, (jnp.arange(4.0),)),
         store.place(double, {"power": 1}, (1.0,)),
