@@ -20,7 +20,7 @@ from jaxba.damping.rules import LARGEST, Ceres
 from jaxba.linear.step import Effort
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions
-from jaxba.refinement.trial import SHORTER
+from jaxba.refinement.backtracking import SHORTER
 
 Observation = Literal["scale-free", "paper", "released-code", "duration"]
 ActionMode = Literal["absolute", "relative"]

@@ -20,8 +20,9 @@ from jaxba.lm.records import LMState, StepInfo
 from jaxba.model.linearize import Reference, cost, linearize, with_free_lenses
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
+from jaxba.refinement.acceptance import Candidate
+from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.subproblems import Whole
-from jaxba.refinement.trial import Trial, best_trial
 from jaxba.structure.layout import Layout
 from jaxba.typing import AnyArray
 
@@ -121,20 +122,20 @@ def try_step(
     """The second part of `lm_step`: candidates along a step, and whether one is accepted."""
     damping = jnp.asarray(damping, state.cost.dtype)
     step = proposal.step
-    trial = best_trial(Whole(layout), *state[:3], proposal.reference, step, options, min_gain, effort)
-    moved = [trial.share * step.cameras, trial.points - state.points]
+    found = best_candidate(Whole(layout), *state[:3], proposal.reference, step, options, min_gain, effort)
+    moved = [found.share * step.cameras, found.points - state.points]
     return _advance(
         state,
-        trial,
+        found,
         moved,
         damping,
         layout.camera_seen,
         gradient_max=step.gradient_max,
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
-        share=trial.share,
+        share=found.share,
         damping_share=jnp.clip(step.damped / step.slope, 0, 1),
-        repairs=trial.repairs,
+        repairs=found.repairs,
     )
 
 
@@ -172,7 +173,7 @@ def _round(
 
 def _advance(
     state: LMState,
-    found: Trial | Round,
+    found: Candidate | Round,
     moved: list[Array],
     damping: Float[Array, ""],
     seen: Bool[AnyArray, " cameras"],

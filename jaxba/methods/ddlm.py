@@ -2,7 +2,7 @@
 
 One round: points that several clusters see stand still, so that clusters share neither a variable nor a residual. Each
 takes a damped step of its own cameras and of the points that it alone sees, with the embedded iterations, camera rounds
-and trials of any other step (`refinement/trial.py`), and keeps it only if its own cost falls. Then cameras stand still
+and trials of any other step (`jaxba/refinement`), and keeps it only if its own cost falls. Then cameras stand still
 and every separator takes a damped step of its own, or embedded iterations, kept under the same condition. The cost of
 the whole can only fall. The next round draws other clusters.
 
@@ -36,9 +36,10 @@ from jaxba.methods.stba import solve_clusters
 from jaxba.model.linearize import Linearization, linearize, point_terms, slot_frames
 from jaxba.model.observations import point_passes, view_terms
 from jaxba.problem.options import StepOptions, check_count
-from jaxba.refinement.points import Home, refine_points
+from jaxba.refinement.acceptance import NEGLIGIBLE
+from jaxba.refinement.candidates import best_candidate
+from jaxba.refinement.points import PreviousPoints, refine_points
 from jaxba.refinement.subproblems import Clusters
-from jaxba.refinement.trial import NEGLIGIBLE, best_trial
 from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import take, total
@@ -116,17 +117,17 @@ def decomposed_round(
     dampings = jnp.full(partition.members.shape[0], damping)
     step = _cluster_steps(parts, linear, cameras, dampings, options)
     before = parts.sums(linear.costs)
-    trial = best_trial(parts, cameras, points, before, linear.reference, step, options, min_gain)
-    good, whole = trial.accepted, step.predicted(jnp.ones_like(before))
+    found = best_candidate(parts, cameras, points, before, linear.reference, step, options, min_gain)
+    good, whole = found.accepted, step.predicted(jnp.ones_like(before))
     possible = jnp.isfinite(whole)
     sum_of = lambda values: jnp.sum(jnp.where(possible, values, 0))
     shared = jnp.asarray(partition.separator)
-    cameras = jnp.where(parts.of_cameras(good), trial.cameras, cameras)
-    points = jnp.where(parts.of_points(good) & ~shared, trial.points, points)
-    predicted = sum_of(jnp.where(good, trial.predicted, whole))
-    gained = sum_of(jnp.where(good, trial.gain * trial.predicted, 0))
+    cameras = jnp.where(parts.of_cameras(good), found.cameras, cameras)
+    points = jnp.where(parts.of_points(good) & ~shared, found.points, points)
+    predicted = sum_of(jnp.where(good, found.predicted, whole))
+    gained = sum_of(jnp.where(good, found.gain * found.predicted, 0))
     offered = jnp.sum(jnp.where(possible, whole, jnp.inf))
-    taken = sum_of(jnp.where(good, trial.share * whole, 0))
+    taken = sum_of(jnp.where(good, found.share * whole, 0))
     moved, after = _separators(layout, cameras, points, damping, partition, options)
     # points alone may lower the cost a little where every cluster was refused, which is no sign of convergence
     share = jnp.where(offered - taken > NEGLIGIBLE * cost, taken / offered, 1)
@@ -140,7 +141,7 @@ def decomposed_round(
         sum_of(step.slope - step.damped),
         step.gradient_max,
         jnp.clip(share, LEAST_SHARE, 1),
-        jnp.max(trial.repairs),
+        jnp.max(found.repairs),
         after < cost,
     )
 
@@ -189,8 +190,8 @@ def _separators(
     *entries, before = one_pass(points, terms)
     if options.refinement.points:
         (inverse_depth,) = view_terms(layout, frames, points, lambda views: [views.projected().inverse_depth])
-        home = Home.of(layout, points, inverse_depth)
-        refined, costs = refine_points(layout, frames, points, options.loss, options.refinement.points, home)
+        previous = PreviousPoints.of(layout, points, inverse_depth)
+        refined, costs = refine_points(layout, frames, points, options.loss, options.refinement.points, previous)
         costs = jnp.where(partition.separator, costs, before)
         return jnp.where(partition.separator, refined, points), total(costs)
     matrix = entries[:6]

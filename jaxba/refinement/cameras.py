@@ -52,7 +52,7 @@ def refine_cameras(
         # on the manifold, in which the Jacobian is written
         moved = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
         costs = observation_costs(layout, moved, points, options.loss)
-        upright = moved[6] * cameras[6] >= 0  # as in refinement/trial.py
+        upright = moved[6] * cameras[6] >= 0  # as in candidates.py
         better = (own_cost(costs) < before) & ~done & upright
         return jnp.where(better, moved, best), done | better, turn + 1
 
