@@ -23,6 +23,7 @@ from jaxba.linear.cholesky import factor_and_solve, factor_panels
 from jaxba.linear.conjugate_gradients import conjugate_gradients
 from jaxba.linear.preconditioners import preconditioner
 from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
+from jaxba.linear.shared_intrinsics_solve import solve_tied
 from jaxba.linear.two_level import Anchor
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
@@ -31,7 +32,6 @@ from jaxba.runtime.barriers import apart
 from jaxba.structure.density import has_few_points
 from jaxba.structure.layout import Layout, PairLayout
 from jaxba.structure.segment_sums import take_rows, tree_sum
-from jaxba.structure.shared_intrinsics import solve_tied
 from jaxba.typing import AnyArray
 
 SINGLE_LIFT = 64.0
