@@ -216,7 +216,7 @@ def _expand(args: Arguments, entry: str) -> list[str]:
     for name in _VARIABLE.findall(entry):
         if not os.environ.get(name):
             raise common.UsageError(
-                f"--suite {args.suite}: {entry}: the environment variable {name} is not set; it names a folder of problems"
+                f"--suite {args.suite}: {entry}: the environment variable {name}, a folder of problems, is not set"
             )
     expanded = os.path.expandvars(entry)
     if not glob.has_magic(expanded):

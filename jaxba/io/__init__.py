@@ -1,4 +1,4 @@
-"""Problems to and from files: BAL text, Bundler and COLMAP models, PLY point clouds. And configuration files by name."""
+"""Files: BAL text, Bundler and COLMAP models, PLY point clouds; and configurations, which are found by name."""
 
 from __future__ import annotations
 

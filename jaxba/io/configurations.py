@@ -77,7 +77,7 @@ def read(kind: Kind, name: str) -> dict[str, Any]:
             raise SettingsError(f"{shown[-1]}: {BASE}: {error}") from None
         shown.append(display_name(base))
         if path.resolve() in visited:
-            raise SettingsError(f"{f' {BASE} '.join(shown)}: a circle")
+            raise SettingsError(f"{' extends '.join(shown)}: a circle")
         visited.append(path.resolve())
         layers.append(data)
     merged: dict[str, Any] = {}
