@@ -14,8 +14,6 @@ from jaxba.training import config, settings
 from jaxba.training.config import SettingsError, TrainConfig, load, to_yaml
 from jaxba.training.sac import SacConfig
 
-REPOSITORY = Path(__file__).parents[2]
-
 
 def written(folder: Path, text: str) -> str:
     path = folder / "some.yaml"
@@ -44,9 +42,19 @@ def test_what_is_written_reads_as_the_same_configuration(name, tmp_path):
     assert hash(found) == hash(load(name))
 
 
-def test_the_repository_shows_the_presets_of_the_package():
-    for name in config.preset_names():
-        assert load(str(REPOSITORY / "configs" / "train" / f"{name}.yaml")) == load(name)
+def test_policies_for_lambda_alone_learn_as_the_default_and_differ_in_the_step():
+    step = ("min_gain", "refine_points", "trials", "camera_rounds", "pattern_moves", "camera_damping")
+    step += ("lens_step", "point_starts", "remembered_steps")
+    plain, driver = load("plain"), load("driver")
+    assert settings.differences(load("default"), plain) == [f"game.agent.{name}" for name in step]
+    assert settings.differences(plain, driver) == ["game.agent.camera_damping"]
+    assert (plain.game.agent.camera_damping, driver.game.agent.camera_damping) == (0.1, 1.0)
+
+
+def test_a_file_may_extend_a_preset_and_overrides_win_over_both(tmp_path):
+    path = written(tmp_path, "extends: plain\nseed: 3\ngame: {agent: {trials: 2}}\n")
+    found = load(path, ["seed=4"])
+    assert found == load("plain", ["seed=4", "game.agent.trials=2"])
 
 
 def test_the_preset_of_the_paper_is_the_papers_setting():
@@ -156,7 +164,7 @@ def test_shaping_must_discount_as_the_agent_does():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("- 1\n- 2\n", "must be a mapping with keys such as seed"),
+        ("- 1\n- 2\n", "must be a mapping of settings to their values"),
         ("seed: 1\nsac: [\n", "line 3: not YAML"),
         ("seed: 1\nsac:\n  with: 3\n", "unknown key sac.with; did you mean width"),
     ],
