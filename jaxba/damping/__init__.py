@@ -4,7 +4,6 @@ from jaxba.damping.learned import Learned, PolicyFileError, load_policy, save_po
 from jaxba.damping.policy import DampingPolicy, ProblemInfo, decides_effort, effort_of
 from jaxba.damping.registry import LEARNED, LEARNED_PLAIN, POLICIES, UnknownPolicyError, is_learned, make_policy
 from jaxba.damping.rules import Ceres, Classic, Geometric, Schedule
-from jaxba.damping.safeguard import Safeguard
 
 __all__ = [
     "LEARNED",
@@ -17,7 +16,6 @@ __all__ = [
     "Learned",
     "PolicyFileError",
     "ProblemInfo",
-    "Safeguard",
     "Schedule",
     "UnknownPolicyError",
     "decides_effort",

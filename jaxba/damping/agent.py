@@ -22,9 +22,8 @@ from jaxba.lm.records import StepInfo
 from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions
 from jaxba.refinement.backtracking import SHORTER
 
-Observation = Literal["scale-free", "paper", "released-code", "duration"]
-ActionMode = Literal["absolute", "relative"]
-GuardMode = Literal["off", "pause", "hand-over"]
+Observation = Literal["scale-free", "paper", "duration"]
+GuardMode = Literal["off", "hand-over"]
 EffortMode = Literal["fixed", "points", "points+forcing"]
 
 FLOOR = 1e-9
@@ -32,9 +31,6 @@ FLOOR = 1e-9
 
 PAPER_LIMIT = 1000.0
 """Upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023."""
-
-RELATIVE_REACH = 3.0
-"""Decades by which a relative action changes lambda at most."""
 
 FORCING = (-3.0, -0.3)
 """log10 of the forcing terms that a third number of an action ranges over: from DeepLM's to half."""
@@ -47,7 +43,7 @@ LARGEST_ESCALATION = 12.0
 """Decades; more than the whole range of lambda means nothing."""
 
 FIRST_DAMPING = -4.0
-"""log10 of the lambda that a first relative action starts from, with twice the reach. Source: Ceres' first lambda."""
+"""log10 of the lambda that a solve's memory starts with, and a rescue. Source: Ceres' first lambda."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,7 @@ class AgentConfig:
 
     observation: Observation = "scale-free"
     """`scale-free`: decreases, gain ratios and lambdas of the last steps as ratios and logarithms. `paper`: the last
-    errors. `released-code`: the decrease that the linear model promised, as in the authors' code. `duration`: minus the
+    errors. `duration`: minus the
     time of each of the last iterations, which by the game's deterministic clock is one (the paper's reversed roles)."""
 
     history: int = 5
@@ -80,19 +76,16 @@ class AgentConfig:
     """Gain ratio that a candidate must exceed: a step that does less than that of what the linear model promised is
     tried again shorter. Source: the sufficient decrease of trust regions (Nocedal, Wright 2006, algorithm 4.1)."""
 
-    action: ActionMode = "absolute"
-    """`absolute`: an action is a lambda, linear in its logarithm. `relative`: it is a factor on the last one."""
-
     guard: GuardMode = "hand-over"
-    """`off`: nothing is done to the agent's choices. Otherwise, after `patience` rejections in a row, Ceres' rule
-    decides: until a step is accepted (`pause`), or to the end (`hand-over`). It starts at the last lambda that worked,
-    or at its own first one where twice the refused lambda is larger."""
+    """`off`: nothing is done to the agent's choices. `hand-over`: after `patience` rejections in a row Ceres' rule
+    decides to the end. It starts at the last lambda that worked, or at its own first one where twice the refused lambda
+    is larger."""
 
     patience: int = 2
     """Rejections in a row that call the guard."""
 
     max_rejections: int = 8
-    """Rejections in a solve after which the guard decides to the end, in either mode."""
+    """Rejections in a solve after which the guard decides to the end."""
 
     escalate: float = 0.5
     """Decades by which lambda must rise at least after a rejection, and after an accepted step for each time that it
@@ -130,7 +123,6 @@ class AgentConfig:
     def __post_init__(self) -> None:
         for name, known in (
             ("observation", Observation),
-            ("action", ActionMode),
             ("guard", GuardMode),
             ("effort", EffortMode),
         ):
@@ -188,10 +180,6 @@ class AgentConfig:
         return self.history
 
 
-BEFORE = {"lens_step": "file", "point_starts": "step", "remembered_steps": 0, "pattern_moves": 0}
-"""What a policy file means that is older than these settings."""
-
-
 def config_from(values: dict[str, Any]) -> AgentConfig:
     """The inverse of `dataclasses.asdict`.
 
@@ -199,7 +187,6 @@ def config_from(values: dict[str, Any]) -> AgentConfig:
         ValueError: unknown names or impossible values.
     """
     known = {field.name: field for field in fields(AgentConfig)}
-    values = {**BEFORE, **values}
     for name, value in values.items():
         if name not in known:
             raise ValueError(f"unknown setting {name!r}")
@@ -317,22 +304,20 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
     return jnp.clip(jnp.nan_to_num(features), -2, 2).astype(jnp.float32)
 
 
-def _scale(config: AgentConfig, memory: Memory) -> tuple[Any, Any]:
+def _scale(config: AgentConfig) -> tuple[float, float]:
     """log10 of the lambda that the action 0 means, and how many decades the action 1 lies above it."""
-    if config.action == "absolute":
-        return 0.5 * (config.low + config.high), 0.5 * (config.high - config.low)
-    return memory.damping, jnp.where(memory.iteration == 0, 2 * RELATIVE_REACH, RELATIVE_REACH)
+    return 0.5 * (config.low + config.high), 0.5 * (config.high - config.low)
 
 
-def action_of(config: AgentConfig, memory: Memory, decades: Float[Array, ""]) -> Float[Array, ""]:
+def action_of(config: AgentConfig, decades: Float[Array, ""]) -> Float[Array, ""]:
     """The action that asks for a lambda of `10**decades`; beyond (-1, 1) where no action does."""
-    middle, half = _scale(config, memory)
+    middle, half = _scale(config)
     return (decades - middle) / half
 
 
 def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) -> Float[Array, ""]:
     """Lambda for an action in (-1, 1), the guard's word included."""
-    middle, half = _scale(config, memory)
+    middle, half = _scale(config)
     least = _least(config, memory.cost.dtype)
     wanted = jnp.clip(middle + half * action.astype(memory.cost.dtype), least, config.high)
     if not config.guarded:
@@ -350,7 +335,7 @@ def damping_of(config: AgentConfig, memory: Memory, action: Float[Array, ""]) ->
     # larger; so does a later one, when the rule in charge is refused as often in a row
     rescue = jnp.where(memory.worked > guard, memory.worked, FIRST_DAMPING)
     guard = jnp.where(memory.row == config.patience, jnp.maximum(guard, rescue), guard)
-    return jnp.clip(10 ** jnp.where(_guarding(config, memory), guard, wanted), 10**least, LARGEST)
+    return jnp.clip(10 ** jnp.where(memory.hand_over, guard, wanted), 10**least, LARGEST)
 
 
 def _least(config: AgentConfig, dtype: Any) -> float:
@@ -360,11 +345,6 @@ def _least(config: AgentConfig, dtype: Any) -> float:
     have no digit left and steps are refused, or accepted a quarter as long (docs/performance.md).
     """
     return max(config.low, math.log10(float(jnp.finfo(dtype).eps)))
-
-
-def _guarding(config: AgentConfig, memory: Memory) -> Bool[Array, ""]:
-    """Whether Ceres' rule chooses lambda, if there is a guard."""
-    return memory.hand_over | (memory.row >= config.patience)
 
 
 def _full_effort(config: AgentConfig, dtype: Any) -> Effort:
@@ -382,7 +362,7 @@ def with_effort(config: AgentConfig, memory: Memory, action: Float[Array, " acti
     if config.effort == "points+forcing":
         low, high = FORCING
         chosen = chosen._replace(forcing=10 ** (low + (high - low) * share[2]))
-    guarded = _guarding(config, memory) & config.guarded
+    guarded = memory.hand_over & config.guarded
     return memory._replace(effort=jax.tree.map(lambda all_, some: jnp.where(guarded, all_, some), full, chosen))
 
 
@@ -409,18 +389,14 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     row = jnp.clip(jnp.nan_to_num(jnp.stack(facts), nan=2.0), -2, 2).astype(dtype)
     error = {
         "paper": lambda: jnp.minimum(_error(memory.info, step.cost), PAPER_LIMIT),
-        "released-code": lambda: jnp.nan_to_num(step.predicted),
         "duration": lambda: -jnp.ones((), dtype),
         "scale-free": lambda: jnp.zeros((), dtype),
     }[config.observation]()
     shifted = lambda old, new: jnp.concatenate([new[None].astype(dtype), old[:-1]])
     in_row = jnp.where(step.accepted, 0, memory.row + 1).astype(jnp.int32)
     rejections = (memory.rejections + ~step.accepted).astype(jnp.int32)
-    over = rejections >= config.max_rejections
-    if config.guard == "hand-over":
-        over = over | (in_row >= config.patience)
-    guarding = _guarding(config, memory)
-    growth = jnp.where(guarding, 2 * memory.growth, Ceres().reject_growth)
+    over = (rejections >= config.max_rejections) | (in_row >= config.patience)
+    growth = jnp.where(memory.hand_over, 2 * memory.growth, Ceres().reject_growth)
     growth = jnp.where(step.accepted, 0.5 * Ceres().reject_growth, growth).astype(dtype)
     pick = lambda yes, no: jnp.where(step.accepted, yes, no).astype(dtype)
     return Memory(

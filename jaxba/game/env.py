@@ -48,9 +48,6 @@ product of the reduced system takes 20 to 25 of an implicit step's 351 ms on a s
 BONUS_DECAY = 0.01
 """Share of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023, ablation."""
 
-SHAPING_FLOOR = 1e-4
-"""Distance to the best cost, relative to it, below which the shaping potential is flat."""
-
 
 @dataclass(frozen=True)
 class GameConfig:
@@ -66,19 +63,8 @@ class GameConfig:
     bonus: float = 10.0
     """Added where the episode ends in success. Source: Belder et al. 2023."""
 
-    repair_cost: float = 0.0
-    """Charged by `duration` for each camera round or further trial of a step, relative to a linear solve. By the clock
-    it would be 0.4, but then giving up is cheaper than crossing a valley (docs/game-tried.md)."""
-
     scale: float = 0.1
     """Factor on every reward, so that returns stay within a few units."""
-
-    shaping: float = 0.0
-    """Reward per decade of distance to the best cost that an iteration takes off; a potential, which leaves the best
-    policy what it is (Ng, Harada, Russell 1999)."""
-
-    discount: float = 0.99
-    """Of the shaping's potential; must be the agent's."""
 
     tolerance: float = 1e-3
     """Success: accepted cost at most (1 + tolerance) times the best known."""
@@ -96,9 +82,8 @@ class GameConfig:
             raise ValueError("max_iterations, tolerance and scale must be positive")
         if not self.tolerance < 1:
             raise ValueError(f"tolerance must be below 1, is {self.tolerance}: starts would be successes")
-        for name in ("bonus", "repair_cost", "shaping"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
+        if not self.bonus >= 0:
+            raise ValueError(f"bonus must not be negative, is {self.bonus}")
 
 
 class Episode(NamedTuple):
@@ -211,7 +196,7 @@ class Game:
         limit = after.memory.iteration >= rules.max_iterations
         terminated = success | (limit & rules.limit_is_failure)
         truncated = limit & ~terminated
-        reward = self._reward(step, after.memory, best, success, terminated)
+        reward = self._reward(step, after.memory, best, success)
         fresh = self._fresh(bank, key)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
         single = lambda x: jnp.asarray(x, jnp.float32)
@@ -224,26 +209,19 @@ class Game:
         see = lambda episode: observe(rules.agent, episode.memory)
         return following, Step(see(following), single(reward), terminated, truncated, see(after), metrics)
 
-    def _reward(
-        self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""], terminated: Bool[Array, ""]
-    ) -> Array:
+    def _reward(self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]) -> Array:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
             points = self.options.refinement.points if memory.effort is None else memory.effort.point_iterations
             inner = CG_ITERATION_COST * step.cg_iterations if rules.agent.effort == "points+forcing" else 0.0
-            reward = bonus - (1 + POINT_ITERATION_COST * points + rules.repair_cost * step.repairs + inner)
+            reward = bonus - (1 + POINT_ITERATION_COST * points + inner)
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":
             reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.iteration - 1))
         else:
             reward = bonus - jnp.log10(step.cost / best)
-        if rules.shaping:
-            height = lambda cost: -jnp.log10(jnp.maximum(cost / best - 1, SHAPING_FLOOR))
-            reward += rules.shaping * (
-                jnp.where(terminated, 0.0, rules.discount) * height(step.cost) - height(step.previous_cost)
-            )
         return rules.scale * reward
 
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
@@ -256,7 +234,7 @@ class Game:
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
         memory = jax.tree.map(lambda *x: jnp.concatenate(x), *(part.memory for part in state.episodes))
         rule = jax.vmap(lambda m: _rule_damping(agent, m))(memory) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
-        action = jax.vmap(lambda m, decades: action_of(agent, m, decades))(memory, rule)
+        action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
         return uniform.at[1::2, 0].set(action[1::2])
 

@@ -99,8 +99,6 @@ class TrainConfig:
         _check_agent(self.sac)
         _check_size(self.sac, self.game.agent)
         _check_effort(self.game.agent.effort, self.method, self.step_options)
-        if self.game.shaping and self.game.discount != self.sac.gamma:
-            raise ValueError(f"game.discount must be sac.gamma, {self.sac.gamma}, where there is shaping")
 
 
 def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None:

@@ -13,8 +13,7 @@ from test_agent import ACCEPTED, REJECTED, after, info
 from test_learned import random_policy
 from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 
-from jaxba import Ceres, Safeguard, Schedule, StepOptions, lm_step
-from jaxba.damping import effort_of
+from jaxba import Schedule, StepOptions, lm_step
 from jaxba.damping.agent import FORCING, AgentConfig, begin, observe, with_effort
 from jaxba.damping.learned import Layer, Learned, PolicyFileError, load_policy, save_policy
 from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
@@ -108,10 +107,10 @@ def test_an_action_ranges_from_no_point_iteration_to_all_and_over_the_forcing_te
 
 
 def test_the_guards_rule_has_the_whole_effort():
-    config = replace(BOTH, guard="pause", patience=2)
+    config = replace(BOTH, patience=2)
     memory = begin(config, info())
     least, full = (0, FORCING[1]), (3, FORCING[0])
-    for accepted, expected in ((REJECTED, least), (REJECTED, full), (ACCEPTED, least)):
+    for accepted, expected in ((REJECTED, least), (REJECTED, full), (ACCEPTED, full)):
         memory = after(config, memory, accepted, -3.0)
         np.testing.assert_allclose(_chosen(config, memory, -1, -1, 1), expected)
 
@@ -149,14 +148,6 @@ def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_on
         found = solve(tiny(), load_policy(path), options, max_iterations=8, callback=callback).history
         np.testing.assert_allclose(found.damping, 1e-3, rtol=1e-5)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-5)
-
-
-def test_a_safeguard_lets_the_policy_inside_decide_the_effort():
-    policy = random_policy(4, POINTS)
-    inner, _ = policy.init(info())
-    state, _ = Safeguard(policy).init(info())
-    assert effort_of(Safeguard(policy), state) == effort_of(policy, inner) is not None
-    assert effort_of(Safeguard(Ceres()), Safeguard(Ceres()).init(info())[0]) is None
 
 
 def test_a_file_with_too_few_numbers_for_its_effort_is_refused(tmp_path):

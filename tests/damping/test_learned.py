@@ -20,7 +20,7 @@ from support import same_bits, solve
 import jaxba
 from jaxba import METHODS, StepOptions, like, make_policy, random_scene, solve_loop
 from jaxba.damping import registry
-from jaxba.damping.agent import AgentConfig, config_from
+from jaxba.damping.agent import AgentConfig
 from jaxba.damping.learned import (
     FORMAT,
     LARGEST_FILE,
@@ -57,10 +57,10 @@ def random_policy(seed: int, agent: AgentConfig = AGENT, width: int = 16, spread
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.integers(0, 99), st.sampled_from(["scale-free", "paper", "released-code", "duration"]), st.integers(1, 20))
+@given(st.integers(0, 99), st.sampled_from(["scale-free", "paper", "duration"]), st.integers(1, 20))
 def test_a_policy_comes_back_from_its_file_bit_by_bit(tmp_path_factory, seed, observation, history):
     path = tmp_path_factory.mktemp("policy") / "some.safetensors"
-    policy = random_policy(seed, AgentConfig(observation=observation, history=history, guard="pause", trials=2))
+    policy = random_policy(seed, AgentConfig(observation=observation, history=history, guard="off", trials=2))
     save_policy(path, policy, {"seed": str(seed)})
     found = load_policy(path)
     assert found.config == policy.config
@@ -333,21 +333,6 @@ def test_the_camera_damping_of_a_policys_training_goes_with_it_whatever_the_poin
     trained = random_policy(5)
     save_policy(path, replace(trained, config=replace(trained.config, camera_damping=0.01)))
     assert SolverName(str(path), refine).build()[1].camera_damping == 0.01
-
-
-def test_an_agent_from_before_camera_damping_damps_cameras_as_points():
-    values = asdict(AgentConfig())
-    del values["camera_damping"]
-    assert config_from(values).camera_damping == 1
-
-
-def test_an_older_agent_steps_as_it_was_trained():
-    """Before lenses were stepped per pixel, points started from rays, steps were remembered, and ways repeated."""
-    settings = lambda config: (config.lens_step, config.point_starts, config.previous_steps_steps, config.pattern_moves)
-    values = asdict(AgentConfig())
-    del values["lens_step"], values["point_starts"], values["remembered_steps"], values["pattern_moves"]
-    assert settings(config_from(values)) == ("file", "step", 0, 0)
-    assert settings(AgentConfig()) == ("pixels", "rays", 3, 1)
 
 
 @pytest.mark.slow

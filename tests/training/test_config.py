@@ -62,7 +62,7 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
     assert found.sac == SacConfig.paper()
     assert found.bank.classes == (SceneClass(10, 10, "paper"),)
     agent = found.game.agent
-    assert (agent.observation, agent.action, agent.guard, agent.refine_points) == ("paper", "absolute", "off", 0)
+    assert (agent.observation, agent.guard, agent.refine_points) == ("paper", "off", 0)
     assert (agent.low, agent.high, agent.history) == (-10.0, 2.0, 5)
     assert agent.step_options(StepOptions()) == StepOptions()  # plain LM steps
     assert (found.game.reward, found.game.bonus, found.loop.warmup_steps) == ("duration", 10.0, 500)
@@ -148,17 +148,11 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("bank.warm_share=2", "bank: warm_share must be 0 to 1, is 2"),
         ("game.tolerance=100", "game: tolerance must be below 1, is 100"),
         ("game.bonus=-5", "game: bonus must not be negative, is -5"),
-        ("game.shaping=-1", "game: shaping must not be negative, is -1"),
         ("bank.dtype=float16", "bank.dtype must be float64 or float32"),
     ],
 )
 def test_impossible_settings_are_one_line_that_names_the_key(override, message):
     assert message in refused(override)
-
-
-def test_shaping_must_discount_as_the_agent_does():
-    load("default", ["game.shaping=0.1", "game.discount=0.9", "sac.gamma=0.9"])
-    assert "game.discount must be sac.gamma" in refused("game.shaping=0.1", "game.discount=0.9", "sac.gamma=0.95")
 
 
 @pytest.mark.parametrize(
