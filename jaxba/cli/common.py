@@ -40,7 +40,7 @@ def run_command(
     print_all_names()
     try:
         parsed = tyro.cli(arguments, args=argv, description=description)
-        from jaxba.damping.learned import PolicyFileError
+        from jaxba.damping.policy_file import PolicyFileError
         from jaxba.damping.registry import UnknownPolicyError
         from jaxba.methods.registry import UnknownMethodError
         from jaxba.problem.bundle_problem import ProblemError

@@ -117,7 +117,7 @@ def _again(folder: Path) -> str:
 
 def _write_policy(folder: Path, config: Any, work: Any, best: Any) -> None:
     from jaxba import __version__
-    from jaxba.damping.learned import save_policy
+    from jaxba.damping.policy_file import save_policy
     from jaxba.training.config import to_yaml
 
     facts = {

@@ -3,8 +3,8 @@
 | | |
 | --- | --- |
 | state | a scene of the bank, its cameras and points, the agent's memory of the episode |
-| observation | `damping.agent.observe` |
-| action | numbers in (-1, 1): lambda by `damping.agent.damping_of`, guard included; the effort if the agent has it |
+| observation | `damping.features.observe` |
+| action | numbers in (-1, 1): lambda by `damping.guard.damping_of`; the effort if the agent has it |
 | terminated | accepted cost within `tolerance` of the scene's best known; or the limit, where that counts as failure |
 | truncated | the limit, where it does not |
 | reward | `GameConfig.reward` |
@@ -23,7 +23,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping.agent import AgentConfig, Memory, action_of, begin, damping_of, observe, record, with_effort
+from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.features import Memory, begin, observation_size, observe, record
+from jaxba.damping.guard import GuardState, action_of, damping_of, effort_for
 from jaxba.damping.rules import Ceres
 from jaxba.game.protocol import Step
 from jaxba.game.random_scenes import SceneClass
@@ -129,7 +131,7 @@ class Game:
     @property
     def observation_size(self) -> int:
         """Features of an observation."""
-        return self.config.agent.observation_size
+        return observation_size(self.config.agent)
 
     @property
     def action_size(self) -> int:
@@ -167,11 +169,11 @@ class Game:
         agent = self.config.agent
         layout = class_layout(kind, self.options)
         own = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
-        memory = with_effort(agent, episode.memory, action)
-        damping = damping_of(agent, memory, action[0])
-        turn, effort = memory.iteration, memory.effort
-        state, step = lm_step(own, episode.state, damping, self.options, agent.min_gain, turn, effort)
-        return Episode(episode.scene, state, record(agent, memory, step)), step
+        guard = episode.memory.guard
+        damping, effort = damping_of(agent, guard, action[0]), effort_for(agent, guard, action)
+        state, step = lm_step(own, episode.state, damping, self.options, agent.min_gain, guard.iteration, effort)
+        memory = record(agent, episode.memory._replace(effort=effort), step)
+        return Episode(episode.scene, state, memory), step
 
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
         """Plays one action everywhere."""
@@ -193,7 +195,7 @@ class Game:
         best = bank.best_cost[episode.scene]
         after, step = self.iterate(kind, bank, episode, action)
         success = step.cost <= best * (1 + rules.tolerance)
-        limit = after.memory.iteration >= rules.max_iterations
+        limit = after.memory.guard.iteration >= rules.max_iterations
         terminated = success | (limit & rules.limit_is_failure)
         truncated = limit & ~terminated
         reward = self._reward(step, after.memory, best, success)
@@ -201,9 +203,9 @@ class Game:
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
         single = lambda x: jnp.asarray(x, jnp.float32)
         metrics = {
-            "length": single(after.memory.iteration),
+            "length": single(after.memory.guard.iteration),
             "success": single(success),
-            "rejections": single(after.memory.rejections),
+            "rejections": single(after.memory.guard.rejections),
             "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
         }
         see = lambda episode: observe(rules.agent, episode.memory)
@@ -219,7 +221,7 @@ class Game:
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":
-            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.iteration - 1))
+            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.guard.iteration - 1))
         else:
             reward = bonus - jnp.log10(step.cost / best)
         return rules.scale * reward
@@ -232,18 +234,18 @@ class Game:
         """
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
-        memory = jax.tree.map(lambda *x: jnp.concatenate(x), *(part.memory for part in state.episodes))
-        rule = jax.vmap(lambda m: _rule_damping(agent, m))(memory) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
+        guard = jax.tree.map(lambda *x: jnp.concatenate(x), *(part.memory.guard for part in state.episodes))
+        rule = jax.vmap(_rule_damping)(guard) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
         action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
         return uniform.at[1::2, 0].set(action[1::2])
 
 
-def _rule_damping(agent: AgentConfig, memory: Memory) -> Array:
+def _rule_damping(guard: GuardState) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
-    shrink = Ceres().after_success(memory.gain)
-    factor = jnp.where(memory.iteration == 0, 1.0, jnp.where(memory.row > 0, 2.0**memory.row, shrink))
-    return memory.damping + jnp.log10(factor)
+    shrink, rejections = Ceres().after_success(guard.gain), guard.consecutive_rejections
+    factor = jnp.where(guard.iteration == 0, 1.0, jnp.where(rejections > 0, 2.0**rejections, shrink))
+    return guard.damping + jnp.log10(factor)
 
 
 def make_game(

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxba.damping import Learned, load_policy, save_policy
+from jaxba.damping import LearnedPolicy, load_policy, save_policy
 from jaxba.game.env import Game, make_game
 from jaxba.game.scene_bank import Bank, Split, sieve
 from jaxba.paper.config import PAPER_STATE, PaperConfig
@@ -69,7 +69,7 @@ def train_config(config: PaperConfig, agent: Agent, seed: int) -> TrainConfig:
 
 def trained(
     config: PaperConfig, agent: Agent, seed: int, folder: Path, say: Callable[[str], None]
-) -> tuple[Learned, bool]:
+) -> tuple[LearnedPolicy, bool]:
     """The policy of an agent, trained now if that is not done.
 
     Args:

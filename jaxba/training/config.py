@@ -10,8 +10,9 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from jaxba.damping.agent import AgentConfig, EffortMode
-from jaxba.damping.learned import LARGEST_FILE
+from jaxba.damping.agent_config import AgentConfig, EffortMode
+from jaxba.damping.features import observation_size
+from jaxba.damping.policy_file import LARGEST_FILE
 from jaxba.game.env import GameConfig
 from jaxba.game.scene_bank import BankConfig
 from jaxba.io import configurations
@@ -131,7 +132,7 @@ def _check_agent(sac: SacConfig) -> None:
 
 def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
     """A policy that is too large for its file would be noticed when all is trained."""
-    sizes = [agent.observation_size, *[sac.width] * sac.layers, 2 * agent.action_size]
+    sizes = [observation_size(agent), *[sac.width] * sac.layers, 2 * agent.action_size]
     numbers = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     if 4 * numbers > LARGEST_FILE - METADATA_BYTES:
         raise ValueError(

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.learned import Learned, learned_from
+from jaxba.damping.learned import LearnedPolicy, learned_from
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
 from jaxba.game.rollout import Trajectories
@@ -62,7 +62,7 @@ class Task:
         """Scores of the yardsticks, `virtual best` among them."""
         return self._scores({})
 
-    def policy(self, actor: Any) -> Learned:
+    def policy(self, actor: Any) -> LearnedPolicy:
         """The policy of an actor's parameters."""
         return learned_from(self.config.game.agent, actor)
 

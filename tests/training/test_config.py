@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.random_scenes import SceneClass
 from jaxba.problem.options import StepOptions
 from jaxba.training import config, settings
