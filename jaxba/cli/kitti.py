@@ -261,8 +261,8 @@ def _evaluate(args: EvaluateArguments) -> int:
     if not args.lengths or not all(length > 0 for length in args.lengths):
         raise common.UsageError("--lengths must be positive")
     from jaxba.bench.plots import save_figure
-    from jaxba.bench.summary import write_text
     from jaxba.datasets.kitti import evaluate, plots
+    from jaxba.runtime.atomic import write_text
 
     side = evaluate.read_side(args.problem)
     truth = None if args.poses is None else evaluate.truth_of(side, args.poses)

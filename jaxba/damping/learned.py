@@ -21,6 +21,7 @@ from jaxba.damping.agent import AgentConfig, Memory, begin, config_from, damping
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.effort import Effort
 from jaxba.lm.step import StepInfo
+from jaxba.runtime.atomic import atomic_write
 from jaxba.typing import AnyArray
 
 FORMAT = "jaxba-policy-1"
@@ -112,14 +113,13 @@ def save_policy(path: str | Path, policy: Learned, metadata: dict[str, str] | No
         tensors[f"layer{k}.kernel"] = np.asarray(layer.kernel, np.float32)
         tensors[f"layer{k}.bias"] = np.asarray(layer.bias, np.float32)
     facts = {**(metadata or {}), "format": FORMAT, "agent": json.dumps(asdict(policy.config))}
-    target, content = Path(path), _in_order(save(tensors, facts))
+    content = _in_order(save(tensors, facts))
     if len(content) > LARGEST_FILE:
         raise PolicyFileError(
             f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy file"
         )
-    part = target.with_name(target.name + ".part")
-    part.write_bytes(content)
-    part.replace(target)
+    with atomic_write(path) as file:
+        file.write(content)
 
 
 def _in_order(content: bytes) -> bytes:

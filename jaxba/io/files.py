@@ -6,17 +6,16 @@ import bz2
 import gzip
 import lzma
 import os
-import secrets
-import shutil
 import stat
 import sys
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from io import BufferedReader
 from typing import IO, Any, BinaryIO, TypeAlias
 
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.runtime.atomic import atomic_write
 
 StrPath: TypeAlias = str | os.PathLike[str]
 
@@ -80,11 +79,10 @@ def open_input(path: StrPath) -> Iterator[Iterator[bytes]]:
 
 @contextmanager
 def open_output(path: StrPath) -> Iterator[BinaryIO]:
-    """A stream whose bytes become the file at the end of the block, or not at all; compressed as the name says.
+    """A stream whose bytes become the file at the end of the block, or not at all (`atomic_write`).
 
-    They go to a temporary file in the same folder, which then replaces the target (of a symbolic link, what it points
-    to, with its permissions) and is removed if anything fails. A device or pipe, such as standard output, is written
-    straight away, an open stream from where it stands.
+    They are compressed if the name ends in `.bz2`, `.gz` or `.xz`. A device or pipe, such as standard output, is
+    written directly, an open stream from its current position.
 
     Raises:
         ProblemError: the file cannot be written.
@@ -97,17 +95,8 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
             with _open_stream(os.fspath(path)) as file, _compressor(file, path) as stream:
                 yield stream
             return
-        temporary = os.path.join(os.path.dirname(target), f".jaxba-{secrets.token_hex(8)}.tmp")
-        try:
-            with open(temporary, "xb") as file, _compressor(file, path) as stream:
-                yield stream
-            if os.path.exists(target):
-                shutil.copymode(target, temporary)
-            os.replace(temporary, target)
-        except BaseException:
-            with suppress(OSError):
-                os.unlink(temporary)
-            raise
+        with atomic_write(path) as file, _compressor(file, path) as stream:
+            yield stream
     except ProblemError:
         raise
     except (OSError, ValueError) as error:

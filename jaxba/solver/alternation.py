@@ -17,7 +17,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.lm.termination import Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.loop import History
 from jaxba.solver.retriangulate import Retriangulation, retriangulate

@@ -26,8 +26,16 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import REDUCED_SOLVERS, StepOptions, check_count
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
-from jaxba.runtime.compilation import Compilation, Part, Stage, options_of, program, run_alone, stages
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import (
+    Compilation,
+    CompileClock,
+    Part,
+    Stage,
+    compile_and_run,
+    compiler_options,
+    program,
+    stages,
+)
 from jaxba.solver.callback_loop import IterationRecord, run_stepwise
 from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.loop import Carry, History, solve_loop
@@ -134,7 +142,7 @@ def solve(
     (`transform.FAR`).
 
     Many problems of many shapes may be solved in one process: before their programs exceed what Linux lets a process
-    map, all compiled programs of JAX are dropped (`host.release_programs`), and compiled anew where they are needed.
+    map, all compiled programs of JAX are dropped (`process.release_programs`), and compiled anew where they are needed.
 
     Returns:
         Parameters as NumPy float64 arrays, histories and timings.
@@ -172,15 +180,15 @@ def solve(
                 f"mixed types are for plain LM solved by {', '.join(REDUCED_SOLVERS)}; others have float64 or float32"
             )
         options, dtype = replace(options, algebra="mixed"), "float64"
-    with jax.enable_x64(dtype == "float64"), process.calm_blas():
+    with jax.enable_x64(dtype == "float64"), process.single_blas_thread():
         started = time.perf_counter()
         middle = far_middle(problem)
         here = problem if middle is None else shift(problem, -middle)
         with CompileClock() as clock:
             layout = jax.device_put(layout_for(problem, options, capacity))
-            initial = program(initial_state, "options", "dtype", way="quick")
+            initial = program(initial_state, "options", "dtype", level="quick")
             begin = here if capacity is None else padded_parameters(here, capacity)
-            state = jax.block_until_ready(run_alone(initial, layout, begin, options, jnp.dtype(dtype)))
+            state = jax.block_until_ready(compile_and_run(initial, layout, begin, options, jnp.dtype(dtype)))
         setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))
@@ -229,10 +237,10 @@ def explain_start(problem: BundleProblem) -> str:
 
 def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
     """How each part of a step is compiled before it is optimised."""
-    parts: dict[str, Part] = {"round": "round"}
+    parts: dict[str, Part] = {"round": "decomposition"}
     if options.in_two:
-        parts = {"propose": "factored" if options.factors else "iterated", "judge": "judge"}
-    if compilation == "full" or options_of("quick") is None:
+        parts = {"propose": "factorization" if options.factors else "iterative", "judge": "acceptance"}
+    if compilation == "full" or compiler_options("quick") is None:
         return dict.fromkeys(parts, ())
     if compilation == "quick":
         return dict.fromkeys(parts, (Stage("quick", sys.maxsize),))

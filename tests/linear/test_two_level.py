@@ -24,7 +24,7 @@ from jaxba.linear.schur import Coordinates, camera_system, eliminate_points
 from jaxba.linear.two_level import MODES, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.model import camera
 from jaxba.model.linearize import linearize
-from jaxba.runtime.process import calm_blas
+from jaxba.runtime.process import single_blas_thread
 from jaxba.structure import camera_clusters
 from jaxba.structure.layout import layout_for
 
@@ -34,7 +34,7 @@ MANIFOLD = StepOptions(linear_solver="implicit", rotation="manifold")
 @pytest.fixture(autouse=True, scope="module")
 def one_blas_thread():
     """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with calm_blas():
+    with single_blas_thread():
         yield
 
 

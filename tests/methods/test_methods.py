@@ -31,7 +31,7 @@ from jaxba.methods.stba import (
     split_right,
 )
 from jaxba.model.linearize import linearize
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock
 from jaxba.structure.layout import partition_of
 
 CLUSTERED = StepOptions(linear_solver="clustered", cluster_cameras=2)
