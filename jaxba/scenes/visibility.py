@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import ProblemError
-from jaxba.problem.geometry import rotation_matrices
+from jaxba.problem.geometry import radial_distortion, rotation_matrices
 from jaxba.scenes.config import VIEW_MARGIN, SceneConfig
 from jaxba.scenes.tracks import MIN_LENGTH
 from jaxba.scenes.trajectory import Path
@@ -80,7 +80,7 @@ class Rig:
         px, py = across * inverse, upwards * inverse
         square = px * px + py * py
         focal = self.focal[cameras]
-        scale = focal * (1 + square * (self.k1[cameras] + square * self.k2[cameras]))
+        scale = focal * radial_distortion(square, self.k1[cameras], self.k2[cameras])
         for p, half in ((px, self.half[0]), (py, self.half[1])):
             good &= (np.abs(p) * focal <= VIEW_MARGIN * half) & (np.abs(p) * scale <= half)
         return good

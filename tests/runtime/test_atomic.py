@@ -13,13 +13,18 @@ import pytest
 from jaxba.runtime.atomic import TEMPORARY, atomic_write, write_text
 
 
+def write_half(path, error):
+    with atomic_write(path) as file:
+        file.write(b"new, but not all of it")
+        raise error
+
+
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_an_error_midway_leaves_the_old_file_and_nothing_else(error, tmp_path):
     path = tmp_path / "file"
     path.write_bytes(b"old")
-    with pytest.raises(error), atomic_write(path) as file:
-        file.write(b"new, but not all of it")
-        raise error
+    with pytest.raises(error):
+        write_half(path, error)
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
