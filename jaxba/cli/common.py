@@ -117,7 +117,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
     """
     import jax
 
-    from jaxba.datasets.bal.places import user_cache
+    from jaxba.datasets.bal.paths import user_cache
     from jaxba.runtime import compilation
 
     choice = os.environ.get(CACHE_VARIABLE, "")
