@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -41,7 +42,11 @@ def measure(problem: BundleProblem, damping: str, iterations: int, repeats: int)
     for repeat in range(repeats + 1):
         for name, times in seconds.items():
             policy, options = parse_solver(damping).build()
-            end = jaxba.solve(problem, policy, options, linear_solver=name, max_iterations=iterations)
+            end = jaxba.solve(
+                problem,
+                policy,
+                replace(options, linear_solver=name, max_iterations=iterations, compilation="full"),
+            )
             products[name] = float(np.sum(end.history.cg_iterations)) / end.iterations
             if repeat:
                 times.append(end.total_s / end.iterations)

@@ -30,6 +30,7 @@ import numpy as np
 from jaxba.bench.sources import sources
 from jaxba.lm import step
 from jaxba.methods.registry import DEFAULT_METHOD
+from jaxba.problem.options import LinearSolverChoice
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Level, compiler_options
 from jaxba.runtime.fusion import fast_compilation
@@ -68,12 +69,13 @@ def measure(step: Any, arguments: tuple[Any, ...], level: Level, repeats: int) -
     return compile_s, float(np.median(times))
 
 
-def rows(location: str, solver: str, linear_solver: str, repeats: int) -> Iterator[str]:
+def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats: int) -> Iterator[str]:
     """All levels for every part of a problem's step, as lines of the table."""
     source = sources([location])[0]
     problem, name = source.read(), parse_solver(solver)
-    _, options = name.build()
-    options = choose_linear_solver(problem, options, linear_solver if name.method == DEFAULT_METHOD else None)
+    policy, asked = name.build()
+    asked_solver = linear_solver if name.method == DEFAULT_METHOD else "auto"
+    options = choose_linear_solver(problem, asked.step_options(policy), asked_solver)
     with jax.enable_x64(name.dtype == "float64"):
         dtype = jnp.dtype(name.dtype)
         layout = jax.device_put(layout_for(problem, options))
@@ -82,16 +84,16 @@ def rows(location: str, solver: str, linear_solver: str, repeats: int) -> Iterat
         parts: dict[str, tuple[Any, tuple[Any, ...]]] = {
             "round": (lambda la, s, d: step.lm_step(la, s, d, options), given)
         }
-        if options.in_two:
+        if options.single_solve:
             propose = lambda la, s, d: step.propose(la, s, d, options)
             proposal = jax.jit(lambda *given: propose(*given))(*given)  # not the program that is timed
             parts = {
                 "propose": (propose, given),
-                "judge": (lambda la, s, d, p: step.judge(la, s, d, p, options), (*given, proposal)),
+                "try_step": (lambda la, s, d, p: step.try_step(la, s, d, p, options), (*given, proposal)),
             }
         for part, (function, arguments) in parts.items():
             measured = {level: measure(function, arguments, level, repeats) for level in LEVELS}
-            line = f"{source.name[:28]:28s} {options.linear_solver:13s} {part:7s}"
+            line = f"{source.name[:28]:28s} {options.solver_name:13s} {part:7s}"
             for compile_s, run_s in measured.values():
                 line += f" {compile_s:17.2f} {1e3 * run_s:8.1f}"
             for worse, better in REPAID:

@@ -22,7 +22,7 @@ from jaxba.game.evaluate import Score, score
 from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import sieve
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.names import parse_solver
 from jaxba.training.config import load
@@ -33,7 +33,7 @@ CONSTANTS = tuple(f"constant:1e{decade}" for decade in (-8, -6, -5, -4, -3, -2))
 LIMIT = 40
 STEPS = {
     "": StepOptions(),
-    "+refine3": StepOptions(refine_points=3),
+    "+refine3": StepOptions(refinement=Refinement(points=3)),
     "+embedded": AgentConfig().step_options(StepOptions()),
 }
 """Plain, with point iterations, and with all embedded ones."""
@@ -75,8 +75,13 @@ def _runs(kind, bank, policies: list[str]) -> dict[str, Trajectories]:
             runs[name + suffix] = play(kind, bank, policy, options, LIMIT)
             print(f"played {name}{suffix}", flush=True)
     for name in policies:
-        runs[name] = play(kind, bank, *parse_solver(name).build(), LIMIT)
+        runs[name] = _played(kind, bank, name)
     return runs
+
+
+def _played(kind, bank, name: str) -> Trajectories:
+    policy, options = parse_solver(name).build()
+    return play(kind, bank, policy, options.step_options(policy), LIMIT)
 
 
 def _report(bank, runs: dict[str, Trajectories], beams: dict[str, Trajectories], policies: list[str]) -> None:

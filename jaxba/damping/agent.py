@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.policy import ProblemInfo
 from jaxba.damping.rules import LARGEST, Ceres
-from jaxba.lm.effort import Effort
-from jaxba.lm.step import StepInfo
-from jaxba.problem.options import LensStep, PointStarts, StepOptions
+from jaxba.linear.step import Effort
+from jaxba.lm.records import StepInfo
+from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions
 from jaxba.refinement.trial import SHORTER
 
 Observation = Literal["scale-free", "paper", "released-code", "duration"]
@@ -159,14 +159,15 @@ class AgentConfig:
         with."""
         return replace(
             options,
-            refine_points=self.refine_points,
-            trials=self.trials,
-            camera_rounds=self.camera_rounds,
-            pattern_moves=self.pattern_moves,
-            camera_damping=self.camera_damping,
-            lens_step=self.lens_step,
-            point_starts=self.point_starts,
-            remembered_steps=self.remembered_steps,
+            refinement=Refinement(
+                points=self.refine_points,
+                starts=self.point_starts,
+                trials=self.trials,
+                camera_rounds=self.camera_rounds,
+                pattern_moves=self.pattern_moves,
+                previous_steps=self.remembered_steps,
+            ),
+            coordinates=replace(options.coordinates, camera_damping=self.camera_damping, lens_step=self.lens_step),
         )
 
     @property

@@ -19,8 +19,9 @@ from jaxtyping import Float
 
 from jaxba.damping.agent import AgentConfig, Memory, begin, config_from, damping_of, observe, record, with_effort
 from jaxba.damping.policy import ProblemInfo
-from jaxba.lm.effort import Effort
-from jaxba.lm.step import StepInfo
+from jaxba.linear.step import Effort
+from jaxba.lm.records import StepInfo
+from jaxba.problem.options import StepOptions
 from jaxba.runtime.atomic import atomic_write
 from jaxba.typing import AnyArray
 
@@ -69,6 +70,10 @@ class Learned:
     def effort(self, state: Memory) -> Effort | None:
         """What the next step may cost; None where that is not the policy's to decide."""
         return state.effort
+
+    def step_options(self, base: StepOptions) -> StepOptions:
+        """The step that the policy was trained with; what it does not decide is that of `base`."""
+        return self.config.step_options(base)
 
     def _choose(self, memory: Memory) -> tuple[Memory, Float[Array, ""]]:
         action = self.act(observe(self.config, memory))

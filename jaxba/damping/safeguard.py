@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.policy import DampingPolicy, ProblemInfo, effort_of
 from jaxba.damping.rules import Ceres
-from jaxba.lm.effort import Effort
-from jaxba.lm.step import StepInfo
+from jaxba.linear.step import Effort
+from jaxba.lm.records import StepInfo
 
 
 class _State(NamedTuple):

@@ -30,7 +30,8 @@ from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.step import LMState, StepInfo, begin_at, lm_step
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 
 Reward = Literal["duration", "constant", "reduction", "reversed"]
@@ -171,7 +172,7 @@ class Game:
         """The episode of one scene before its first iteration."""
         scenes, initial, info = jax.tree.map(lambda x: x[scene], (bank.scenes, bank.initial_cost, bank.info))
         info = info._replace(max_iterations=jnp.asarray(self.config.max_iterations, jnp.int32))
-        state = begin_at(scenes.cameras, scenes.points, initial, self.options)
+        state = state_at(scenes.cameras, scenes.points, initial, self.options)
         return Episode(scene, state, begin(self.config.agent, info))
 
     def iterate(
@@ -229,7 +230,7 @@ class Game:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
-            points = self.options.refine_points if memory.effort is None else memory.effort.point_iterations
+            points = self.options.refinement.points if memory.effort is None else memory.effort.point_iterations
             inner = CG_ITERATION_COST * step.cg_iterations if rules.agent.effort == "points+forcing" else 0.0
             reward = bonus - (1 + POINT_ITERATION_COST * points + rules.repair_cost * step.repairs + inner)
         elif rules.reward == "constant":

@@ -22,7 +22,7 @@ def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
     Random clusters, where the options ask for them, are those of a scene in which everybody sees everything, so that
     all scenes of a class share them.
     """
-    return _layout(kind, options.cluster_cameras if options.uses_partitions else None)
+    return _layout(kind, options.cluster_cameras)
 
 
 @functools.cache

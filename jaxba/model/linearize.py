@@ -18,7 +18,7 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take, total
 
 
-class Present(NamedTuple):
+class Reference(NamedTuple):
     """What a candidate is compared with, slot by slot."""
 
     costs: Array  # (slots,), pixels squared
@@ -38,9 +38,9 @@ class Linearization(NamedTuple):
     inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
 
     @property
-    def present(self) -> Present:
+    def reference(self) -> Reference:
         """What there is to know without derivatives."""
-        return Present(self.costs, self.inverse_depth)
+        return Reference(self.costs, self.inverse_depth)
 
 
 @traced_once()

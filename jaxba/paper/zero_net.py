@@ -28,7 +28,7 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.game.env import Episode, Game
 from jaxba.game.rollout import step_groups
 from jaxba.game.scene_bank import Bank
-from jaxba.lm.step import StepInfo
+from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
 from jaxba.runtime.atomic import atomic_write

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, ProblemInfo
-from jaxba.lm.step import StepInfo
+from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
@@ -28,7 +28,8 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.loop import after_step
-from jaxba.solver.solve import MAX_ITERATIONS, Solution
+from jaxba.solver.options import MAX_ITERATIONS
+from jaxba.solver.solve import Solution
 
 LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
 """Limits of the radius that leave every lambda of a policy as it is."""

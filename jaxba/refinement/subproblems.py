@@ -73,7 +73,7 @@ class Whole(NamedTuple):
 
     def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " terms"]:
         """See `Parts`."""
-        return point_sum(self.layout, costs[None])[0] if options.refine_points else costs
+        return point_sum(self.layout, costs[None])[0] if options.refinement.points else costs
 
     def settle(
         self,
@@ -84,7 +84,7 @@ class Whole(NamedTuple):
         search: Search,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
         """See `Parts`."""
-        if options.refine_points:
+        if options.refinement.points:
             return _refined(self.layout, cameras, points, home, options, search)
         return points, observation_costs(self.layout, cameras, points, options.loss)
 
@@ -130,7 +130,7 @@ class Clusters(NamedTuple):
         search: Search,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " slots"]]:
         """See `Parts`."""
-        if options.refine_points:
+        if options.refinement.points:
             points, _ = _refined(self.layout, cameras, points, home, options, search)
             points = jnp.where(self.partition.separator, home.points, points)
         return points, observation_costs(self.layout, cameras, points, options.loss)
@@ -156,6 +156,6 @@ def _refined(
     layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, search: Search
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     frames = slot_frames(layout, cameras)
-    if options.point_starts == "step":
+    if options.refinement.starts == "step":
         return refine_points(layout, frames, points, options.loss, search.iterations, home, search.enough)
     return refine_from_starts(layout, frames, points, options.loss, search.iterations, home, *search[1:])

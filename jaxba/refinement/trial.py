@@ -32,9 +32,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.lm.damped_step import Step
-from jaxba.lm.effort import Effort
-from jaxba.model.linearize import Present
+from jaxba.linear.step import Effort, Step
+from jaxba.model.linearize import Reference
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.points import Home
@@ -99,7 +98,7 @@ def best_trial(
     cameras: Float[Array, "9 cameras"],
     points: Float[Array, "3 points"],
     cost: Float[Array, "*parts"],
-    present: Present,
+    reference: Reference,
     step: Step,
     options: StepOptions,
     min_gain: float | Float[Array, ""],
@@ -112,23 +111,25 @@ def best_trial(
         cameras: present cameras.
         points: present points.
         cost: their cost, pixels squared.
-        present: costs of the slots there, and depths.
+        reference: costs of the slots there, and depths.
         step: the solution of the damped system; its slope and damped part are those of the parts.
         options: static.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
         effort: number of point iterations, where it is not that of the options.
     """
-    point_iterations = options.refine_points
+    point_iterations = options.refinement.points
     if effort is not None:
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     # costs are compared term by term: two sums would cancel in float32
-    before = parts.terms(present.costs, options)
-    home = Home.of(parts.layout, points, present.inverse_depth)
+    before = parts.terms(reference.costs, options)
+    home = Home.of(parts.layout, points, reference.inverse_depth)
     one, none = jnp.ones_like(cost), jnp.zeros(cost.shape, jnp.int32)
     matters = step.predicted(one) > NEGLIGIBLE * cost
     starts = jnp.where(jnp.all(step.predicted(one) <= LITTLE_LEFT * cost), 2, 1)
     no = jnp.zeros((), bool)
-    settled = replace(options, point_starts="step")  # points that a round finds where their cameras left them
+    settled = replace(
+        options, refinement=replace(options.refinement, starts="step")
+    )  # points that a round finds where their cameras left them
 
     def settle(
         cameras: Array, points: Array, share: Array, repairs: Array, options: StepOptions, whole: Bool[Array, ""]
@@ -145,12 +146,12 @@ def best_trial(
         """The next one, with its camera rounds."""
         best, share = turn.best, jnp.where(turn.best.accepted, turn.best.share, turn.length)
         moved = move_cameras(parts.layout, turn.cameras, parts.of_cameras(turn.length) * turn.way[0], options)
-        if options.trials > 1:
+        if options.refinement.trials > 1:
             moved = jnp.where(moved[6] * cameras[6] < 0, turn.cameras, moved)
         there = turn.points + parts.of_points(turn.length) * turn.way[1]
         whole = ~best.accepted & (turn.length == 1)
         trial = settle(moved, there, share, best.repairs + 1, options, jnp.any(whole & turn.going))
-        if not options.camera_rounds:
+        if not options.refinement.camera_rounds:
             return trial
 
         def repair(round_: tuple[Trial, Array]) -> tuple[Trial, Array]:
@@ -166,7 +167,9 @@ def best_trial(
             within_reach = trial.gain > jnp.select([done == 0, done == 1], [-jnp.inf, WITHIN_REACH[0]], WITHIN_REACH[1])
             return (left > 0) & lacks & (trial.cost < HOPELESS * cost) & within_reach & matters
 
-        rounds = jnp.where(whole, options.camera_rounds, min(ROUNDS_OF_OTHERS, options.camera_rounds))
+        rounds = jnp.where(
+            whole, options.refinement.camera_rounds, min(ROUNDS_OF_OTHERS, options.refinement.camera_rounds)
+        )
         rounds = jnp.where(turn.going, rounds, 0)
         return lax.while_loop(lambda round_: jnp.any(worth_it(round_)), repair, (trial, rounds))[0]
 
@@ -177,7 +180,7 @@ def best_trial(
         tried = best._replace(repairs=jnp.where(turn.going, trial.repairs, best.repairs))
         after = _chosen(parts, turn.going & (better | ~best.accepted), trial, tried)
         shorter = ~trial.accepted & (turn.length > shortest) & matters
-        if not options.pattern_moves:
+        if not options.refinement.pattern_moves:
             return turn._replace(best=after, length=SHORTER * turn.length, going=turn.going & shorter)
         foreseen = (jnp.abs(trial.gain - 1) <= FORESEEN) & (trial.repairs == 0) & (step.damped <= FREE * step.slope)
         longer = better & (turn.length < longest)
@@ -196,11 +199,11 @@ def best_trial(
             turn.going & goes_on,
         )
 
-    shortest, longest = 1.5 * SHORTER ** (options.trials - 1), 2.0 ** (options.pattern_moves - 1)
+    shortest, longest = 1.5 * SHORTER ** (options.refinement.trials - 1), 2.0 ** (options.refinement.pattern_moves - 1)
     bad, yes = jnp.full_like(cost, jnp.inf), jnp.ones(cost.shape, bool)
     nothing = Trial(cameras, points, bad, -one, -bad, ~yes, one, none - 1)
     start = _Turn(nothing, cameras, points, (step.cameras, step.points), one, yes)
-    if options.trials == 1 and not options.pattern_moves:
+    if options.refinement.trials == 1 and not options.refinement.pattern_moves:
         return candidate(start)
     # the whole step is the first turn of the loop, so that the program has one copy of all this
     return lax.while_loop(lambda turn: jnp.any(turn.going), turn_over, start).best

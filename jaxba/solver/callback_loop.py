@@ -19,7 +19,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy, decides_effort, effort_of
-from jaxba.lm.step import LMState, StepInfo, judge, lm_step, propose
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.compilation import (
@@ -69,10 +70,10 @@ class _Loop(NamedTuple):
             effort = call(program(effort_of, level="quick"), self.policy, carry.policy)
         part = lambda name, function: program(function, "options", level=levels[name])
         min_gain = jnp.asarray(self.policy.min_gain, state.cost.dtype)
-        if options.in_two:
+        if options.single_solve:
             given = (self.layout, state, carry.damping)
             proposal = call(part("propose", propose), *given, options, carry.iteration, effort)
-            state, step = call(part("judge", judge), *given, proposal, options, min_gain, effort)
+            state, step = call(part("try_step", try_step), *given, proposal, options, min_gain, effort)
         else:
             given = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
             state, step = call(part("round", lm_step), *given)
@@ -110,8 +111,8 @@ def run_stepwise(
         options: static.
         max_iterations: limit of linear solves.
         callback: sees every record; a true answer ends the solve.
-        stages: how each part of a step is compiled before it is optimised, `propose` and `judge`, or `round`. A camera
-            round or a further trial counts for `RUNS_PER_REPAIR` more runs.
+        stages: how each part of a step is compiled before it is optimised, `propose` and `try_step`, or `round`. A
+            camera round or a further trial counts for `RUNS_PER_REPAIR` more runs.
 
     Returns:
         Final carry, histories of as many entries as there were iterations, how many of these had a part
@@ -150,7 +151,7 @@ def run_stepwise(
         records.append(step)
         quick_iterations += not optimised(levels)
         for name in runs:
-            runs[name] += 1 + RUNS_PER_REPAIR * int(step.repairs) if name == "judge" else 1
+            runs[name] += 1 + RUNS_PER_REPAIR * int(step.repairs) if name == "try_step" else 1
         wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - waited, step))
         if end != Termination.RUNNING:
             break

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemError
-from jaxba.problem.options import REDUCED_SOLVERS, LinearSolver, LinearSolverChoice, StepOptions
+from jaxba.problem.options import LinearSolver, LinearSolverChoice, StepOptions
 from jaxba.structure.camera_ordering import camera_order, is_banded
 from jaxba.structure.density import has_dense_shape, has_small_capacitance
 
@@ -210,41 +210,35 @@ def choose(problem: BundleProblem) -> LinearSolver:
     return min(times, key=lambda name: times[name])  # type: ignore[return-value]
 
 
-def choose_linear_solver(problem: BundleProblem, options: StepOptions, linear_solver: str | None) -> StepOptions:
+def choose_linear_solver(problem: BundleProblem, options: StepOptions, asked: LinearSolverChoice) -> StepOptions:
     """Options with the linear solver that was asked for.
 
     Args:
         problem: decides `auto`.
         options: of the step.
-        linear_solver: a name, `auto`, or None to keep what the options say. A method that is a linear solver itself
-            (methods/registry.py) has no choice to make: `auto` keeps it. Fixed intrinsics leave the explicit one.
+        asked: `auto` or a name. A method in the place of plain LM has its own solver and leaves no choice. Fixed
+            intrinsics leave the explicit one.
 
     Raises:
-        ValueError: such a method, and another solver asked for by name.
-        ProblemError: cameras share a lens, or some of it stays, and it is not the explicit solver that was asked for.
+        ValueError: a method, and a solver asked for by name.
+        ProblemError: cameras share a lens, or some of it stays, and another than the explicit solver was asked for; or
+            a factorisation would take more memory than there is.
     """
+    if options.method is not None and asked != "auto":
+        raise ValueError(f"linear solver {asked!r} is for plain LM steps; {options.method.name} has its own")
     if problem.lenses is not None and options.intrinsics == "free":
-        own = linear_solver is None or options.linear_solver not in REDUCED_SOLVERS
-        asked = options.linear_solver if own else linear_solver
-        if asked not in ("auto", "explicit"):
-            refused = asked if asked in get_args(LinearSolverChoice) else "by this method"
+        if options.method is not None or asked not in ("auto", "explicit"):
+            refused = asked if options.method is None else f"by {options.method.name}"
             raise ProblemError(f"shared or partly fixed lenses need plain LM, solved explicitly, not {refused}")
-        _check_memory(problem)
-        return replace(options, linear_solver="explicit")
-    if linear_solver is None or linear_solver == options.linear_solver:
-        if linear_solver == "explicit":
-            _check_memory(problem)
+        asked = "explicit"
+    if options.method is not None:
         return options
-    if options.linear_solver not in REDUCED_SOLVERS:
-        if linear_solver == "auto":
-            return options
-        raise ValueError(f"linear solver {linear_solver!r} is for plain LM steps; this method has its own")
-    if linear_solver == "auto" and options.intrinsics == "free":
+    if asked == "auto" and options.intrinsics == "free":
         return replace(options, linear_solver=choose(problem))  # it looks at memory itself
-    linear_solver = "explicit" if linear_solver == "auto" else linear_solver
-    if linear_solver == "explicit":
+    asked = "explicit" if asked == "auto" else asked
+    if asked == "explicit":
         _check_memory(problem)
-    return replace(options, linear_solver=linear_solver)
+    return replace(options, linear_solver=asked)
 
 
 def _check_memory(problem: BundleProblem) -> None:

@@ -32,7 +32,7 @@ from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import compile_and_run, level_after, program, stages
-from jaxba.solver.solve import explain_start
+from jaxba.solver.prepare import explain_start
 from jaxba.structure.layout import Layout, build_layout
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)

@@ -211,9 +211,9 @@ def layout_for(problem: BundleProblem, options: StepOptions, capacity: Capacity 
     return build_layout(
         problem,
         pairs=options.forms_reduced_system,
-        factor=options.linear_solver == "explicit",
-        clusters=options.uses_clusters,
-        partitions=options.cluster_cameras if options.uses_partitions else None,
+        factor=options.factors_reduced_system,
+        clusters=options.uses_camera_clusters,
+        partitions=options.cluster_cameras,
         capacity=capacity,
         lenses=options.intrinsics == "free",
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -80,7 +80,10 @@ class TrainConfig:
         plain = StepOptions(intrinsics=self.bank.intrinsics)
         if self.method == DEFAULT_METHOD:
             return plain
-        return make_method(self.method).options(replace(plain, cluster_cameras=self.cluster_cameras))
+        method = make_method(self.method)
+        if method.options(plain).cluster_cameras is not None:
+            method = make_method(f"{self.method}:{self.cluster_cameras}")
+        return method.options(plain)
 
     def __post_init__(self) -> None:
         for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep", "cluster_cameras"):
@@ -105,12 +108,12 @@ class TrainConfig:
 
 def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None:
     """What an agent chooses must be something that the method has."""
-    if effort != "fixed" and options.linear_solver == "decomposed":
+    if effort != "fixed" and not options.single_solve:
         raise ValueError(
             f"game.agent.effort: {effort!r} means nothing to method {method}, "
             "whose rounds always take all point iterations"
         )
-    if effort == "points+forcing" and options.linear_solver != "normal":
+    if effort == "points+forcing" and options.truncated is None:
         raise ValueError("game.agent.effort: a forcing term needs conjugate gradients, as method deeplm has them")
 
 

@@ -140,10 +140,10 @@ def _rules(
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
     names = tuple(dict.fromkeys((*own, *yardsticks)))
     policies: dict[str, tuple[DampingPolicy, StepOptions]] = {name: (make_policy(name), plain) for name in names}
-    embedded = replace(game.options, camera_damping=plain.camera_damping)
-    # neither coordinates of a lens alone nor what is remembered are embedded iterations
-    same = {name: getattr(plain, name) for name in ("lens_step", "point_starts", "remembered_steps")}
-    if replace(embedded, **same) != plain:
+    coordinates = replace(game.options.coordinates, camera_damping=plain.coordinates.camera_damping)
+    embedded = replace(game.options, coordinates=coordinates)
+    own_refinement = embedded.refinement  # of which the starts of points and previous steps alone embed nothing
+    if replace(own_refinement, starts="step", previous_steps=0) != plain.refinement:
         policies[yardsticks[0] + EMBEDDED] = make_policy(yardsticks[0]), embedded
     runs = _play(config, held_out, policies)
     fields = lambda name, number, run: {f"{name}/{number}/{field}": x for field, x in run._asdict().items()}

@@ -28,6 +28,7 @@ from jaxba.damping.agent import (
     record,
 )
 from jaxba.game.env import _rule_damping
+from jaxba.problem.options import ConjugateGradients
 
 _begin = jax.jit(begin, static_argnums=0)
 _observe = jax.jit(observe, static_argnums=0)
@@ -404,7 +405,7 @@ configs = st.builds(
 @given(configs)
 def test_a_configuration_comes_back_from_its_numbers(config):
     assert config_from(asdict(config)) == config
-    made = config.step_options(StepOptions(cg_forcing=0.2))
+    made = config.step_options(StepOptions(conjugate_gradients=ConjugateGradients(forcing=0.2)))
     own = "refine_points", "trials", "camera_rounds", "pattern_moves", "camera_damping", "lens_step", "point_starts"
     assert [getattr(made, name) for name in own] == [getattr(config, name) for name in own]
     assert made.cg_forcing == 0.2

@@ -8,17 +8,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import start, step, tiny
+from support import solve, start, step, tiny
 from test_agent import ACCEPTED, REJECTED, after, info
 from test_learned import random_policy
 from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 
-from jaxba import Ceres, Safeguard, Schedule, StepOptions, lm_step, solve
+from jaxba import Ceres, Safeguard, Schedule, StepOptions, lm_step
 from jaxba.damping import effort_of
 from jaxba.damping.agent import FORCING, AgentConfig, begin, observe, with_effort
 from jaxba.damping.learned import Layer, Learned, PolicyFileError, load_policy, save_policy
 from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
-from jaxba.lm.effort import Effort
+from jaxba.linear.step import Effort
+from jaxba.methods.deeplm import GlobalConjugateGradients
+from jaxba.problem.options import ConjugateGradients, Refinement
 from jaxba.training import config as configs
 from jaxba.training.settings import SettingsError
 
@@ -39,12 +41,12 @@ def effort(points: int, forcing: float | None = None) -> Effort:
 
 
 def test_a_step_with_fewer_point_iterations_is_that_of_options_with_fewer_and_compiles_nothing():
-    options = StepOptions(refine_points=3)
+    options = StepOptions(refinement=Refinement(points=3))
     layout, state = start(tiny(), options)
     damping = jnp.asarray(1e-3)
     costs = []
     for count in (1, 3):
-        expected, _ = step(layout, state, 1e-3, replace(options, refine_points=count))
+        expected, _ = step(layout, state, 1e-3, replace(options, refinement=replace(options.refinement, points=count)))
         found, _ = _step(layout, state, damping, options, effort=effort(count))
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
         np.testing.assert_allclose(found.points, expected.points, rtol=1e-9, atol=1e-12)
@@ -63,15 +65,22 @@ def test_a_step_with_fewer_point_iterations_is_that_of_options_with_fewer_and_co
 @pytest.mark.slow
 @pytest.mark.parametrize("solver", ["implicit", "normal"])
 def test_a_step_with_another_forcing_term_is_that_of_options_with_it(solver):
-    options = StepOptions(linear_solver=solver, refine_points=1, cg_forcing=1e-3)
+    options = StepOptions(
+        linear_solver=solver, refinement=Refinement(points=1), conjugate_gradients=ConjugateGradients(forcing=1e-3)
+    )
     layout, state = start(tiny(), options)
     iterations = []
     for forcing in (0.5, 1e-6, None):  # None: that of the options
         if forcing is None:
-            forcing, chosen = options.cg_forcing, effort(1)
+            forcing, chosen = options.conjugate_gradients.forcing, effort(1)
         else:
             chosen = effort(1, forcing)
-        expected, one = step(layout, state, 1e-6, replace(options, cg_forcing=forcing))
+        expected, one = step(
+            layout,
+            state,
+            1e-6,
+            replace(options, conjugate_gradients=replace(options.conjugate_gradients, forcing=forcing)),
+        )
         found, other = _step(layout, state, jnp.asarray(1e-6), options, effort=chosen)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
         assert int(one.cg_iterations) == int(other.cg_iterations)
@@ -133,7 +142,9 @@ def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_on
     save_policy(path, Learned(tuple(zero), config))
     options = config.step_options(StepOptions())
     rule = Schedule(values=(1e-3,), min_gain=config.min_gain)
-    expected = solve(tiny(), rule, replace(options, refine_points=1), max_iterations=8).history
+    expected = solve(
+        tiny(), rule, replace(options, refinement=replace(options.refinement, points=1)), max_iterations=8
+    ).history
     for callback in (None, lambda _: None):
         found = solve(tiny(), load_policy(path), options, max_iterations=8, callback=callback).history
         np.testing.assert_allclose(found.damping, 1e-3, rtol=1e-5)
@@ -177,7 +188,7 @@ def test_an_iteration_is_paid_by_the_point_iterations_that_the_action_chose():
 
 def test_an_iteration_is_paid_by_its_conjugate_gradients_where_the_action_chooses_the_forcing_term():
     config = replace(RULES, agent=replace(BOTH, guard="off", refine_points=1))
-    game = make_game(config, [KIND], [tiny_bank()], [4], StepOptions(linear_solver="normal"))
+    game = make_game(config, [KIND], [tiny_bank()], [4], StepOptions(method=GlobalConjugateGradients()))
     state, _ = _jitted_reset(game, jax.random.key(0))
     paid = []
     for forcing in (-1.0, 1.0):

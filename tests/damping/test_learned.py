@@ -15,10 +15,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
-from support import same_bits
+from support import same_bits, solve
 
 import jaxba
-from jaxba import METHODS, StepOptions, like, make_policy, random_scene, solve, solve_loop
+from jaxba import METHODS, StepOptions, like, make_policy, random_scene, solve_loop
 from jaxba.damping import registry
 from jaxba.damping.agent import AgentConfig, config_from
 from jaxba.damping.learned import (
@@ -31,6 +31,7 @@ from jaxba.damping.learned import (
     load_policy,
     save_policy,
 )
+from jaxba.problem.options import Coordinates, Refinement
 from jaxba.solver.names import SolverName, parse_solver
 from jaxba.training import sac
 from jaxba.training.config import load
@@ -287,14 +288,14 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     policy, options = parse_solver("learned").build()
     assert same_bits(policy.layers, load_policy(shipped["learned"]).layers)
     rounds = AGENT.camera_rounds
-    own = StepOptions(lens_step="pixels")
+    own = StepOptions(coordinates=Coordinates(lens_step="pixels"))
     embedded = {"refine_points": 2, "trials": 3, "camera_rounds": rounds, "pattern_moves": 1, "point_starts": "rays"}
-    assert options == replace(own, **embedded, remembered_steps=3)
+    assert options == replace(own, **embedded, refinement=replace(own.refinement, previous_steps=3))
     policy, options = parse_solver("learned+refine0").build()
     assert same_bits(policy.layers, load_policy(shipped["learned-plain"]).layers)
     assert options == own
-    assert parse_solver("learned+refine3").build()[1] == replace(own, refine_points=3)
-    assert parse_solver("ceres+refine3").build()[1] == StepOptions(refine_points=3)
+    assert parse_solver("learned+refine3").build()[1] == replace(own, refinement=replace(own.refinement, points=3))
+    assert parse_solver("ceres+refine3").build()[1] == StepOptions(refinement=Refinement(points=3))
     assert parse_solver("ceres+embedded").build()[1] == AgentConfig().step_options(StepOptions())
 
 
@@ -323,7 +324,7 @@ def test_a_shipped_policy_is_wired_as_the_preset_of_its_files_name(name):
 def test_the_policy_that_drives_another_library_damps_cameras_as_points():
     """Which is all that Ceres' one radius can do."""
     policy, options = parse_solver("pyceres:dense+learned+refine0").build()
-    assert policy.config.camera_damping == options.camera_damping == 1
+    assert policy.config.camera_damping == options.coordinates.camera_damping == 1
 
 
 @pytest.mark.parametrize("refine", [None, 0, 4])
@@ -342,7 +343,7 @@ def test_an_agent_from_before_camera_damping_damps_cameras_as_points():
 
 def test_an_older_agent_steps_as_it_was_trained():
     """Before lenses were stepped per pixel, points started from rays, steps were remembered, and ways repeated."""
-    settings = lambda config: (config.lens_step, config.point_starts, config.remembered_steps, config.pattern_moves)
+    settings = lambda config: (config.lens_step, config.point_starts, config.previous_steps_steps, config.pattern_moves)
     values = asdict(AgentConfig())
     del values["lens_step"], values["point_starts"], values["remembered_steps"], values["pattern_moves"]
     assert settings(config_from(values)) == ("file", "step", 0, 0)

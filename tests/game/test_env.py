@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support import same_bits
+from support import same_bits, solve
 from tiny_game import AGENT, KIND, RULES, grid, problem_of, tiny_bank, tiny_game
 
-from jaxba import StepOptions, make_method, make_policy, solve
+from jaxba import StepOptions, make_method, make_policy
 from jaxba.damping.agent import begin, damping_of, observe
 from jaxba.damping.learned import Layer, Learned
 from jaxba.game.env import POINT_ITERATION_COST, SHAPING_FLOOR, Game, GameConfig
@@ -27,8 +27,11 @@ from jaxba.game.random_scenes import MIN_VIEWS, SceneClass, _angle_axis, make_sc
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, sieve
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.step import LMState, lm_step
+from jaxba.lm.records import LMState
+from jaxba.lm.step import lm_step
+from jaxba.methods.ddlm import DomainDecomposition
 from jaxba.problem import geometry
+from jaxba.problem.options import Refinement
 from jaxba.structure.layout import partition_of
 
 LIMIT = 25
@@ -163,7 +166,7 @@ def test_a_scene_is_played_as_it_is_solved_by_every_method(method):
 @pytest.mark.slow
 def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
     """Forty cameras and four hundred points, as no preset has them."""
-    kind, options = SceneClass(40, 400), StepOptions(refine_points=3)
+    kind, options = SceneClass(40, 400), StepOptions(refinement=Refinement(points=3))
     scenes = make_scenes(kind, jax.random.key(5), 4)
     costs = initial_costs(kind, scenes)
     found = play(kind, Bank(scenes, costs, costs, info_of(kind, scenes, costs, 6), costs), CERES, options, 6)
@@ -177,7 +180,7 @@ def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
 
 @pytest.mark.parametrize("method", ["stba", "ddlm"])
 def test_scenes_of_a_class_share_random_clusters(method):
-    bank, options = tiny_bank(), make_method(method).options(StepOptions(cluster_cameras=2))
+    bank, options = tiny_bank(), make_method(f"{method}:2").options(StepOptions())
     labels = partition_of(class_layout(KIND, options)).label
     assert labels.max() >= 1
     assert len(np.unique(labels, axis=0)) > 1
@@ -192,7 +195,8 @@ def test_scenes_whose_clusters_have_trials_and_rounds_are_played_as_each_alone()
     """Loops with a verdict per cluster, scenes along another axis: as one scene after the other."""
     bank, damping = tiny_bank(), 1e-6
     options = StepOptions(
-        linear_solver="decomposed", cluster_cameras=2, refine_points=2, trials=3, camera_rounds=2, pattern_moves=2
+        method=DomainDecomposition(cluster_cameras=2),
+        refinement=Refinement(points=2, trials=3, camera_rounds=2, pattern_moves=2),
     )
     found = play(KIND, bank, make_policy(f"constant:{damping}"), options, 4)
     layout = class_layout(KIND, options)
@@ -442,7 +446,7 @@ def tiny_info():
 def test_a_point_iteration_costs_a_tenth_of_a_linear_solve():
     from support import step_info
 
-    game = dataclasses.replace(tiny_game(), options=StepOptions(refine_points=3))
+    game = dataclasses.replace(tiny_game(), options=StepOptions(refinement=Refinement(points=3)))
     memory = begin(AGENT, tiny_info())
     no = jnp.asarray(False)
     found = game._reward(step_info(True, cost=5.0, previous_cost=9.0), memory, jnp.asarray(1.0), no, no)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import support
 from scipy.spatial.transform import Rotation
+from support import solve
 
-from jaxba import solve
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import (

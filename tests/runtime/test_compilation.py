@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import support
 from jax import monitoring
+from support import solve
 
-from jaxba import SceneConfig, Termination, random_scene, solve, solve_and_retriangulate
+from jaxba import SceneConfig, Termination, random_scene, solve_and_retriangulate
 from jaxba.cli.solve import run
 from jaxba.io import write_problem
-from jaxba.lm.step import judge, lm_step, propose
-from jaxba.problem.options import StepOptions
+from jaxba.lm.step import lm_step, propose, try_step
+from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import compilation
 from jaxba.runtime.compilation import (
     BREAK_EVEN,
@@ -137,18 +138,18 @@ def test_every_program_is_compiled_once_before_the_first_iteration(how):
         solved = solve(problem, "learned", **how, max_iterations=4, callback=watch)
     assert solved.iterations == 4
     assert late == [len(seen.names)] * 4
-    step = ["lm_step"] if how.get("method") == "ddlm" else ["judge", "propose"]
-    assert sorted(name for name in seen.names if name in ("lm_step", "judge", "propose")) == step
+    step = ["lm_step"] if how.get("method") == "ddlm" else ["try_step", "propose"]
+    assert sorted(name for name in seen.names if name in ("lm_step", "try_step", "propose")) == step
     assert seen.names.count("_advance_and_tell") == 1
 
 
 @pytest.mark.fully_compiled
 def test_the_two_parts_are_the_step():
     layout, state = support.start(support.tiny())
-    options = StepOptions(refine_points=3, camera_rounds=3, trials=4)
+    options = StepOptions(refinement=Refinement(points=3, camera_rounds=3, trials=4))
     damping = jax.numpy.asarray(1e-6)
     proposal = jax.jit(propose, static_argnums=3)(layout, state, damping, options)
-    parts = jax.jit(judge, static_argnums=4)(layout, state, damping, proposal, options)
+    parts = jax.jit(try_step, static_argnums=4)(layout, state, damping, proposal, options)
     whole = jax.jit(lm_step, static_argnums=3)(layout, state, damping, options)
     assert whole[1].accepted
     for part, one in zip(jax.tree.leaves(parts), jax.tree.leaves(whole), strict=True):
@@ -236,7 +237,9 @@ def test_a_callback_stops_a_quick_solve():
 
 @on_a_cpu
 def test_iterations_of_alternating_solves_are_added():
-    turns = solve_and_retriangulate(support.tiny(), "ceres", StepOptions(refine_points=3), compilation="quick")
+    turns = solve_and_retriangulate(
+        support.tiny(), "ceres", StepOptions(refinement=Refinement(points=3)), compilation="quick"
+    )
     assert turns.quick_iterations == turns.iterations
 
 

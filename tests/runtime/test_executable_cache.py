@@ -16,12 +16,13 @@ import numpy as np
 import pytest
 import support
 from jax.experimental.compilation_cache import compilation_cache
+from support import solve
 from test_compilation import Compilations
 
-from jaxba import make_policy, solve
+from jaxba import make_policy
 from jaxba.io import write_problem
-from jaxba.lm.step import judge
-from jaxba.problem.options import StepOptions
+from jaxba.lm.step import try_step
+from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import ParallelCompilation, Stage, compile_and_run, program
 from jaxba.solver.retriangulate import retriangulate
@@ -102,7 +103,16 @@ def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how
     forget()
     with Compilations() as seen:
         again = once()
-    parts = ("initial_state", "problem_info", "begin", "effort_of", "propose", "judge", "lm_step", "_advance_and_tell")
+    parts = (
+        "initial_state",
+        "problem_info",
+        "begin",
+        "effort_of",
+        "propose",
+        "try_step",
+        "lm_step",
+        "_advance_and_tell",
+    )
     assert not set(seen.names) & set(parts)
     assert len(kept(folder)) == count
     assert support.same_bits(first.history, again.history)
@@ -128,7 +138,7 @@ monitoring.register_event_duration_secs_listener(
 )
 from jaxba.cli.solve import run
 status = run(sys.argv[1:])
-print("traced", sum("judge" in str(name) or "propose" in str(name) for name in names))
+print("traced", sum("try_step" in str(name) or "propose" in str(name) for name in names))
 sys.exit(status)
 """
 
@@ -174,11 +184,11 @@ def test_everything_that_changes_a_program_changes_its_file(folder, monkeypatch)
     learned = make_policy("learned")
     stricter = dataclasses.replace(learned, config=dataclasses.replace(learned.config, min_gain=0.2))
     others = [
-        cache.path_for(judge, {"power": 1}, (x,)),
+        cache.path_for(try_step, {"power": 1}, (x,)),
         *(cache.path_for(double, {}, (tree,)) for tree in (layout, fewer, learned, stricter)),
         cache.path_for(double, {"power": 2}, (x,)),
         cache.path_for(double, {"power": StepOptions()}, (x,)),
-        cache.path_for(double, {"power": StepOptions(trials=2)}, (x,)),
+        cache.path_for(double, {"power": StepOptions(refinement=Refinement(trials=2))}, (x,)),
         cache.path_for(double, {"power": 1}, (x.astype(jnp.float32),)),
         cache.path_for(double, {"power": 1}, (jnp.arange(4.0),)),
         cache.path_for(double, {"power": 1}, (1.0,)),
@@ -234,7 +244,7 @@ def test_two_rules_of_a_user_are_not_confused(folder):
         solved = solve(support.tiny(), rule(factor), max_iterations=3, callback=lambda record: None)
         np.testing.assert_allclose(solved.history.damping[1:] / solved.history.damping[:-1], factor, rtol=1e-12)
     names = {file.name.partition("-")[0] for file in kept(folder)}
-    assert {"propose", "judge"} <= names
+    assert {"propose", "try_step"} <= names
     assert not {"begin", "_advance_and_tell"} & names
 
 
@@ -274,11 +284,11 @@ def test_programs_of_both_levels_are_stored(folder, monkeypatch):
     once = lambda: solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
     first = once()
     assert first.quick_iterations == 1
-    assert sum(file.name.startswith(("propose", "judge")) for file in kept(folder)) == 4
+    assert sum(file.name.startswith(("propose", "try_step")) for file in kept(folder)) == 4
     forget()
     with Compilations() as seen:
         again = once()
-    assert not {"propose", "judge"} & set(seen.names)
+    assert not {"propose", "try_step"} & set(seen.names)
     assert support.same_bits(first.history, again.history)
 
 
