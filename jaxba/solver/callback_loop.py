@@ -133,9 +133,8 @@ def run_stepwise(
     carry = jax.block_until_ready(loop.start(run, state))
     compile_s = 0.0
     if clock.seconds > 0 or compile_programs.loaded:
-        if optimised(
-            levels
-        ):  # a program's first run touches its memory for the first time; the time of others is wanted
+        # a program's first run touches its memory for the first time; it is the time of later runs that is reported
+        if optimised(levels):
             jax.block_until_ready(loop.iterate(run, carry, levels)[2])
         compile_s = time.perf_counter() - started
     records, quick_iterations = [], 0
