@@ -51,7 +51,7 @@ def main() -> None:
     prepare_process()
     config = load(str(args.run / "config.yaml"))
     splits = read_banks(args.run / BANK)
-    with process.calm_blas():
+    with process.single_blas_thread():
         for kind, split in zip(config.bank.classes, splits, strict=True):
             count = min(args.scenes, len(split.held_out.initial_cost))
             bank = sieve(split.held_out, np.arange(count))

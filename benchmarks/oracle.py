@@ -67,7 +67,7 @@ def main() -> None:
     rows = []
     for source in sources(args.problem or real_problems()):
         problem = source.read()
-        with process.calm_blas():
+        with process.single_blas_thread():
             runs = [search(problem, options, policy.min_gain, args.iterations, width) for width in (WIDTH, 1)]
             runs += [_play(problem, *rule) for rule in rules.values()]
         best = min(float(known.get(source.name, np.inf)), *(run.costs[-1] for run in runs))

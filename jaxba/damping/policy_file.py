@@ -15,6 +15,7 @@ import numpy as np
 from jaxba.damping.agent_config import config_from
 from jaxba.damping.features import observation_size
 from jaxba.damping.learned import Layer, LearnedPolicy
+from jaxba.runtime.atomic import atomic_write
 
 FORMAT = "jaxba-policy-1"
 """Kind and version of a policy file, in its metadata."""
@@ -45,14 +46,13 @@ def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str
         tensors[f"layer{k}.kernel"] = np.asarray(layer.kernel, np.float32)
         tensors[f"layer{k}.bias"] = np.asarray(layer.bias, np.float32)
     metadata = {**(metadata or {}), "format": FORMAT, "agent": json.dumps(asdict(policy.config))}
-    target, content = Path(path), _with_sorted_metadata(save(tensors, metadata))
+    content = _with_sorted_metadata(save(tensors, metadata))
     if len(content) > LARGEST_FILE:
         raise PolicyFileError(
             f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy file"
         )
-    part = target.with_name(target.name + ".part")
-    part.write_bytes(content)
-    part.replace(target)
+    with atomic_write(path) as file:
+        file.write(content)
 
 
 def _with_sorted_metadata(content: bytes) -> bytes:

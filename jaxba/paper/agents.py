@@ -18,6 +18,7 @@ from jaxba.game.scene_bank import Bank, Split, sieve
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.atomic import atomic_write
 from jaxba.training import config as train_configs
 from jaxba.training import driver, task
 from jaxba.training.config import TrainConfig
@@ -143,6 +144,5 @@ def _share(config: PaperConfig, folder: Path, own: Path, say: Callable[[str], No
     _shared(config, folder, say)
     for name in (task.BANK, task.RULES):
         if not (own / name).is_file():
-            part = own / f"{name}.part"
-            shutil.copyfile(folder / SCENES / name, part)
-            part.replace(own / name)
+            with open(folder / SCENES / name, "rb") as source, atomic_write(own / name) as file:
+                shutil.copyfileobj(source, file)

@@ -33,6 +33,7 @@ from jaxba.game.scene_bank import Bank
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
+from jaxba.runtime.atomic import atomic_write
 
 STEEPEST = 1.0
 """Largest slope of a cost's decimal logarithm in the action that a scene may contribute, so that one diverging step
@@ -183,15 +184,13 @@ def parameters(net: ZeroNet) -> int:
 
 def save(path: Any, net: ZeroNet) -> None:
     """Writes the weights, whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with atomic_write(path) as file:
         arrays: dict[str, Any] = {
             f"{name}{k}": np.asarray(getattr(layer, name))
             for k, layer in enumerate(net.layers)
             for name in Layer._fields
         }
         np.savez(file, **arrays)
-    part.replace(path)
 
 
 def restore(path: Any, agent: AgentConfig) -> ZeroNet:

@@ -23,6 +23,7 @@ from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.atomic import atomic_write
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig
 from jaxba.training.driver import TrainError
@@ -162,10 +163,8 @@ def _write_banks(path: Path, splits: list[Split]) -> None:
 
 
 def _write(path: Path, arrays: dict[str, Any]) -> None:
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
+    with atomic_write(path) as file:
         np.savez(file, **arrays)
-    part.replace(path)
 
 
 def read_banks(path: Path) -> list[Split]:
