@@ -55,7 +55,8 @@ def imports(source: str) -> Iterator[str]:
 
 def room_of(module: str) -> str:
     """Room in which a module stands."""
-    return (module.split(".") + ["jaxba"])[1]
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else module
 
 
 def turned_arrows(room: str, sources: dict[str, str]) -> list[str]:

@@ -401,7 +401,10 @@ BAD = {
     "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
     "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
     "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
-    "loss without scale": (lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"], "--loss-scale must be positive"),
+    "loss without scale": (
+        lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"],
+        "--loss-scale must be positive",
+    ),
     "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
     "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "--output"),
     "output named as a directory": (
