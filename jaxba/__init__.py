@@ -12,7 +12,7 @@ from jaxba.damping import (
     make_policy,
     save_policy,
 )
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.io import (
     read_bal,
     read_bundler,
