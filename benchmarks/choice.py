@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -41,7 +42,11 @@ def measure(problem: BundleProblem, damping: str, iterations: int, repeats: int)
     for repeat in range(repeats + 1):
         for name, times in seconds.items():
             policy, options = parse_solver(damping).build()
-            end = jaxba.solve(problem, policy, options, linear_solver=name, max_iterations=iterations)
+            end = jaxba.solve(
+                problem,
+                policy,
+                replace(options, linear_solver=name, max_iterations=iterations, compilation="full"),
+            )
             products[name] = float(np.sum(end.history.cg_iterations)) / end.iterations
             if repeat:
                 times.append(end.total_s / end.iterations)
@@ -89,7 +94,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from jaxba.runtime.process import calm_blas
+    from jaxba.runtime.process import single_blas_thread
 
-    with calm_blas():
+    with single_blas_thread():
         main()

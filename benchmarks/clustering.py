@@ -17,7 +17,7 @@ import time
 import jax
 import numpy as np
 
-from jaxba import StepOptions, make_method, solve
+from jaxba import SolveOptions, StepOptions, make_method, solve
 from jaxba.bench.sources import sources
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
@@ -42,9 +42,9 @@ def main() -> None:
         problem = source.read()
         for name in args.methods.split(","):
             options = make_method(name).options(StepOptions())
-            graph, drawing = _clustering_seconds(problem, options.cluster_cameras)
-            with process.calm_blas():
-                iteration = _iteration_seconds(problem, options)
+            graph, drawing = _clustering_seconds(problem, options.cluster_cameras or 0)
+            with process.single_blas_thread():
+                iteration = _iteration_seconds(problem, name)
             started = time.perf_counter()
             layout_for(problem, options)
             layout = time.perf_counter() - started
@@ -65,13 +65,12 @@ def _clustering_seconds(problem: BundleProblem, largest: int) -> tuple[float, fl
     return made - started, (time.perf_counter() - made) / len(drawn)
 
 
-def _iteration_seconds(problem: BundleProblem, options: StepOptions) -> float:
+def _iteration_seconds(problem: BundleProblem, method: str) -> float:
     stamps = [0.0]
     solve(
         problem,
         "ceres",
-        options,
-        max_iterations=ITERATIONS,
+        SolveOptions(method=method, max_iterations=ITERATIONS, compilation="full"),
         callback=lambda record: stamps.append(record.time_s) and False,
     )
     return statistics.median(after - before for before, after in itertools.pairwise(stamps))

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import statistics
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -21,13 +22,13 @@ import numpy as np
 
 from benchmarks.padding import windows
 from benchmarks.suite import real_problems
-from jaxba import DampingPolicy, StepOptions, normalize, perturb, solve
+from jaxba import DampingPolicy, normalize, perturb, solve
 from jaxba.bench.sources import sources
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.preprocess import drop_invalid
 from jaxba.runtime import process
 from jaxba.solver.names import parse_solver
-from jaxba.solver.solve import MAX_ITERATIONS
+from jaxba.solver.options import MAX_ITERATIONS, SolveOptions
 
 WINDOWS = (("kitti00vo", 14, 16), ("kittistereo00s", 6, 16), ("bulani1", 6, 14))
 """A part of a problem's name, how many windows it is cut into, and how many cameras a window has."""
@@ -104,9 +105,9 @@ class Run(NamedTuple):
         return max(1, int(np.argmax(near))) if near[-1] else MAX_ITERATIONS
 
 
-def run(problem: BundleProblem, policy: DampingPolicy, options: StepOptions) -> Run:
+def run(problem: BundleProblem, policy: DampingPolicy, options: SolveOptions) -> Run:
     """One solve with the explicit solver."""
-    found = solve(problem, policy, options, linear_solver="explicit", pad=True)
+    found = solve(problem, policy, replace(options, linear_solver="explicit", pad=True, compilation="full"))
     costs = np.append(found.initial_cost, found.history.cost)
     return Run(costs, found.iterations if found.termination.converged else MAX_ITERATIONS)
 

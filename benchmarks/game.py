@@ -17,12 +17,12 @@ import numpy as np
 
 from jaxba.cli.common import prepare_process
 from jaxba.damping import DampingPolicy, Schedule, make_policy
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.evaluate import Score, score
 from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import sieve
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.names import parse_solver
 from jaxba.training.config import load
@@ -33,7 +33,7 @@ CONSTANTS = tuple(f"constant:1e{decade}" for decade in (-8, -6, -5, -4, -3, -2))
 LIMIT = 40
 STEPS = {
     "": StepOptions(),
-    "+refine3": StepOptions(refine_points=3),
+    "+refine3": StepOptions(refinement=Refinement(points=3)),
     "+embedded": AgentConfig().step_options(StepOptions()),
 }
 """Plain, with point iterations, and with all embedded ones."""
@@ -51,7 +51,7 @@ def main() -> None:
     prepare_process()
     config = load(str(args.run / "config.yaml"))
     splits = read_banks(args.run / BANK)
-    with process.calm_blas():
+    with process.single_blas_thread():
         for kind, split in zip(config.bank.classes, splits, strict=True):
             count = min(args.scenes, len(split.held_out.initial_cost))
             bank = sieve(split.held_out, np.arange(count))
@@ -75,8 +75,13 @@ def _runs(kind, bank, policies: list[str]) -> dict[str, Trajectories]:
             runs[name + suffix] = play(kind, bank, policy, options, LIMIT)
             print(f"played {name}{suffix}", flush=True)
     for name in policies:
-        runs[name] = play(kind, bank, *parse_solver(name).build(), LIMIT)
+        runs[name] = _played(kind, bank, name)
     return runs
+
+
+def _played(kind, bank, name: str) -> Trajectories:
+    policy, options = parse_solver(name).build()
+    return play(kind, bank, policy, options.step_options(policy), LIMIT)
 
 
 def _report(bank, runs: dict[str, Trajectories], beams: dict[str, Trajectories], policies: list[str]) -> None:

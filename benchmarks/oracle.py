@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,10 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.suite import real_problems
-from jaxba import DampingPolicy, LMState, StepOptions, initial_state, lm_step, make_policy, solve
+from jaxba import DampingPolicy, LMState, SolveOptions, StepOptions, initial_state, lm_step, make_policy, solve
 from jaxba.bench.sources import sources
 from jaxba.cli.common import prepare_process
-from jaxba.damping.learned import Learned
+from jaxba.damping.learned import LearnedPolicy
 from jaxba.game.oracle import GRID, WIDTH
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
@@ -51,13 +52,14 @@ def main() -> None:
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     prepare_process()
-    policy, options = parse_solver(args.solver).build()
-    if not isinstance(policy, Learned):
+    policy, asked = parse_solver(args.solver).build()
+    options = asked.step_options(policy)
+    if not isinstance(policy, LearnedPolicy):
         parser.error(f"--solver {args.solver}: not a learned one")
     known = dict(line.split() for line in args.best.read_text().splitlines()) if args.best else {}
     rules = {
-        args.solver: (policy, options),
-        "ceres, same step": (make_policy("ceres"), options),
+        args.solver: (policy, asked),
+        "ceres, same step": (make_policy("ceres"), asked),
         **{name: (make_policy(name), StepOptions()) for name in ("ceres", "classic")},
     }
     names = (f"beam of {WIDTH}", "greedy", *rules)
@@ -65,7 +67,7 @@ def main() -> None:
     rows = []
     for source in sources(args.problem or real_problems()):
         problem = source.read()
-        with process.calm_blas():
+        with process.single_blas_thread():
             runs = [search(problem, options, policy.min_gain, args.iterations, width) for width in (WIDTH, 1)]
             runs += [_play(problem, *rule) for rule in rules.values()]
         best = min(float(known.get(source.name, np.inf)), *(run.costs[-1] for run in runs))
@@ -107,8 +109,8 @@ def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterat
     return Run(np.array(costs), LIMIT)
 
 
-def _play(problem: BundleProblem, policy: DampingPolicy, options: StepOptions) -> Run:
-    solution = solve(problem, policy, options, linear_solver="auto", max_iterations=LIMIT)
+def _play(problem: BundleProblem, policy: DampingPolicy, options: SolveOptions) -> Run:
+    solution = solve(problem, policy, replace(options, max_iterations=LIMIT, compilation="full"))
     costs = np.append(solution.initial_cost, solution.history.cost)
     return Run(costs, solution.iterations if solution.converged else LIMIT)
 

@@ -90,7 +90,9 @@ def main() -> None:
     ):
         print(f"{name}: {min(sizes)} to {max(sizes)}")
     plain, pad = (
-        lambda problem, pad=pad: jaxba.solve(problem, args.damping, linear_solver="explicit", pad=pad)
+        lambda problem, pad=pad: jaxba.solve(
+            problem, args.damping, jaxba.SolveOptions(linear_solver="explicit", pad=pad, compilation="full")
+        )
         for pad in (False, True)
     )
     first = [solve_all(problems, solve) for solve in (plain, pad)]

@@ -26,7 +26,7 @@ from jaxba.lm import step
 from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, slot_frames
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import Refinement, StepOptions
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
@@ -82,7 +82,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     Args:
         layout: made for these options, on the device.
         problem: the problem.
-        options: of the step; `refine_points` only matters where refinement is timed.
+        options: of the step; `refinement` only matters where refinement is timed.
         rate: copy bandwidth, bytes per second.
         repeats: runs of each phase.
     """
@@ -93,14 +93,14 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
         done[name], least, median, compile_s = timed(function, layout, *arguments, repeats=repeats)
         return Phase(name, least, median, (size(arguments) + size(done[name])) / rate, compile_s)
 
-    plain = replace(options, refine_points=0)
+    plain = replace(options, refinement=Refinement())
     state = step.initial_state(layout, problem, plain)
     damping = jnp.asarray(1e-4)
     yield phase("linearise", lambda la, s: linearize(la, s.cameras, s.points, plain.loss), state)
     linear = done["linearise"]
     yield phase("eliminate", lambda la, li, d: schur.eliminate_points(la, li, d, plain), linear, damping)
     points = done["eliminate"]
-    turn = schur.Coordinates.of(state.cameras, plain)
+    turn = schur.RotationCoordinates.of(state.cameras, plain)
     by_camera = lambda la, li, po, tu: schur.camera_system(la, li, po, tu, damping, plain)
     yield phase("camera sums", by_camera, linear, points, turn)
     system = done["camera sums"]
@@ -122,15 +122,17 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
         yield phase("one product", product, linear, points, system, system.right)
     frames = camera.frames(state.cameras)
     anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), state.points)
-    if plain.uses_clusters:
+    if plain.uses_camera_clusters:
         coarse = lambda la, li, po, sy, an, x: coarse_preconditioner(la, li, po, sy, an)(x)
         yield phase("coarse system", coarse, linear, points, system, anchor, system.right)
-    whole = lambda la, li, po, sy, an: reduced_system.solve_reduced(la, li, po, sy, an, plain, plain.cg_forcing)
+    whole = lambda la, li, po, sy, an: reduced_system.solve_reduced(
+        la, li, po, sy, an, plain, plain.conjugate_gradients.forcing
+    )
     yield phase("reduced solve", whole, linear, points, system, anchor)
     back = lambda la, li, po, x: schur.back_substitute(la, li, po, x)
     yield phase("back-substitute", back, linear, points, system.right)
     yield phase("cost", lambda la, s: cost(la, s.cameras, s.points, plain.loss), state)
-    count = options.refine_points
+    count = options.refinement.points
     if count:
         refine = lambda la, s: refine_points(la, slot_frames(la, s.cameras), s.points, plain.loss, count)
         yield phase(f"refine {count}", refine, state)
@@ -151,7 +153,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     process.keep_memory()
     problem = sources([args.problem])[0].read()
-    options = StepOptions(linear_solver=args.solver, refine_points=args.refine)
+    options = StepOptions(linear_solver=args.solver, refinement=Refinement(points=args.refine))
     started = time.perf_counter()
     arrays = layout_for(problem, options)
     print(f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations")
@@ -164,5 +166,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with process.calm_blas():
+    with process.single_blas_thread():
         main()

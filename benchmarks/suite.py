@@ -10,6 +10,7 @@ missing is left out, and said. Ratios are compared with benchmarks/baseline.json
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import itertools
 import math
 import os
@@ -147,8 +148,7 @@ def _our_iteration(problem, repeats: int) -> tuple[float, str]:
         solution = jaxba.solve(
             problem,
             "ceres",
-            linear_solver="auto",
-            max_iterations=ITERATIONS,
+            jaxba.SolveOptions(max_iterations=ITERATIONS, compilation="full"),
             callback=lambda record, stamps=stamps: stamps.append(record.time_s) and False,
         )
         solver = solution.linear_solver
@@ -221,10 +221,7 @@ def _solved(problem: BundleProblem, name: str, goal: float = -math.inf) -> tuple
     solution = jaxba.solve(
         problem,
         policy,
-        options,
-        linear_solver="auto",
-        dtype=solver.dtype,
-        tolerances=jaxba.Tolerances(target=goal),
+        dataclasses.replace(options, tolerances=jaxba.Tolerances(target=goal), compilation="full"),
     )
     return geometry.cost(solution.problem), solution.total_s
 
@@ -328,7 +325,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    from jaxba.runtime.process import calm_blas
+    from jaxba.runtime.process import single_blas_thread
 
-    with calm_blas():
+    with single_blas_thread():
         sys.exit(main())

@@ -7,7 +7,6 @@ from jaxba.damping import (
     DampingPolicy,
     Geometric,
     ProblemInfo,
-    Safeguard,
     Schedule,
     make_policy,
 )
@@ -21,18 +20,21 @@ from jaxba.io import (
     write_ply,
     write_problem,
 )
-from jaxba.lm.step import LMState, StepInfo, initial_state, lm_step
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.step import initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.methods.registry import METHODS, Method, make_method
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.loop import History, solve_loop
+from jaxba.solver.options import SolveOptions
+from jaxba.solver.prepare import Prepared, prepare
 from jaxba.solver.retriangulate import Retriangulation, retriangulate
 from jaxba.solver.solve import Solution, solve
 from jaxba.structure.layout import Layout, build_layout
@@ -45,6 +47,8 @@ __all__ = [
     "BundleProblem",
     "Ceres",
     "Classic",
+    "ConjugateGradients",
+    "Coordinates",
     "DampingPolicy",
     "Geometric",
     "History",
@@ -54,13 +58,15 @@ __all__ = [
     "Lenses",
     "Loss",
     "Method",
+    "Prepared",
     "ProblemError",
     "ProblemInfo",
+    "Refinement",
     "Retriangulation",
-    "Safeguard",
     "SceneConfig",
     "Schedule",
     "Solution",
+    "SolveOptions",
     "StepInfo",
     "StepOptions",
     "Termination",
@@ -75,6 +81,7 @@ __all__ = [
     "normalize",
     "perturb",
     "poba_start",
+    "prepare",
     "random_scene",
     "random_scene_with_truth",
     "read_bal",

@@ -18,8 +18,8 @@ import jaxtyping
 import pytest
 
 QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-"""What `jaxba.programs.HASTE["quick"]` says, for all programs of a process and its children; not imported from there,
-because it has to be said before jaxba is."""
+"""`jaxba.runtime.compilation.COMPILER_OPTIONS["quick"]`, for all programs of a process and its children; not imported,
+because it must be set before jaxba is imported."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

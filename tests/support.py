@@ -18,8 +18,19 @@ import pytest
 from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
-from jaxba import BundleProblem, LMState, StepOptions, initial_state, like, lm_step, random_scene
-from jaxba.lm.step import StepInfo
+import jaxba
+from jaxba import (
+    BundleProblem,
+    LMState,
+    Solution,
+    SolveOptions,
+    StepOptions,
+    initial_state,
+    like,
+    lm_step,
+    random_scene,
+)
+from jaxba.lm.records import StepInfo
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.segment_sums import point_sum, point_sums, tree_sum
 
@@ -30,10 +41,23 @@ MINIATURES = ("dubrovnik-3-7-pre", "dubrovnik-3-7-18-pre", "dubrovnik-1-1-pre")
 _step = jax.jit(lm_step, static_argnames=("options",))
 
 
-def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0, turn=0):
+def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0, iteration=0):
     """`lm_step`, compiled. Called as `solve` does, so that the compilation cache serves both."""
     number = lambda x: jnp.asarray(x, state.cost.dtype)
-    return _step(layout, state, number(damping), options, number(min_gain), jnp.asarray(turn, jnp.int32))
+    return _step(layout, state, number(damping), options, number(min_gain), jnp.asarray(iteration, jnp.int32))
+
+
+def solve(problem, policy="ceres", options: StepOptions | None = None, *, callback=None, **asked) -> Solution:
+    """`jaxba.solve` with the options of a step, by default the one that the policy was made for, solved explicitly, and
+    the whole loop compiled as one program unless `asked`, which holds fields of `SolveOptions`, says otherwise."""
+    if options is None:
+        given = {"linear_solver": "explicit"}
+    else:
+        given = {name: getattr(options, name) for name in ("refinement", "coordinates", "intrinsics", "loss")}
+        given |= {"linear_solver": "auto" if options.method else options.linear_solver}
+        given |= {"conjugate_gradients": options.conjugate_gradients}
+        given |= {"method": options.method} if options.method else {}
+    return jaxba.solve(problem, policy, SolveOptions(**{"compilation": "full", **given, **asked}), callback=callback)
 
 
 def bal_file(name: str) -> Path:
@@ -256,7 +280,7 @@ def _residual(problem: BundleProblem):
 def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np.ndarray]:
     """Residuals and Jacobian as a vector and a matrix, weighted by the loss; cameras first, then points."""
     residual, (turn, camera, point) = _residual(problem)
-    if options.rotation == "manifold":
+    if options.coordinates.rotation == "manifold":
         camera[:, :, :3] = turn
     weight = np.sqrt(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[1])
     count, cameras = problem.num_observations, problem.num_cameras
@@ -279,9 +303,9 @@ def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense
     """
     residual, jacobian = linear(problem, options)
     diagonal = np.ones(jacobian.shape[1])
-    if options.scaling == "diagonal":
+    if options.coordinates.scaling == "diagonal":
         diagonal = np.clip(np.sum(jacobian**2, axis=0), 1e-6, 1e32)
-    diagonal[: problem.cameras.size] *= options.camera_damping
+    diagonal[: problem.cameras.size] *= options.coordinates.camera_damping
     stacked = np.vstack([jacobian, np.diag(np.sqrt(damping * diagonal))])
     free = jacobian.any(axis=0)  # what no residual depends on stays; a factorisation finds that to rounding only
     stacked = stacked[:, free]
@@ -295,7 +319,7 @@ def dense(problem: BundleProblem, options: StepOptions, damping: float) -> Dense
 def moved(problem: BundleProblem, options: StepOptions, change: np.ndarray) -> BundleProblem:
     """The problem after a step."""
     cameras = problem.cameras + change[: problem.cameras.size].reshape(-1, 9)
-    if options.rotation == "manifold":
+    if options.coordinates.rotation == "manifold":
         turn = Rotation.from_rotvec(change[: problem.cameras.size].reshape(-1, 9)[:, :3])
         cameras[:, :3] = (turn * Rotation.from_rotvec(problem.cameras[:, :3])).as_rotvec()
     return problem.replace(cameras=cameras, points=problem.points + change[problem.cameras.size :].reshape(-1, 3))
@@ -314,7 +338,7 @@ def back(problem: BundleProblem, before: LMState, after: LMState) -> BundleProbl
 def difference(problem: BundleProblem, after: BundleProblem, options: StepOptions) -> np.ndarray:
     """The step between two sets of parameters, in the coordinates of the options."""
     cameras = np.array(after.cameras - problem.cameras)
-    if options.rotation == "manifold":
+    if options.coordinates.rotation == "manifold":
         turned = (
             Rotation.from_rotvec(np.array(after.cameras[:, :3])) * Rotation.from_rotvec(problem.cameras[:, :3]).inv()
         )

@@ -22,8 +22,9 @@ import jax.numpy as jnp
 import jaxba
 from benchmarks.phases import HEADING, bandwidth, measure, timed
 from jaxba.bench.sources import sources
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import Refinement, StepOptions
 from jaxba.solver.cost_model import choose
+from jaxba.solver.options import SolveOptions
 from jaxba.structure.layout import layout_for
 
 PROBLEMS = "scene:ladybug-49,scene:random-150,scene:ladybug-1197,scene:venice-1778"
@@ -37,10 +38,10 @@ def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, A
     """Seconds per iteration of whole solves, for every type of arithmetic."""
     for dtype in ("float64", "mixed", "float32"):
         for refine in (0, 3):
-            options = StepOptions(refine_points=refine)
-            run = lambda dtype=dtype, options=options: jaxba.solve(
-                problem, options=options, linear_solver="auto", dtype=dtype, max_iterations=iterations
+            options = SolveOptions(
+                refinement=Refinement(points=refine), dtype=dtype, max_iterations=iterations, compilation="full"
             )
+            run = lambda options=options: jaxba.solve(problem, "ceres", options)
             first, second = run(), run()
             yield {
                 "dtype": dtype,
@@ -96,7 +97,7 @@ def main() -> int:
     for source in sources(args.problems.split(",")):
         problem = source.read()
         print(f"\n{source.name}: {problem.num_cameras} cameras, {problem.num_observations} observations\n{HEADING}")
-        options = StepOptions(linear_solver=choose(problem), refine_points=3)
+        options = StepOptions(linear_solver=choose(problem), refinement=Refinement(points=3))
         started = time.perf_counter()
         layout = jax.device_put(layout_for(problem, options))
         entry: dict[str, Any] = {"solver": options.linear_solver, "layout_s": time.perf_counter() - started}

@@ -17,17 +17,18 @@ import jax
 import jaxba
 from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import SCENE_PREFIX, Source
-from jaxba.bench.summary import write_text
 from jaxba.damping.registry import SUFFIX
 from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.peers import require
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.runtime.atomic import write_text
 from jaxba.runtime.process import out_of_memory
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import SolverName, parse_solver
-from jaxba.solver.solve import MAX_ITERATIONS, Solution, solve
+from jaxba.solver.options import MAX_ITERATIONS
+from jaxba.solver.solve import Solution, solve
 
 try:
     import fcntl
@@ -83,16 +84,14 @@ def run_solver(
     if solver.peer:
         return _run_peer(problem, source, solver, repeat, settings, steps, watch)
     policy, options = solver.build()
-    solution = solve(
-        problem,
-        policy,
+    options = replace(
         options,
-        linear_solver=settings.linear_solver if solver.method == DEFAULT_METHOD else None,
+        linear_solver=settings.linear_solver if solver.method == DEFAULT_METHOD else "auto",
         max_iterations=settings.max_iterations,
         tolerances=Tolerances(ftol=settings.ftol),
-        dtype=solver.dtype,
-        callback=watch,
+        compilation="full",
     )
+    solution = solve(problem, policy, options, callback=watch)
     record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
     if solver.dtype == "float32":  # whose own sums are wrong by more than solvers differ
         record = replace(record, initial_cost=geometry.cost(problem), final_cost=geometry.cost(solution.problem))
@@ -122,7 +121,9 @@ def _run_peer(
     }
     if solver.policy:
         policy, options = solver.build()
-        solution = drive_ceres(problem, mode, policy, embedded=options if solver.embeds else None, **shared)
+        solution = drive_ceres(
+            problem, mode, policy, embedded=options.step_options(policy) if solver.embeds else None, **shared
+        )
     else:
         solution = solve_by_ceres(problem, mode, **shared)
     record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)

@@ -15,8 +15,21 @@ import tyro
 from jaxba.cli import common
 from jaxba.cli.interrupt import Interrupt
 from jaxba.methods.registry import DEFAULT_METHOD
-from jaxba.problem.options import Intrinsics, LinearSolverChoice, Preconditioner
+from jaxba.problem.options import (
+    ConjugateGradients,
+    Coordinates,
+    Intrinsics,
+    LinearSolverChoice,
+    Preconditioner,
+    Rotation,
+    Scaling,
+)
 from jaxba.runtime.compilation import Compilation
+from jaxba.solver.options import Dtype, SolveOptions
+from jaxba.solver.prepare import DEFAULT_POLICY
+
+DEFAULTS = SolveOptions()
+"""The one table of defaults."""
 
 _STDOUT = 1
 """File descriptor of standard output."""
@@ -36,7 +49,7 @@ class Arguments:
     """BAL file or Bundler .out file, plain or .bz2, .gz, .xz; the folder of a COLMAP model (extra colmap); or the name
     of a downloaded problem of BAL, such as ladybug-49 (see jaxba-data). Without it a built-in scene is solved."""
 
-    damping: str = "learned"
+    policy: str = DEFAULT_POLICY
     """Who chooses lambda: learned (the shipped policy that fits the step), a .safetensors file of jaxba-train, ceres,
     classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4; most take a first lambda, as in
     classic:0.03."""
@@ -50,22 +63,22 @@ class Arguments:
     """Embedded point iterations after each camera step, and no other embedded iterations. If left out: those that a
     learned policy was trained with, none for a rule."""
 
-    linear_solver: LinearSolverChoice = "auto"
+    linear_solver: LinearSolverChoice = DEFAULTS.linear_solver
     """explicit: form and factor the reduced camera system. sparse: form it, conjugate gradients. implicit: conjugate
-    gradients without forming it. power: a power series. auto chooses by size."""
+    gradients without forming it. auto chooses by size."""
 
-    preconditioner: Preconditioner = "two-level"
+    preconditioner: Preconditioner = DEFAULTS.conjugate_gradients.preconditioner
     """Of conjugate gradients (sparse, implicit). two-level: block diagonal and the motion of clusters of cameras."""
 
-    dtype: Literal["float64", "float32", "mixed"] = "float64"
+    dtype: Dtype = DEFAULTS.dtype
     """Type of all arithmetic. mixed: float64, but the reduced camera system in float32."""
 
-    pad: bool = False
+    pad: bool = DEFAULTS.pad
     """Round sizes up to a coarse grid, so that problems of similar size share one compiled program, also from one call
     of this command to the next; auto then means explicit. For many small problems: large ones and those for other
     solvers are left as they are, and the summary says so."""
 
-    compilation: Compilation = "auto"
+    compilation: Compilation = DEFAULTS.compilation
     """quick: compiled in a third of the time, but iterations take two to six times as long. full: all optimisation.
     auto: quick, or in half of the time and nearly as fast, by the number of observations, and optimised after as many
     iterations as pay for it. On a GPU always full."""
@@ -74,25 +87,25 @@ class Arguments:
     """After convergence look for every point at other depths, go on from the cheapest places, and so on in turns while
     that pays. Finds points that hang in the wrong place, and a lower cost, for more iterations."""
 
-    max_iterations: int = 100
+    max_iterations: int = DEFAULTS.max_iterations
     """Linear solves before giving up."""
 
-    ftol: float = 1e-6
+    ftol: float = DEFAULTS.tolerances.ftol
     """Converged when an accepted step lowers the cost by less than this share."""
 
-    xtol: float = 1e-8
+    xtol: float = DEFAULTS.tolerances.xtol
     """Converged when an accepted step is shorter than this share of the parameters."""
 
-    gtol: float = 1e-10
+    gtol: float = DEFAULTS.tolerances.gtol
     """Converged when no gradient entry is larger."""
 
-    scaling: Literal["diagonal", "identity"] = "diagonal"
+    scaling: Scaling = Coordinates().scaling
     """What lambda multiplies: the Hessian's diagonal, or the unit matrix (the paper's equation)."""
 
-    rotation: Literal["angle-axis", "manifold"] = "angle-axis"
+    rotation: Rotation = Coordinates().rotation
     """Coordinates of rotation steps: those of the file, as Ceres, or multiplication by exp(step)."""
 
-    intrinsics: Intrinsics = "free"
+    intrinsics: Intrinsics = DEFAULTS.intrinsics
     """free: focal length and distortion of every camera are optimised, as in BAL, or of every lens, as in COLMAP.
     fixed: they stay, as they should with calibrated cameras; the reduced camera system is then formed and factored."""
 
@@ -164,7 +177,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.bench.sources import embedded_sources
     from jaxba.cli import table
     from jaxba.damping import is_learned
-    from jaxba.datasets.bal.places import resolve
+    from jaxba.datasets.bal.paths import resolve
     from jaxba.io import read_problem, write_colmap, write_problem
     from jaxba.io.files import open_output
     from jaxba.lm.termination import Tolerances
@@ -174,23 +187,28 @@ def _solve(args: Arguments) -> int:
     from jaxba.solver.retriangulate import Retriangulation
     from jaxba.solver.solve import solve
 
-    refine = None if args.refine_points is None and is_learned(args.damping) else args.refine_points or 0
-    name = SolverName(args.damping, refine, args.dtype, args.method)
+    refine = None if args.refine_points is None and is_learned(args.policy) else args.refine_points or 0
+    name = SolverName(args.policy, refine, args.dtype, args.method)
     policy, options = name.build()
     place = None if args.problem is None else resolve(args.problem)
     if place and args.log and Path(place).resolve() == Path(args.log).resolve():
         raise common.UsageError(f"--log names the problem's file, {args.log}")
     problem = embedded_sources()[0].read() if place is None else read_problem(place)
     common.prepare_process(untraced=True)
+    coordinates = options.step_options(policy).coordinates
     options = replace(
         options,
-        scaling=args.scaling,
-        rotation=args.rotation,
-        preconditioner=args.preconditioner,
+        linear_solver=args.linear_solver,
+        conjugate_gradients=ConjugateGradients(args.preconditioner),
+        coordinates=replace(coordinates, scaling=args.scaling, rotation=args.rotation),
         intrinsics=args.intrinsics,
         loss=loss,
+        tolerances=Tolerances(args.ftol, args.xtol, args.gtol),
+        max_iterations=args.max_iterations,
+        pad=args.pad,
+        compilation=args.compilation,
     )
-    common.say(table.heading(args.problem or DEFAULT_SCENE, problem, args, options))
+    common.say(table.heading(args.problem or DEFAULT_SCENE, problem, args, options.step_options(policy)))
     steps: list[IterationRecord] = []
     with Interrupt("iteration", gentle=True) as interrupt:
 
@@ -209,13 +227,7 @@ def _solve(args: Arguments) -> int:
             problem,
             policy,
             options,
-            linear_solver=args.linear_solver,
-            max_iterations=args.max_iterations,
-            tolerances=Tolerances(args.ftol, args.xtol, args.gtol),
-            dtype=args.dtype,
             callback=show,
-            pad=args.pad,
-            compilation=args.compilation,
             **search,
         )
     common.say(table.summary(problem, solution))

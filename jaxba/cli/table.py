@@ -21,21 +21,21 @@ _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      la
 
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
     """What is about to be solved, and how."""
-    refine = f" + {options.refine_points} point iterations" if options.refine_points else ""
-    if refine and options.point_starts == "rays":
+    refine = f" + {options.refinement.points} point iterations" if options.refinement.points else ""
+    if refine and options.refinement.starts == "rays":
         refine += " from the better of step and rays"
-    if options.camera_rounds:
-        refine += f", up to {options.camera_rounds} camera rounds"
-    if options.trials > 1:
-        refine += f", up to {options.trials} trials"
-    if options.pattern_moves:
-        refine += f", up to {options.pattern_moves} pattern moves"
-    if options.lens_step == "pixels":
+    if options.refinement.camera_rounds:
+        refine += f", up to {options.refinement.camera_rounds} camera rounds"
+    if options.refinement.trials > 1:
+        refine += f", up to {options.refinement.trials} trials"
+    if options.refinement.pattern_moves:
+        refine += f", up to {options.refinement.pattern_moves} pattern moves"
+    if options.coordinates.lens_step == "pixels":
         refine += ", distortion per pixel"
-    if options.remembers:
-        refine += f", {options.remembers} step{'s' * (options.remembers > 1)} remembered"
-    if options.camera_damping != 1:
-        refine += f", cameras damped by {options.camera_damping:g} lambda"
+    if options.kept_steps:
+        refine += f", {options.kept_steps} previous step{'s' * (options.kept_steps > 1)}"
+    if options.coordinates.camera_damping != 1:
+        refine += f", cameras damped by {options.coordinates.camera_damping:g} lambda"
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     sizes = f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations"
     if problem.lenses is not None:
@@ -43,7 +43,7 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         for kind, number in Counter(map(tuple, free.tolist())).most_common():
             names = [one for one, used in zip(("f", "k1", "k2"), kind, strict=True) if used]
             sizes += f", {number} lens{'es' * (number > 1)} ({', '.join(names) or 'fixed'})"
-    return f"{name}: {sizes}\ndamping {args.damping}{refine}, {args.dtype}, {solver}"
+    return f"{name}: {sizes}\npolicy {args.policy}{refine}, {args.dtype}, {solver}"
 
 
 def header(initial_cost: float) -> str:

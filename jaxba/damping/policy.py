@@ -7,8 +7,9 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.lm.effort import Effort
-from jaxba.lm.step import StepInfo
+from jaxba.linear.step import Effort
+from jaxba.lm.records import StepInfo
+from jaxba.problem.options import StepOptions
 
 
 class ProblemInfo(NamedTuple):
@@ -28,8 +29,8 @@ class DampingPolicy(Protocol):
     """Chooses lambda for every iteration.
 
     A policy is a frozen dataclass and a pytree: its numbers are traced, so that changing one never
-    recompiles, and its class selects the code. Both functions are pure and jittable. A policy may have a third one,
-    `effort(state)`, see `effort_of`.
+    recompiles, and its class selects the code. Both functions are pure and jittable. A policy may have two more,
+    `effort(state)`, see `effort_of`, and `step_options(base)`, see `trained_step`.
     """
 
     @property
@@ -54,3 +55,9 @@ def decides_effort(policy: DampingPolicy) -> bool:
 def effort_of(policy: DampingPolicy, state: Any) -> Effort | None:
     """What the iteration that follows may cost, if the policy decides that; None where `StepOptions` do."""
     return policy.effort(state) if decides_effort(policy) else None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def trained_step(policy: DampingPolicy) -> StepOptions:
+    """The step that a policy was made for: that of its method `step_options`, if it has one, else a plain step."""
+    made_for = getattr(policy, "step_options", None)
+    return StepOptions() if made_for is None else made_for(StepOptions())

@@ -14,7 +14,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.damping.policy import ProblemInfo
-from jaxba.lm.step import StepInfo
+from jaxba.lm.records import StepInfo
 
 LARGEST = 1e32
 """Upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32."""

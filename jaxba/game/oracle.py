@@ -21,7 +21,8 @@ from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import Trajectories, step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.step import LMState, StepInfo, begin_at, lm_step
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 
 GRID = tuple(10.0**decade for decade in (-8, -7, -6, -5, -4, -3, -2, -1, 0))
@@ -77,7 +78,7 @@ def _search(
 
     def one(scene: Bank) -> Array:
         own = with_scene(layout, scene.scenes.pixels, scene.scenes.mask)
-        start = begin_at(scene.scenes.cameras, scene.scenes.points, scene.initial_cost, options)
+        start = state_at(scene.scenes.cameras, scene.scenes.points, scene.initial_cost, options)
         return beam_search(lambda state, damping: lm_step(own, state, damping, options), start, iterations, width, grid)
 
     return lax.map(one, bank)

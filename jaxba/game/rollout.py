@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float, Int
 from jaxba.damping import DampingPolicy, effort_of
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.step import LMState, StepInfo, begin_at, lm_step
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.step import lm_step, state_at
 from jaxba.lm.termination import converged_in_cost
 from jaxba.problem.options import StepOptions
 
@@ -112,7 +113,7 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
         at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)
         start = at(bank.scenes)
         policy_state, damping = policy.init(at(bank.info))
-        state = begin_at(start.cameras, start.points, at(bank.initial_cost), options)
+        state = state_at(start.cameras, start.points, at(bank.initial_cost), options)
         return _Lane(scene, state, policy_state, damping, jnp.zeros((), jnp.int32))
 
     def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:

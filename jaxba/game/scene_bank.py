@@ -25,7 +25,7 @@ from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.game.warm_starts import warm_starts
 from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
-from jaxba.problem.options import Intrinsics, StepOptions
+from jaxba.problem.options import Intrinsics, Refinement, StepOptions
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose best cost counts, each with point iterations."""
@@ -118,7 +118,7 @@ class BankConfig:
     @property
     def options(self) -> StepOptions:
         """Of the portfolio's steps; those of plain rules without the point iterations."""
-        return StepOptions(refine_points=self.refine_points, intrinsics=self.intrinsics)
+        return StepOptions(refinement=Refinement(points=self.refine_points), intrinsics=self.intrinsics)
 
     def __post_init__(self) -> None:
         if len(self.classes) != len(self.scenes) or not self.classes:

@@ -10,9 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.game.random_scenes import SceneClass
-from jaxba.problem.bundle_problem import AnyArray, BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout, build_layout
+from jaxba.typing import AnyArray
 
 
 def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
@@ -21,7 +22,7 @@ def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
     Random clusters, where the options ask for them, are those of a scene in which everybody sees everything, so that
     all scenes of a class share them.
     """
-    return _layout(kind, options.cluster_cameras if options.uses_partitions else None)
+    return _layout(kind, options.cluster_cameras)
 
 
 @functools.cache

@@ -18,7 +18,8 @@ from jaxtyping import Float
 from jaxba.game.random_scenes import SceneClass, Scenes
 from jaxba.game.rollout import step_groups
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.step import LMState, begin_at, lm_step
+from jaxba.lm.records import LMState
+from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 
 ITERATIONS = 10
@@ -64,7 +65,7 @@ def warm_starts(
             after, _ = lm_step(own, state, damping, options, 0.0, turn)
             return jax.tree.map(lambda new, old: jnp.where(turn < count, new, old), after, state)
 
-        return lax.fori_loop(0, ITERATIONS, body, begin_at(scene.cameras, scene.points, cost, options))
+        return lax.fori_loop(0, ITERATIONS, body, state_at(scene.cameras, scene.points, cost, options))
 
     moved = step_groups(one, scenes, initial, count, damping)
     return scenes._replace(cameras=moved.cameras, points=moved.points), moved.cost

@@ -1,7 +1,6 @@
 """Preconditioners of the reduced camera system.
 
-Source: Agarwal et al. 2010 (block diagonals), Weber et al. 2023 (power series, Ceres calls it SPSE); two levels:
-linear/two_level.py.
+Source: Agarwal et al. 2010 (block diagonals); two levels: two_level.py.
 """
 
 from __future__ import annotations
@@ -9,15 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
 from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.linear.two_level import Anchor, coarse_preconditioner
 from jaxba.model.linearize import Linearization
-from jaxba.problem.options import StepOptions
-from jaxba.runtime.barriers import materialized
+from jaxba.problem.options import Preconditioner
+from jaxba.runtime.fusion import fusion_barrier
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
@@ -31,26 +30,27 @@ def preconditioner(
     system: CameraSystem,
     anchor: Anchor,
     blocks: Float[Array, "blocks 9 9"] | None,
-    apply: Operator,
-    options: StepOptions,
+    name: Preconditioner,
 ) -> Operator:
-    """The preconditioner that the options name, as a function of the residual.
+    """The preconditioner of this name, as a function of the residual.
 
     Args:
+        layout: slots; grouped cameras for two levels.
+        linear: Jacobians.
+        points: eliminated.
+        system: damped camera blocks.
+        anchor: where cameras and points are, for two levels.
         blocks: the reduced camera system where it has been formed.
-        apply: its product with a vector.
+        name: see `ConjugateGradients`.
     """
-    if options.preconditioner in ("jacobi", "power-series"):
-        inverse = block_inverse(system.blocks)
-        if options.preconditioner == "jacobi":
-            return inverse
-        return lambda r: series(apply, system, inverse, r, options.preconditioner_order)
+    if name == "jacobi":
+        return block_inverse(system.blocks)
     if blocks is None or layout.pairs is None:
         diagonal = diagonal_blocks(layout, linear, points, system)
     else:
         diagonal = take_rows(blocks, layout.pairs.diagonal)
     fine = block_inverse(diagonal)
-    if options.preconditioner == "schur-jacobi":
+    if name == "schur-jacobi":
         return fine
     coarse = coarse_preconditioner(layout, linear, points, system, anchor)
     return lambda r: fine(r) + coarse(r)
@@ -69,30 +69,12 @@ def diagonal_blocks(
     f00 = jnp.sqrt(jnp.maximum(1 - dot(over, over), 0))
     f10 = -dot(over, under) / jnp.where(f00 > 0, f00, 1)
     f11 = jnp.sqrt(jnp.maximum(1 - dot(under, under) - f10 * f10, 0))
-    f00, f10, f11 = materialized(jnp.stack([f00, f10, f11]))
+    f00, f10, f11 = fusion_barrier(jnp.stack([f00, f10, f11]))
     first, second = linear.camera_jacobian
     columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
     level, *levels = layout.camera_levels
     gathered = take_rows(as_rows(columns), level).reshape(level.shape[0], -1, 9)
     return system.only_damping + tree_sum(outer_sum(gathered, gathered), tuple(levels))
-
-
-def series(
-    apply: Callable[[Array], Array],
-    system: CameraSystem,
-    inverse: Callable[[Array], Array],
-    right: Float[Array, "cameras 9"],
-    order: int,
-) -> Float[Array, "cameras 9"]:
-    """First `order + 1` terms of `sum_i (B^-1 W)^i B^-1 b`, a symmetric map of b."""
-
-    def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        total, term = carry
-        term = inverse(jnp.einsum("cab,cb->ca", system.blocks, term) - apply(term))
-        return total + term, term
-
-    start = inverse(right)
-    return lax.fori_loop(0, order, body, (start, start))[0]
 
 
 def block_inverse(blocks: Float[Array, "cameras 9 9"]) -> Callable[[Array], Array]:

@@ -3,9 +3,8 @@
 - `explicit`: S formed from chunked products over co-visible pairs, factored: dense, or as a band where it is one.
 - `sparse`: S formed in blocks, conjugate gradients on the blocks.
 - `implicit`: conjugate gradients with two passes over the observations a product; S is never formed.
-- `power`: the power series `sum_i (B^-1 W)^i B^-1 b`, `S = B - W`, without inner products.
 
-Source: Agarwal et al. 2010 (implicit and explicit), Weber et al. 2023, "Power Bundle Adjustment" (series).
+Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
 """
 
 from __future__ import annotations
@@ -22,18 +21,18 @@ from jaxba.linear.band_cholesky import band_factor, band_factor_and_solve
 from jaxba.linear.blocks import dense_blocks, pair_products
 from jaxba.linear.cholesky import factor_and_solve, factor_panels
 from jaxba.linear.conjugate_gradients import conjugate_gradients
-from jaxba.linear.preconditioners import block_inverse, preconditioner, series
+from jaxba.linear.preconditioners import preconditioner
 from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
+from jaxba.linear.shared_intrinsics_solve import solve_tied
 from jaxba.linear.two_level import Anchor
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.problem.options import StepOptions
-from jaxba.runtime.barriers import apart
+from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.density import has_few_points
 from jaxba.structure.layout import Layout, PairLayout
 from jaxba.structure.segment_sums import take_rows, tree_sum
-from jaxba.structure.shared_intrinsics import solve_tied
+from jaxba.typing import AnyArray
 
 SINGLE_LIFT = 64.0
 """Rounding units added to the scaled diagonal of a system formed in float32, which may have lost its sign."""
@@ -58,20 +57,18 @@ def solve_reduced(
     Conjugate gradients, where they are all of the solver, end by `forcing`.
 
     Returns:
-        The step, and the number of iterations (0 after a factorisation, the order of a power series). Not finite where
+        The step, and the number of iterations (0 after a factorisation). Not finite where
         a factorisation failed.
     """
     product = lambda x: apply_reduced(layout, linear, points, system, x)
-    if options.linear_solver == "power":
-        return _power_series(product, system, options)
     explicit, grid = options.linear_solver == "explicit", layout.grid
     if system.ties is not None:
         formed = _dense(layout, linear, points, system)
         return solve_tied(system.ties, formed, system.right), _no_iterations()
     # a small capacitance matrix is not worth rounding to float32
-    if explicit and grid is not None and (options.algebra == "full" or has_few_points(*grid.shape)):
+    if explicit and grid is not None and (not options.mixed_precision or has_few_points(*grid.shape)):
         return solve_dense(grid, linear, points, system), _no_iterations()
-    if options.algebra == "full":
+    if not options.mixed_precision:
         if explicit:
             return factor_blocks(layout, reduced_blocks(layout, linear, points, system), system.right), _no_iterations()
         return _iterate_reduced(layout, linear, points, system, anchor, options, forcing)
@@ -108,7 +105,9 @@ def _iterate_reduced(
     if options.linear_solver == "sparse":
         formed = blocks = reduced_blocks(layout, linear, points, system)
         apply = lambda x: apply_blocks(layout, formed, x)
-    precondition = preconditioner(layout, linear, points, system, anchor, blocks, apply, options)
+    precondition = preconditioner(
+        layout, linear, points, system, anchor, blocks, options.conjugate_gradients.preconditioner
+    )
     return _iterate(apply, precondition, system, options, forcing)
 
 
@@ -127,7 +126,7 @@ def reduced_blocks(
         own = jnp.concatenate([own.reshape(-1, 81), jnp.zeros((1, 81), own.dtype)])
         return (take_rows(own, pairs.block_camera) - products).reshape(-1, 9, 9)
 
-    return apart(subtracted, system.blocks, products, index=pairs.block_row)
+    return compute_unfused(subtracted, system.blocks, products, index=pairs.block_row)
 
 
 def solve_dense(
@@ -230,13 +229,6 @@ def _iterate(
         system.right,
         precondition,
         forcing=forcing,
-        tolerance=options.cg_tolerance,
-        max_iterations=options.cg_max_iterations,
+        tolerance=options.conjugate_gradients.tolerance,
+        max_iterations=options.conjugate_gradients.max_iterations,
     )
-
-
-def _power_series(
-    apply: Callable[[Array], Array], system: CameraSystem, options: StepOptions
-) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
-    order = options.power_order
-    return series(apply, system, block_inverse(system.blocks), system.right, order), jnp.asarray(order, jnp.int32)

@@ -5,13 +5,14 @@ observation and `Y = J_c^T Q`, the reduced camera system is `S = B + D_c - sum Y
 `-J_c^T (r - Q h)`, `h = L^-1 g_p`. Writing the right-hand side with the projected residual `r - Q h` keeps it free
 of cancellation.
 
-Rotations are perturbed on the manifold here. `Coordinates` says in which coordinates damping is diagonal.
+Rotations are perturbed on the manifold here. `RotationCoordinates` says in which coordinates damping is diagonal.
 Source: Triggs et al. 2000, section 6; Agarwal et al. 2010, section 3.
 """
 
 from __future__ import annotations
 
 import functools
+import operator
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -22,22 +23,22 @@ from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
-from jaxba.runtime.single_loop import together
+from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
-from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_rows, tree_sum
+from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_each, take_rows, tree_sum
 from jaxba.structure.shared_intrinsics import LensTies
 
 
-class Coordinates(NamedTuple):
+class RotationCoordinates(NamedTuple):
     """Maps between manifold rotation steps and the coordinates in which damping is diagonal."""
 
     forward: Float[Array, "cameras 3 3"]  # coordinates -> manifold
     inverse: Float[Array, "cameras 3 3"]
 
     @classmethod
-    def of(cls, cameras: Float[Array, "9 cameras"], options: StepOptions) -> Coordinates:
+    def of(cls, cameras: Float[Array, "9 cameras"], options: StepOptions) -> RotationCoordinates:
         """Angle-axis coordinates need the left Jacobian; the manifold's own need nothing."""
-        if options.rotation == "manifold":
+        if options.coordinates.rotation == "manifold":
             one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
             return cls(one, one)
         to_front = lambda m: jnp.moveaxis(m, -1, 0)
@@ -88,7 +89,7 @@ def eliminate_points(
     def projected(factor: Array, jacobian: list[list[Array]]) -> list[Array]:
         return [entry for row in jacobian for entry in Cholesky3(*factor).forward(row)]
 
-    rows = together(projected, at_slot, linear.point_jacobian)
+    rows = compute_in_one_loop(projected, at_slot, linear.point_jacobian)
     return PointSystem(factor, gradient, diagonal, solved, [rows[:3], rows[3:]])
 
 
@@ -96,7 +97,7 @@ def camera_system(
     layout: Layout,
     linear: Linearization,
     points: PointSystem,
-    coordinates: Coordinates,
+    coordinates: RotationCoordinates,
     damping: Float[Array, "*cameras_1"],
     options: StepOptions,
 ) -> CameraSystem:
@@ -114,7 +115,7 @@ def camera_system(
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
     )
-    factor = options.camera_damping * damping
+    factor = options.coordinates.camera_damping * damping
     extra = damping_diagonal(diagonal, factor, options)
     ties = layout.lenses if layout.lenses is not None and layout.lenses.shared else None
     if ties is not None:
@@ -147,7 +148,7 @@ def apply_reduced(
         over, under = (sum(row[i] * at_slot[i] for i in range(3)) for row in projected)
         return [first[a] * over + second[a] * under for a in range(9)]
 
-    rows = as_rows(together(lifted, at_slot, points.projected, *linear.camera_jacobian))
+    rows = as_rows(compute_in_one_loop(lifted, at_slot, points.projected, *linear.camera_jacobian))
     return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(rows, layout.camera_levels)
 
 
@@ -177,10 +178,20 @@ def project_to_points(
         over, under = (sum(row[a] * at_slot[a] for a in range(9)) for row in jacobian)
         return [projected[0][i] * over + projected[1][i] * under for i in range(3)]
 
-    return point_sums(layout, together(inner, at_slot, points.projected, linear.camera_jacobian))
+    return point_sums(layout, compute_in_one_loop(inner, at_slot, points.projected, linear.camera_jacobian))
 
 
-def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: Coordinates) -> Float[Array, ""]:
+def jacobian_product(
+    layout: Layout, linear: Linearization, cameras: Float[Array, "cameras 9"], points: Float[Array, "3 points"]
+) -> list[Array]:
+    """`J d` of every slot, two vectors, pixels."""
+    by_camera, by_point = take_each(cameras.T, layout.slot_camera), take_each(points, layout.slot_point)
+    rows = zip(linear.camera_jacobian, linear.point_jacobian, strict=True)
+    dot = lambda a, b: functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
+    return [dot(c, by_camera) + dot(p, by_point) for c, p in rows]
+
+
+def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates) -> Float[Array, ""]:
     """Largest entry of the gradient, in the options' coordinates."""
     turned = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
     lens = system.gradient[:, 6:] if system.ties is None else system.ties.total(system.gradient[:, 6:])
@@ -190,7 +201,7 @@ def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: Coo
 
 def damping_diagonal(diagonal: Array, damping: Float[Array, "..."], options: StepOptions) -> Array:
     """The diagonal matrix that damping adds to one with the given diagonal."""
-    if options.scaling == "identity":
+    if options.coordinates.scaling == "identity":
         return jnp.full_like(diagonal, 1) * damping
     high = min(DIAGONAL_MAXIMUM, float(jnp.finfo(diagonal.dtype).max) / 4)
     return damping * jnp.clip(diagonal, DIAGONAL_MINIMUM, high)

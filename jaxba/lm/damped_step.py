@@ -6,7 +6,7 @@ linear/reduced_system.py.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import cast
 
 import jax.numpy as jnp
 from jax import Array
@@ -15,41 +15,22 @@ from jaxtyping import Float, Int
 from jaxba.linear.reduced_system import solve_reduced
 from jaxba.linear.schur import (
     CameraSystem,
-    Coordinates,
     PointSystem,
-    apply_reduced,
+    RotationCoordinates,
     back_substitute,
     camera_system,
     eliminate_points,
+    jacobian_product,
     largest_gradient,
 )
+from jaxba.linear.step import Effort, Step
 from jaxba.linear.two_level import Anchor
-from jaxba.lm.effort import Effort
-from jaxba.methods.deeplm import image, solve_normal
-from jaxba.methods.stba import clustered_step
-from jaxba.methods.subspace import on_manifold, with_remembered
+from jaxba.lm.method import DampedSystem, MethodStep, StepMethod
 from jaxba.model import camera
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
-from jaxba.structure.layout import Layout, partition_of
+from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
-
-
-class Step(NamedTuple):
-    """A step and what the linear model says about it."""
-
-    cameras: Float[Array, "9 cameras"]  # in the coordinates of the options
-    points: Float[Array, "3 points"]
-    # of the whole, or of every part that is judged by itself (refinement/subproblems.py):
-    slope: Float[Array, "*parts"]  # -g.d = d.(H + D) d, pixels^2
-    damped: Float[Array, "*parts"]  # d.D d, pixels^2; of a step that solves no system, what -g.d exceeds d.H d by
-    gradient_max: Float[Array, ""]  # largest entry of the gradient before the step
-    cg_iterations: Int[Array, ""]  # 0 when the system was factored
-    forcing: Float[Array, ""]  # term by which they ended, 0 where that is not by one
-
-    def predicted(self, share: Float[Array, "*parts"]) -> Float[Array, "*parts"]:
-        """Decrease of the cost that the linear model promises at a share of the step, pixels^2."""
-        return share * (0.5 * share * self.damped + (1 - 0.5 * share) * self.slope)
 
 
 def solve_step(
@@ -59,9 +40,9 @@ def solve_step(
     points: Float[Array, "3 points"],
     damping: Float[Array, ""],
     options: StepOptions,
-    turn: int | Int[Array, ""] = 0,
+    iteration: int | Int[Array, ""] = 0,
     effort: Effort | None = None,
-    remembered: Float[Array, "steps 9 cameras"] | None = None,
+    previous: Float[Array, "steps 9 cameras"] | None = None,
 ) -> Step:
     """One damped step.
 
@@ -72,46 +53,45 @@ def solve_step(
         points: current points, for the directions of the coarse system.
         damping: lambda, dimensionless for diagonal scaling.
         options: solver, scaling, coordinates.
-        turn: number of the iteration, where the step depends on it (random clusters).
+        iteration: its number, where the step depends on it (random clusters).
         effort: forcing term of conjugate gradients, where it is not that of the options.
-        remembered: last changes of the cameras, if the step is to be the best one together with them.
+        previous: last changes of the cameras, if the step is to be the best one together with them.
 
     Returns:
         The step; not finite where the factorisation failed, which the caller treats as a rejection.
     """
-    forcing = options.cg_forcing if effort is None or effort.forcing is None else effort.forcing
-    coordinates = Coordinates.of(cameras, options)
-    frames = camera.frames(cameras)
-    anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
+    truncated = options.truncated
+    forcing = options.conjugate_gradients.forcing if truncated is None else truncated.forcing
+    if effort is not None and effort.forcing is not None:
+        forcing = effort.forcing
+    coordinates = RotationCoordinates.of(cameras, options)
     eliminated = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, eliminated, coordinates, damping, options)
-    point_step = None
-    if options.linear_solver == "normal":
-        step, point_step, iterations = solve_normal(layout, linear, eliminated, system, options, forcing)
-    elif options.linear_solver == "clustered":
-        partition = partition_of(layout).at(turn)
-        step = clustered_step(layout, linear, eliminated, system, damping, partition, options)
-        iterations = jnp.zeros((), jnp.int32)
+    reduced = camera_system(layout, linear, eliminated, coordinates, damping, options)
+    if options.method is None:
+        frames = camera.frames(cameras)
+        anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
+        solved = solve_reduced(layout, linear, eliminated, reduced, anchor, options, forcing)
+        found = MethodStep(solved[0], None, solved[1], residual_orthogonal=True)
     else:
-        step, iterations = solve_reduced(layout, linear, eliminated, system, anchor, options, forcing)
-    if remembered is not None:  # the points then follow the cameras
-        product = lambda x: apply_reduced(layout, linear, eliminated, system, x)
-        step, point_step = with_remembered(product, system.right, step, on_manifold(cameras, remembered)), None
-    step = jnp.where(layout.camera_seen[:, None], step, jnp.zeros_like(step))
+        system = DampedSystem(layout, linear, eliminated, reduced, damping)
+        method = cast(StepMethod, options.method)
+        found = method.solve(system, options, forcing, iteration, cameras, previous)
+    step = jnp.where(layout.camera_seen[:, None], found.cameras, jnp.zeros_like(found.cameras))
+    point_step = found.points
     if point_step is None:
         point_step = jnp.stack(back_substitute(layout, linear, eliminated, step))
     camera_step = coordinates.given(step)
-    slope, damped = _slope_and_damping(eliminated, system, step, camera_step, point_step)
-    if options.leaves_rest and remembered is None:
-        damped = slope - sum(jnp.sum(m * m) for m in image(layout, linear, step, point_step))
+    slope, damped = _slope_and_damping(eliminated, reduced, step, camera_step, point_step)
+    if not found.residual_orthogonal:
+        damped = slope - sum(jnp.sum(m * m) for m in jacobian_product(layout, linear, step, point_step))
     return Step(
         camera_step.T,
         point_step,
         slope,
         damped,
-        largest_gradient(eliminated, system, coordinates),
-        iterations,
-        jnp.asarray(forcing if options.inexact else 0.0, cameras.dtype),
+        largest_gradient(eliminated, reduced, coordinates),
+        found.iterations,
+        jnp.asarray(0.0 if truncated is None else forcing, cameras.dtype),
     )
 
 

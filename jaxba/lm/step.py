@@ -1,64 +1,37 @@
 """The Levenberg-Marquardt step: the one piece that solver, game and benchmark share.
 
-`lm_step` is pure: `propose`, a linear solve, and `judge`, the verdict on what it proposes (solver/callback_loop.py
-compiles them as two programs). It compiles once per problem shape and `StepOptions`, runs under `vmap`, and never
-branches in Python on a value: a failed factorisation or an overflow is a candidate with a non-finite cost, and that is
-a rejected step.
+`lm_step` is pure: `propose`, a linear solve, and `try_step`, which looks along the step for a candidate to accept. It
+compiles once per problem shape and `StepOptions`, runs under `vmap`, and never branches in Python on a value: a failed
+factorisation or an overflow is a candidate with a non-finite cost, and that is a rejected step.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.lm.damped_step import Step, solve_step
-from jaxba.lm.effort import Effort
-from jaxba.methods.ddlm import Round, decomposed_round
-from jaxba.model.linearize import Present, cost, linearize, with_free_lenses
-from jaxba.problem.bundle_problem import AnyArray, BundleProblem
+from jaxba.linear.step import Effort, Step
+from jaxba.lm.damped_step import solve_step
+from jaxba.lm.method import Round, RoundMethod
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.model.linearize import Reference, cost, linearize, with_free_lenses
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
+from jaxba.refinement.acceptance import Candidate
+from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.subproblems import Whole
-from jaxba.refinement.trial import Trial, best_trial
-from jaxba.structure.layout import Layout, partition_of
-
-
-class LMState(NamedTuple):
-    """Parameters in layout order and their cost."""
-
-    cameras: Float[Array, "9 cameras"]
-    points: Float[Array, "3 points"]
-    cost: Float[Array, ""]
-    remembered: Float[Array, "steps 9 cameras"] | None = None  # last changes of the cameras; None: of no use to a step
-
-
-class StepInfo(NamedTuple):
-    """What one iteration did. Everything a damping policy may look at is here or follows from it."""
-
-    cost: Float[Array, ""]  # accepted cost after the iteration, pixels^2
-    previous_cost: Float[Array, ""]  # accepted cost before it
-    candidate_cost: Float[Array, ""]  # cost at the proposed parameters, perhaps not finite
-    predicted: Float[Array, ""]  # decrease promised by the linear model
-    gain_ratio: Float[Array, ""]  # actual over predicted decrease
-    accepted: Bool[Array, ""]
-    damping: Float[Array, ""]  # lambda that was used
-    gradient_max: Float[Array, ""]  # largest gradient entry before the step
-    step_norm: Float[Array, ""]  # of the proposed step as long as it was tried, refined points included
-    parameter_norm: Float[Array, ""]  # before the step
-    cg_iterations: Int[Array, ""]
-    forcing: Float[Array, ""]  # term by which conjugate gradients ended; 0 where the step is not inexact by design
-    share: Float[Array, ""]  # length of the candidate relative to the whole step, below 1 after further trials
-    damping_share: Float[Array, ""]  # share of the step's curvature that is damping's, 0 (Gauss-Newton) to 1
-    repairs: Int[Array, ""]  # camera rounds, further trials and pattern moves after the first candidate
+from jaxba.structure.layout import Layout
+from jaxba.typing import AnyArray
 
 
 class Proposal(NamedTuple):
     """What the linear model proposes, and what candidates are compared with."""
 
     step: Step
-    present: Present
+    reference: Reference
 
 
 def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
@@ -74,16 +47,16 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
     order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
     # padding points name an index out of range; they rest at the origin
     points = jnp.asarray(problem.points, dtype).at[order].get(mode="fill", fill_value=0).T
-    return begin_at(cameras, points, cost(layout, cameras, points, options.loss), options)
+    return state_at(cameras, points, cost(layout, cameras, points, options.loss), options)
 
 
-def begin_at(
+def state_at(
     cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], cost: Float[Array, ""], options: StepOptions
 ) -> LMState:
-    """The state before the first iteration: where everything is, its cost, and nothing that is remembered."""
-    if not options.remembers:
+    """The state before the first iteration: where everything is, its cost, and no previous steps."""
+    if not options.kept_steps:
         return LMState(cameras, points, cost)
-    return LMState(cameras, points, cost, jnp.zeros((options.remembers, *cameras.shape), cameras.dtype))
+    return LMState(cameras, points, cost, jnp.zeros((options.kept_steps, *cameras.shape), cameras.dtype))
 
 
 def lm_step(
@@ -92,10 +65,10 @@ def lm_step(
     damping: Float[Array, ""],
     options: StepOptions,
     min_gain: float | Float[Array, ""] = 0.0,
-    turn: int | Int[Array, ""] = 0,
+    iteration: int | Int[Array, ""] = 0,
     effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
-    """One iteration: one linear solve with one lambda, accepted or rejected (design, section 2).
+    """One iteration: one linear solve with one lambda, accepted or rejected.
 
     Args:
         layout: the problem's observations.
@@ -103,8 +76,8 @@ def lm_step(
         damping: lambda; see `StepOptions.scaling`.
         options: static.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
-        turn: iterations done before, for methods that draw new clusters in each.
-        effort: what the step may cost, instead of what the options say; not heard in domain decomposition.
+        iteration: number of iterations done before, for methods that draw new clusters in each.
+        effort: what the step may cost, instead of what the options say; has no effect in domain decomposition.
 
     Returns:
         The next state (the same one after a rejection) and a record of what happened.
@@ -112,10 +85,10 @@ def lm_step(
     Raises:
         ValueError: the layout has lenses, and the solver is not the explicit one.
     """
-    if not options.in_two:
-        return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, turn)
-    proposal = propose(layout, state, damping, options, turn, effort)
-    return judge(layout, state, damping, proposal, options, min_gain, effort)
+    if not options.single_solve:
+        return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, iteration)
+    proposal = propose(layout, state, damping, options, iteration, effort)
+    return try_step(layout, state, damping, proposal, options, min_gain, effort)
 
 
 def propose(
@@ -123,7 +96,7 @@ def propose(
     state: LMState,
     damping: Float[Array, ""],
     options: StepOptions,
-    turn: int | Int[Array, ""] = 0,
+    iteration: int | Int[Array, ""] = 0,
     effort: Effort | None = None,
 ) -> Proposal:
     """The first part of `lm_step`: the linear model and its damped solution. Arguments are those of `lm_step`."""
@@ -131,11 +104,13 @@ def propose(
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = with_free_lenses(layout, linear, options.intrinsics)
-    step = solve_step(layout, linear, state.cameras, state.points, damping, options, turn, effort, state.remembered)
-    return Proposal(step, linear.present)
+    step = solve_step(
+        layout, linear, state.cameras, state.points, damping, options, iteration, effort, state.previous_steps
+    )
+    return Proposal(step, linear.reference)
 
 
-def judge(
+def try_step(
     layout: Layout,
     state: LMState,
     damping: Float[Array, ""],
@@ -147,26 +122,26 @@ def judge(
     """The second part of `lm_step`: candidates along a step, and whether one is accepted."""
     damping = jnp.asarray(damping, state.cost.dtype)
     step = proposal.step
-    trial = best_trial(Whole(layout), *state[:3], proposal.present, step, options, min_gain, effort)
-    moved = [trial.share * step.cameras, trial.points - state.points]
-    return _verdict(
+    found = best_candidate(Whole(layout), *state[:3], proposal.reference, step, options, min_gain, effort)
+    moved = [found.share * step.cameras, found.points - state.points]
+    return _advance(
         state,
-        trial,
+        found,
         moved,
         damping,
         layout.camera_seen,
         gradient_max=step.gradient_max,
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
-        share=trial.share,
+        share=found.share,
         damping_share=jnp.clip(step.damped / step.slope, 0, 1),
-        repairs=trial.repairs,
+        repairs=found.repairs,
     )
 
 
 def _check_lenses(layout: Layout, options: StepOptions) -> None:
-    if layout.lenses is not None and options.linear_solver != "explicit":
-        raise ValueError(f"shared or partly fixed lenses need the explicit solver, not {options.linear_solver}")
+    if layout.lenses is not None and not options.factors_reduced_system:
+        raise ValueError(f"shared or partly fixed lenses need the explicit solver, not {options.solver_name}")
 
 
 def _round(
@@ -175,13 +150,13 @@ def _round(
     damping: Float[Array, ""],
     options: StepOptions,
     min_gain: float | Float[Array, ""],
-    turn: int | Int[Array, ""],
+    iteration: int | Int[Array, ""],
 ) -> tuple[LMState, StepInfo]:
-    """A round of domain decomposition in the place of a step: parts of it are accepted, each by itself."""
+    """A round of several solves in the place of a step: parts of it are accepted, each by itself."""
     _check_lenses(layout, options)
-    partition = partition_of(layout).at(turn)
-    found = decomposed_round(layout, *state[:3], damping, partition, options, min_gain)
-    return _verdict(
+    method = cast(RoundMethod, options.method)
+    found = method.round(layout, *state[:3], damping, iteration, options, min_gain)
+    return _advance(
         state,
         found,
         [found.cameras - state.cameras, found.points - state.points],
@@ -196,26 +171,26 @@ def _round(
     )
 
 
-def _verdict(
+def _advance(
     state: LMState,
-    found: Trial | Round,
+    found: Candidate | Round,
     moved: list[Array],
     damping: Float[Array, ""],
     seen: Bool[AnyArray, " cameras"],
-    **facts: Array,
+    **fields: Array,
 ) -> tuple[LMState, StepInfo]:
     """The state after a candidate was accepted or not, and the record of it.
 
-    `moved` is the step that was tried, `seen` are the cameras that take part; `facts` are the fields of
+    `moved` is the step that was tried, `seen` are the cameras that take part; `fields` are those of
     `StepInfo` that are not set here.
     """
     choose = lambda new, old: jnp.where(found.accepted, new, old)
-    remembered = state.remembered
-    if remembered is not None:
+    previous = state.previous_steps
+    if previous is not None:
         latest = found.cameras - state.cameras
-        remembered = choose(jnp.concatenate([latest[None], remembered[:-1]]), remembered)
+        previous = choose(jnp.concatenate([latest[None], previous[:-1]]), previous)
     cameras, points, lower = (choose(*pair) for pair in zip(found[:3], state[:3], strict=True))
-    after = LMState(cameras, points, lower, remembered)
+    after = LMState(cameras, points, lower, previous)
     return after, StepInfo(
         cost=after.cost,
         previous_cost=state.cost,
@@ -226,5 +201,5 @@ def _verdict(
         damping=damping,
         step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in moved)),
         parameter_norm=jnp.sqrt(jnp.sum(jnp.where(seen, state.cameras, 0) ** 2) + jnp.sum(state.points**2)),
-        **facts,
+        **fields,
     )

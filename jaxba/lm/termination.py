@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.lm.step import StepInfo
+from jaxba.lm.records import StepInfo
 
 DAMPING_LIMIT = 1e32
 """A step rejected with this lambda ends the solve. Source: Ceres min_trust_region_radius 1e-32."""

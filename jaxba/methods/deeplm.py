@@ -11,8 +11,7 @@ moves the clamp of the diagonal: ours is Ceres'. The recomputation of the residu
 
 from __future__ import annotations
 
-import functools
-import operator
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 from jax import Array
@@ -20,21 +19,53 @@ from jaxtyping import Float, Int
 
 from jaxba.linear.conjugate_gradients import conjugate_gradients
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.schur import CameraSystem, PointSystem
+from jaxba.linear.schur import CameraSystem, PointSystem, jacobian_product
+from jaxba.lm.method import DampedSystem, MethodStep
+from jaxba.methods.subspace import best_in_span
 from jaxba.model.linearize import Linearization
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.structure.layout import Layout
-from jaxba.structure.segment_sums import as_rows, point_sums, take_each, tree_sum
+from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 
 
-def image(
-    layout: Layout, linear: Linearization, cameras: Float[Array, "cameras 9"], points: Float[Array, "3 points"]
-) -> list[Array]:
-    """`J d` of every slot, two vectors, pixels."""
-    by_camera, by_point = take_each(cameras.T, layout.slot_camera), take_each(points, layout.slot_point)
-    rows = zip(linear.camera_jacobian, linear.point_jacobian, strict=True)
-    dot = lambda a, b: functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
-    return [dot(c, by_camera) + dot(p, by_point) for c, p in rows]
+@dataclass(frozen=True)
+class GlobalConjugateGradients:
+    """The method `deeplm`."""
+
+    conjugate_gradients: ConjugateGradients = field(
+        default_factory=lambda: ConjugateGradients(forcing=1e-3, max_iterations=150)
+    )
+    """Their stopping rule; the preconditioner is that of the method. Source: 1e-3 and 150, the authors' code."""
+
+    name: str = field(default="deeplm", init=False)
+    description: str = field(
+        default="DeepLM's global solver: conjugate gradients on cameras and points together", init=False
+    )
+    rule: str = field(default="ceres", init=False)
+    forms_reduced_system: bool = field(default=False, init=False)
+    cluster_cameras: None = field(default=None, init=False)
+    single_solve: bool = field(default=True, init=False)
+    uses_previous_steps: bool = field(default=True, init=False)
+
+    def options(self, base: StepOptions) -> StepOptions:
+        """See `Method`."""
+        return replace(base, method=self)
+
+    def solve(
+        self,
+        system: DampedSystem,
+        options: StepOptions,
+        forcing: float | Float[Array, ""],
+        iteration: int | Int[Array, ""],
+        parameters: Float[Array, "9 cameras"],
+        previous: Float[Array, "steps 9 cameras"] | None,
+    ) -> MethodStep:
+        """See `StepMethod`."""
+        rule = self.conjugate_gradients
+        step, points, iterations = solve_normal(*system[:4], rule, forcing)
+        if previous is not None:
+            step, points = best_in_span(system, step, parameters, previous), None  # the points then follow the cameras
+        return MethodStep(step, points, iterations, True)
 
 
 def solve_normal(
@@ -42,7 +73,7 @@ def solve_normal(
     linear: Linearization,
     points: PointSystem,
     system: CameraSystem,
-    options: StepOptions,
+    rule: ConjugateGradients,
     forcing: float | Float[Array, ""],
 ) -> tuple[Float[Array, "cameras 9"], Float[Array, "3 points"], Int[Array, ""]]:
     """Solves for cameras (manifold coordinates) and points at once.
@@ -52,7 +83,7 @@ def solve_normal(
         linear: Jacobians and residuals.
         points: factored diagonal blocks and damping of the points.
         system: damped diagonal blocks of the cameras.
-        options: stopping rule of conjugate gradients ...
+        rule: tolerance and limit of conjugate gradients ...
         forcing: ... and its forcing term.
 
     Returns:
@@ -66,7 +97,7 @@ def solve_normal(
 
     def apply(x: Array) -> Array:
         c, p = part(x)
-        moved = image(layout, linear, c, p)
+        moved = jacobian_product(layout, linear, c, p)
         pull = lambda first, second: [a * moved[0] + b * moved[1] for a, b in zip(first, second, strict=True)]
         back = tree_sum(as_rows(pull(*linear.camera_jacobian)), layout.camera_levels)
         back = back + jnp.einsum("cab,cb->ca", system.only_damping, c)
@@ -82,7 +113,7 @@ def solve_normal(
         right,
         precondition,
         forcing=forcing,
-        tolerance=options.cg_tolerance,
-        max_iterations=options.cg_max_iterations,
+        tolerance=rule.tolerance,
+        max_iterations=rule.max_iterations,
     )
     return *part(found), iterations

@@ -1,16 +1,19 @@
-"""Methods: ways to make a step, or something in its place, each of which any damping policy can drive.
+"""Methods by name: ways to make a step, or something in its place, each of which any damping policy can drive.
 
-A method says which part of `StepOptions` it fixes; `lm_step` does the rest, so that solver, benchmark and game run all
-of them alike. How to choose: docs/methods.md.
+Plain Levenberg-Marquardt is `lm`. The others implement `StepMethod` or `RoundMethod` of `jaxba.lm.method`, so that
+solver, benchmark and game run all of them through one `lm_step`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
-from typing import Any, Literal, get_args
+from typing import Literal, Protocol, get_args, runtime_checkable
 
+from jaxba.methods.ddlm import DomainDecomposition
+from jaxba.methods.deeplm import GlobalConjugateGradients
+from jaxba.methods.poba import PowerSeries
+from jaxba.methods.stba import StochasticClusters
 from jaxba.problem.options import StepOptions
 
 MethodName = Literal["lm", "stba", "deeplm", "ddlm", "poba"]
@@ -23,60 +26,59 @@ class UnknownMethodError(ValueError):
     """A name that is no method. The message is one line for a person."""
 
 
-@dataclass(frozen=True)
-class Method:
+@runtime_checkable
+class Method(Protocol):
     """One way to make a step."""
 
-    name: MethodName
-    """In commands, tables and files."""
+    @property
+    def name(self) -> str:
+        """In commands, tables and files."""
+        ...
 
-    description: str
-    """One line."""
+    @property
+    def description(self) -> str:
+        """One line."""
+        ...
 
-    rule: str
-    """The damping policy that the method was published with."""
-
-    fixes: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-    """Fields of `StepOptions` that make the method."""
+    @property
+    def rule(self) -> str:
+        """The damping policy that the method was published with."""
+        ...
 
     def options(self, base: StepOptions) -> StepOptions:
-        """The options of a step of this method; what it does not fix is that of `base`."""
-        return replace(base, **self.fixes)
+        """The options of a step of this method; what it does not decide is that of `base`."""
+        ...
 
 
-def _fixed(**fields: Any) -> Mapping[str, Any]:
-    return MappingProxyType(fields)
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """The method `lm`."""
 
+    name: str = field(default=DEFAULT_METHOD, init=False)
+    description: str = field(
+        default="Levenberg-Marquardt: one reduced camera system, factored or by conjugate gradients", init=False
+    )
+    rule: str = field(default="ceres", init=False)
+
+    def options(self, base: StepOptions) -> StepOptions:
+        """See `Method`."""
+        return replace(base, method=None)
+
+
+_CLUSTERED: dict[str, Callable[[int], Method]] = {
+    "stba": lambda size: StochasticClusters(cluster_cameras=size),
+    "ddlm": lambda size: DomainDecomposition(cluster_cameras=size),
+}
+"""Methods whose clusters can be given a size."""
 
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        Method("lm", "Levenberg-Marquardt: one reduced camera system, factored or by conjugate gradients", "ceres"),
-        Method(
-            "stba",
-            "stochastic bundle adjustment: random clusters of cameras solved apart, then four repairs",
-            "stba",
-            _fixed(linear_solver="clustered"),
-        ),
-        # 1e-3 and 150: DeepLM, authors' code
-        Method(
-            "deeplm",
-            "DeepLM's global solver: conjugate gradients on cameras and points together",
-            "ceres",
-            _fixed(linear_solver="normal", cg_forcing=1e-3, cg_max_iterations=150),
-        ),
-        Method(
-            "ddlm",
-            "DeepLM's stochastic domain decomposition: clusters optimised beside each other, then the points between",
-            "ceres",
-            _fixed(linear_solver="decomposed"),
-        ),
-        Method(
-            "poba",
-            "power bundle adjustment: a power series for the inverse of the reduced camera system",
-            "ceres",
-            _fixed(linear_solver="power"),
-        ),
+        LevenbergMarquardt(),
+        StochasticClusters(),
+        GlobalConjugateGradients(),
+        DomainDecomposition(),
+        PowerSeries(),
     )
 }
 """All methods by name."""
@@ -97,11 +99,10 @@ def make_method(name: str) -> Method:
     base, colon, size = name.partition(":")
     if base not in METHODS:
         raise UnknownMethodError(f"unknown method {name!r}; known: {', '.join(METHODS)}")
-    method = METHODS[base]
     if not colon:
-        return method
-    if not method.options(StepOptions()).uses_partitions:
+        return METHODS[base]
+    if base not in _CLUSTERED:
         raise UnknownMethodError(f"{name!r}: {base} has no clusters whose size could be set")
     if not (size.isdecimal() and int(size) > 0):
         raise UnknownMethodError(f"{name!r}: the cameras of a cluster must be a positive number, not {size!r}")
-    return replace(method, fixes=_fixed(**method.fixes, cluster_cameras=int(size)))
+    return _CLUSTERED[base](int(size))

@@ -13,22 +13,24 @@ and the authors' code. Clusters: structure/random_partitions.py.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba.linear.cholesky import MIN_UNKNOWNS, factor_and_solve
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.linear.preconditioners import block_inverse
 from jaxba.linear.reduced_system import reduced_blocks
 from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, damping_diagonal
+from jaxba.lm.method import DampedSystem, MethodStep
 from jaxba.model.linearize import Linearization, normal_entries
-from jaxba.problem.options import StepOptions
-from jaxba.runtime.barriers import after
-from jaxba.structure.layout import Layout
+from jaxba.problem.options import StepOptions, check_count
+from jaxba.runtime.fusion import computed_after
+from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
 
@@ -43,6 +45,50 @@ class SplitSystem(NamedTuple):
     solved: list[Array]  # L^-1 g of each slot's copy, [3] of (slots,)
 
 
+@dataclass(frozen=True)
+class StochasticClusters:
+    """The method `stba`."""
+
+    cluster_cameras: int = 100
+    """Cameras of a cluster at most. Source: the authors' code."""
+
+    repairs: int = 4
+    """Richardson steps on the true system after the clusters' solution. Source: the authors' code."""
+
+    name: str = field(default="stba", init=False)
+    description: str = field(
+        default="stochastic bundle adjustment: random clusters of cameras solved apart, then four repairs",
+        init=False,
+    )
+    rule: str = field(default="stba", init=False)
+    forms_reduced_system: bool = field(default=True, init=False)
+    conjugate_gradients: None = field(default=None, init=False)
+    single_solve: bool = field(default=True, init=False)
+    uses_previous_steps: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        check_count("cluster_cameras", self.cluster_cameras, 1)
+        check_count("repairs", self.repairs, 0)
+
+    def options(self, base: StepOptions) -> StepOptions:
+        """See `Method`."""
+        return replace(base, method=self)
+
+    def solve(
+        self,
+        system: DampedSystem,
+        options: StepOptions,
+        forcing: float | Float[Array, ""],
+        iteration: int | Int[Array, ""],
+        parameters: Float[Array, "9 cameras"],
+        previous: Float[Array, "steps 9 cameras"] | None,
+    ) -> MethodStep:
+        """See `StepMethod`."""
+        partition = partition_of(system.layout).at(iteration)
+        step = clustered_step(*system, partition, options, self.repairs)
+        return MethodStep(step, None, jnp.zeros((), jnp.int32), False)
+
+
 def clustered_step(
     layout: Layout,
     linear: Linearization,
@@ -51,6 +97,7 @@ def clustered_step(
     damping: Float[Array, ""],
     partition: Partition,
     options: StepOptions,
+    repairs: int,
 ) -> Float[Array, "cameras 9"]:
     """The camera step of one STBA iteration, in manifold coordinates.
 
@@ -61,12 +108,13 @@ def clustered_step(
         system: the true camera system, damped.
         damping: lambda.
         partition: of this iteration.
-        options: `repairs` Richardson steps.
+        options: scaling of the damping.
+        repairs: Richardson steps.
     """
     split = eliminate_copies(layout, linear, damping, partition, options)
     right = split_right(layout, linear, system, split)
     step = solve_clusters(layout, linear, points._replace(projected=split.projected), system, right, partition)
-    return repair(layout, linear, points, system, step, options.repairs)
+    return repair(layout, linear, points, system, step, repairs)
 
 
 def eliminate_copies(
@@ -160,6 +208,6 @@ def repair(
 ) -> Float[Array, "cameras 9"]:
     """Richardson steps `x + B^-1 (b - S x)` on the true system: the error shrinks by the spectral radius of
     `B^-1 E C^-1 E^T`, which is below one."""
-    inverse = block_inverse(after(step, system.blocks))
+    inverse = block_inverse(computed_after(step, system.blocks))
     again = lambda _, x: x + inverse(system.right - apply_reduced(layout, linear, points, system, x))
     return lax.fori_loop(0, rounds, again, step)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -18,7 +18,6 @@ from jaxba.bench.sources import Source
 from jaxba.damping import DampingPolicy
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import Bank, reach
-from jaxba.methods.registry import make_method
 from jaxba.paper import agents, rows, zero_net
 from jaxba.paper.agents import Agent
 from jaxba.paper.config import PaperConfig
@@ -26,10 +25,11 @@ from jaxba.paper.rows import NEAR, Row
 from jaxba.paper.schedule import LENGTH
 from jaxba.paper.store import Play, Store
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import LinearSolverChoice, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import SolverName, parse_solver
+from jaxba.solver.options import SolveOptions
 from jaxba.solver.solve import solve
 
 LIMIT = profile.ITERATION_LIMIT
@@ -45,14 +45,11 @@ class Method:
     name: str
     """In records."""
 
-    build: Callable[[int], tuple[DampingPolicy, StepOptions]]
+    build: Callable[[int], tuple[DampingPolicy, SolveOptions]]
     """Policy and options of a training run; rules ignore the number. Called only where something is to be run."""
 
     seeds: int = 0
     """Training runs; 0 for a rule."""
-
-    linear_solver: str | None = "auto"
-    """Of plain LM steps; None where the method of the step has its own."""
 
     @property
     def numbers(self) -> range:
@@ -68,7 +65,12 @@ def named(name: str) -> Method:
     """A solver by the name that `jaxba-bench` uses, perhaps with `/linear solver` behind it."""
     solver, slash, linear = name.partition("/")
     parsed = parse_solver(solver)
-    return Method(name, lambda _: parsed.build(), 0, linear if slash else "auto" if parsed.method == "lm" else None)
+
+    def build(_: int) -> tuple[DampingPolicy, SolveOptions]:
+        policy, options = parsed.build()
+        return policy, replace(options, linear_solver=cast(LinearSolverChoice, linear if slash else "auto"))
+
+    return Method(name, build, 0)
 
 
 class Workshop:
@@ -97,19 +99,19 @@ class Workshop:
     def agent(self, agent: Agent, method: str = "lm") -> Method:
         """A trained agent, all of its training runs."""
 
-        def build(seed: int) -> tuple[DampingPolicy, StepOptions]:
+        def build(seed: int) -> tuple[DampingPolicy, SolveOptions]:
             policy, fresh = agents.trained(self.config, agent, seed, self.folder, self.say)
             self.done += fresh
-            return policy, make_method(method).options(policy.config.step_options(StepOptions()))
+            return policy, SolveOptions(method=method)
 
         name = agent.name if method == "lm" else f"{method}+{agent.name}"
-        return Method(name, build, self.config.agents.seeds, "auto" if method == "lm" else None)
+        return Method(name, build, self.config.agents.seeds)
 
     def zero_net(self) -> Method:
         """The non-holistic network, as many training runs as of an agent."""
         return Method("zero-net", self._zero_net, self.config.agents.seeds)
 
-    def _zero_net(self, seed: int) -> tuple[DampingPolicy, StepOptions]:
+    def _zero_net(self, seed: int) -> tuple[DampingPolicy, SolveOptions]:
         agent = agents.train_config(self.config, agents.OURS, seed).game.agent
         path = self.folder / "agents" / f"zero-net-{seed}.npz"
         if path.is_file():
@@ -124,7 +126,8 @@ class Workshop:
             path.parent.mkdir(parents=True, exist_ok=True)
             zero_net.save(path, net)
             self.done += 1
-        return net, agent.step_options(StepOptions())
+        trained = agent.step_options(StepOptions())
+        return net, SolveOptions(refinement=trained.refinement, coordinates=trained.coordinates)
 
     # Work
 
@@ -142,7 +145,7 @@ class Workshop:
             process.release_programs()
             policy, options = method.build(seed)
             settings = agents.train_config(self.config, agents.OURS, 0)
-            options = replace(options, intrinsics=settings.bank.intrinsics)
+            options = replace(options, intrinsics=settings.bank.intrinsics).step_options(policy)
             bank = self.test_scenes()
             self.say(f"{method.label(seed)} on {len(bank.initial_cost)} scenes")
             started = time.perf_counter()
@@ -193,9 +196,7 @@ class Workshop:
         solution = solve(
             problem,
             policy,
-            options,
-            linear_solver=method.linear_solver,
-            max_iterations=limit,
+            replace(options, max_iterations=limit, compilation="full"),
             callback=lambda step: steps.append(step),
         )
         known: Any = {"name": source.name, "family": source.family, "repeat": repeat, "solver": SolverName("ceres")}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
-from jaxba.lm.step import StepInfo
+from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
 from jaxba.peers.colmap_problem import ColmapProblem
@@ -22,7 +22,9 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.loop import History
 from jaxba.solver.names import INNER
-from jaxba.solver.solve import MAX_ITERATIONS, Solution, explain_start
+from jaxba.solver.options import MAX_ITERATIONS
+from jaxba.solver.prepare import explain_start
+from jaxba.solver.solve import Solution
 
 _log = logging.getLogger(__name__)
 

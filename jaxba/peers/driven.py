@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, ProblemInfo
-from jaxba.lm.step import StepInfo
+from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
@@ -26,9 +26,10 @@ from jaxba.peers.verdict import Told, Verdict
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.loop import after_step
-from jaxba.solver.solve import MAX_ITERATIONS, Solution
+from jaxba.solver.options import MAX_ITERATIONS
+from jaxba.solver.solve import Solution
 
 LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
 """Limits of the radius that leave every lambda of a policy as it is."""
@@ -102,7 +103,7 @@ def drive_ceres(
     last = _Last()
     options.callbacks = [last]
     options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
-    with jax.enable_x64(True), process.calm_blas(), CompileClock() as clock:
+    with jax.enable_x64(True), process.single_blas_thread(), CompileClock() as clock:
         started = time.perf_counter()
         state, damping = _init(policy, _problem_info(problem, run.initial_cost, max_iterations))
         # everything is compiled before the clock starts

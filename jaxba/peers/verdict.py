@@ -1,8 +1,8 @@
 """jaxba's verdict on a step of Ceres: the embedded iterations around what another library has computed.
 
-Ceres makes the step, and never judges it: its problem has one more error (`Forgiving`), which no parameter moves, large
-before a step and zero after it, so that any candidate is taken. What becomes of it, `lm.judge` decides as for jaxba's
-own steps, and Ceres goes on from there. Needs the extra `ceres`.
+Ceres makes the step, and never decides on it: its problem has one more error (`Forgiving`), which no parameter moves,
+large before a step and zero after it, so that any candidate is taken. What becomes of it, `try_step` decides as for
+jaxba's own steps, and Ceres goes on from there. Needs the extra `ceres`.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.lm.damped_step import Step
-from jaxba.lm.step import LMState, Proposal, StepInfo, initial_state, judge
-from jaxba.methods.deeplm import image
+from jaxba.linear.schur import jacobian_product
+from jaxba.linear.step import Step
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.step import Proposal, initial_state, try_step
 from jaxba.model.linearize import linearize
 from jaxba.peers.ceres import Run, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import half_turn
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
-from jaxba.problem.options import StepOptions
-from jaxba.solver.solve import write_back
+from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.solver.prepare import write_back
 from jaxba.structure.layout import Layout, layout_for
 
 FORGIVEN = 1e200
@@ -88,7 +89,13 @@ class Verdict:
             min_gain: gain ratio that an accepted step exceeds.
         """
         # a step is Ceres': nothing of a linear system is laid out or remembered
-        self.options = replace(options, linear_solver="normal", remembered_steps=0, rotation="manifold")
+        self.options = replace(
+            options,
+            linear_solver="implicit",
+            method=None,
+            conjugate_gradients=ConjugateGradients(preconditioner="jacobi"),
+            coordinates=replace(options.coordinates, rotation="manifold"),
+        )
         self.run, self.min_gain = run, np.float64(min_gain)
         problem = run.colmap.start
         self.layout = jax.device_put(layout_for(problem, self.options))
@@ -130,7 +137,7 @@ def _judged(
     min_gain: Float[Array, ""],
     options: StepOptions,
 ) -> tuple[LMState, StepInfo]:
-    """`lm.judge` of a step between two sets of COLMAP's parameters `(poses [c, 7], lenses [c, 5], points [p, 3])`."""
+    """`try_step` of a step between two sets of COLMAP's parameters `(poses [c, 7], lenses [c, 5], points [p, 3])`."""
     flip = jnp.asarray(FLIP)[:, None]
     turn = 2 * half_turn(before[0][:, :4].T, after[0][:, :4].T)
     lens = (after[1] - before[1]).T
@@ -138,8 +145,8 @@ def _judged(
     order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
     points = (after[2] - before[2]).at[order].get(mode="fill", fill_value=0).T
     linear = linearize(layout, state.cameras, state.points, options.loss)
-    residual, moved = jnp.stack(linear.residual), jnp.stack(image(layout, linear, cameras.T, points))
+    residual, moved = jnp.stack(linear.residual), jnp.stack(jacobian_product(layout, linear, cameras.T, points))
     slope = -jnp.sum(residual * moved)
     damped = slope - jnp.sum(moved * moved)
-    proposal = Proposal(Step(cameras, points, slope, damped, *told), linear.present)
-    return judge(layout, state, damping, proposal, options, min_gain)
+    proposal = Proposal(Step(cameras, points, slope, damped, *told), linear.reference)
+    return try_step(layout, state, damping, proposal, options, min_gain)

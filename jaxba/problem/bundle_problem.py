@@ -13,7 +13,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.problem.intrinsics import AnyArray, Lenses, checked_lenses
+from jaxba.problem.intrinsics import Lenses, checked_lenses
+from jaxba.typing import AnyArray
 
 CAMERA_SIZE = 9
 """Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""

@@ -10,11 +10,9 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
-from jax import Array
 from jaxtyping import Bool, Int
 
-AnyArray = np.ndarray | Array
-"""An array on the host or on a device; tracers are of the second kind."""
+from jaxba.typing import AnyArray
 
 LENS_SIZE = 3
 """Numbers of a lens: f (pixels), k1, k2."""

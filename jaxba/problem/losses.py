@@ -58,16 +58,20 @@ NAMES = tuple(_SHAPES)
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Loss:
-    """A loss by name and scale (pixels)."""
+    """A loss and its scale (pixels).
 
-    name: str = "squared"
-    """One of `squared`, `huber`, `soft_l1`, `cauchy`, `tukey`."""
+    Your own loss is a function `rho(s)` in the place of a name, elementwise in JAX, with `rho(0) = 0` and a derivative
+    that is 1 at zero and nowhere negative; JAX differentiates it. Define it once: another function is another program.
+    """
+
+    name: str | Callable[[Array], Array] = "squared"
+    """One of `squared`, `huber`, `soft_l1`, `cauchy`, `tukey`, or a function of `s / scale^2`."""
 
     scale: float = 1.0
     """Residual size in pixels at which the loss bends; no effect for `squared`."""
 
     def __post_init__(self) -> None:
-        if self.name not in _SHAPES:
+        if not callable(self.name) and self.name not in _SHAPES:
             raise ValueError(f"unknown loss {self.name!r}; known: {', '.join(NAMES)}")
         if not (self.scale > 0 and 0 < self.scale * self.scale < float("inf")):
             raise ValueError(f"the scale of a loss must be positive, and its square a finite number, not {self.scale}")
@@ -80,5 +84,8 @@ class Loss:
     def __call__(self, squared: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """`rho(s)` and `rho'(s)` at squared residual norms, pixels squared."""
         area = self.scale * self.scale
-        value, slope = _SHAPES[self.name](squared / area)
+        if callable(self.name):
+            value, slope = jax.jvp(self.name, (squared / area,), (jnp.ones_like(squared),))
+        else:
+            value, slope = _SHAPES[self.name](squared / area)
         return area * value, slope

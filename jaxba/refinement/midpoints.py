@@ -14,7 +14,7 @@ from jaxba.model import camera
 from jaxba.model.linearize import slot_costs, view_residuals
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
-from jaxba.refinement.points import Home, gone, refine_points
+from jaxba.refinement.points import PreviousPoints, gone, refine_points
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 
@@ -63,14 +63,14 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
 class Starts(NamedTuple):
     """Two places for every point."""
 
-    likely: Float[Array, "3 points"]  # the cheaper one, or the one that is not astray
+    likely: Float[Array, "3 points"]  # the cheaper one, or the one that is not diverged
     other: Float[Array, "3 points"]  # the same where there is no other
 
 
 def better_starts(
-    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], loss: Loss, home: Home
+    layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], loss: Loss, previous: PreviousPoints
 ) -> Starts:
-    """Where the step took a point and the midpoint of its rays, if that is a place to start (`refine.Home`).
+    """Where the step took a point and the midpoint of its rays, if that is a place to start (`refine.PreviousPoints`).
 
     A step moves points by a linear model. Where that sends one behind its cameras, or so far away or so near that it
     feels nothing any more, no small step of its own finds back; the rays of its pixels say where to look.
@@ -80,7 +80,7 @@ def better_starts(
         frames: of every slot, where the cameras are now.
         points: where the step took them.
         loss: robust loss.
-        home: where they were before.
+        previous: where they were before.
     """
     middle = midpoints(layout, frames, FEW_UNDISTORTIONS)
 
@@ -93,10 +93,10 @@ def better_starts(
         return found
 
     there = take_each(list(middle), layout.slot_point)
-    own, own_lost, nearness, costs, lost, other = point_passes(layout, frames)(points, terms, home.front, *there)
-    astray = (own_lost > 0) | gone(nearness, home.nearness)
-    possible = (lost == 0) & ~gone(other, home.nearness) & jnp.isfinite(costs)
-    better = possible & ((costs < own) | astray)
+    own, own_lost, nearness, costs, lost, other = point_passes(layout, frames)(points, terms, previous.front, *there)
+    diverged = (own_lost > 0) | gone(nearness, previous.nearness)
+    possible = (lost == 0) & ~gone(other, previous.nearness) & jnp.isfinite(costs)
+    better = possible & ((costs < own) | diverged)
     return Starts(jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points))
 
 
@@ -106,7 +106,7 @@ def refine_from_starts(
     points: Float[Array, "3 points"],
     loss: Loss,
     iterations: int | Int[Array, ""],
-    home: Home,
+    previous: PreviousPoints,
     starts: int | Int[Array, ""],
     enough: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
@@ -122,16 +122,16 @@ def refine_from_starts(
         points: where the step took them.
         loss: robust loss.
         iterations: steps per point and start.
-        home: where points were before.
+        previous: where points were before.
         starts: 0, 1 or 2: where the step took them, the likelier of that and their rays, or both.
         enough: see `refine_points`.
     """
     # a loop of at most one turn: under vmap a condition would be computed either way
-    places = lambda _, __: jnp.stack(better_starts(layout, frames, points, loss, home))
+    places = lambda _, __: jnp.stack(better_starts(layout, frames, points, loss, previous))
     places = lax.fori_loop(0, jnp.minimum(starts, 1), places, jnp.stack([points, points]))
 
     def visit(turn: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
-        found, costs = refine_points(layout, frames, places[turn], loss, iterations, home, enough)
+        found, costs = refine_points(layout, frames, places[turn], loss, iterations, previous, enough)
         lower = costs < best[1]
         return jnp.where(lower, found, best[0]), jnp.where(lower, costs, best[1])
 

@@ -7,11 +7,11 @@ bold camera step threw far away come back in one pass over the observations each
 Projection does not see the difference between a point and its mirror image behind the camera, and a point far away
 comes to the other side by way of infinity. There it may fit for a while and never find back: kittistereo00s ended 1.8%
 above the best known cost with 61 such points. So a point that the step sent behind a camera starts again from where it
-was before the step (`Home`).
+was before the step (`PreviousPoints`).
 
 Nor does it see distance where rays are nearly parallel: one step may take a point a million times as far, where it
 feels nothing any more, or through infinity behind its cameras. So neither the step nor a point's own iterations take
-it more than `FARTHEST` times as far (docs/game-tried.md, "Starts that are far away").
+it more than `FARTHEST` times as far.
 
 Source: "embedded point iterations", Jeong et al., "Pushing the Envelope of Modern Methods for Bundle
 Adjustment", PAMI 2012; Ceres calls the same idea inner iterations.
@@ -30,7 +30,7 @@ from jaxba.model import camera
 from jaxba.model.linearize import point_terms
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
-from jaxba.runtime.single_loop import together
+from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sum
 
@@ -54,7 +54,7 @@ LITTLE = 1e-2
 """Share of the cost below which the decrease of a pass is small."""
 
 
-class Home(NamedTuple):
+class PreviousPoints(NamedTuple):
     """Where points were before the step, and what was visible there."""
 
     points: Float[Array, "3 points"]
@@ -62,7 +62,9 @@ class Home(NamedTuple):
     nearness: Float[Array, " points"]  # see `gone`
 
     @classmethod
-    def of(cls, layout: Layout, points: Float[Array, "3 points"], inverse_depth: Float[Array, " slots"]) -> Home:
+    def of(
+        cls, layout: Layout, points: Float[Array, "3 points"], inverse_depth: Float[Array, " slots"]
+    ) -> PreviousPoints:
         """Where points are, with `Projection.inverse_depth` of every slot there."""
         return cls(points, inverse_depth < 0, point_sum(layout, inverse_depth[None])[0])
 
@@ -74,7 +76,7 @@ class _Carry(NamedTuple):
     damping: Float[Array, " points"]
     trial: Float[Array, "3 points"]  # where to look next
     nearness: Float[Array, " points"]  # of the start, see `gone`
-    late: Bool[Array, " points"]  # whether it was taken home, and so is a pass behind the others
+    late: Bool[Array, " points"]  # whether it was put back, and so is a pass behind the others
     passes: Int[Array, ""]
     settled: Bool[Array, ""]  # whether the last pass brought too little for another one
 
@@ -85,7 +87,7 @@ def refine_points(
     points: Float[Array, "3 points"],
     loss: Loss,
     iterations: int | Int[Array, ""],
-    home: Home | None = None,
+    previous: PreviousPoints | None = None,
     enough: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     """Improves every point by `iterations` steps of its own.
@@ -96,18 +98,18 @@ def refine_points(
         points: where to start.
         loss: robust loss.
         iterations: steps per point, none or more; each costs one pass over the observations, and so does the end, and
-            one more where points are taken home.
-        home: a point that lies behind a camera in front of which it was at home, or `FARTHEST` times as far from its
-            cameras, starts from there.
+            one more where points are put back.
+        previous: where points were before the step. A point that lies behind a camera in front of which it was, or
+            `FARTHEST` times as far from its cameras, is put back there first.
         enough: ends after a step that lowered the cost by no more than this, all points together, nor by more than
             `LITTLE` of what is left.
 
     Returns:
         Points, and the cost of each point's observations there (pixels squared), never larger than where it
-        started, which is its home for a point that was taken there.
+        started, which is its previous place for a point that was put back.
     """
     one_pass = point_passes(layout, frames)
-    fronts = () if home is None else (home.front,)
+    fronts = () if previous is None else (previous.front,)
 
     def terms(views: Views, *front: Array) -> list[Array]:
         found = point_terms(views, loss)
@@ -122,16 +124,16 @@ def refine_points(
             return [x - d for x, d in zip(points, factor.backward(factor.forward(list(gradient))), strict=True)]
 
         factor = cholesky3(matrix)
-        return jnp.stack(together(moved, best.points, factor, best.system[6:]))
+        return jnp.stack(compute_in_one_loop(moved, best.points, factor, best.system[6:]))
 
     def body(carry: _Carry) -> _Carry:
         *system, costs, nearness = (found := one_pass(carry.trial, terms, *fronts))[:11]
-        astray, late = jnp.zeros_like(carry.late), carry.late
-        if home is not None:
-            astray = (carry.passes == 0) & ((found[11] > 0) | gone(nearness, home.nearness))
-            late = late | astray
+        diverged, late = jnp.zeros_like(carry.late), carry.late
+        if previous is not None:
+            diverged = (carry.passes == 0) & ((found[11] > 0) | gone(nearness, previous.nearness))
+            late = late | diverged
         start = jnp.where(jnp.isinf(carry.costs), nearness, carry.nearness)
-        going_on = ~astray & (late | (carry.passes <= iterations))
+        going_on = ~diverged & (late | (carry.passes <= iterations))
         better = (costs < carry.costs) & ~gone(nearness, start) & going_on
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
         damping = jnp.where(better, carry.damping / DAMPING_FACTOR, grown)
@@ -140,7 +142,7 @@ def refine_points(
             points=jnp.where(better, carry.trial, carry.points),
             costs=least,
             system=jnp.where(better, jnp.stack(system), carry.system),
-            damping=jnp.where(astray, carry.damping, damping),
+            damping=jnp.where(diverged, carry.damping, damping),
             trial=carry.trial,
             nearness=start,
             late=late,
@@ -148,10 +150,11 @@ def refine_points(
             settled=lowered <= jnp.minimum(enough, LITTLE * jnp.sum(least)),
         )
         best = best._replace(trial=propose(best))
-        if home is None:
+        if previous is None:
             return best
         return best._replace(
-            points=jnp.where(astray, home.points, best.points), trial=jnp.where(astray, home.points, best.trial)
+            points=jnp.where(diverged, previous.points, best.points),
+            trial=jnp.where(diverged, previous.points, best.trial),
         )
 
     # the start is a trial better than nothing, and the end one like the others: the program has one copy of a pass

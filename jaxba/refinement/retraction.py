@@ -35,9 +35,9 @@ def move_cameras(
         options: `rotation`, `lens_step` and `intrinsics`.
     """
     moved = cameras + step
-    if options.rotation == "manifold":
+    if options.coordinates.rotation == "manifold":
         moved = moved.at[:3].set(camera.compose_left(step[:3], cameras[:3]))
-    if options.lens_step == "file" or options.intrinsics == "fixed":
+    if options.coordinates.lens_step == "file" or options.intrinsics == "fixed":
         return moved
     growth = step[6] / cameras[6]
     near = jnp.abs(growth) <= LARGEST_ZOOM  # false where there is no focal length
@@ -54,7 +54,7 @@ def step_between(
 ) -> Float[Array, "9 cameras"]:
     """What `move_cameras` has to add to get from one place to the other, to first order."""
     change = moved - cameras
-    if options.rotation == "manifold":
+    if options.coordinates.rotation == "manifold":
         turn = camera.left_jacobian(cameras[:3])
         change = change.at[:3].set(jnp.einsum("ijc,jc->ic", turn, change[:3], precision="highest"))
     return change

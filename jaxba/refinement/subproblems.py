@@ -15,13 +15,13 @@ from jaxtyping import Float, Int
 from jaxba.model.linearize import observation_costs, slot_frames
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import refine_from_starts
-from jaxba.refinement.points import Home, refine_points
+from jaxba.refinement.points import PreviousPoints, refine_points
 from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import point_sum, take, total, tree_sum
 
 
-class Search(NamedTuple):
+class PointSearch(NamedTuple):
     """How far embedded point iterations go."""
 
     iterations: int | Int[Array, ""]
@@ -30,7 +30,7 @@ class Search(NamedTuple):
 
 
 @runtime_checkable
-class Parts(Protocol):
+class Subproblems(Protocol):
     """How a problem falls into parts."""
 
     @property
@@ -39,16 +39,16 @@ class Parts(Protocol):
         ...
 
     def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " terms"]:
-        """The cost of every observation, in the pieces in which `settle` has it."""
+        """The cost of every observation, in the pieces in which `refine` has it."""
         ...
 
-    def settle(
+    def refine(
         self,
         cameras: Float[Array, "9 cameras"],
         points: Float[Array, "3 points"],
-        home: Home,
+        previous: PreviousPoints,
         options: StepOptions,
-        search: Search,
+        search: PointSearch,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
         """The parts' own points after embedded iterations, if the options have any, and the cost in pieces."""
         ...
@@ -72,32 +72,32 @@ class Whole(NamedTuple):
     layout: Layout
 
     def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " terms"]:
-        """See `Parts`."""
-        return point_sum(self.layout, costs[None])[0] if options.refine_points else costs
+        """See `Subproblems`."""
+        return point_sum(self.layout, costs[None])[0] if options.refinement.points else costs
 
-    def settle(
+    def refine(
         self,
         cameras: Float[Array, "9 cameras"],
         points: Float[Array, "3 points"],
-        home: Home,
+        previous: PreviousPoints,
         options: StepOptions,
-        search: Search,
+        search: PointSearch,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
-        """See `Parts`."""
-        if options.refine_points:
-            return _refined(self.layout, cameras, points, home, options, search)
+        """See `Subproblems`."""
+        if options.refinement.points:
+            return _refined(self.layout, cameras, points, previous, options, search)
         return points, observation_costs(self.layout, cameras, points, options.loss)
 
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
-        """See `Parts`."""
+        """See `Subproblems`."""
         return total(terms)
 
     def of_cameras(self, values: Array) -> Array:
-        """See `Parts`."""
+        """See `Subproblems`."""
         return values
 
     def of_points(self, values: Array) -> Array:
-        """See `Parts`."""
+        """See `Subproblems`."""
         return values
 
 
@@ -118,25 +118,25 @@ class Clusters(NamedTuple):
         return Clusters(layout, partition, (sums[0] / jnp.maximum(sums[1], 1)).astype(jnp.int32))
 
     def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " slots"]:
-        """See `Parts`."""
+        """See `Subproblems`."""
         return costs
 
-    def settle(
+    def refine(
         self,
         cameras: Float[Array, "9 cameras"],
         points: Float[Array, "3 points"],
-        home: Home,
+        previous: PreviousPoints,
         options: StepOptions,
-        search: Search,
+        search: PointSearch,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " slots"]]:
-        """See `Parts`."""
-        if options.refine_points:
-            points, _ = _refined(self.layout, cameras, points, home, options, search)
-            points = jnp.where(self.partition.separator, home.points, points)
+        """See `Subproblems`."""
+        if options.refinement.points:
+            points, _ = _refined(self.layout, cameras, points, previous, options, search)
+            points = jnp.where(self.partition.separator, previous.points, points)
         return points, observation_costs(self.layout, cameras, points, options.loss)
 
     def sums(self, terms: Float[Array, " slots"]) -> Float[Array, " clusters"]:
-        """See `Parts`."""
+        """See `Subproblems`."""
         own_terms = jnp.where(self.layout.slot_mask, terms, 0)  # empty slots belong to some camera of another cluster
         per_camera = tree_sum(own_terms[:, None], self.layout.camera_levels)[:, 0]
         members = self.partition.members
@@ -144,18 +144,18 @@ class Clusters(NamedTuple):
         return jnp.sum(jnp.where(members < self.layout.num_cameras, own, 0), axis=1)
 
     def of_cameras(self, values: Array) -> Array:
-        """See `Parts`."""
+        """See `Subproblems`."""
         return take(values, self.partition.label)
 
     def of_points(self, values: Array) -> Array:
-        """See `Parts`."""
+        """See `Subproblems`."""
         return take(values, self.owner)
 
 
 def _refined(
-    layout: Layout, cameras: Array, points: Array, home: Home, options: StepOptions, search: Search
+    layout: Layout, cameras: Array, points: Array, previous: PreviousPoints, options: StepOptions, search: PointSearch
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     frames = slot_frames(layout, cameras)
-    if options.point_starts == "step":
-        return refine_points(layout, frames, points, options.loss, search.iterations, home, search.enough)
-    return refine_from_starts(layout, frames, points, options.loss, search.iterations, home, *search[1:])
+    if options.refinement.starts == "step":
+        return refine_points(layout, frames, points, options.loss, search.iterations, previous, search.enough)
+    return refine_from_starts(layout, frames, points, options.loss, search.iterations, previous, *search[1:])

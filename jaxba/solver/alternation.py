@@ -5,23 +5,21 @@ Source: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-mo
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from jaxba.damping import DampingPolicy
-from jaxba.lm.termination import Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.options import StepOptions
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.loop import History
+from jaxba.solver.options import SolveOptions
+from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.retriangulate import Retriangulation, retriangulate
-from jaxba.solver.solve import MAX_ITERATIONS, Solution, solve
+from jaxba.solver.solve import Solution, solve
 
 MAX_ROUNDS = 5
 """Searches at most. Source: COLMAP, ba_global_max_refinements."""
@@ -29,14 +27,11 @@ MAX_ROUNDS = 5
 
 def solve_and_retriangulate(
     problem: BundleProblem,
-    damping: str | DampingPolicy = "ceres",
-    options: StepOptions | None = None,
+    policy: str | DampingPolicy = DEFAULT_POLICY,
+    options: SolveOptions | None = None,
     *,
-    max_iterations: int = MAX_ITERATIONS,
-    tolerances: Tolerances | None = None,
     callback: Callable[[IterationRecord], bool | None] | None = None,
     on_search: Callable[[Retriangulation], None] | None = None,
-    **more: Any,
 ) -> Solution:
     """`solve`, and where it converged `retriangulate`, in turns, until that no longer pays.
 
@@ -45,13 +40,11 @@ def solve_and_retriangulate(
 
     Args:
         problem: start of the optimisation.
-        damping: as for `solve`.
-        options: as for `solve`; their loss is that of the search.
-        max_iterations: limit of linear solves, all solves together.
-        tolerances: as for `solve`, for each of the solves.
+        policy: as for `solve`.
+        options: as for `solve`; the limit of linear solves is that of all solves together. The search has their loss,
+            is in float64 and is not padded.
         callback: as for `solve`; iterations and seconds count through.
         on_search: called after every search; what does not pay (`Retriangulation.pays`) is dropped.
-        more: further arguments of `solve`; the search itself is in float64 and is not padded.
 
     Returns:
         One solution for all of it. A search counts as no iteration; its seconds are in `total_s` and `compile_s`.
@@ -59,7 +52,7 @@ def solve_and_retriangulate(
     Raises:
         ValueError, ProblemError: as `solve`.
     """
-    tolerances = tolerances or Tolerances()
+    options = SolveOptions() if options is None else options
     before, stopped = (0, 0.0), False
 
     def heard(record: IterationRecord) -> bool:
@@ -69,22 +62,22 @@ def solve_and_retriangulate(
         return stopped
 
     # with a callback a solve runs step by step: one program, whatever the limit of each solve is
-    run = functools.partial(solve, damping=damping, options=options, tolerances=tolerances, callback=heard, **more)
-    whole = run(problem, max_iterations=max_iterations)
+    run = lambda problem, limit: solve(problem, policy, replace(options, max_iterations=limit), callback=heard)
+    whole = run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):
-        if stopped or not whole.converged or whole.iterations == max_iterations:
+        if stopped or not whole.converged or whole.iterations == options.max_iterations:
             break
         started = time.perf_counter()
         with CompileClock() as clock:
-            found = retriangulate(whole.problem, options.loss if options else None)
+            found = retriangulate(whole.problem, options.loss)
         seconds = time.perf_counter() - started - clock.seconds
         whole = replace(whole, total_s=whole.total_s + seconds, compile_s=whole.compile_s + clock.seconds)
         if on_search:
             on_search(found)
-        if not found.pays(tolerances.ftol):
+        if not found.pays(options.tolerances.ftol):
             break
         before = whole.iterations, whole.total_s
-        whole = _joined(whole, run(found.problem, max_iterations=max_iterations - whole.iterations))
+        whole = _joined(whole, run(found.problem, options.max_iterations - whole.iterations))
     return whole
 
 

@@ -12,13 +12,14 @@ from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
 from jaxba.lm.damped_step import largest_diagonal
-from jaxba.lm.step import LMState, StepInfo, lm_step
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, with_free_lenses
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout, turns_of
 from jaxba.structure.segment_sums import point_sum
+from jaxba.typing import AnyArray
 
 
 class History(NamedTuple):
@@ -47,7 +48,7 @@ class Carry(NamedTuple):
 def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: Any) -> ProblemInfo:
     """What a policy may know before the first iteration."""
     unit = jnp.ones_like(state.cost)
-    if options.scaling == "identity":
+    if options.coordinates.scaling == "identity":
         linear = linearize(layout, state.cameras, state.points, options.loss)
         unit = largest_diagonal(layout, with_free_lenses(layout, linear, "free"))
     count = lambda n: jnp.asarray(n, jnp.int32)

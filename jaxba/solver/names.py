@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from typing import cast, get_args
 
-from jaxba.damping import DampingPolicy, Learned, is_learned, make_policy
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping import DampingPolicy, is_learned, make_policy
+from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.policy import trained_step
 from jaxba.damping.registry import LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
 from jaxba.methods.registry import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import Refinement, StepOptions
+from jaxba.solver.options import Dtype, SolveOptions
 
-DTYPES = ("float64", "float32", "mixed")
+DTYPES = get_args(Dtype)
 """Known floating point types; the first is understood where none is named."""
 
 INNER = "-inner"
@@ -39,7 +42,7 @@ class SolverName:
     """Embedded point iterations and no others. None: all embedded iterations; a learned policy brings those that it
     was trained with, a rule gets the default ones under the name `RULE+embedded`."""
 
-    dtype: str = DTYPES[0]
+    dtype: Dtype = DTYPES[0]
     """Floating point type."""
 
     method: str = DEFAULT_METHOD
@@ -65,21 +68,22 @@ class SolverName:
         """Whether there are embedded iterations."""
         return self.refine_points != 0
 
-    def build(self) -> tuple[DampingPolicy, StepOptions]:
-        """The policy, and the options of the step that it drives.
+    def build(self) -> tuple[DampingPolicy, SolveOptions]:
+        """The policy, and the options of the solve that it drives.
 
         Raises:
             UnknownPolicyError, PolicyFileError, UnknownMethodError: as `make_policy`, `make_method`.
         """
         alone, peer = self.refine_points == 0, bool(self.peer)
         policy = make_policy(fitting_policy(self.policy, alone=alone, peer=peer))
-        base = make_method(self.method).options(StepOptions())
-        agent = policy.config if isinstance(policy, Learned) else AgentConfig()
-        if self.refine_points is None:
-            return policy, agent.step_options(base)
-        if isinstance(policy, Learned):  # the coordinates that it knows
-            base = replace(base, camera_damping=agent.camera_damping, lens_step=agent.lens_step)
-        return policy, replace(base, refine_points=self.refine_points)
+        step = trained_step(policy)
+        if self.refine_points is not None:
+            step = replace(step, refinement=Refinement(points=self.refine_points))
+        elif not is_learned(self.policy):
+            step = AgentConfig().step_options(StepOptions())
+        return policy, SolveOptions(
+            method=self.method, refinement=step.refinement, coordinates=step.coordinates, dtype=self.dtype
+        )
 
 
 def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> str:
@@ -147,7 +151,7 @@ def parse_solver(name: str) -> SolverName:
     make_policy(merged[0])
     if is_learned(merged[0]) and not stated:
         refine = None
-    return SolverName(merged[0], refine, dtype or DTYPES[0], method)
+    return SolverName(merged[0], refine, cast(Dtype, dtype or DTYPES[0]), method)
 
 
 def _parse_peer(name: str) -> SolverName:

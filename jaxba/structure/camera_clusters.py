@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
+from jaxba.typing import AnyArray
 
 CLUSTER_CAMERAS = 8
 """Cameras a cluster; larger where that would make more than `MAX_CLUSTERS`. On the real problems at hand 8 took as many

@@ -14,7 +14,7 @@ from jaxtyping import Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from jaxba.problem.bundle_problem import AnyArray
+from jaxba.typing import AnyArray
 
 MAX_BAND_SHARE = 1 / 3
 """A band of `b` of `n` cameras is factored as one if `b / n` is below this. The two factorisations run at the same

@@ -13,10 +13,10 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.structure.camera_ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, sorted_by, sum_tree
+from jaxba.typing import AnyArray
 
 PAIR_CHUNKS = (4, 8)
 """Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""

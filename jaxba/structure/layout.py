@@ -18,16 +18,18 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.problem.bundle_problem import AnyArray, BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.structure.camera_clusters import ClusterLayout, cluster_layout
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.density import is_dense
+from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.random_partitions import Partition, partition_layout
 from jaxba.structure.shared_intrinsics import LensTies, lens_ties
 from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
+from jaxba.typing import AnyArray
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
@@ -109,6 +111,7 @@ def build_layout(
     partitions: int | None = None,
     capacity: Capacity | None = None,
     lenses: bool = True,
+    observations: ObservationOrder | None = None,
 ) -> Layout:
     """Sorts a problem's observations into slots.
 
@@ -124,6 +127,7 @@ def build_layout(
         capacity: pads all sizes, for a system that is factored: no clusters, no partitions. Where the system is a band,
             it is factored dense all the same.
         lenses: whether the problem's lenses count; not where intrinsics are fixed.
+        observations: of the problem, where they are sorted already.
 
     Returns:
         A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths. Those of a padded
@@ -137,14 +141,10 @@ def build_layout(
         raise ValueError("only layouts for a factored system are padded: no clusters, no partitions, factor=True")
     if capacity is not None and not capacity.holds(problem):
         raise ValueError(f"the problem is larger than the capacity: {capacity}")
-    camera = np.asarray(problem.camera_index)
-    point = np.asarray(problem.point_index)
     cameras = problem.num_cameras if capacity is None else capacity.cameras
-    tracks = np.bincount(point, minlength=problem.num_points)
-    # by point, then by camera: pairs of a track then come with sorted cameras
-    order = np.argsort(point.astype(np.int64) * problem.num_cameras + camera, kind="stable")
-    camera, point = camera[order], point[order]
-    start = np.concatenate([[0], np.cumsum(tracks)])
+    observations = observations or ObservationOrder.of(problem)
+    camera, point, tracks = observations.camera, observations.point, observations.tracks
+    order, start = observations.order, observations.start
     seen = np.bincount(camera, minlength=cameras)
 
     made = bucket_slots(tracks) if capacity is None else padded_slots(tracks, point, capacity)
@@ -205,16 +205,22 @@ def build_layout(
     )
 
 
-def layout_for(problem: BundleProblem, options: StepOptions, capacity: Capacity | None = None) -> Layout:
+def layout_for(
+    problem: BundleProblem,
+    options: StepOptions,
+    capacity: Capacity | None = None,
+    observations: ObservationOrder | None = None,
+) -> Layout:
     """The layout that a step with these options needs, and nothing more; padded where there is a capacity."""
     return build_layout(
         problem,
         pairs=options.forms_reduced_system,
-        factor=options.linear_solver == "explicit",
-        clusters=options.uses_clusters,
-        partitions=options.cluster_cameras if options.uses_partitions else None,
+        factor=options.factors_reduced_system,
+        clusters=options.uses_camera_clusters,
+        partitions=options.cluster_cameras,
         capacity=capacity,
         lenses=options.intrinsics == "free",
+        observations=observations,
     )
 
 

@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem
-from jaxba.problem.options import REDUCED_SOLVERS, StepOptions
+from jaxba.problem.options import LinearSolverChoice, StepOptions
+from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
 LEAST_CAMERAS = 8
@@ -66,7 +67,7 @@ class Capacity:
         return f"{self.cameras} cameras, {self.points} points, {self.observations} observations, {self.pairs} pairs"
 
 
-def capacity_of(problem: BundleProblem) -> Capacity | None:
+def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = None) -> Capacity | None:
     """The grid cell of a problem.
 
     Cameras are rounded up to 8, 12, 16, 24, ..., observations to a power of two. Points and pairs mostly follow from
@@ -81,11 +82,9 @@ def capacity_of(problem: BundleProblem) -> Capacity | None:
         return None
     if max(problem.num_points, problem.num_observations + 1) > MAX_OBSERVATIONS:
         return None
-    camera, point = np.asarray(problem.camera_index, np.int64), np.asarray(problem.point_index)
-    tracks = np.bincount(point).astype(np.int64)
-    # a camera that sees a point twice: both orders of the two are listed (structure/covisibility.py)
-    _, times = np.unique(point * problem.num_cameras + camera, return_counts=True)
-    pairs = int(np.sum(tracks * (tracks + 1) // 2) + np.sum(times * (times - 1) // 2))
+    observations = observations or ObservationOrder.of(problem)
+    # of a camera that sees a point twice both orders are listed (covisibility.py)
+    pairs = observations.num_pairs + observations.num_repeated_pairs
     if pairs > MAX_PAIRS:
         return None
     cameras = max(LEAST_CAMERAS, _power(problem.num_cameras))
@@ -113,8 +112,8 @@ def room_for(counts: Int[np.ndarray, " targets"], items: int, expected: int) -> 
 
 
 def with_padded_solver(
-    capacity: Capacity | None, options: StepOptions, linear_solver: str | None
-) -> tuple[Capacity | None, str | None]:
+    capacity: Capacity | None, options: StepOptions, asked: LinearSolverChoice
+) -> tuple[Capacity | None, LinearSolverChoice]:
     """Padding is for the explicit solver alone, and wherever there is a choice it takes that.
 
     `auto` chooses by counts of the very problem, so that neighbours in one cell might get different programs. Up to the
@@ -122,16 +121,15 @@ def with_padded_solver(
 
     Args:
         capacity: of the problem, None where it is not padded.
-        options: of the step, as its method wants them.
-        linear_solver: what was asked for: a name, `auto`, or None for that of the options.
+        options: of the step, with its method.
+        asked: the linear solver that was asked for.
 
     Returns:
         The capacity, None where another solver was asked for, and the linear solver to ask for.
     """
-    if linear_solver == "auto" and options.linear_solver in REDUCED_SOLVERS and capacity is not None:
-        return capacity, "explicit"
-    chosen = options.linear_solver if linear_solver in (None, "auto") else linear_solver
-    return (capacity if chosen == "explicit" else None), linear_solver
+    if options.method is not None or asked not in ("auto", "explicit"):
+        return None, asked
+    return capacity, asked if capacity is None else "explicit"
 
 
 def padded_parameters(problem: BundleProblem, capacity: Capacity) -> BundleProblem:

@@ -18,11 +18,11 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Int
 
-from jaxba.problem.bundle_problem import AnyArray
 from jaxba.structure.camera_clusters import cluster_members
 from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.louvain import camera_graph, clusterings
 from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
+from jaxba.typing import AnyArray
 
 PARTITIONS = 16
 """Different partitions of a problem, used in turn."""

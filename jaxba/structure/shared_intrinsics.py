@@ -15,8 +15,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.cholesky import factor_and_solve
-from jaxba.problem.intrinsics import LENS_SIZE, AnyArray, Lenses
+from jaxba.problem.intrinsics import Lenses
+from jaxba.typing import AnyArray
 
 POSE_SIZE = 6
 """Unknowns of a camera that are its own: rotation and translation. Those of the lens follow."""
@@ -64,32 +64,3 @@ def lens_ties(lenses: Lenses, seen: Bool[np.ndarray, " cameras"]) -> LensTies:
     if lenses.shared:
         members = (index[:, None] == np.arange(len(lenses.free))) & seen[:, None]
     return LensTies(index, members, np.asarray(lenses.free)[index].T, lenses.shared)
-
-
-def solve_tied(
-    ties: LensTies, matrix: Float[Array, "unknowns unknowns"], right: Float[Array, "cameras 9"]
-) -> Float[Array, "cameras 9"]:
-    """Solves `T^T S T y = T^T b` by a dense Cholesky factorisation.
-
-    Args:
-        ties: T.
-        matrix: S, of which the lower triangle is read.
-        right: b.
-
-    Returns:
-        T y; not finite where the tied matrix is not positive definite.
-    """
-    cameras, lenses = ties.members.shape
-    lower = jnp.tril(matrix)
-    whole = (lower + jnp.tril(matrix, -1).T).reshape(cameras, 9, cameras, 9)
-    poses = whole[:, :POSE_SIZE, :, :POSE_SIZE].reshape(POSE_SIZE * cameras, -1)
-    own = ties.members.astype(matrix.dtype)
-    columns = jnp.einsum("cadk,dl->calk", whole[..., POSE_SIZE:], own, precision="highest")  # [c, 9, lens, 3]
-    both = columns[:, :POSE_SIZE].reshape(-1, LENS_SIZE * lenses)
-    alone = jnp.einsum("cl,cjmk->ljmk", own, columns[:, POSE_SIZE:], precision="highest")
-    unused = jnp.repeat(ties.counts() == 0, LENS_SIZE).astype(matrix.dtype)  # such a lens gets a zero step
-    alone = alone.reshape(LENS_SIZE * lenses, -1) + jnp.diag(unused)
-    tied = jnp.block([[poses, both], [both.T, alone]])
-    step = factor_and_solve(tied, jnp.concatenate([right[:, :POSE_SIZE].ravel(), ties.total(right[:, 6:]).ravel()]))
-    pose, lens = step[: POSE_SIZE * cameras], step[POSE_SIZE * cameras :]
-    return jnp.concatenate([pose.reshape(cameras, POSE_SIZE), ties.spread(lens.reshape(lenses, LENS_SIZE))], axis=1)

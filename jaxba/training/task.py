@@ -16,13 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.learned import Learned, learned_from
+from jaxba.damping.learned import LearnedPolicy, learned_from
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.atomic import atomic_write
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig
 from jaxba.training.driver import TrainError
@@ -62,7 +63,7 @@ class Task:
         """Scores of the yardsticks, `virtual best` among them."""
         return self._scores({})
 
-    def policy(self, actor: Any) -> Learned:
+    def policy(self, actor: Any) -> LearnedPolicy:
         """The policy of an actor's parameters."""
         return learned_from(self.config.game.agent, actor)
 
@@ -139,10 +140,10 @@ def _rules(
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
     names = tuple(dict.fromkeys((*own, *yardsticks)))
     policies: dict[str, tuple[DampingPolicy, StepOptions]] = {name: (make_policy(name), plain) for name in names}
-    embedded = replace(game.options, camera_damping=plain.camera_damping)
-    # neither coordinates of a lens alone nor what is remembered are embedded iterations
-    same = {name: getattr(plain, name) for name in ("lens_step", "point_starts", "remembered_steps")}
-    if replace(embedded, **same) != plain:
+    coordinates = replace(game.options.coordinates, camera_damping=plain.coordinates.camera_damping)
+    embedded = replace(game.options, coordinates=coordinates)
+    own_refinement = embedded.refinement  # of which the starts of points and previous steps alone embed nothing
+    if replace(own_refinement, starts="step", previous_steps=0) != plain.refinement:
         policies[yardsticks[0] + EMBEDDED] = make_policy(yardsticks[0]), embedded
     runs = _play(config, held_out, policies)
     fields = lambda name, number, run: {f"{name}/{number}/{field}": x for field, x in run._asdict().items()}
@@ -162,10 +163,8 @@ def _write_banks(path: Path, splits: list[Split]) -> None:
 
 
 def _write(path: Path, arrays: dict[str, Any]) -> None:
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
+    with atomic_write(path) as file:
         np.savez(file, **arrays)
-    part.replace(path)
 
 
 def read_banks(path: Path) -> list[Split]:

@@ -15,12 +15,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import support
+from support import solve
 
-from jaxba import StepOptions, read_bal, solve, write_bal
+from jaxba import StepOptions, read_bal, write_bal
 from jaxba.bench.records import record_from_json
 from jaxba.cli import table
 from jaxba.cli.solve import run
 from jaxba.problem import geometry
+from jaxba.problem.options import Coordinates
 
 RECORD_KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
@@ -447,5 +449,5 @@ def test_what_the_parser_refuses_is_status_2_and_nothing_on_stdout(argv, capsys)
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])
 def test_the_heading_says_where_cameras_are_damped_otherwise_than_points(factor, said):
     args = SimpleNamespace(damping="mine.safetensors", dtype="float64", method="lm", linear_solver="auto")
-    text = table.heading("scene", support.tiny(), args, StepOptions(camera_damping=factor))
+    text = table.heading("scene", support.tiny(), args, StepOptions(coordinates=Coordinates(camera_damping=factor)))
     assert ("cameras damped by 0.01 lambda" in text) == said

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxba.game.oracle import beam_search
-from jaxba.lm.step import LMState
+from jaxba.lm.records import LMState
 
 GRID = (1e-3, 1e-2, 1e-1)
 DEPTH = 4

@@ -30,6 +30,7 @@ from jaxba.cli.solve import run
 from jaxba.io import colmap
 from jaxba.io.colmap import MODELS
 from jaxba.problem import geometry
+from jaxba.problem.options import Refinement
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
 
@@ -435,5 +436,5 @@ def test_a_start_far_from_the_end_is_solved_with_a_shared_lens(tmp_path):
     rng = np.random.default_rng(2)
     far: BundleProblem = problem.replace(points=problem.points + rng.normal(scale=0.3, size=problem.points.shape))
     near = solve(problem, "learned").final_cost
-    options = StepOptions(refine_points=3)
+    options = StepOptions(refinement=Refinement(points=3))
     np.testing.assert_allclose(solve(far, "ceres", options).final_cost, near, rtol=1e-4)

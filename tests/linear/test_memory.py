@@ -1,3 +1,5 @@
+from jaxba.problem.options import Refinement
+
 """What a step needs of the device's memory, by XLA's own account of the program it has made."""
 
 from dataclasses import replace
@@ -25,7 +27,9 @@ def bytes_per_observation(problem, options, dtype):
 @pytest.mark.parametrize(("dtype", "share", "refine"), [(jnp.float64, 1.0, 3), (jnp.float32, 0.55, 0)])
 def test_an_implicit_step_keeps_to_the_stated_bytes_per_observation(dtype, share, refine):
     problem = random_scene(like("random-150"), 0)
-    used = bytes_per_observation(problem, StepOptions(linear_solver="implicit", refine_points=refine), dtype)
+    used = bytes_per_observation(
+        problem, StepOptions(linear_solver="implicit", refinement=Refinement(points=refine)), dtype
+    )
     # below half of the stated figure it would be the figure that is wrong
     assert 0.5 * share * BYTES_PER_OBSERVATION < used < share * BYTES_PER_OBSERVATION
 

@@ -11,17 +11,22 @@ import support
 from support import start, step
 
 from jaxba import BundleProblem, StepOptions
-from jaxba.runtime.process import calm_blas
+from jaxba.problem.options import ConjugateGradients
+from jaxba.runtime.process import single_blas_thread
 from jaxba.scenes import SceneConfig, random_scene
 from jaxba.structure.layout import layout_for
 
 EXACT = StepOptions()
-TO_THE_END = StepOptions(linear_solver="implicit", cg_forcing=0.0, cg_tolerance=1e-12, cg_max_iterations=3000)
+TO_THE_END = StepOptions(
+    linear_solver="implicit", conjugate_gradients=ConjugateGradients(forcing=0.0, tolerance=1e-12, max_iterations=3000)
+)
 OPTIONS = {
     "explicit": EXACT,
     "sparse": replace(TO_THE_END, linear_solver="sparse"),
     "implicit": TO_THE_END,
-    "schur-jacobi": replace(TO_THE_END, preconditioner="schur-jacobi"),
+    "schur-jacobi": replace(
+        TO_THE_END, conjugate_gradients=replace(TO_THE_END.conjugate_gradients, preconditioner="schur-jacobi")
+    ),
 }
 DAMPING = 1e-4
 
@@ -29,7 +34,7 @@ DAMPING = 1e-4
 @pytest.fixture(autouse=True, scope="module")
 def one_blas_thread():
     """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with calm_blas():
+    with single_blas_thread():
         yield
 
 

@@ -20,21 +20,22 @@ from scipy.spatial.transform import Rotation
 from jaxba import BundleProblem, Loss, StepOptions, initial_state
 from jaxba.linear.preconditioners import diagonal_blocks, preconditioner
 from jaxba.linear.reduced_system import apply_reduced
-from jaxba.linear.schur import Coordinates, camera_system, eliminate_points
+from jaxba.linear.schur import RotationCoordinates, camera_system, eliminate_points
 from jaxba.linear.two_level import MODES, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.model import camera
 from jaxba.model.linearize import linearize
-from jaxba.runtime.process import calm_blas
+from jaxba.problem.options import Coordinates
+from jaxba.runtime.process import single_blas_thread
 from jaxba.structure import camera_clusters
 from jaxba.structure.layout import layout_for
 
-MANIFOLD = StepOptions(linear_solver="implicit", rotation="manifold")
+MANIFOLD = StepOptions(linear_solver="implicit", coordinates=Coordinates(rotation="manifold"))
 
 
 @pytest.fixture(autouse=True, scope="module")
 def one_blas_thread():
     """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with calm_blas():
+    with single_blas_thread():
         yield
 
 
@@ -58,7 +59,12 @@ def part(problem: BundleProblem, cameras: int, points: int) -> BundleProblem:
 
 # cameras a cluster, problem, options, lambda
 CASES = {
-    "three-clusters": (2, support.tiny, replace(MANIFOLD, scaling="identity"), 1000.0),
+    "three-clusters": (
+        2,
+        support.tiny,
+        replace(MANIFOLD, coordinates=replace(MANIFOLD.coordinates, scaling="identity")),
+        1000.0,
+    ),
     "unseen-camera": (2, lambda: whitened(support.odd()), replace(MANIFOLD, loss=Loss("huber", 1.7)), 0.1),
     "more-clusters-than-points": (1, lambda: part(support.paper(0), 5, 2), MANIFOLD, 0.1),
     "two-cameras": (8, lambda: part(support.tiny(), 2, 40), MANIFOLD, 0.1),
@@ -104,7 +110,7 @@ def everything(layout, problem, damping, more, options: StepOptions):
     state = initial_state(layout, problem, options, jnp.float64)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     points = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, points, Coordinates.of(state.cameras, options), damping, options)
+    system = camera_system(layout, linear, points, RotationCoordinates.of(state.cameras, options), damping, options)
     system = system._replace(blocks=system.blocks + more)
     frames = camera.frames(state.cameras)
     anchor = Anchor(frames.rotation, frames.translation, state.points)
@@ -124,7 +130,7 @@ def dense_schur(problem: BundleProblem, options: StepOptions, damping: float) ->
     _, jacobian = support.linear(problem, options)
     square = jacobian.T @ jacobian
     diagonal = np.diagonal(square)
-    clamped = np.clip(diagonal, 1e-6, 1e32) if options.scaling == "diagonal" else np.ones_like(diagonal)
+    clamped = np.clip(diagonal, 1e-6, 1e32) if options.coordinates.scaling == "diagonal" else np.ones_like(diagonal)
     square = square + np.diag(damping * clamped)
     n = 9 * problem.num_cameras
     schur = square[:n, :n] - square[:n, n:] @ np.linalg.solve(square[n:, n:], square[n:, :n])
@@ -221,7 +227,10 @@ def test_clusters_sum_their_cameras():
 
 def test_a_layout_without_clusters_is_refused():
     problem = support.tiny()
-    layout = layout_for(problem, replace(MANIFOLD, preconditioner="schur-jacobi"))
+    layout = layout_for(
+        problem,
+        replace(MANIFOLD, conjugate_gradients=replace(MANIFOLD.conjugate_gradients, preconditioner="schur-jacobi")),
+    )
     with pytest.raises(ValueError, match="clusters=True"):
         everything(layout, problem, jnp.asarray(0.1), np.zeros((6, 9, 9)), MANIFOLD)
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import DATA, needs_data, start
+from support import DATA, needs_data, solve, start
 
-from jaxba import StepOptions, Termination, read_problem, solve
+from jaxba import StepOptions, Termination, read_problem
 from jaxba.problem import geometry
+from jaxba.problem.options import Refinement
 
 pytestmark = [needs_data, pytest.mark.slow]
 
@@ -55,7 +56,9 @@ def solved():
         key = (name, damping, refine_points)
         if key not in done:
             problem = read_problem(path(name))
-            done[key] = solve(problem, damping, StepOptions(refine_points=refine_points), callback=lambda record: None)
+            done[key] = solve(
+                problem, damping, StepOptions(refinement=Refinement(points=refine_points)), callback=lambda record: None
+            )
         return done[key]
 
     return get

@@ -12,33 +12,52 @@ import support
 from support import MINIATURES, bal_file, needs_data, same_bits, start, step
 
 from jaxba import BundleProblem, Loss, StepOptions, lm_step, read_bal
+from jaxba.methods.deeplm import GlobalConjugateGradients
+from jaxba.methods.poba import PowerSeries
+from jaxba.problem.options import ConjugateGradients
 
 pytestmark = pytest.mark.step
 
 DAMPINGS = (1e-8, 1e-4, 1e-2, 1.0, 100.0)
 EXACT = StepOptions()
-TO_THE_END = StepOptions(linear_solver="implicit", cg_forcing=0.0, cg_tolerance=1e-14, cg_max_iterations=5000)
+TO_THE_END = StepOptions(
+    linear_solver="implicit", conjugate_gradients=ConjugateGradients(forcing=0.0, tolerance=1e-14, max_iterations=5000)
+)
 """Conjugate gradients until nothing changes any more."""
 
 KINDS = {
-    f"{solver}-{rotation}-{scaling}": replace(options, rotation=rotation, scaling=scaling)
+    f"{solver}-{rotation}-{scaling}": replace(
+        options, coordinates=replace(options.coordinates, rotation=rotation, scaling=scaling)
+    )
     for solver, options in (("explicit", EXACT), ("implicit", TO_THE_END))
     for rotation in ("angle-axis", "manifold")
     for scaling in ("diagonal", "identity")
 }
 SOLVERS = {
     "sparse": replace(TO_THE_END, linear_solver="sparse"),
-    "implicit-jacobi": replace(TO_THE_END, preconditioner="jacobi"),
-    "implicit-power-series": replace(TO_THE_END, preconditioner="power-series"),
+    "implicit-jacobi": replace(
+        TO_THE_END, conjugate_gradients=replace(TO_THE_END.conjugate_gradients, preconditioner="jacobi")
+    ),
+    "implicit-power-series": replace(
+        TO_THE_END, conjugate_gradients=replace(TO_THE_END.conjugate_gradients, preconditioner="power-series")
+    ),
 }
 SHARES = {
-    f"{name}-cameras-damped-by-{share:g}": replace(options, camera_damping=share)
+    f"{name}-cameras-damped-by-{share:g}": replace(
+        options, coordinates=replace(options.coordinates, camera_damping=share)
+    )
     for name, options in (("explicit", EXACT), ("implicit", TO_THE_END), ("sparse", SOLVERS["sparse"]))
     for share in (0.01, 10.0)
 } | {
-    "normal-cameras-damped-by-0.01": replace(TO_THE_END, linear_solver="normal", camera_damping=0.01),
-    "identity-cameras-damped-by-0.01": replace(EXACT, scaling="identity", camera_damping=0.01),
-    "fixed-intrinsics-cameras-damped-by-0.01": replace(EXACT, intrinsics="fixed", camera_damping=0.01),
+    "normal-cameras-damped-by-0.01": replace(
+        TO_THE_END, method=GlobalConjugateGradients(), coordinates=replace(TO_THE_END.coordinates, camera_damping=0.01)
+    ),
+    "identity-cameras-damped-by-0.01": replace(
+        EXACT, coordinates=replace(EXACT.coordinates, scaling="identity", camera_damping=0.01)
+    ),
+    "fixed-intrinsics-cameras-damped-by-0.01": replace(
+        EXACT, intrinsics="fixed", coordinates=replace(EXACT.coordinates, camera_damping=0.01)
+    ),
 }
 LOSSES = {name: replace(EXACT, loss=Loss(name, 1.7)) for name in ("huber", "soft_l1", "cauchy", "tukey")}
 PROBLEMS = {
@@ -81,7 +100,9 @@ def check_step(problem: BundleProblem, options: StepOptions, damping: float) -> 
     after, info = step(layout, before, damping, options)
     truth = support.dense(problem, options, damping)
     cost = support.cost(problem, options)
-    well_conditioned = min(1, options.camera_damping) * damping > 5e-5 and options.scaling == "diagonal"
+    well_conditioned = (
+        min(1, options.coordinates.camera_damping) * damping > 5e-5 and options.coordinates.scaling == "diagonal"
+    )
 
     np.testing.assert_allclose(before.cost, cost, rtol=1e-12)
     np.testing.assert_allclose(info.previous_cost, cost, rtol=1e-12)
@@ -118,7 +139,7 @@ def test_schur_step_equals_dense_normal_equation_step(make, options, damping):
 @pytest.mark.parametrize("damping", [1.0, 100.0])
 def test_a_long_power_series_ends_at_the_dense_step(damping):
     """It converges for every lambda, the slower the smaller it is."""
-    check_step(support.tiny(), StepOptions(linear_solver="power", power_order=300), damping)
+    check_step(support.tiny(), StepOptions(method=PowerSeries(order=300)), damping)
 
 
 # Many problems at once
@@ -205,7 +226,7 @@ def test_no_damping_lets_the_cost_rise_or_a_nan_in(damping):
 def test_a_candidate_that_overflows_is_a_rejected_step(refine_points):
     """A pixel at 1e150 asks for steps of that size, and the distortion raises them to the fifth power."""
     problem = BundleProblem.create([[0, 0, 0, 0, 0, 0, 1.0, 0.0, 1.0]], [[0.1, 0, -1]], [[1e150, 0]], [0], [0])
-    options = replace(EXACT, refine_points=refine_points)
+    options = replace(EXACT, refinement=replace(EXACT.refinement, points=refine_points))
     layout, before = start(problem, options)
     assert np.isfinite(before.cost)
     after, info = step(layout, before, 1e-4, options)
@@ -283,7 +304,12 @@ def test_cameras_and_points_that_nobody_observes_do_not_move():
 
 @pytest.mark.parametrize("name", ["explicit", "implicit"])
 def test_float32_steps_agree_with_float64_to_single_precision(name):
-    options = replace(EXACT if name == "explicit" else TO_THE_END, cg_tolerance=1e-6, cg_max_iterations=200)
+    options = replace(
+        EXACT if name == "explicit" else TO_THE_END,
+        conjugate_gradients=replace(
+            (EXACT if name == "explicit" else TO_THE_END).conjugate_gradients, tolerance=1e-6, max_iterations=200
+        ),
+    )
     layout, before = start(support.tiny(), options)
     after, info = step(layout, before, 1e-2, options)
     with jax.enable_x64(False):

@@ -9,9 +9,9 @@ import pytest
 import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support import step_info
+from support import solve, step_info
 
-from jaxba import Termination, Tolerances, solve
+from jaxba import Termination, Tolerances
 from jaxba.lm.termination import HIDDEN_DECREASE, converged_in_cost, lost_in_rounding, termination_of
 from jaxba.problem import geometry
 

@@ -13,16 +13,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
-from support import bal_file, needs_data, paper, start, step
+from support import bal_file, needs_data, paper, solve, start, step
 from test_step import DAMPINGS, check_step
 
-from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal, solve
-from jaxba.linear.schur import Coordinates, apply_reduced, camera_system, eliminate_points
+from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal
+from jaxba.linear.schur import RotationCoordinates, apply_reduced, camera_system, eliminate_points
 from jaxba.lm.damped_step import solve_step
 from jaxba.lm.termination import converged_in_cost
-from jaxba.methods.ddlm import LEAST_SHARE, decomposed_round
+from jaxba.methods.ddlm import LEAST_SHARE, DomainDecomposition, decomposed_round
+from jaxba.methods.deeplm import GlobalConjugateGradients
+from jaxba.methods.poba import PowerSeries
 from jaxba.methods.registry import UnknownMethodError
 from jaxba.methods.stba import (
+    StochasticClusters,
     agreed_gradient,
     clustered_step,
     eliminate_copies,
@@ -31,13 +34,16 @@ from jaxba.methods.stba import (
     split_right,
 )
 from jaxba.model.linearize import linearize
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.problem.options import ConjugateGradients
+from jaxba.runtime.compilation import CompileClock
 from jaxba.structure.layout import partition_of
 
-CLUSTERED = StepOptions(linear_solver="clustered", cluster_cameras=2)
-DECOMPOSED = StepOptions(linear_solver="decomposed", cluster_cameras=2)
+CLUSTERED = StepOptions(method=StochasticClusters(cluster_cameras=2))
+DECOMPOSED = StepOptions(method=DomainDecomposition(cluster_cameras=2))
 EMBEDDED = {"refine_points": 3, "camera_rounds": 2, "trials": 3}
-NORMAL = StepOptions(linear_solver="normal", cg_forcing=0.0, cg_tolerance=1e-15, cg_max_iterations=20000)
+NORMAL = StepOptions(
+    method=GlobalConjugateGradients(ConjugateGradients(forcing=0.0, tolerance=1e-15, max_iterations=20000))
+)
 
 
 def pieces(problem: BundleProblem, label: np.ndarray) -> BundleProblem:
@@ -59,7 +65,7 @@ def systems(problem: BundleProblem, options: StepOptions, damping: float, turn: 
 def _systems(layout, state, damping, options):
     linear = linearize(layout, state.cameras, state.points, options.loss)
     points = eliminate_points(layout, linear, damping, options)
-    system = camera_system(layout, linear, points, Coordinates.of(state.cameras, options), damping, options)
+    system = camera_system(layout, linear, points, RotationCoordinates.of(state.cameras, options), damping, options)
     return linear, points, system
 
 
@@ -69,13 +75,13 @@ def _systems(layout, state, damping, options):
 @pytest.mark.parametrize("damping", DAMPINGS)
 @pytest.mark.parametrize("make", [support.tiny, support.odd, support.whitened], ids=["tiny", "odd", "whitened"])
 def test_stba_with_one_cluster_is_the_exact_step(make, damping):
-    check_step(make(), replace(CLUSTERED, cluster_cameras=100), damping)
+    check_step(make(), replace(CLUSTERED, method=replace(CLUSTERED.method, cluster_cameras=100)), damping)
 
 
 @pytest.mark.parametrize("damping", [1e-4, 1e-2, 1.0])
 def test_stba_with_one_cluster_and_plain_lm_make_the_same_step(damping):
     """To 1e-10 of the step, in the norm of the damped Hessian, which both solve."""
-    problem, options = support.tiny(), replace(CLUSTERED, cluster_cameras=100)
+    problem, options = support.tiny(), replace(CLUSTERED, method=replace(CLUSTERED.method, cluster_cameras=100))
     made = []
     for kind in (options, StepOptions()):
         layout, before = start(problem, kind)
@@ -89,7 +95,10 @@ def test_stba_with_one_cluster_and_plain_lm_make_the_same_step(damping):
 @pytest.mark.parametrize("damping", [1e-6, 1e-3, 0.5])
 def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
     """Below lambda 1 the step is that of a dense solution in which nothing holds the pieces of a point together."""
-    problem, options = support.tiny(), replace(CLUSTERED, rotation="manifold")
+    problem, options = (
+        support.tiny(),
+        replace(CLUSTERED, coordinates=replace(CLUSTERED.coordinates, rotation="manifold")),
+    )
     layout, linear, points, system, part = systems(problem, options, damping)
     split = eliminate_copies(layout, linear, jnp.asarray(damping), part, options)
     right = split_right(layout, linear, system, split)
@@ -100,7 +109,10 @@ def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
 
 def test_the_split_reduced_system_is_block_diagonal():
     """The dense Schur complement of the split problem has nothing outside the clusters; that of the true one has."""
-    problem, options = support.tiny(), replace(CLUSTERED, rotation="manifold")
+    problem, options = (
+        support.tiny(),
+        replace(CLUSTERED, coordinates=replace(CLUSTERED.coordinates, rotation="manifold")),
+    )
     label = np.asarray(systems(problem, options, 1e-3)[-1].label)
     apart = np.repeat(label, 9)[:, None] != np.repeat(label, 9)
 
@@ -118,7 +130,10 @@ def test_the_split_reduced_system_is_block_diagonal():
 def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_iteration(damping):
     """In the norm of B the error, and in that of B^-1 the residual, falls by at least the spectral radius of
     `B^-1 (B - S)`, which is below one."""
-    problem, options = support.tiny(), replace(CLUSTERED, rotation="manifold")
+    problem, options = (
+        support.tiny(),
+        replace(CLUSTERED, coordinates=replace(CLUSTERED.coordinates, rotation="manifold")),
+    )
     layout, linear, points, system, part = systems(problem, options, damping)
     size = system.right.size
     basis = jnp.eye(size).reshape(size, -1, 9)
@@ -131,7 +146,15 @@ def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_
     radius = np.max(np.abs(np.linalg.eigvalsh((inner + inner.T) / 2)))
     assert radius < 1
     exact = np.linalg.solve(matrix, np.asarray(system.right).ravel())
-    first = clustered_step(layout, linear, points, system, jnp.asarray(damping), part, replace(options, repairs=0))
+    first = clustered_step(
+        layout,
+        linear,
+        points,
+        system,
+        jnp.asarray(damping),
+        part,
+        replace(options, method=replace(options.method, repairs=0)),
+    )
     error = lambda x: np.linalg.norm(root.T @ (np.asarray(x).ravel() - exact))
     residual = lambda x: np.linalg.norm(np.linalg.solve(root, matrix @ (np.asarray(x).ravel() - exact)))
     for norm, whole in ((error, np.linalg.norm(root.T @ exact)), (residual, residual(np.zeros(size)))):
@@ -172,7 +195,7 @@ def test_copies_agree_from_lambda_one_on_and_not_before():
     np.testing.assert_allclose(np.stack(below.projected[0]), np.stack(above.projected[0]), rtol=1e-6)
 
 
-@pytest.mark.parametrize("options", [CLUSTERED, StepOptions(linear_solver="power", power_order=3)])
+@pytest.mark.parametrize("options", [CLUSTERED, StepOptions(method=PowerSeries(order=3))])
 def test_an_inexact_step_predicts_what_its_own_linear_model_says(options):
     """`-(g.d + d.H d / 2)` of the step that was made, not of the one that would solve the system."""
     problem, damping = support.tiny(), 1e-2
@@ -201,12 +224,15 @@ def test_global_deeplm_run_to_convergence_is_the_exact_step(make, damping):
 @pytest.mark.parametrize("embedded", [{}, EMBEDDED])
 def test_ddlm_with_one_block_is_plain_lm(embedded):
     problem = support.tiny()
-    one, whole = replace(DECOMPOSED, cluster_cameras=100, **embedded), StepOptions(**embedded)
+    one, whole = (
+        replace(DECOMPOSED, **embedded, method=replace(DECOMPOSED.method, cluster_cameras=100)),
+        StepOptions(**embedded),
+    )
     layout, state = start(problem, one)
     plain, _ = start(problem, whole)
     for turn, damping in enumerate([1e-4, 1e-2, 1e-6, 1.0]):
         before = state
-        state, ours = step(layout, before, damping, one, turn=turn)
+        state, ours = step(layout, before, damping, one, iteration=turn)
         same, theirs = step(plain, before, damping, whole)
         assert ours.accepted
         assert theirs.accepted
@@ -224,7 +250,7 @@ def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, chan
     state = first
     for turn in range(6):
         before = state
-        state, info = step(layout, state, damping, options, turn=turn)
+        state, info = step(layout, state, damping, options, iteration=turn)
         assert state.cost <= before.cost
         assert bool(info.accepted) == (state.cost < before.cost)
         np.testing.assert_allclose(state.cost, support.cost(support.back(problem, first, state), options), rtol=1e-9)
@@ -234,7 +260,7 @@ def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, chan
 def test_clusters_of_ddlm_have_shares_and_repairs_of_their_own():
     """Three scenes in one problem: one step passes, one is shortened, one repaired, as each would be alone."""
     scenes, damping = [paper(2), turned(paper(1)), turned(paper(3))], 1e-3
-    options = StepOptions(linear_solver="decomposed", cluster_cameras=scenes[0].num_cameras, **EMBEDDED)
+    options = StepOptions(**EMBEDDED, method=DomainDecomposition(cluster_cameras=scenes[0].num_cameras))
     layout, state = start(side_by_side(scenes), options)
     part = partition_of(layout).at(0)
     found = _round(layout, state, jnp.asarray(damping), part, options)
@@ -281,7 +307,7 @@ def side_by_side(problems: list[BundleProblem]) -> BundleProblem:
 
 def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
     """Points move on alone, and the cost with them, less and less."""
-    options = replace(DECOMPOSED, refine_points=3)
+    options = replace(DECOMPOSED, refinement=replace(DECOMPOSED.refinement, points=3))
     layout, state = start(support.tiny(), options)
     _, good = step(layout, state, 1e-2, options)
     assert good.share == 1
@@ -300,7 +326,7 @@ def test_clusters_of_ddlm_that_cannot_be_factored_have_no_gain_while_separators_
     """A gain of 0 / 0 would become the next lambda."""
     from jaxba.methods import ddlm
 
-    options = replace(DECOMPOSED, refine_points=3)
+    options = replace(DECOMPOSED, refinement=replace(DECOMPOSED.refinement, points=3))
     layout, state = start(support.tiny(), options)
     monkeypatch.setattr(ddlm, "solve_clusters", lambda *arguments: jnp.full_like(arguments[4], jnp.nan))
     part = partition_of(layout).at(0)
@@ -385,7 +411,7 @@ def test_the_power_series_comes_closer_with_every_order(damping, left):
     truth = support.dense(problem, StepOptions(), damping)
     errors = []
     for order in (0, 1, 2, 5, 10, 20, 40, 80):
-        options = StepOptions(linear_solver="power", power_order=order)
+        options = StepOptions(method=PowerSeries(order=order))
         layout, before = start(problem, options)
         after, info = step(layout, before, damping, options, -1e9)
         assert info.accepted
@@ -401,7 +427,7 @@ def test_the_power_series_comes_closer_with_every_order(damping, left):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_lowers_the_cost_under_its_own_rule_and_stops(method):
     problem = support.tiny()
-    options = make_method(method).options(StepOptions(cluster_cameras=3))
+    options = make_method(f"{method}:3").options(StepOptions())
     solution = solve(problem, make_method(method).rule, options)
     reference = solve(problem, "ceres")
     assert solution.converged or method == "ddlm"  # whose rounds come closer for ever
@@ -412,7 +438,7 @@ def test_every_method_lowers_the_cost_under_its_own_rule_and_stops(method):
 def test_a_method_chosen_by_name_is_the_one_made_of_its_options():
     problem = support.tiny()
     by_name = solve(problem, "classic", method="poba")
-    by_hand = solve(problem, "classic", StepOptions(linear_solver="power"))
+    by_hand = solve(problem, "classic", StepOptions(method=PowerSeries()))
     np.testing.assert_array_equal(by_name.history.cost, by_hand.history.cost)
     assert by_name.linear_solver == "power"
 
@@ -438,14 +464,14 @@ def test_every_method_names_a_rule_that_exists(method):
 def test_random_clusters_are_one_program_for_all_turns(method):
     """Ladybug-49 in clusters of 16: iterations draw different clusters and compile nothing new."""
     problem = read_bal(bal_file("problem-49-7776-pre"))
-    options = make_method(method).options(StepOptions(cluster_cameras=16))
+    options = make_method(f"{method}:16").options(StepOptions())
     layout, state = start(problem, options)
     label = partition_of(layout).label
     assert len(np.unique(label, axis=0)) > 10
-    state, _ = step(layout, state, 1e-3, options, turn=0)
+    state, _ = step(layout, state, 1e-3, options, iteration=0)
     with CompileClock() as clock:
         for turn in range(1, 4):
-            state, info = step(layout, state, 1e-3, options, turn=turn)
+            state, info = step(layout, state, 1e-3, options, iteration=turn)
             assert float(info.cost) <= float(info.previous_cost)  # of arrays it would be a program
     assert clock.seconds == 0
 
@@ -456,7 +482,8 @@ def test_many_clusters_and_camera_blocks_factored_in_one_program_do_not_wait_for
     script = """
 import jax
 jax.config.update("jax_enable_x64", True)
-from jaxba import random_scene, solve
+from jaxba import random_scene
+from support import solve
 from jaxba.scenes import SceneConfig
 scene = random_scene(SceneConfig(336, 2500, 9000), 0)
 solution = solve(scene, "constant:1e-2", method="stba:16", max_iterations=30)

@@ -9,18 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
-from support import start, step
+from support import solve, start, step
 from test_cg import PRECONDITIONERS, SIZE, by_hand, right, spd
 
-from jaxba import LMState, StepOptions, make_policy, random_scene, solve
-from jaxba.methods.subspace import on_manifold, with_remembered
+from jaxba import LMState, StepOptions, make_policy, random_scene
+from jaxba.methods.poba import PowerSeries
+from jaxba.methods.subspace import on_manifold, with_previous
 from jaxba.model import camera
+from jaxba.problem.options import ConjugateGradients, Refinement
 from jaxba.scenes import SceneConfig
 
-SERIES = StepOptions(linear_solver="power", power_order=3, remembered_steps=2)
+SERIES = StepOptions(method=PowerSeries(order=3), refinement=Refinement(previous_steps=2))
 
 combine = jax.jit(
-    lambda matrix, b, found, before: with_remembered(
+    lambda matrix, b, found, before: with_previous(
         lambda x: (matrix @ x.reshape(-1)).reshape(x.shape), b, found, before
     )
 )
@@ -80,16 +82,16 @@ def test_changes_of_the_file_are_turned_to_the_manifold():
 def test_accepted_changes_of_the_cameras_are_remembered_and_refused_ones_are_not():
     problem = support.tiny()
     layout, first = start(problem, SERIES)
-    np.testing.assert_array_equal(first.remembered, np.zeros((2, *first.cameras.shape)))
+    np.testing.assert_array_equal(first.previous_steps, np.zeros((2, *first.cameras.shape)))
     second, info = step(layout, first, 1e-2, SERIES)
     assert info.accepted
-    np.testing.assert_array_equal(second.remembered[0], second.cameras - first.cameras)
+    np.testing.assert_array_equal(second.previous_steps[0], second.cameras - first.cameras)
     third, info = step(layout, second, 1e-3, SERIES)
     assert info.accepted
-    np.testing.assert_array_equal(third.remembered, [third.cameras - second.cameras, second.remembered[0]])
+    np.testing.assert_array_equal(third.previous_steps, [third.cameras - second.cameras, second.previous_steps[0]])
     same, info = step(layout, third, 1e-3, SERIES, 1e9)
     assert not info.accepted
-    np.testing.assert_array_equal(same.remembered, third.remembered)
+    np.testing.assert_array_equal(same.previous_steps, third.previous_steps)
 
 
 def test_a_step_with_remembered_ones_predicts_what_its_own_linear_model_says():
@@ -107,19 +109,26 @@ def test_a_step_with_remembered_ones_predicts_what_its_own_linear_model_says():
 
 @pytest.mark.parametrize("solver", ["explicit", "implicit", "clustered", "decomposed"])
 def test_other_solvers_remember_nothing(solver):
-    problem, options = support.tiny(), StepOptions(linear_solver=solver, remembered_steps=1)
+    problem, options = support.tiny(), StepOptions(linear_solver=solver, refinement=Refinement(previous_steps=1))
     _, state = start(problem, options)
     assert isinstance(state, LMState)
-    assert state.remembered is None
+    assert state.previous_steps is None
 
 
 @pytest.mark.parametrize("method", ["power", "normal"])
 def test_a_solver_that_remembers_converges_where_it_crawls_without(method):
     """A sequence of thirty cameras under Ceres' rule, conjugate gradients cut short; to the end of plain LM."""
     problem, ceres = random_scene(SceneConfig(30, 400, 1600), 0), make_policy("ceres")
-    best = solve(problem, ceres, StepOptions(refine_points=3)).final_cost
-    options = StepOptions(linear_solver=method, refine_points=3, cg_forcing=0.0, cg_max_iterations=20)
-    crawling, found = (solve(problem, ceres, replace(options, remembered_steps=k)) for k in (0, 1))
+    best = solve(problem, ceres, StepOptions(refinement=Refinement(points=3))).final_cost
+    options = StepOptions(
+        linear_solver=method,
+        refinement=Refinement(points=3),
+        conjugate_gradients=ConjugateGradients(forcing=0.0, max_iterations=20),
+    )
+    crawling, found = (
+        solve(problem, ceres, replace(options, refinement=replace(options.refinement, previous_steps=k)))
+        for k in (0, 1)
+    )
     assert crawling.final_cost > best * (1 + 1e-3)
     assert found.termination.converged
     assert found.final_cost < best * (1 + 1e-4)

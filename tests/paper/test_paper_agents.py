@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import numpy as np
 import pytest
-from support import paper
+from support import paper, solve
 
-from jaxba import StepOptions, solve
+from jaxba import StepOptions
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, make_banks
 from jaxba.paper import agents, config

@@ -33,7 +33,8 @@ from jaxba.bench import report
 from jaxba.bench.records import read_records
 from jaxba.cli.bench import run as run_bench
 from jaxba.problem import geometry
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.problem.options import Coordinates, Refinement
+from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.names import parse_solver
 
 pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")
@@ -47,7 +48,7 @@ from jaxba.peers.model import observed, step_facts
 
 pytestmark = pytest.mark.extra
 
-MANIFOLD = StepOptions(rotation="manifold")
+MANIFOLD = StepOptions(coordinates=Coordinates(rotation="manifold"))
 NEVER = Tolerances(ftol=0.0, xtol=0.0, gtol=0.0)
 SOME = Schedule(values=(1e-3, 1e-2, 1e-1, 1.0))
 
@@ -304,7 +305,12 @@ def test_every_lambda_is_possible(damping):
 def test_with_embedded_iterations_ceres_does_what_our_step_does(name, make):
     policy, options = parse_solver(f"pyceres:dense+{name}").build()
     found = drive_ceres(make(), "dense", policy, embedded=options, max_iterations=12)
-    ours = solve(make(), policy, replace(options, rotation="manifold"), max_iterations=12)
+    ours = solve(
+        make(),
+        policy,
+        replace(options, coordinates=replace(options.coordinates, rotation="manifold")),
+        max_iterations=12,
+    )
     assert (found.iterations, found.termination) == (ours.iterations, ours.termination)
     np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
     np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-3)
@@ -314,7 +320,7 @@ def test_with_embedded_iterations_ceres_does_what_our_step_does(name, make):
 
 def test_ceres_makes_the_same_step_when_it_is_not_to_judge_it():
     """With nothing embedded, steps as long as Ceres makes them."""
-    bare = StepOptions(rotation="manifold")
+    bare = StepOptions(coordinates=Coordinates(rotation="manifold"))
     found, plain = (drive_ceres(support.tiny(), "dense", SOME, max_iterations=6, embedded=it) for it in (bare, None))
     np.testing.assert_allclose(found.history.cost, plain.history.cost, rtol=1e-10)
     np.testing.assert_allclose(found.history.gain_ratio, plain.history.gain_ratio, rtol=1e-6)
@@ -330,7 +336,7 @@ def test_a_step_that_ceres_would_refuse_is_judged_and_then_leaves_every_bit():
         assert not refused.history.accepted[0]
         assert same_bits(refused.problem, problem)
     # shorter trials and points mend it
-    around = StepOptions(refine_points=5, point_starts="rays", trials=4)
+    around = StepOptions(refinement=Refinement(points=5, starts="rays", trials=4))
     mended = drive_ceres(problem, "dense", bold, max_iterations=1, embedded=around)
     assert mended.history.accepted[0]
     assert mended.final_cost < 1e-2 * mended.initial_cost
@@ -482,7 +488,7 @@ def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys
 def test_real_problems_end_as_with_our_step_where_iterations_are_embedded(name):
     policy, options = parse_solver("pyceres:dense+learned").build()
     found = drive_ceres(real(name), "dense", policy, embedded=options)
-    ours = solve(real(name), policy, replace(options, rotation="manifold"))
+    ours = solve(real(name), policy, replace(options, coordinates=replace(options.coordinates, rotation="manifold")))
     assert found.termination.converged
     assert abs(found.iterations - ours.iterations) <= 1  # the network turns rounding into differences of lambda
     np.testing.assert_allclose(found.final_cost, ours.final_cost, rtol=1e-5)

@@ -29,6 +29,7 @@ from jaxba.cli import table
 from jaxba.cli.solve import run
 from jaxba.paper.subproblem import sub_problem
 from jaxba.problem import geometry
+from jaxba.problem.options import Coordinates, Refinement
 from jaxba.structure.layout import layout_for
 
 INDEX = np.array([0, 1, 0, 2, 1, 0])
@@ -89,10 +90,10 @@ def dense_step(problem: BundleProblem, options: StepOptions, damping: float) -> 
     tied = ties(problem)
     small = jacobian @ tied
     diagonal = np.ones(small.shape[1])
-    if options.scaling == "diagonal":
+    if options.coordinates.scaling == "diagonal":
         diagonal = np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)
     of_camera = tied[: problem.cameras.size].any(axis=0)
-    diagonal[of_camera] *= options.camera_damping
+    diagonal[of_camera] *= options.coordinates.camera_damping
     stacked = np.vstack([small, np.diag(np.sqrt(damping * diagonal))])
     scale = 1 / np.linalg.norm(stacked, axis=0)
     right = np.concatenate([-residual, np.zeros(len(diagonal))])
@@ -104,8 +105,8 @@ def dense_step(problem: BundleProblem, options: StepOptions, damping: float) -> 
     "options",
     [
         StepOptions(),
-        StepOptions(rotation="manifold", camera_damping=0.1),
-        StepOptions(scaling="identity"),
+        StepOptions(coordinates=Coordinates(rotation="manifold", camera_damping=0.1)),
+        StepOptions(coordinates=Coordinates(scaling="identity")),
     ],
     ids=["diagonal", "manifold-soft", "identity"],
 )
@@ -124,7 +125,7 @@ def test_a_step_is_that_of_the_dense_tied_problem(make, options, damping):
 
 
 def test_the_promised_decrease_and_the_gradient_are_those_of_the_tied_problem():
-    problem, options = shared(), StepOptions(rotation="manifold")
+    problem, options = shared(), StepOptions(coordinates=Coordinates(rotation="manifold"))
     layout, before = support.start(problem, options)
     _, info = support.step(layout, before, 1e-2, options)
     residual, jacobian = support.linear(problem, options)
@@ -201,7 +202,7 @@ def test_a_long_sequence_with_one_lens_is_solved():
 
 def test_fixed_intrinsics_are_fixed_whoever_shares_them():
     problem = shared()
-    after = solve(problem, "learned", StepOptions(intrinsics="fixed", refine_points=3)).problem
+    after = solve(problem, "learned", StepOptions(intrinsics="fixed", refinement=Refinement(points=3))).problem
     assert (after.cameras[:, 6:] == problem.cameras[:, 6:]).all()
 
 

@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 
 from jaxba import Loss, StepOptions
+from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement
 
 
 @pytest.mark.parametrize(
@@ -43,13 +44,13 @@ def test_equal_options_are_one_key_and_different_ones_are_not():
     different = {
         StepOptions(),
         StepOptions(linear_solver="implicit"),
-        StepOptions(scaling="identity"),
-        StepOptions(rotation="manifold"),
-        StepOptions(refine_points=1),
+        StepOptions(coordinates=Coordinates(scaling="identity")),
+        StepOptions(coordinates=Coordinates(rotation="manifold")),
+        StepOptions(refinement=Refinement(points=1)),
         StepOptions(loss=Loss("huber")),
-        StepOptions(cg_forcing=0.5),
+        StepOptions(conjugate_gradients=ConjugateGradients(forcing=0.5)),
         StepOptions(intrinsics="fixed"),
-        StepOptions(camera_damping=0.01),
+        StepOptions(coordinates=Coordinates(camera_damping=0.01)),
     }
     assert len(different) == 9
 
@@ -61,5 +62,13 @@ def test_options_cannot_change_under_a_compiled_program():
 
 def test_the_defaults_are_those_of_ceres():
     options = StepOptions()
-    assert (options.scaling, options.rotation, options.refine_points) == ("diagonal", "angle-axis", 0)
-    assert (options.cg_forcing, options.cg_max_iterations, options.loss.name) == (0.1, 500, "squared")
+    assert (options.coordinates.scaling, options.coordinates.rotation, options.refinement.points) == (
+        "diagonal",
+        "angle-axis",
+        0,
+    )
+    assert (options.conjugate_gradients.forcing, options.conjugate_gradients.max_iterations, options.loss.name) == (
+        0.1,
+        500,
+        "squared",
+    )

@@ -12,9 +12,9 @@ import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from support import same_bits, start, step
+from support import same_bits, solve, start, step
 
-from jaxba import BundleProblem, Layout, LMState, StepOptions, lm_step, make_policy, solve
+from jaxba import BundleProblem, Layout, LMState, StepOptions, lm_step, make_policy
 from jaxba.game.random_scenes import SceneClass, make_scenes
 from jaxba.game.scene_bank import initial_costs
 from jaxba.game.scene_layout import class_layout, with_scene
@@ -22,6 +22,7 @@ from jaxba.linear.cholesky import solve_positive
 from jaxba.lm.damped_step import solve_step
 from jaxba.model.linearize import cost, linearize
 from jaxba.problem import geometry
+from jaxba.problem.options import Coordinates, Refinement
 from jaxba.refinement import trial
 from jaxba.refinement.cameras import DAMPINGS, refine_cameras
 from jaxba.refinement.subproblems import Whole
@@ -40,9 +41,9 @@ from jaxba.refinement.trial import (
 pytestmark = pytest.mark.step
 
 PLAIN = StepOptions()
-SHORTER_ONLY = StepOptions(trials=4)
-EVERYTHING = StepOptions(refine_points=3, trials=4, camera_rounds=3, pattern_moves=4)
-MOVES_ONLY = StepOptions(pattern_moves=4)
+SHORTER_ONLY = StepOptions(refinement=Refinement(trials=4))
+EVERYTHING = StepOptions(refinement=Refinement(points=3, trials=4, camera_rounds=3, pattern_moves=4))
+MOVES_ONLY = StepOptions(refinement=Refinement(pattern_moves=4))
 
 BOLD = 1e-8
 """A lambda that leaves far starts to Gauss-Newton."""
@@ -108,7 +109,7 @@ def test_no_camera_gets_worse_and_points_are_not_touched(seed, size):
 
 def test_a_round_is_a_damped_gauss_newton_step_of_each_camera():
     """On the manifold, by the Jacobian of support.py; where the first damping does not help, the second."""
-    manifold = StepOptions(rotation="manifold")
+    manifold = StepOptions(coordinates=Coordinates(rotation="manifold"))
     helped = 0
     for seed, size in ((1, 0.1), (2, 0.5), (5, 2.0)):
         problem = turned(seed, size)
@@ -254,7 +255,7 @@ def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
     linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
     whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(1e-3), PLAIN)
     mirrored = whole._replace(cameras=whole.cameras.at[6, 0].set(-1.5 * before.cameras[6, 0]))
-    found = lambda options: _best_trial(Whole(layout), *before[:3], linear.present, mirrored, options, 0.0)
+    found = lambda options: _best_trial(Whole(layout), *before[:3], linear.reference, mirrored, options, 0.0)
     plain, kept = found(PLAIN), found(SHORTER_ONLY)
     assert plain.cameras[6, 0] < 0
     assert kept.share == 1
@@ -288,7 +289,7 @@ def test_a_refused_step_leaves_every_bit_alone(options):
 
 @pytest.mark.fully_compiled
 def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
-    rounds = StepOptions(camera_rounds=3)
+    rounds = StepOptions(refinement=Refinement(camera_rounds=3))
     better = trusted = 0
     for layout, before in wide():
         plain = step(layout, before, BOLD, PLAIN)[1]
@@ -313,7 +314,7 @@ def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatc
 
     def repaired(rounds: int, *limits: float) -> tuple[np.ndarray, np.ndarray]:
         monkeypatch.setattr(trial, "WITHIN_REACH", limits)
-        options = StepOptions(camera_rounds=rounds)
+        options = StepOptions(refinement=Refinement(camera_rounds=rounds))
         once = jax.jit(lambda layout, before: lm_step(layout, before, jnp.asarray(BOLD), options)[1])
         infos = [once(*scene) for scene in scenes]
         return np.array([info.repairs for info in infos]), np.array([info.gain_ratio for info in infos])
@@ -333,7 +334,7 @@ def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatc
 
 @pytest.mark.fully_compiled
 def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
-    with_rounds = StepOptions(trials=4, camera_rounds=3)
+    with_rounds = StepOptions(refinement=Refinement(trials=4, camera_rounds=3))
     better = 0
     for layout, before in wide():
         bare = step(layout, before, BOLD, SHORTER_ONLY, min_gain=0.25)[1]

@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from support import solve
 from test_retriangulate import solved, strayed, thrown
 
-from jaxba import BundleProblem, Loss, StepOptions, build_layout, initial_state, lm_step, solve
+from jaxba import BundleProblem, Loss, StepOptions, build_layout, initial_state, lm_step
 from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
+from jaxba.problem.options import Refinement
 from jaxba.refinement import trial
 from jaxba.refinement.midpoints import better_starts, midpoints, refine_from_starts
 from jaxba.refinement.points import Home, refine_points
@@ -161,7 +163,7 @@ def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
     home, points = wrong(2, 3.0)
     problem = home.replace(points=points)
     args = build_layout(home), np.asarray(home.cameras).T, *[in_layout(home, points)] * 2
-    options, damping = StepOptions(refine_points=3, point_starts="rays"), jnp.asarray(1e12)
+    options, damping = StepOptions(refinement=Refinement(points=3, starts="rays")), jnp.asarray(1e12)
     costs = {}
     for limit, both in ((trial.LITTLE_LEFT, True), (0.0, False)):
         monkeypatch.setattr(trial, "LITTLE_LEFT", limit)
@@ -180,7 +182,7 @@ def test_only_the_whole_step_asks_for_the_rays():
     state = initial_state(layout, start, StepOptions())
     damping, costs = jnp.asarray(1.0), {}
     for trials in (1, 2):
-        options = StepOptions(refine_points=3, point_starts="rays", trials=trials)
+        options = StepOptions(refinement=Refinement(points=3, starts="rays", trials=trials))
         once = jax.jit(lambda layout, state, options=options: lm_step(layout, state, damping, options, jnp.inf)[1])
         info = once(layout, state)
         assert not info.accepted
@@ -190,8 +192,8 @@ def test_only_the_whole_step_asks_for_the_rays():
 
 def test_points_that_lie_far_away_come_back_in_four_iterations_where_their_rays_are_asked():
     start, best = strayed(30.0), geometry.cost(solved())
-    step = StepOptions(refine_points=3)
-    rays = StepOptions(refine_points=3, point_starts="rays")
+    step = StepOptions(refinement=Refinement(points=3))
+    rays = StepOptions(refinement=Refinement(points=3, starts="rays"))
     found = solve(start, "gauss-newton", rays, max_iterations=4)
     np.testing.assert_allclose(found.final_cost, best, rtol=1e-3)
     other = solve(start, "gauss-newton", step, max_iterations=4)

@@ -14,11 +14,12 @@ import pytest
 import support
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from support import bal_file, needs_data, published_loss, same_bits, start, step
+from support import bal_file, needs_data, published_loss, same_bits, solve, start, step
 
-from jaxba import BundleProblem, Loss, StepOptions, read_bal, solve
+from jaxba import BundleProblem, Loss, StepOptions, read_bal
 from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
+from jaxba.problem.options import Refinement
 from jaxba.refinement.points import FARTHEST, LITTLE, Home, refine_points
 
 pytestmark = pytest.mark.step
@@ -38,7 +39,7 @@ def thrown(seed: int, size: float) -> BundleProblem:
 
 def refined(problem: BundleProblem, iterations: int, loss: Loss | None = None):
     """The problem after refinement alone, and the record of it."""
-    options = StepOptions(refine_points=iterations, loss=loss or Loss())
+    options = StepOptions(loss=loss or Loss(), refinement=Refinement(points=iterations))
     layout, before = start(problem, options)
     after, info = step(layout, before, STILL, options)
     return support.back(problem, before, after), info
@@ -123,7 +124,7 @@ def test_refinement_never_makes_the_candidate_of_a_step_worse(damping):
     for seed, size in ((0, 0.0), (1, 0.3), (2, 2.0)):
         layout, before = start(thrown(seed, size))
         plain = step(layout, before, damping, StepOptions())[1]
-        with_points = step(layout, before, damping, StepOptions(refine_points=3))[1]
+        with_points = step(layout, before, damping, StepOptions(refinement=Refinement(points=3)))[1]
         assert not with_points.candidate_cost > plain.candidate_cost
         np.testing.assert_allclose(with_points.predicted, plain.predicted, rtol=1e-12)
 
@@ -135,7 +136,7 @@ def test_a_bold_step_that_fails_alone_is_saved_by_its_points():
     after, plain = step(layout, before, 1e-8, StepOptions())
     assert not plain.accepted
     assert same_bits(after, before)
-    _, info = step(layout, before, 1e-8, StepOptions(refine_points=3))
+    _, info = step(layout, before, 1e-8, StepOptions(refinement=Refinement(points=3)))
     assert info.accepted
     assert info.cost < 0.1 * plain.previous_cost
 
@@ -148,7 +149,7 @@ def test_points_whose_rays_are_parallel_stay_finite():
     problem = BundleProblem.create(
         [camera, camera], points, rng.normal(scale=80, size=(12, 2)), np.tile([0, 1], 6), np.repeat(np.arange(6), 2)
     )
-    options = replace(StepOptions(), refine_points=3)
+    options = replace(StepOptions(), refinement=replace(StepOptions().refinement, points=3))
     layout, before = start(problem, options)
     for damping in (STILL, 1e-2, 1e-8, 1e-16):
         after, info = step(layout, before, damping, options)

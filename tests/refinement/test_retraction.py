@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 import support
 from scipy.spatial.transform import Rotation
-from support import same_bits
+from support import same_bits, solve
 
-from jaxba import BundleProblem, StepOptions, build_layout, solve
+from jaxba import BundleProblem, StepOptions, build_layout
 from jaxba.problem import geometry
 from jaxba.problem.intrinsics import Lenses
+from jaxba.problem.options import Coordinates
 from jaxba.refinement.retraction import LARGEST_ZOOM, move_cameras, step_between
 
-PIXELS = StepOptions(lens_step="pixels")
+PIXELS = StepOptions(coordinates=Coordinates(lens_step="pixels"))
 FILE = StepOptions()
 
 _move = jax.jit(move_cameras, static_argnames=("options",))
@@ -37,13 +38,16 @@ def test_all_lens_steps_agree_to_first_order(rotation):
     layout = build_layout(support.tiny())
     first = []
     for lens_step in ("file", "pixels"):
-        options = StepOptions(rotation=rotation, lens_step=lens_step)
+        options = StepOptions(coordinates=Coordinates(rotation=rotation, lens_step=lens_step))
         along = lambda size, options=options: move_cameras(layout, jnp.asarray(cameras), size * step, options)
         first.append(jax.jvp(along, (0.0,), (1.0,)))
     (start, slope), (other_start, other_slope) = first
     np.testing.assert_allclose(other_slope, slope, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(other_start, start, atol=0)
-    far, other_far = (_move(layout, cameras, 0.2 * step, StepOptions(lens_step=how)) for how in ("file", "pixels"))
+    far, other_far = (
+        _move(layout, cameras, 0.2 * step, StepOptions(coordinates=Coordinates(lens_step=how)))
+        for how in ("file", "pixels")
+    )
     assert np.abs(other_far[7:] - far[7:]).max() > 1e-3  # and not to second
 
 
@@ -52,7 +56,7 @@ def test_all_lens_steps_agree_to_first_order(rotation):
 def test_the_step_between_two_places_is_the_one_that_was_made_to_first_order(rotation, lens_step):
     cameras, step = random_step(3, 1e-5)
     cameras[:3] = np.random.default_rng(4).normal(size=cameras[:3].shape)  # turned by a radian or two
-    options = StepOptions(rotation=rotation, lens_step=lens_step)
+    options = StepOptions(coordinates=Coordinates(rotation=rotation, lens_step=lens_step))
     moved = _move(build_layout(support.tiny()), cameras, step, options)
     found = step_between(jnp.asarray(cameras), moved, options)
     np.testing.assert_allclose(found, step, rtol=1e-3, atol=1e-9)
@@ -77,7 +81,9 @@ def test_a_zoom_along_which_the_image_stays_changes_no_pixel(growth):
         point_index=np.arange(20),
     )
     after = {
-        how: np.asarray(_move(build_layout(problem), camera[:, None], step, StepOptions(lens_step=how)))[:, 0]
+        how: np.asarray(
+            _move(build_layout(problem), camera[:, None], step, StepOptions(coordinates=Coordinates(lens_step=how)))
+        )[:, 0]
         for how in ("file", "pixels")
     }
     stretched = local * [1, 1, 1 + growth]
@@ -115,7 +121,7 @@ def test_what_of_a_lens_stays_is_not_touched_by_a_zoom():
         free = held[lenses.index, column]
         assert same_bits(moved[row, ~free], cameras[row, ~free])
         assert (moved[row, free] != (cameras + step)[row, free]).all()
-    fixed = StepOptions(lens_step="pixels", intrinsics="fixed")
+    fixed = StepOptions(intrinsics="fixed", coordinates=Coordinates(lens_step="pixels"))
     step[6:] = 0
     assert same_bits(np.asarray(_move(layout, cameras, step, fixed))[6:], cameras[6:])
 

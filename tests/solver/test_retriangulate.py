@@ -24,6 +24,7 @@ from jaxba import (
     solve_and_retriangulate,
 )
 from jaxba.problem import geometry
+from jaxba.problem.options import Refinement
 
 TIGHT = Tolerances(ftol=1e-12)
 
@@ -151,7 +152,7 @@ def test_a_cost_that_is_not_finite_is_refused():
 # In turns with the solve
 
 
-STRANDING = "ceres", StepOptions(refine_points=3)
+STRANDING = "ceres", StepOptions(refinement=Refinement(points=3))
 """A step that leaves a point in the valley where it is; `learned` looks where its rays meet."""
 
 

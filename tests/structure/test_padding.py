@@ -25,6 +25,7 @@ from jaxba import (
     solve_loop,
 )
 from jaxba.paper.subproblem import sub_problem
+from jaxba.problem.options import Coordinates, Refinement
 from jaxba.scenes import SceneConfig
 from jaxba.structure import covisibility
 from jaxba.structure.layout import layout_for
@@ -245,8 +246,8 @@ KINDS = {
     "dense product": (lambda: support.paper(0), StepOptions()),
     "whitened": (support.whitened, StepOptions()),
     "loss": (support.tiny, StepOptions(loss=Loss("huber", 1.7))),
-    "identity": (support.tiny, StepOptions(scaling="identity")),
-    "embedded": (support.odd, StepOptions(refine_points=3, camera_rounds=2, trials=3, pattern_moves=2)),
+    "identity": (support.tiny, StepOptions(coordinates=Coordinates(scaling="identity"))),
+    "embedded": (support.odd, StepOptions(refinement=Refinement(points=3, camera_rounds=2, trials=3, pattern_moves=2))),
     "fixed intrinsics": (support.tiny, StepOptions(intrinsics="fixed")),
 }
 

@@ -15,6 +15,8 @@ from scipy.sparse.csgraph import connected_components
 from support import bal_file, needs_data
 
 from jaxba import BundleProblem, StepOptions, read_bal
+from jaxba.methods.ddlm import DomainDecomposition
+from jaxba.methods.stba import StochasticClusters
 from jaxba.structure.layout import build_layout, layout_for, partition_of
 from jaxba.structure.louvain import camera_graph, cluster, clusterings
 from jaxba.structure.random_partitions import PARTITIONS
@@ -135,10 +137,10 @@ def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
 
 
 def test_small_problems_have_one_partition_with_one_cluster():
-    partitions = partition_of(layout_for(support.tiny(), StepOptions(linear_solver="clustered")))
+    partitions = partition_of(layout_for(support.tiny(), StepOptions(method=StochasticClusters())))
     assert partitions.label.shape == (1, 6)
     assert not partitions.separator.any()
-    many = partition_of(layout_for(support.tiny(), StepOptions(linear_solver="clustered", cluster_cameras=2)))
+    many = partition_of(layout_for(support.tiny(), StepOptions(method=StochasticClusters(cluster_cameras=2))))
     assert many.label.shape == (PARTITIONS, 6)
 
 
@@ -152,6 +154,6 @@ def test_a_layout_without_partitions_says_how_to_get_them():
 @needs_data
 def test_no_cluster_of_a_real_problem_is_larger_than_asked():
     problem = read_bal(bal_file("problem-49-7776-pre"))
-    partitions = partition_of(layout_for(problem, StepOptions(linear_solver="decomposed", cluster_cameras=16)))
+    partitions = partition_of(layout_for(problem, StepOptions(method=DomainDecomposition(cluster_cameras=16))))
     assert partitions.members.shape[2] <= 16
     assert 3 <= partitions.members.shape[1] <= 12

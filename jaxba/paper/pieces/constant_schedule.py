@@ -12,14 +12,14 @@ from jaxba.paper.pieces.base import Piece
 from jaxba.paper.rows import Row
 from jaxba.paper.schedule import average_schedule
 from jaxba.paper.workshop import Method, Workshop, named
-from jaxba.problem.options import StepOptions
+from jaxba.solver.options import SolveOptions
 
 AVERAGE = "schedule-of-our-agent"
 
 
 def _methods(shop: Workshop) -> list[tuple[str, Method, float | None]]:
-    def build(_: int) -> tuple[Schedule, StepOptions]:
-        return Schedule(values=_average(shop)), StepOptions()
+    def build(_: int) -> tuple[Schedule, SolveOptions]:
+        return Schedule(values=_average(shop)), SolveOptions()
 
     return [
         *base.yardsticks(),

@@ -13,8 +13,8 @@ from jaxba.paper.pieces import base
 from jaxba.paper.pieces.base import Piece
 from jaxba.paper.workshop import Method, Workshop, named
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.options import StepOptions
 from jaxba.scenes import SceneConfig, random_scene
+from jaxba.solver.options import SolveOptions
 
 PAPER_SIZE = 5
 """Cameras and points of the paper's small problem."""
@@ -52,11 +52,11 @@ def _sources(shop: Workshop, size: int) -> list[SmallScene]:
 def _known_lens(method: Method) -> Method:
     """The same with focal lengths and distortions held."""
 
-    def build(seed: int) -> tuple[DampingPolicy, StepOptions]:
+    def build(seed: int) -> tuple[DampingPolicy, SolveOptions]:
         policy, options = method.build(seed)
-        return policy, replace(options, intrinsics="fixed")
+        return policy, replace(options, intrinsics="fixed", linear_solver="explicit")
 
-    return replace(method, build=build, linear_solver="explicit")
+    return replace(method, build=build)
 
 
 def _methods(shop: Workshop, size: int) -> list[tuple[str, Method, float | None]]:

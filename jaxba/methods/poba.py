@@ -1,0 +1,81 @@
+"""Power bundle adjustment (PoBA): a power series for the inverse of the reduced camera system.
+
+With `S = B - W`, `S^-1 b = sum_i (B^-1 W)^i B^-1 b`: products with S, the inverses of its 9 x 9 blocks, and no inner
+products. Source: Weber et al. 2023, "Power Bundle Adjustment for Large-Scale 3D Reconstruction".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Float, Int
+
+from jaxba.linear.preconditioners import block_inverse
+from jaxba.linear.schur import CameraSystem, apply_reduced
+from jaxba.lm.method import DampedSystem, MethodStep
+from jaxba.methods.subspace import best_in_span
+from jaxba.problem.options import StepOptions, check_count
+
+
+@dataclass(frozen=True)
+class PowerSeries:
+    """The method `poba`."""
+
+    order: int = 20
+    """Terms of the series. Source: Weber et al. 2023, section 5."""
+
+    name: str = field(default="poba", init=False)
+    description: str = field(
+        default="power bundle adjustment: a power series for the inverse of the reduced camera system", init=False
+    )
+    rule: str = field(default="ceres", init=False)
+    forms_reduced_system: bool = field(default=False, init=False)
+    cluster_cameras: None = field(default=None, init=False)
+    conjugate_gradients: None = field(default=None, init=False)
+    single_solve: bool = field(default=True, init=False)
+    uses_previous_steps: bool = field(default=True, init=False)
+
+    def __post_init__(self) -> None:
+        check_count("order", self.order, 0)
+
+    def options(self, base: StepOptions) -> StepOptions:
+        """See `Method`."""
+        return replace(base, method=self)
+
+    def solve(
+        self,
+        system: DampedSystem,
+        options: StepOptions,
+        forcing: float | Float[Array, ""],
+        iteration: int | Int[Array, ""],
+        parameters: Float[Array, "9 cameras"],
+        previous: Float[Array, "steps 9 cameras"] | None,
+    ) -> MethodStep:
+        """See `StepMethod`."""
+        product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
+        inverse = block_inverse(system.cameras.blocks)
+        step = series(product, system.cameras, inverse, system.cameras.right, self.order)
+        if previous is not None:
+            step = best_in_span(system, step, parameters, previous)
+        return MethodStep(step, None, jnp.asarray(self.order, jnp.int32), previous is not None)
+
+
+def series(
+    apply: Callable[[Array], Array],
+    system: CameraSystem,
+    inverse: Callable[[Array], Array],
+    right: Float[Array, "cameras 9"],
+    order: int,
+) -> Float[Array, "cameras 9"]:
+    """First `order + 1` terms of `sum_i (B^-1 W)^i B^-1 b`, a symmetric map of b."""
+
+    def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        total, term = carry
+        term = inverse(jnp.einsum("cab,cb->ca", system.blocks, term) - apply(term))
+        return total + term, term
+
+    start = inverse(right)
+    return lax.fori_loop(0, order, body, (start, start))[0]

@@ -1,0 +1,150 @@
+"""From a problem to what a compiled loop takes: layout, state and resolved options; and back."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxba.damping import DampingPolicy, make_policy
+from jaxba.damping.policy import trained_step
+from jaxba.lm.records import LMState
+from jaxba.lm.step import initial_state
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.options import StepOptions
+from jaxba.problem.preprocess import far_middle, shift
+from jaxba.runtime import process
+from jaxba.runtime.compilation import CompileClock, compile_and_run, program
+from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.names import fitting_policy
+from jaxba.solver.options import SolveOptions
+from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.observation_order import ObservationOrder
+from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
+
+DEFAULT_POLICY = "learned"
+"""Who chooses lambda where nobody is named."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What `jaxba.solve_loop` and `jaxba.lm_step` take, for one problem."""
+
+    layout: Layout
+    """The observations, on the device."""
+
+    state: LMState
+    """Parameters in layout order, on the device, and their cost."""
+
+    options: StepOptions
+    """The step that was asked for, with its linear solver; static and hashable."""
+
+    policy: DampingPolicy
+    """Who chooses lambda."""
+
+    problem: BundleProblem
+    """As it was given."""
+
+    capacity: Capacity | None
+    """Sizes to which the problem was padded; None where it was not."""
+
+    offset: np.ndarray | None
+    """By how much the scene was moved towards the origin, scene units; None where it was not."""
+
+    setup_s: float
+    """Seconds for the layout and the transfer to the device."""
+
+    compile_s: float
+    """Seconds for the compilation of the initial state."""
+
+    def problem_at(self, state: LMState) -> BundleProblem:
+        """The problem with the parameters of a state, NumPy float64; what is not optimised is copied bit by bit."""
+        if self.offset is None:
+            return write_back(self.problem, self.layout, state, self.options)
+        return shift(write_back(shift(self.problem, -self.offset), self.layout, state, self.options), self.offset)
+
+
+def prepare(
+    problem: BundleProblem, options: SolveOptions | None = None, *, policy: str | DampingPolicy = DEFAULT_POLICY
+) -> Prepared:
+    """Everything that a solve does before its first iteration, for those who jit, vmap or time the loop themselves.
+
+    Arrays are float64 unless the options say float32: JAX must then be allowed 64 bits where they are used, by
+    `jax.config.update("jax_enable_x64", True)` or inside of `jax.enable_x64(True)`.
+
+    Args:
+        problem: start of the optimisation.
+        options: as for `solve`.
+        policy: as for `solve`.
+
+    Raises:
+        ValueError, ProblemError: as `solve`.
+    """
+    options = SolveOptions() if options is None else options
+    if isinstance(policy, str):
+        alone = options.refinement is not None and not options.refinement.points
+        policy = make_policy(fitting_policy(policy, alone=alone))
+    if not isinstance(policy, DampingPolicy):
+        raise ValueError(f"policy must be the name of a policy or a policy, not {policy!r}")
+    step = options.step_options(policy)
+    scaling = step.coordinates.scaling
+    if getattr(policy, "step_options", None) is not None and scaling != trained_step(policy).coordinates.scaling:
+        raise ProblemError(f"this policy knows lambda as a factor on the diagonal, not with scaling {scaling!r}")
+    capacity, asked = None, options.linear_solver
+    observations = ObservationOrder.of(problem)
+    if options.pad:
+        capacity, asked = with_padded_solver(capacity_of(problem, observations), step, asked)
+    step = choose_linear_solver(problem, step, asked, observations)
+    if step.mixed_precision and step.method is not None:
+        raise ProblemError("mixed types are for plain LM; methods have float64 or float32")
+    dtype = jnp.dtype("float32" if options.dtype == "float32" else "float64")
+    with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
+        started = time.perf_counter()
+        offset = far_middle(problem)
+        here = problem if offset is None else shift(problem, -offset)
+        with CompileClock() as clock:
+            layout = jax.device_put(layout_for(here, step, capacity, observations))
+            initial = program(initial_state, "options", "dtype", level="quick")
+            begin = here if capacity is None else padded_parameters(here, capacity)
+            state = jax.block_until_ready(compile_and_run(initial, layout, begin, step, dtype))
+        setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
+        if not np.isfinite(float(state.cost)):
+            raise ProblemError(explain_start(problem))
+    return Prepared(layout, state, step, policy, problem, capacity, offset, setup_s, clock.seconds)
+
+
+def explain_start(problem: BundleProblem) -> str:
+    """Which observation makes the initial cost infinite, in one line."""
+    with np.errstate(all="ignore"):
+        bad = np.flatnonzero(~np.isfinite(geometry.residuals(problem)).all(axis=1))
+    if not bad.size:
+        return "the cost at the start overflows"
+    camera, point = (int(index[bad[0]]) for index in (problem.camera_index, problem.point_index))
+    others = f" (and {bad.size - 1} more)" if bad.size > 1 else ""
+    return (
+        f"the cost at the start is not finite: observation {bad[0]}{others}, point {point} lies on the plane of camera "
+        f"{camera} or its projection overflows"
+    )
+
+
+def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:
+    """Optimised parameters in the problem's own order; what was not optimised is copied bit by bit."""
+    cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
+    seen = np.flatnonzero(layout.camera_seen)  # cameras of padding are not seen
+    cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
+    if options.intrinsics == "fixed":
+        cameras[:, 6:] = problem.cameras[:, 6:]
+    elif problem.lenses is not None:  # what nobody observes has the lens of the others
+        lens = np.asarray(problem.lenses.index)
+        used, first = np.unique(lens[seen], return_index=True)
+        follows = np.isin(lens, used)
+        cameras[follows, 6:] = cameras[seen[first[np.searchsorted(used, lens[follows])]], 6:]
+        cameras[:, 6:] = np.where(np.asarray(problem.lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
+    order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    real = order < problem.num_points
+    points[order[real]] = np.asarray(state.points, np.float64).T[real]
+    return problem.replace(cameras=cameras, points=points)
