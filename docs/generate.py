@@ -54,9 +54,11 @@ def table(path: str, *, command: bool) -> str:
     """
     try:
         found = _package()[path.removeprefix("jaxba.")]
+        found = found.final_target if found.is_alias else found
     except KeyError:
         raise DocumentError(f"{path}: no such class") from None
-    fields = [m for m in found.members.values() if m.is_attribute and m.annotation is not None]
+    members = [m for m in found.members.values() if m.is_attribute and m.annotation is not None]
+    fields = [m for m in members if "property" not in m.labels]
     if not fields:
         raise DocumentError(f"{path}: no fields")
     rows = [f"| {'option' if command else 'field'} | default | meaning |", "| --- | --- | --- |"]
@@ -88,33 +90,66 @@ def _option(name: str, annotation: str) -> str:
 
 
 def _value(owner: Any, value: Any) -> str:
-    """A default as text; a name is followed to what it stands for."""
+    """A default as text."""
     if value is None:
         return ""
-    text = str(value)
-    factory = re.fullmatch(r"(?:dataclasses\.)?field\(default_factory=(\w+)\)", text)
-    if factory:
-        return f"{factory[1]}()"
-    if text.isidentifier() and text not in ("None", "True", "False"):
-        try:
-            text = str(owner.parent[text].value)
-        except (KeyError, AttributeError):
-            return text
+    text = _text(owner.parent, ast.parse(str(value), mode="eval").body)
+    return "" if text == "()" else re.sub(r"e([+-])0(\d)", r"e\1\2", text)
+
+
+def _text(module: Any, value: ast.expr) -> str:
+    """What an expression stands for where it names constants, or fields of instances; else its own text."""
+    if isinstance(value, ast.Constant) and isinstance(value.value, str):
+        return value.value
+    if isinstance(value, ast.Call) and ast.unparse(value.func).endswith("field"):
+        factory = next((word.value for word in value.keywords if word.arg == "default_factory"), None)
+        return f"{ast.unparse(factory)}()" if factory is not None else ""
+    if isinstance(value, ast.Name):
+        found = _member(module, value.id)
+        if found is not None and found.is_attribute and found.value is not None:
+            return _text(found.parent, ast.parse(str(found.value), mode="eval").body)
+    if isinstance(value, ast.Attribute):
+        kind = _class_of(module, value.value)
+        field = kind and _member(kind, value.attr)
+        if field:
+            return _text(kind.parent, ast.parse(str(field.value), mode="eval").body)
+    return ast.unparse(value)
+
+
+def _class_of(module: Any, value: ast.expr) -> Any:
+    """The class of an instance whose fields have their defaults; None where that is not told by the source."""
+    if isinstance(value, ast.Name):
+        found = _member(module, value.id)
+        if found is None or not found.is_attribute:
+            return None
+        return _class_of(found.parent, ast.parse(str(found.value), mode="eval").body)
+    if isinstance(value, ast.Attribute):
+        kind = _class_of(module, value.value)
+        field = kind and _member(kind, value.attr)
+        if not field:
+            return None
+        call = ast.parse(str(field.value), mode="eval").body
+        factory = [word.value for word in getattr(call, "keywords", []) if word.arg == "default_factory"]
+        return _class_of(kind.parent, ast.Call(factory[0], [], [])) if factory else _class_of(kind.parent, call)
+    if isinstance(value, ast.Call) and not value.args and not value.keywords and isinstance(value.func, ast.Name):
+        found = _member(module, value.func.id)
+        return found if found is not None and found.is_class else None
+    return None
+
+
+def _member(owner: Any, name: str) -> Any:
+    """A member of a module or class by name, what it is imported from included; None where there is none."""
     try:
-        literal = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        return text
-    shortened = re.sub(r"e([+-])0(\d)", r"e\1\2", text)
-    return literal if isinstance(literal, str) else "" if literal == () else shortened
+        found = owner[name]
+        return found.final_target if found.is_alias else found
+    except (KeyError, AttributeError):
+        return None
 
 
 def _choices(owner: Any, annotation: str) -> list[str]:
     """The values that a Literal, or a name that stands for one, allows."""
-    if annotation.isidentifier():
-        try:
-            annotation = str(owner.parent[annotation].value)
-        except (KeyError, AttributeError):
-            return []
+    found = _member(owner.parent, annotation) if annotation.isidentifier() else None
+    annotation = str(found.value) if found is not None and found.is_attribute else annotation
     match = re.search(r"Literal\[(.*?)\]", annotation)
     return [str(x) for x in ast.literal_eval(f"({match[1]},)")] if match else []
 
