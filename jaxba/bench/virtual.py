@@ -12,6 +12,7 @@ from jaxba.bench.profile import NEVER, Reach
 from jaxba.damping import is_learned
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, parse_solver
+from jaxba.solver.options import SolveOptions
 
 FEWEST = 3
 """Rules that make a virtual best: of the two yardsticks, which most tables have, one is nearly always the better."""
@@ -26,12 +27,18 @@ def rules_of_one_step(solvers: Iterable[str]) -> dict[str, list[str]]:
     Returns:
         `FEWEST` rules or more each.
     """
-    groups: dict[str, list[str]] = {}
+    groups: dict[SolveOptions, dict[str, str]] = {}
     for name in solvers:
         rule = _rule(name)
         if rule is not None:
-            groups.setdefault(str(rule).removeprefix(rule.policy), []).append(name)
-    return {f"best of {len(rules)} rules{step}": rules for step, rules in groups.items() if len(rules) >= FEWEST}
+            ending = str(rule).removeprefix(rule.policy)
+            groups.setdefault(rule.build()[1], {})[name] = ending
+    # `bold` has the embedded iterations without the ending that the other rules of its group have
+    return {
+        f"best of {len(group)} rules{max(group.values(), key=len)}": list(group)
+        for group in groups.values()
+        if len(group) >= FEWEST
+    }
 
 
 def best_reach(reaches: Sequence[Reach]) -> Reach:

@@ -17,7 +17,7 @@ from jaxba.bench.sources import embedded_sources
 from jaxba.cli import common, table
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.output import check_outputs, write_solution
-from jaxba.damping import DampingPolicy, is_learned
+from jaxba.damping import DampingPolicy, brings_embedded
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import read_problem
 from jaxba.io.files import open_output, stream_number
@@ -64,8 +64,8 @@ class Arguments:
 
     policy: str = DEFAULT_POLICY
     """Who chooses lambda: learned (the shipped policy that fits the step), a .safetensors file of jaxba-train, ceres,
-    classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4; most take a first lambda, as in
-    classic:0.03."""
+    classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, bold (the smallest lambda that the guard of learned
+    allows), constant:1e-4; most take a first lambda, as in classic:0.03."""
 
     method: str = DEFAULT_METHOD
     """How a step is made. lm: Levenberg-Marquardt. stba: random clusters of cameras, of at most 100 or, as stba:16, of
@@ -150,7 +150,7 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 def solver_name(args: Arguments) -> SolverName:
     """The name of the solver in records and tables."""
-    refine = 0 if args.refine_points is None and not is_learned(args.policy) else args.refine_points
+    refine = 0 if args.refine_points is None and not brings_embedded(args.policy) else args.refine_points
     return SolverName(args.policy, refine, args.dtype, args.method)
 
 
