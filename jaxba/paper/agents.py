@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxba.damping import LearnedPolicy, load_policy, save_policy
 from jaxba.game.env import Game, make_game
-from jaxba.game.scene_bank import Bank, Split, sieve
+from jaxba.game.scene_bank import Bank, Split, select
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions
@@ -27,8 +27,8 @@ POLICY = "policy.safetensors"
 SCENES = "scenes"
 """Folder of the scenes that all agents share."""
 
-YARDSTICKS = ("ceres",)
-"""Rules that training logs are measured against; the tables have their own."""
+BASELINES = ("ceres",)
+"""What training logs are compared with; the tables have baselines of their own."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +119,13 @@ def scenes(config: PaperConfig, folder: Path, say: Callable[[str], None]) -> tup
     kept = len(split.held_out.initial_cost)
     if count <= kept:
         raise ProblemError(f"only {count} scenes to train on: draw more (bank.scenes)")
-    return sieve(split.train, np.arange(count - kept)), sieve(split.train, np.arange(count - kept, count))
+    return select(split.train, np.arange(count - kept)), select(split.train, np.arange(count - kept, count))
 
 
 def game(config: PaperConfig, agent: Agent, settings: TrainConfig, train_on: Bank) -> Game:
     """What an agent plays."""
     if agent.few_scenes:
-        train_on = sieve(train_on, np.arange(min(config.agents.trajectories, len(train_on.initial_cost))))
+        train_on = select(train_on, np.arange(min(config.agents.trajectories, len(train_on.initial_cost))))
     options = StepOptions(intrinsics=settings.bank.intrinsics)
     return make_game(settings.game, settings.bank.classes, [train_on], settings.envs, options)
 
@@ -135,7 +135,7 @@ def _shared(config: PaperConfig, folder: Path, say: Callable[[str], None]) -> Sp
     shared = folder / SCENES
     if not all((shared / name).is_file() for name in (task.BANK, task.RULES)):
         shared.mkdir(parents=True, exist_ok=True)
-        task.build(train_config(config, OURS, 0), shared, say, YARDSTICKS)
+        task.build(train_config(config, OURS, 0), shared, say, BASELINES)
     return task.read_banks(shared / task.BANK)[0]
 
 

@@ -34,7 +34,7 @@ CLOCKS = ("wall_s", "chunk_s", "steps_per_s", "updates_per_s", "cpu_per_wall", "
 def quick(monkeypatch):
     """Few lanes and rules, since every rule is a program of its own."""
     monkeypatch.setattr(rollout, "LANES", rollout.GROUP)
-    monkeypatch.setattr(task, "YARDSTICKS", ("ceres",))
+    monkeypatch.setattr(task, "BASELINES", ("ceres",))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def scenes(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("train") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollout, "LANES", rollout.GROUP)
-        patch.setattr(task, "YARDSTICKS", ("ceres",))
+        patch.setattr(task, "BASELINES", ("ceres",))
         interrupt_at(1, patch)
         assert run([*COMMAND, "--out", str(folder)]) == 130
     return folder
@@ -59,7 +59,7 @@ def finished(scenes, tmp_path_factory) -> Path:
     folder = Path(shutil.copytree(scenes, tmp_path_factory.mktemp("done") / "run"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollout, "LANES", rollout.GROUP)
-        patch.setattr(task, "YARDSTICKS", ("ceres",))
+        patch.setattr(task, "BASELINES", ("ceres",))
         assert run(["--out", str(folder), "--resume"]) == 0
     return folder
 
@@ -185,7 +185,7 @@ def test_a_resumed_run_of_other_settings_is_refused(folder, capsys):
 
 def test_a_bank_without_useful_scenes_is_one_line(capsys, tmp_path, monkeypatch):
     def none(*_args, **_kwargs):
-        raise TooFewScenes("only 0 of 9 scenes are of use: draw more")
+        raise TooFewScenes("only 0 of 9 scenes are usable: draw more")
 
     monkeypatch.setattr(task, "make_banks", none)
     assert "draw more" in error_of(capsys, *COMMAND, "--out", str(tmp_path / "run"))
