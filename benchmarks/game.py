@@ -21,7 +21,7 @@ from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.evaluate import Score, score
 from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.rollout import Trajectories, play
-from jaxba.game.scene_bank import sieve
+from jaxba.game.scene_bank import select
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.names import parse_solver
@@ -54,9 +54,9 @@ def main() -> None:
     with process.single_blas_thread():
         for kind, split in zip(config.bank.classes, splits, strict=True):
             count = min(args.scenes, len(split.held_out.initial_cost))
-            bank = sieve(split.held_out, np.arange(count))
+            bank = select(split.held_out, np.arange(count))
             runs = _runs(kind, bank, args.policy)
-            some = sieve(bank, np.arange(min(args.oracle, count)))
+            some = select(bank, np.arange(min(args.oracle, count)))
             beams = {}
             for suffix, options in STEPS.items() if args.oracle else ():
                 for name, width in ((f"beam search, width {WIDTH}", WIDTH), ("greedy", 1)):
