@@ -84,9 +84,9 @@ def _bench(args: Arguments) -> int:
     if not solvers:
         raise common.UsageError("--solvers names no solver")
     from jaxba.bench import run
-    from jaxba.bench.sources import embedded_sources, sources
+    from jaxba.bench.sources import default_sources, sources
 
-    places = sources(list(args.problems)) if args.problems else embedded_sources()
+    places = sources(list(args.problems)) if args.problems else default_sources()
     jobs = run.plan(places, solvers, repeats)
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
     try:
@@ -122,7 +122,7 @@ def _fill(folder: Path, jobs: Any, settings: Any, tolerance: float) -> int:
         status = common.INTERRUPTED
     if records:
         console.print("drawing", highlight=False)
-        files = report.write_all(records, folder, tolerance, facts={**report.run_facts(records), **run.machine()})
+        files = report.write_all(records, folder, tolerance, metadata={**report.run_metadata(records), **run.machine()})
         print_summary(summarize(records, tolerance), console, details=console.width >= DETAILS_WIDTH)
         console.print(f"wrote {len(files)} files; see {folder / 'report.html'}", highlight=False)
     return status

@@ -174,7 +174,7 @@ def _solve(args: Arguments) -> int:
         raise common.UsageError(f"--output and --log name the same file, {args.output}")
     from jaxba.bench.records import record_to_json
     from jaxba.bench.run import record_of
-    from jaxba.bench.sources import embedded_sources
+    from jaxba.bench.sources import default_sources
     from jaxba.cli import table
     from jaxba.damping import is_learned
     from jaxba.datasets.bal.paths import resolve
@@ -193,7 +193,7 @@ def _solve(args: Arguments) -> int:
     place = None if args.problem is None else resolve(args.problem)
     if place and args.log and Path(place).resolve() == Path(args.log).resolve():
         raise common.UsageError(f"--log names the problem's file, {args.log}")
-    problem = embedded_sources()[0].read() if place is None else read_problem(place)
+    problem = default_sources()[0].read() if place is None else read_problem(place)
     common.prepare_process(untraced=True)
     coordinates = options.step_options(policy).coordinates
     options = replace(
