@@ -1,4 +1,4 @@
-"""What tables and figures have in common."""
+"""Code shared by the tables and figures, mostly by the ablation tables."""
 
 from __future__ import annotations
 
@@ -6,111 +6,114 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from jaxba.bench.sources import Source
-from jaxba.paper import places
+from jaxba.paper import real_problems
 from jaxba.paper.agents import OURS
 from jaxba.paper.claims import Claim
-from jaxba.paper.markdown import Line, Section, counted, lines_table
+from jaxba.paper.markdown import Line, Section, format_iterations, lines_table
 from jaxba.paper.rows import Row
-from jaxba.paper.workshop import Method, Workshop, named
+from jaxba.paper.runner import Method, Runner, method_named
 
 CLASSIC, CERES, LEARNED, PLAIN = "classic", "ceres", "learned", "learned-driver"
-"""Names of the rows that most tables have; `PLAIN` is lambda alone, the paper's own comparison."""
+"""Solvers that most tables have. In `PLAIN` the policy chooses lambda only, as in the paper."""
 
 NOT_YET = "Not run in this folder yet."
+"""Text of the report if there are no results."""
 
 
 @dataclass(frozen=True)
-class Piece:
+class TableOrFigure:
     """A table or figure of the paper."""
 
     name: str
-    """For `--only`."""
+    """Name for `--only`."""
 
     title: str
-    """Heading in the report, and the line of `--list`."""
+    """Description for `--list`."""
 
-    work: Callable[[Workshop], None]
-    """Does what is missing."""
+    run: Callable[[Runner], None]
+    """Computes the results that are missing."""
 
-    section: Callable[[Workshop], Section]
-    """Its part of the report, from what is there."""
+    section: Callable[[Runner], Section]
+    """Makes the section of the report from the results so far."""
 
 
 def agent_lines(
-    shop: Workshop, methods: Sequence[tuple[str, Method, float | None]], sources: Sequence[Source] | None
+    runner: Runner, methods: Sequence[tuple[str, Method, float | None]], sources: Sequence[Source] | None
 ) -> list[Line]:
-    """Rows of an ablation.
+    """Rows of an ablation table.
 
     Args:
-        shop: of the run.
-        methods: label, method and the paper's iterations.
-        sources: real problems; None for the tables' own scenes.
+        runner: the run.
+        methods: label, method and the paper's iterations of each row.
+        sources: real problems; None for the scenes of the tables.
     """
-    pick = lambda method: shop.row_on_scenes(method) if sources is None else shop.row_on(sources, method)
+    pick = lambda method: runner.row_on_scenes(method) if sources is None else runner.row_on(sources, method)
     return [Line(label, pick(method), paper) for label, method, paper in methods]
 
 
-def ablation_work(shop: Workshop, methods: Sequence[tuple[str, Method, float | None]]) -> None:
-    """Plays all methods on the tables' own scenes and solves the problems of BAL with them."""
+def run_ablation(runner: Runner, methods: Sequence[tuple[str, Method, float | None]]) -> None:
+    """Solves the scenes of the tables and the BAL problems with all methods."""
     for _, method, _ in methods:
-        shop.play(method)
-    shop.solve(places.bal(shop.config.real), [method for _, method, _ in methods])
+        runner.play(method)
+    runner.solve(real_problems.bal(runner.config.real), [method for _, method, _ in methods])
 
 
-def on_both(
-    shop: Workshop,
+def claims_on_both_sets(
+    runner: Runner,
     methods: Sequence[tuple[str, Method, float | None]],
-    judge: Callable[[str, Callable[[str], Row | None]], list[Claim]],
+    make_claims: Callable[[str, Callable[[str], Row | None]], list[Claim]],
 ) -> tuple[Claim, ...]:
-    """The claims of an ablation on the tables' own scenes, and on BAL.
+    """The claims of an ablation table, on the scenes of the tables and on BAL.
 
     Args:
-        shop: of the run.
-        methods: rows of the ablation.
-        judge: given the name of the set of problems and the rows by method (None where it was not run).
+        runner: the run.
+        methods: label, method and the paper's iterations of each row.
+        make_claims: makes the claims on a set of problems. Its arguments are the name of the set, and a function that
+            gives the row of a method by name (None if it was not run).
     """
     found = []
-    for name, sources in (("synthetic", None), ("BAL", places.bal(shop.config.real))):
-        known = {line.row.method: line.row for line in agent_lines(shop, methods, sources) if line.row.solves}
-        found += judge(name, known.get)
+    for name, sources in (("synthetic", None), ("BAL", real_problems.bal(runner.config.real))):
+        known = {line.row.method: line.row for line in agent_lines(runner, methods, sources) if line.row.solves}
+        found += make_claims(name, known.get)
     return tuple(found)
 
 
 def problems(count: int) -> str:
-    """A number of problems in words."""
+    """`1 problem`, `2 problems` and so on."""
     return f"{count} problem{'' if count == 1 else 's'}"
 
 
-def headroom(shop: Workshop) -> str:
-    """What next to no damping needs on the tables' own scenes, where that was run."""
-    bold, ceres = shop.row_on_scenes(named("gauss-newton")), shop.row_on_scenes(named(CERES))
-    if not (bold.solves and ceres.solves):
+def gauss_newton_comparison(runner: Runner) -> str:
+    """A sentence on the iterations of Gauss-Newton and of Ceres' rule on the scenes of the tables; empty if they were
+    not run."""
+    undamped, ceres = runner.row_on_scenes(method_named("gauss-newton")), runner.row_on_scenes(method_named(CERES))
+    if not (undamped.solves and ceres.solves):
         return ""
     return (
-        f"For scale: on these scenes Gauss-Newton (1e-10 throughout) takes {counted(bold.iterations)} iterations and "
-        f"Ceres' rule {counted(ceres.iterations)}, without having learned anything."
+        f"For scale: on these scenes Gauss-Newton (1e-10 throughout) takes {format_iterations(undamped.iterations)} "
+        f"iterations and Ceres' rule {format_iterations(ceres.iterations)}, without any learning."
     )
 
 
-def ablation_body(shop: Workshop, methods: Sequence[tuple[str, Method, float | None]]) -> list[str]:
-    """Both tables of an ablation."""
+def ablation_body(runner: Runner, methods: Sequence[tuple[str, Method, float | None]]) -> list[str]:
+    """The tables of an ablation, on the scenes of the tables and on BAL."""
     body = []
-    count = shop.scenes_known()
-    lines = agent_lines(shop, methods, None)
+    count = runner.number_of_scenes()
+    lines = agent_lines(runner, methods, None)
     if any(line.row.solves for line in lines):
         body.append(
             f"**{count} synthetic scenes** of the kind that the agents train on, none of them seen in training:"
         )
         body.append(_table(lines))
-        body.append(headroom(shop))
+        body.append(gauss_newton_comparison(runner))
     else:
         body.append(NOT_YET)
-    reason = places.why_no_bal(shop.config.real)
+    reason = real_problems.reason_without_bal(runner.config.real)
     if reason:
         body.append(f"**BAL**: {reason}.")
         return body
-    sources = places.bal(shop.config.real)
-    lines = agent_lines(shop, methods, sources)
+    sources = real_problems.bal(runner.config.real)
+    lines = agent_lines(runner, methods, sources)
     if any(line.row.solves for line in lines):
         body.append(f"**BAL**, {problems(len(sources))} ({', '.join(source.name for source in sources)}):")
         body.append(_table(lines))
@@ -123,17 +126,17 @@ def _table(lines: Sequence[Line]) -> str:
 
 
 def yardsticks() -> list[tuple[str, Method, float | None]]:
-    """The paper's yardstick and the rule that people use."""
-    return [("classic", named(CLASSIC), 20.0), ("Ceres' rule", named(CERES), None)]
+    """Rows of the paper's baseline and of Ceres' rule."""
+    return [("classic", method_named(CLASSIC), 20.0), ("Ceres' rule", method_named(CERES), None)]
 
 
-def ours(shop: Workshop) -> tuple[str, Method, float | None]:
-    """The agent that every ablation is compared with."""
-    return ("ours: 5 errors, duration, bonus", shop.agent(OURS), 4.0)
+def ours(runner: Runner) -> tuple[str, Method, float | None]:
+    """Row of the agent with which each ablation is compared."""
+    return ("ours: 5 errors, duration, bonus", runner.agent(OURS), 4.0)
 
 
 AGENTS_DIFFER = (
-    "our agents train on synthetic scenes of 10 x 10 only, the paper's on BAL; the time of an iteration is a "
-    "constant in our "
-    "game and a measured one in the paper; the test set is another one."
+    "our agents train on synthetic scenes of 10 x 10 only, the paper's on BAL; the time of an iteration is a constant "
+    "in our game and measured in the paper; the test set is another one."
 )
+"""Differences of the set-up of the ablations from the paper's."""

@@ -5,46 +5,45 @@ from __future__ import annotations
 from jaxba.bench.plots import plot_convergence
 from jaxba.bench.sources import sources
 from jaxba.paper.markdown import Section
-from jaxba.paper.pieces import base, figures
-from jaxba.paper.pieces.base import Piece
-from jaxba.paper.workshop import Workshop, named
+from jaxba.paper.runner import Runner, method_named
+from jaxba.paper.tables_and_figures import common, figures
+from jaxba.paper.tables_and_figures.common import TableOrFigure
 
 METHODS = tuple(
     f"{policy}/{linear}" for policy in ("classic", "ceres", "learned-driver") for linear in ("explicit", "implicit")
 )
 
 
-def _work(shop: Workshop) -> None:
-    config = shop.config.figures
-    shop.solve([figures.main_problem(shop)], [named(name) for name in METHODS], repeats=1)
-    large = [named(name) for name in config.large_solvers]
-    shop.solve(sources([config.large_scene]), large, limit=config.large_iterations, repeats=1)
+def _run(runner: Runner) -> None:
+    config = runner.config.figures
+    runner.solve([figures.main_problem(runner)], [method_named(name) for name in METHODS], repeats=1)
+    large = [method_named(name) for name in config.large_solvers]
+    runner.solve(sources([config.large_scene]), large, limit=config.large_iterations, repeats=1)
 
 
-def _section(shop: Workshop) -> Section:
-    config = shop.config.figures
+def _section(runner: Runner) -> Section:
+    config = runner.config.figures
     body = [
-        "The paper's caption says that explicit stands for PCG and implicit for Cholesky's method, which is the "
-        "other way round "
-        "in the literature. Here explicit forms the reduced camera system and factors it; implicit runs preconditioned "
-        "conjugate gradients without forming it."
+        "The paper's caption says that explicit means PCG and implicit means Cholesky's method, which is the other way "
+        "round in the literature. Here explicit forms the reduced camera system and factors it; implicit runs "
+        "preconditioned conjugate gradients without forming it."
     ]
     groups = [
-        (figures.main_problem(shop), METHODS, "convergence"),
+        (figures.main_problem(runner), METHODS, "convergence"),
         (sources([config.large_scene])[0], config.large_solvers, "convergence-large"),
     ]
     for problem, names, file in groups:
-        records = shop.records_on([problem], [named(name) for name in names])
+        records = runner.records_on([problem], [method_named(name) for name in names])
         if not records:
-            body.append(f"{problem.name}: {base.NOT_YET}")
+            body.append(f"{problem.name}: {common.NOT_YET}")
             continue
         drawn = plot_convergence(records, problem.name)
         caption = f"{problem.name}: cost over time and iterations; above dashed at τ = 0.1 and 0.001"
-        body.append(figures.picture(shop, drawn, file, caption))
+        body.append(figures.picture(runner, drawn, file, caption))
         if file != "convergence":
             sizes = f"{records[0].cameras} cameras, {records[0].points} points, {records[0].observations} observations"
             body.append(
-                f"`{config.large_scene}` ({sizes}) stands in for Ladybug-1197; at most {config.large_iterations} "
+                f"`{config.large_scene}` ({sizes}) is used instead of Ladybug-1197; at most {config.large_iterations} "
                 "iterations."
             )
             if not any(r.solver.endswith("/explicit") for r in records):
@@ -52,4 +51,4 @@ def _section(shop: Workshop) -> Section:
     return Section("Convergence with explicit and implicit solvers", tuple(body))
 
 
-PIECE = Piece("convergence", "Figure: convergence with explicit and implicit solvers", _work, _section)
+ENTRY = TableOrFigure("convergence", "Figure: convergence with explicit and implicit solvers", _run, _section)

@@ -1,4 +1,4 @@
-"""What the figures have in common: their problems, and files."""
+"""Code shared by the figures: their problems and files."""
 
 from __future__ import annotations
 
@@ -8,24 +8,26 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from jaxba.bench.sources import Source, sources
-from jaxba.paper import places
-from jaxba.paper.workshop import Workshop
+from jaxba.paper import real_problems
+from jaxba.paper.runner import Runner
 from jaxba.runtime.atomic import atomic_write
 
 FIGURES = "figures"
-"""Folder of the pictures inside the run's."""
+"""Folder of the figures inside the folder of the run."""
 
 RESOLUTIONS = (100, 80, 60)
-"""Dots per inch; the first that keeps a picture below `LARGEST`."""
+"""Resolutions in dots per inch; the first that keeps the file below `LARGEST` is used, else the last."""
 
 LARGEST = 200_000
-"""Bytes of a picture."""
+"""Limit of the size of a figure, bytes."""
 
 
-def main_problem(shop: Workshop) -> Source:
-    """The largest Ladybug at hand; where there is none, a random scene of that kind."""
-    found = [s for family in places.families(shop.config.real) if family.family == "Ladybug" for s in family.whole]
-    return max(found, key=_cameras) if found else sources([shop.config.figures.scene])[0]
+def main_problem(runner: Runner) -> Source:
+    """The largest Ladybug problem on this machine; a random scene if there is none."""
+    found = [
+        s for family in real_problems.families(runner.config.real) if family.family == "Ladybug" for s in family.whole
+    ]
+    return max(found, key=_cameras) if found else sources([runner.config.figures.scene])[0]
 
 
 def _cameras(source: Source) -> int:
@@ -33,9 +35,9 @@ def _cameras(source: Source) -> int:
     return int(digits[0]) if digits else 0
 
 
-def picture(shop: Workshop, figure: Figure, name: str, caption: str) -> str:
-    """Draws a figure into the run's folder and returns the Markdown that shows it."""
-    folder = shop.folder / FIGURES
+def picture(runner: Runner, figure: Figure, name: str, caption: str) -> str:
+    """Writes a figure into the folder of the run and returns the Markdown that shows it."""
+    folder = runner.folder / FIGURES
     folder.mkdir(parents=True, exist_ok=True)
     path: Path = folder / f"{name}.png"
     with atomic_write(path) as file:

@@ -1,12 +1,12 @@
-"""Table: KITTI."""
+"""Table: average efficiency on KITTI."""
 
 from __future__ import annotations
 
-from jaxba.paper import claims, places
+from jaxba.paper import claims, real_problems
 from jaxba.paper.markdown import Section, disagreements
-from jaxba.paper.pieces import base, real
-from jaxba.paper.pieces.base import Piece
-from jaxba.paper.workshop import Workshop, named
+from jaxba.paper.runner import Runner, method_named
+from jaxba.paper.tables_and_figures import common, real
+from jaxba.paper.tables_and_figures.common import TableOrFigure
 
 METHODS: tuple[tuple[str, str, float | None, float | None], ...] = (
     ("STBA", "stba+stba", 80.0, 287.4),
@@ -17,27 +17,28 @@ METHODS: tuple[tuple[str, str, float | None, float | None], ...] = (
     ("ours: shipped policy, lambda alone", "learned-driver", 14.0, 100.2),
     ("ours: shipped policy, embedded iterations", "learned", None, None),
 )
-"""Rows. Source: the paper, table "Average efficiency improvement - KITTI"."""
+"""Label, solver, and the paper's iterations and seconds of each row. Source: the paper, table "Average efficiency
+improvement - KITTI"."""
 
 WHY = (
     "the shipped policy was trained on synthetic scenes, the paper's for this table on KITTI; front end, sequences "
-    "and windows "
-    "are other ones, which the paper does not describe; our STBA is written from its paper and authors' code, in JAX."
+    "and windows differ, since the paper does not describe them; our STBA is written in JAX from its paper and its "
+    "authors' code."
 )
 
 
-def _methods() -> list[real.Named]:
-    return [(label, named(name), its, seconds) for label, name, its, seconds in METHODS]
+def _methods() -> list[real.LabelledMethod]:
+    return [(label, method_named(name), its, seconds) for label, name, its, seconds in METHODS]
 
 
-def _work(shop: Workshop) -> None:
-    shop.solve(places.find(shop.config.real.kitti).all, [method for _, method, _, _ in _methods()])
+def _run(runner: Runner) -> None:
+    runner.solve(real_problems.find(runner.config.real.kitti).all, [method for _, method, _, _ in _methods()])
 
 
-def _section(shop: Workshop) -> Section:
-    place = places.find(shop.config.real.kitti)
-    sources = place.all
-    rows = {line.row.method: line.row for line in real.real_lines(shop, _methods(), sources)}
+def _section(runner: Runner) -> Section:
+    problems = real_problems.find(runner.config.real.kitti)
+    sources = problems.all
+    rows = {line.row.method: line.row for line in real.real_lines(runner, _methods(), sources)}
     known = {name: row if row.solves else None for name, row in rows.items()}
     ours, classic = known["learned-driver"], known["classic"]
     found = (
@@ -46,21 +47,21 @@ def _section(shop: Workshop) -> Section:
             "KITTI: ours takes a fifth of STBA's iterations", 0.2, known["stba+learned-driver"], known["stba+stba"]
         ),
         claims.time_claim("KITTI: ours takes a third of classic's time", 100.2 / 340.0, ours, classic),
-        claims.share_claim("KITTI: classic succeeds everywhere", 1.0, rows["classic"].success),
-        claims.share_claim("KITTI: ours succeeds everywhere", 1.0, rows["learned-driver"].success),
+        claims.fraction_claim("KITTI: classic succeeds everywhere", 1.0, rows["classic"].success),
+        claims.fraction_claim("KITTI: ours succeeds everywhere", 1.0, rows["learned-driver"].success),
     )
-    if place.reason or not any(row.solves for row in rows.values()):
-        return Section("KITTI", (f"KITTI: {place.reason}." if place.reason else base.NOT_YET,), found)
+    if problems.reason or not any(row.solves for row in rows.values()):
+        return Section("KITTI", (f"KITTI: {problems.reason}." if problems.reason else common.NOT_YET,), found)
     body = [
-        f"{base.problems(len(sources))}: {', '.join(source.name for source in sources)}. `-firstN` is the part of N "
-        "neighbouring "
-        "cameras, begun with the camera that sees most.",
-        *real.real_tables(shop, _methods(), sources),
+        f"{common.problems(len(sources))}: {', '.join(source.name for source in sources)}. `-firstN` is the "
+        "sub-problem of N neighbouring cameras, starting with the camera that observes most points.",
+        *real.real_tables(runner, _methods(), sources),
         disagreements(found, WHY),
     ]
-    if place.missing:
-        body.insert(1, f"Named by the configuration and not here: {', '.join(f'`{name}`' for name in place.missing)}.")
+    if problems.missing:
+        names = ", ".join(f"`{name}`" for name in problems.missing)
+        body.insert(1, f"In the configuration, but not on this machine: {names}.")
     return Section("KITTI", tuple(body), found)
 
 
-PIECE = Piece("kitti", "Table: average efficiency, KITTI", _work, _section)
+ENTRY = TableOrFigure("kitti", "Table: average efficiency, KITTI", _run, _section)

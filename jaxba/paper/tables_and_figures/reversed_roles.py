@@ -1,4 +1,4 @@
-"""Table: time as the state, error as the reward."""
+"""Table: reversed roles, with the time as the state and the error as the reward."""
 
 from __future__ import annotations
 
@@ -7,45 +7,47 @@ from collections.abc import Callable
 
 from jaxba.paper import agents, claims
 from jaxba.paper.markdown import Section, disagreements
-from jaxba.paper.pieces import base
-from jaxba.paper.pieces.base import Piece
 from jaxba.paper.rows import Row
-from jaxba.paper.workshop import Method, Workshop
+from jaxba.paper.runner import Method, Runner
+from jaxba.paper.tables_and_figures import common
+from jaxba.paper.tables_and_figures.common import TableOrFigure
 
 
-def _methods(shop: Workshop) -> list[tuple[str, Method, float | None]]:
-    return [*base.yardsticks(), base.ours(shop), ("reversed: 5 durations, error", shop.agent(agents.REVERSED), 10.0)]
+def _methods(runner: Runner) -> list[tuple[str, Method, float | None]]:
+    return [
+        *common.yardsticks(),
+        common.ours(runner),
+        ("reversed: 5 durations, error", runner.agent(agents.REVERSED), 10.0),
+    ]
 
 
-def _work(shop: Workshop) -> None:
-    base.ablation_work(shop, _methods(shop))
+def _run(runner: Runner) -> None:
+    common.run_ablation(runner, _methods(runner))
 
 
-def _section(shop: Workshop) -> Section:
-    methods = _methods(shop)
+def _section(runner: Runner) -> Section:
+    methods = _methods(runner)
 
-    def judge(where: str, row: Callable[[str], Row | None]) -> list[claims.Claim]:
+    def make_claims(where: str, row: Callable[[str], Row | None]) -> list[claims.Claim]:
         ours, turned = row(agents.OURS.name), row(agents.REVERSED.name)
         success = lambda one: one.success if one else math.nan
         half = f"Reversed roles still halve classic's iterations ({where})"
         return [
             claims.order_claim(f"Reversed roles accelerate less ({where})", "4 against 10", ours, turned),
-            claims.ratio_claim(half, 0.5, turned, row(base.CLASSIC)),
-            claims.share_claim(f"Reversed roles succeed less often ({where})", 0.7, success(turned)),
-            claims.share_claim(f"Our agent always succeeds ({where})", 1.0, success(ours)),
+            claims.ratio_claim(half, 0.5, turned, row(common.CLASSIC)),
+            claims.fraction_claim(f"Reversed roles succeed less often ({where})", 0.7, success(turned)),
+            claims.fraction_claim(f"Our agent always succeeds ({where})", 1.0, success(ours)),
         ]
 
-    found = base.on_both(shop, methods, judge)
+    found = common.claims_on_both_sets(runner, methods, make_claims)
     body = (
-        "Read as: the state is minus the time of each of the last five iterations, which our deterministic clock "
-        "makes 1, "
-        "so that this agent sees how many iterations have gone by and nothing else; the reward is minus the "
-        "logarithm of the "
-        "error over the best known one, with the same bonus.",
-        *base.ablation_body(shop, methods),
-        disagreements(found, base.AGENTS_DIFFER),
+        "Interpreted as: the state is minus the time of each of the last five iterations. The time of an iteration is "
+        "always 1 in our game, so that this agent observes only how many iterations it has made. The reward is minus "
+        "the logarithm of the error over the best known one, with the same bonus.",
+        *common.ablation_body(runner, methods),
+        disagreements(found, common.AGENTS_DIFFER),
     )
     return Section("Reversed roles", body, found)
 
 
-PIECE = Piece("reversed", "Table: reversed roles of state and reward", _work, _section)
+ENTRY = TableOrFigure("reversed", "Table: reversed roles of state and reward", _run, _section)

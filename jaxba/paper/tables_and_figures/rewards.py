@@ -6,46 +6,44 @@ from collections.abc import Callable
 
 from jaxba.paper import agents, claims
 from jaxba.paper.markdown import Section, disagreements
-from jaxba.paper.pieces import base
-from jaxba.paper.pieces.base import Piece
 from jaxba.paper.rows import Row
-from jaxba.paper.workshop import Method, Workshop
+from jaxba.paper.runner import Method, Runner
+from jaxba.paper.tables_and_figures import common
+from jaxba.paper.tables_and_figures.common import TableOrFigure
 
 
-def _methods(shop: Workshop) -> list[tuple[str, Method, float | None]]:
+def _methods(runner: Runner) -> list[tuple[str, Method, float | None]]:
     return [
-        *base.yardsticks(),
-        ("reward: minus the duration; here a constant, -1", shop.agent(agents.OURS), 4.0),
-        ("reward: nothing, bonus shrinking by 1 %", shop.agent(agents.REDUCTION), 4.2),
+        *common.yardsticks(),
+        ("reward: minus the duration; here a constant, -1", runner.agent(agents.OURS), 4.0),
+        ("reward: nothing, bonus shrinking by 1 %", runner.agent(agents.REDUCTION), 4.2),
     ]
 
 
-def _work(shop: Workshop) -> None:
-    base.ablation_work(shop, _methods(shop))
+def _run(runner: Runner) -> None:
+    common.run_ablation(runner, _methods(runner))
 
 
-def _section(shop: Workshop) -> Section:
-    methods = _methods(shop)
+def _section(runner: Runner) -> Section:
+    methods = _methods(runner)
 
-    def judge(where: str, row: Callable[[str], Row | None]) -> list[claims.Claim]:
+    def make_claims(where: str, row: Callable[[str], Row | None]) -> list[claims.Claim]:
         text = f"The duration is a better reward than a shrinking bonus ({where})"
         return [claims.order_claim(text, "4 against 4.2", row(agents.OURS.name), row(agents.REDUCTION.name))]
 
     same = claims.Claim(
         "The duration is a better reward than a constant", "4 against 5", "the same reward in our game", "not run"
     )
-    found = (same, *base.on_both(shop, methods, judge))
+    found = (same, *common.claims_on_both_sets(runner, methods, make_claims))
     body = (
-        "In a compiled game the time of an iteration is a deterministic cost, 1 for a plain step. **Duration and "
-        "constant "
-        "are then one reward**, so that they share a row (the paper: 4 and 5 iterations); the paper explains its "
-        "difference by the measured durations, which cannot show here. Bonus 10 in all cases; the shrinking bonus "
-        "loses "
-        "1 % of its first value an iteration.",
-        *base.ablation_body(shop, methods),
-        disagreements(found, base.AGENTS_DIFFER),
+        "In our compiled game the time of an iteration is deterministic, 1 for a plain step. **Duration and "
+        "constant are then the same reward** and have one row (the paper: 4 and 5 iterations); the paper explains its "
+        "difference by measured durations, which do not exist here. The bonus is 10 in all cases; the shrinking bonus "
+        "loses 1 % of its first value in each iteration.",
+        *common.ablation_body(runner, methods),
+        disagreements(found, common.AGENTS_DIFFER),
     )
     return Section("Rewards", body, found)
 
 
-PIECE = Piece("rewards", "Table: rewards duration, constant, reduction", _work, _section)
+ENTRY = TableOrFigure("rewards", "Table: rewards duration, constant, reduction", _run, _section)
