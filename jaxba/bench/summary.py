@@ -150,10 +150,6 @@ class Summary:
     metadata: dict[str, Any] = field(default_factory=dict)
     """Device, threads, versions and the like; written to `summary.json` as `facts`."""
 
-    def cell(self, problem: str, solver: str) -> Cell | None:
-        """The cell of a problem and a solver, None if the pair was not run."""
-        return next((c for c in self.cells if c.problem == problem and c.solver == solver), None)
-
 
 def summarize(
     records: Sequence[Record],

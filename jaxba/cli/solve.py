@@ -195,10 +195,10 @@ def _solve(args: Arguments) -> int:
     refine = None if args.refine_points is None and is_learned(args.policy) else args.refine_points or 0
     name = SolverName(args.policy, refine, args.dtype, args.method)
     policy, options = name.build()
-    place = None if args.problem is None else resolve(args.problem)
-    if place and args.log and Path(place).resolve() == Path(args.log).resolve():
+    path = None if args.problem is None else resolve(args.problem)
+    if path and args.log and Path(path).resolve() == Path(args.log).resolve():
         raise common.UsageError(f"--log names the problem's file, {args.log}")
-    problem = default_sources()[0].read() if place is None else read_problem(place)
+    problem = default_sources()[0].read() if path is None else read_problem(path)
     common.prepare_process(untraced=True)
     coordinates = options.step_options(policy).coordinates
     options = replace(

@@ -1,4 +1,4 @@
-"""What a reproduction run depends on, and the YAML files that say it.
+"""Configuration of a reproduction run, and its YAML files.
 
 A file in `configs/paper` states differences to the file that it extends, or to the defaults of the classes
 (jaxba/io/configurations.py).

@@ -78,11 +78,6 @@ class Row:
     seconds: float = math.nan
     """Mean time of set-up and iterations, without compilation. NaN if it was not measured."""
 
-    @property
-    def halfwidth(self) -> float:
-        """Half of the range over the training runs."""
-        return 0.5 * (self.high - self.low)
-
 
 def row(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -> Row:
     """The row of a method.

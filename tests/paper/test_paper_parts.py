@@ -85,7 +85,7 @@ def test_a_sub_problem_of_a_scene_is_made_when_it_is_read():
     assert tracks.min() >= 2
 
 
-# The schedule made the paper's way
+# Average schedules
 
 
 def test_a_schedule_is_the_arithmetic_mean_at_each_iteration():

@@ -13,8 +13,8 @@ from jaxba.paper.markdown import Line, Section, format_iterations, lines_table
 from jaxba.paper.rows import Row
 from jaxba.paper.runner import Method, Runner, method_named
 
-CLASSIC, CERES, LEARNED, PLAIN = "classic", "ceres", "learned", "learned-driver"
-"""Solvers that most tables have. In `PLAIN` the policy chooses lambda only, as in the paper."""
+CLASSIC, CERES = "classic", "ceres"
+"""Names of the rules that all tables have: the paper's baseline and Ceres' rule."""
 
 NOT_YET = "Not run in this folder yet."
 """Text of the report if there are no results."""
