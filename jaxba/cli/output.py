@@ -60,6 +60,6 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
             lost = table.lost_in_bal(problem)
     except OSError as error:
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
-    common.say(f"wrote {output}")
+    common.print_line(f"wrote {output}")
     if lost:
-        common.say(f"note: that file has no place for: {lost}")
+        common.print_line(f"note: that file has no place for: {lost}")

@@ -1,4 +1,4 @@
-"""`jaxba-solve`: one problem in, an optimised one out."""
+"""`jaxba-solve`: bundle adjustment of one problem."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import tyro
 
 from jaxba.bench.records import record_to_json
 from jaxba.bench.run import record_of
-from jaxba.bench.sources import embedded_sources
+from jaxba.bench.sources import default_sources
 from jaxba.cli import common, table
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.output import check_outputs, write_solution
@@ -42,13 +42,13 @@ from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.solve import Solution, solve
 
 DEFAULTS = SolveOptions()
-"""Defaults of all options of a solve."""
+"""Defaults of the options, those of `jaxba.solve`."""
 
 _STDOUT = 1
 """File descriptor of standard output."""
 
 DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
-"""What is solved where no problem is named."""
+"""Description of the scene that is solved if no problem is given."""
 
 OPTION_OF_FIELD = {"points": "refine_points", "scale": "loss_scale"}
 """Options that are not called as the field that they fill."""
@@ -60,82 +60,85 @@ class Arguments:
 
     problem: Annotated[str | None, tyro.conf.Positional] = None
     """BAL file or Bundler .out file, plain or .bz2, .gz, .xz; the folder of a COLMAP model (extra colmap); or the name
-    of a downloaded problem of BAL, such as ladybug-49 (see jaxba-data). Without it a built-in scene is solved."""
+    of a downloaded BAL problem such as ladybug-49 (see jaxba-data). Default: a random scene."""
 
     policy: str = DEFAULT_POLICY
-    """Who chooses lambda: learned (the shipped policy that fits the step), a .safetensors file of jaxba-train, ceres,
-    classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, bold (the smallest lambda that the guard of learned
-    allows), constant:1e-4; most take a first lambda, as in classic:0.03."""
+    """Damping policy, which chooses lambda: learned (the shipped policy for the options of the step), a .safetensors
+    file of jaxba-train, or one of the rules ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton,
+    bold (the smallest lambda that the guard of learned allows), constant:1e-4. Most rules take the first lambda, as in
+    classic:0.03."""
 
     method: str = DEFAULT_METHOD
-    """How a step is made. lm: Levenberg-Marquardt. stba: random clusters of cameras, of at most 100 or, as stba:16, of
-    another size. deeplm: conjugate gradients on all variables. ddlm: clusters optimised beside each other, ddlm:16.
-    poba: a power series. See docs/methods.md."""
+    """Method that computes a step. lm: Levenberg-Marquardt. stba: random clusters of at most 100 cameras; stba:16: of
+    at most 16. deeplm: conjugate gradients on all variables. ddlm, ddlm:16: clusters that are optimised in parallel.
+    poba: a power series."""
 
     refine_points: int | None = None
-    """Embedded point iterations after each camera step, and no other embedded iterations. If left out: those that a
-    learned policy was trained with, none for a rule."""
+    """Number of embedded point iterations after each camera step, without other embedded iterations. Default: the
+    embedded iterations with which a learned policy was trained; none for a rule."""
 
     linear_solver: LinearSolverChoice = DEFAULTS.linear_solver
-    """explicit: form and factor the reduced camera system. sparse: form it, conjugate gradients. implicit: conjugate
-    gradients without forming it. auto chooses by size."""
+    """explicit: form and factor the reduced camera system. sparse: form it and use conjugate gradients. implicit:
+    conjugate gradients without forming it. auto: choose by size."""
 
     preconditioner: Preconditioner = DEFAULTS.conjugate_gradients.preconditioner
-    """Of conjugate gradients (sparse, implicit). two-level: block diagonal and the motion of clusters of cameras."""
+    """Preconditioner of conjugate gradients (sparse, implicit). two-level: block diagonal, and a coarse system of the
+    motion of clusters of cameras."""
 
     dtype: Dtype = DEFAULTS.dtype
-    """Type of all arithmetic. mixed: float64, but the reduced camera system in float32."""
+    """Floating point type. mixed: float64, but the reduced camera system in float32."""
 
     pad: bool = DEFAULTS.pad
-    """Round sizes up to a coarse grid, so that problems of similar size share one compiled program, also from one call
-    of this command to the next; auto then means explicit. For many small problems: large ones and those for other
-    solvers are left as they are, and the summary says so."""
+    """Pad sizes to a coarse grid, so that problems of similar size share one compiled program, also between calls of
+    this command. auto then means explicit. This is for many small problems; large problems, and those for other linear
+    solvers, are not padded."""
 
     compilation: Compilation = DEFAULTS.compilation
-    """quick: compiled in a third of the time, but iterations take two to six times as long. full: all optimisation.
-    auto: quick, or in half of the time and nearly as fast, by the number of observations, and optimised after as many
-    iterations as pay for it. On a GPU always full."""
+    """quick: compile in a third of the time, with iterations that take two to six times as long. full: compile with all
+    optimisations. auto: quick for few observations, for more an intermediate mode with half of the compilation time and
+    nearly full speed; compile again with all optimisations after as many iterations as repay it. On a GPU always
+    full."""
 
     retriangulate: bool = False
-    """After convergence look for every point at other depths, go on from the cheapest places, and so on in turns while
-    that pays. Finds points that hang in the wrong place, and a lower cost, for more iterations."""
+    """After convergence, search for points at other depths with a lower cost, continue from them, and repeat this while
+    it pays. Finds points in wrong local minima, and so a lower cost, for more iterations."""
 
     max_iterations: int = DEFAULTS.max_iterations
-    """Linear solves before giving up."""
+    """Limit of linear solves."""
 
     ftol: float = DEFAULTS.tolerances.ftol
-    """Converged when an accepted step lowers the cost by less than this share."""
+    """Converged when the relative decrease of the cost by an accepted step is below this."""
 
     xtol: float = DEFAULTS.tolerances.xtol
-    """Converged when an accepted step is shorter than this share of the parameters."""
+    """Converged when the norm of an accepted step, relative to that of the parameters, is below this."""
 
     gtol: float = DEFAULTS.tolerances.gtol
-    """Converged when no gradient entry is larger."""
+    """Converged when the largest gradient entry is below this."""
 
     scaling: Scaling | None = None
-    """What lambda multiplies: the Hessian's diagonal, or the unit matrix (the paper's equation). If left out: as a
-    learned policy was trained, the diagonal for a rule."""
+    """Matrix that lambda multiplies. diagonal: the diagonal of the Hessian. identity: the unit matrix, as in the
+    paper's equation. Default: as a learned policy was trained; the diagonal for a rule."""
 
     rotation: Rotation | None = None
-    """Coordinates of rotation steps: those of the file, as Ceres, or multiplication by exp(step). If left out: as a
-    learned policy was trained, those of the file for a rule."""
+    """Coordinates of rotation steps. angle-axis: those of the file, as in Ceres. manifold: multiplication by
+    exp(step). Default: as a learned policy was trained; those of the file for a rule."""
 
     intrinsics: Intrinsics = DEFAULTS.intrinsics
-    """free: focal length and distortion of every camera are optimised, as in BAL, or of every lens, as in COLMAP.
-    fixed: they stay, as they should with calibrated cameras; the reduced camera system is then formed and factored."""
+    """free: optimise focal length and distortion of every camera, as in BAL, or of every lens, as in COLMAP. fixed:
+    keep them, for calibrated cameras; the linear solver must be explicit."""
 
     loss: Literal["squared", "huber", "soft_l1", "cauchy", "tukey"] = "squared"
-    """Robust loss of the squared residual."""
+    """Robust loss function of the squared residual."""
 
     loss_scale: float = DEFAULTS.loss.scale
-    """Residual in pixels where the loss bends."""
+    """Scale of the robust loss, pixels: residuals well below it count quadratically."""
 
     output: str | None = None
-    """Write the solution here: BAL format, compressed by its ending, or .ply for a viewer; /dev/stdout too. Of a COLMAP
-    model: a COLMAP model, in a folder of this name, unless it ends in .txt, .bal, .ply, .bz2, .gz or .xz."""
+    """Output file in BAL format, compressed by its ending, or .ply for a viewer; also /dev/stdout. If the problem is a
+    COLMAP model: output folder of a COLMAP model, unless the name ends in .txt, .bal, .ply, .bz2, .gz or .xz."""
 
     log: str | None = None
-    """Write a JSON record of the solve here, compressed by its ending."""
+    """Output file of a JSON record of the solve, compressed by its ending."""
 
 
 def main() -> None:
@@ -144,7 +147,8 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command and returns its exit status: 0 when a solution was found and written, 2 for bad input."""
+    """Runs the command. Exit status: 0 if a solution was found and written, 2 for bad input, 130 after a second
+    Ctrl-C."""
     return common.run_command(Arguments, _run, "Bundle adjustment of one problem.", argv)
 
 
@@ -197,7 +201,7 @@ def _about_option(message: str) -> str:
 def _run(args: Arguments) -> int:
     if _STDOUT not in [stream_number(path or "") for path in (args.output, args.log)]:
         return _solve(args)
-    with redirect_stdout(sys.stderr):  # nothing comes between the lines of the file
+    with redirect_stdout(sys.stderr):  # stdout has only the output file
         return _solve(args)
 
 
@@ -207,21 +211,21 @@ def _solve(args: Arguments) -> int:
     policy, options = solve_options(args)
     path = None if args.problem is None else resolve(args.problem)
     check_outputs(args.output, args.log, path)
-    problem = embedded_sources()[0].read() if path is None else read_problem(path)
+    problem = default_sources()[0].read() if path is None else read_problem(path)
     common.prepare_process(untraced=True)
     name = args.problem or DEFAULT_SCENE
-    common.say(table.heading(name, problem, args, options.step_options(policy)))
+    common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     solution, steps = _iterate(args, problem, policy, options)
-    common.say(table.summary(problem, solution))
+    common.print_line(table.summary(problem, solution))
     if args.pad:
-        common.say(table.padding(problem, solution))
+        common.print_line(table.padding(problem, solution))
     if args.output:
         write_solution(args.output, solution.problem, path)
     if args.log:
         record = record_of(solution, steps, name=name, family="", solver=solver_name(args))
         with open_output(args.log) as file:
             file.write(json.dumps(record_to_json(record), allow_nan=False).encode() + b"\n")
-        common.say(f"wrote {args.log}")
+        common.print_line(f"wrote {args.log}")
     return 0
 
 
@@ -230,16 +234,16 @@ def _iterate(
 ) -> tuple[Solution, list[IterationRecord]]:
     """Solves, and prints every iteration; the first Ctrl-C stops after the present one."""
     steps: list[IterationRecord] = []
-    with Interrupt("iteration", gentle=True) as interrupt:
+    with Interrupt("iteration", graceful=True) as interrupt:
 
         def show(record: IterationRecord) -> bool:
             if not steps:
-                common.say(table.header(float(record.step.previous_cost)))
-            common.say(table.row(record, steps[-1].time_s if steps else 0.0))
+                common.print_line(table.header(float(record.step.previous_cost)))
+            common.print_line(table.row(record, steps[-1].time_s if steps else 0.0))
             steps.append(record)
-            return interrupt.asked
+            return interrupt.requested
 
         if not args.retriangulate:
             return solve(problem, policy, options, callback=show), steps
-        show_search = lambda found: common.say(table.retriangulated(found, args.ftol))
+        show_search = lambda found: common.print_line(table.retriangulated(found, args.ftol))
         return solve_and_retriangulate(problem, policy, options, callback=show, on_search=show_search), steps

@@ -88,6 +88,17 @@ def play_all(
     }
 
 
+def virtual_best(runs: Sequence[Trajectories], limit: int) -> Trajectories:
+    """The virtual best of several policies on a bank: for each scene the lowest cost after each iteration, and the
+    fewest iterations to convergence, each of the policy that has it. Its dampings are those of the first policy."""
+    return Trajectories(
+        costs=np.min([run.costs for run in runs], axis=0),
+        dampings=runs[0].dampings,
+        iterations=np.min([np.where(run.converged, run.iterations, limit) for run in runs], axis=0),
+        converged=np.any([run.converged for run in runs], axis=0),
+    )
+
+
 def scores(
     policies: Mapping[str, Runs], rules: Mapping[str, Runs], banks: Sequence[Bank], tolerance: float, limit: int
 ) -> dict[str, Score]:
@@ -100,10 +111,5 @@ def scores(
         np.min([np.asarray(bank.best_cost), *(run[k].costs[:, -1] for run in runs.values())], axis=0)
         for k, bank in enumerate(banks)
     ]
-    lowest = []
-    for k in range(len(banks)):
-        on_bank = [run[k] for run in rules.values()]
-        pick = lambda name, choose, on_bank=on_bank: choose([getattr(run, name) for run in on_bank], axis=0)
-        ended = np.min([np.where(run.converged, run.iterations, limit) for run in on_bank], axis=0)
-        lowest.append(Trajectories(pick("costs", np.min), on_bank[0].dampings, ended, pick("converged", np.any)))
+    lowest = [virtual_best([run[k] for run in rules.values()], limit) for k in range(len(banks))]
     return {name: score(run, best, tolerance, limit) for name, run in {**runs, "virtual best": lowest}.items()}

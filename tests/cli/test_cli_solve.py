@@ -44,7 +44,7 @@ def rows(text: str) -> list[list[str]]:
     return [line.split() for line in text.splitlines() if line[:4].strip().isdigit()]
 
 
-# What works
+# Solves
 
 
 def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
@@ -84,7 +84,7 @@ def test_without_a_problem_a_built_in_scene_is_solved(capsys):
     assert printed.err == ""
 
 
-def test_a_search_for_points_is_told_and_rows_count_through(tmp_path, capsys):
+def test_a_search_for_points_is_reported_and_rows_are_numbered_consecutively(tmp_path, capsys):
     """One point behind its cameras, with which the solve alone converges far above the minimum."""
     problem, log = solve(support.tiny()).problem, tmp_path / "log.json"
     points, center = np.array(problem.points), geometry.camera_centers(problem.cameras)[problem.camera_index[0]]
@@ -115,7 +115,7 @@ def test_the_rms_is_that_of_the_residuals_whatever_the_loss(loss, tiny, tmp_path
     np.testing.assert_allclose([float(number) for number in found.groups()], rms, rtol=1e-3)
 
 
-def test_padded_sizes_are_said_and_so_is_why_there_are_none(tiny, capsys):
+def test_padded_sizes_are_reported_or_why_there_is_no_padding(tiny, capsys):
     fast = [str(tiny), "--max-iterations", "1", "--policy", "ceres", "--pad"]
     assert run(fast) == 0
     assert "padded to 8 cameras, 512 points, 1024 observations, 4096 pairs\n" in capsys.readouterr().out
@@ -123,7 +123,7 @@ def test_padded_sizes_are_said_and_so_is_why_there_are_none(tiny, capsys):
     assert "note: not padded: that is for the explicit linear solver\n" in capsys.readouterr().out
 
 
-def test_the_iteration_limit_is_no_error_and_is_said(tiny, tmp_path, capsys):
+def test_the_iteration_limit_is_reported_and_not_an_error(tiny, tmp_path, capsys):
     output = tmp_path / "out.txt"
     assert run([str(tiny), "--max-iterations", "2", "--ftol", "0", "--output", str(output)]) == 0
     printed = capsys.readouterr().out
@@ -171,7 +171,7 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     assert "method stba:3" in capsys.readouterr().out
 
 
-def test_fixed_intrinsics_stay_to_the_last_bit_and_the_rest_is_optimised(tiny, tmp_path):
+def test_fixed_intrinsics_are_bitwise_unchanged_and_the_rest_is_optimised(tiny, tmp_path):
     out = tmp_path / "out.txt"
     assert run([str(tiny), "--intrinsics", "fixed", "--output", str(out)]) == 0
     before, after = read_bal(tiny), read_bal(out)
@@ -180,7 +180,7 @@ def test_fixed_intrinsics_stay_to_the_last_bit_and_the_rest_is_optimised(tiny, t
     assert geometry.cost(after) < 0.5 * geometry.cost(before)
 
 
-def test_what_is_odd_about_the_data_is_counted(tmp_path, capsys):
+def test_notes_on_the_data_have_the_right_counts(tmp_path, capsys):
     problem = support.odd()
     path, output = tmp_path / "odd.txt", tmp_path / "out.txt"
     write_bal(problem, path)
@@ -228,7 +228,7 @@ def test_the_input_may_be_the_output(tiny, capsys):
     assert geometry.cost(read_bal(tiny)) < geometry.cost(support.tiny())
 
 
-def test_a_start_that_is_not_finite_ends_with_an_honest_word(tmp_path, capsys):
+def test_a_start_without_a_finite_cost_is_reported(tmp_path, capsys):
     """A point on its camera's plane: there is nothing to descend from."""
     problem = support.single().replace(
         cameras=np.array([[0, 0, 0, 0, 0, 0, 500.0, 0, 0]]), points=np.array([[1.0, 2.0, 0.0]])
@@ -244,7 +244,7 @@ def test_a_start_that_is_not_finite_ends_with_an_honest_word(tmp_path, capsys):
         check_one_line(status, printed.err)
 
 
-def test_ctrl_c_stops_after_the_iteration_and_writes_what_there_is(tiny, tmp_path, capsys, monkeypatch):
+def test_ctrl_c_stops_after_the_iteration_and_writes_the_solution(tiny, tmp_path, capsys, monkeypatch):
     output = tmp_path / "out.txt"
     row = table.row
 
@@ -277,7 +277,7 @@ def test_a_second_ctrl_c_ends_at_once_with_one_line(tiny, tmp_path, capsys, monk
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_the_solution_is_written_where_nobody_reads_the_table_to_its_end(tiny, tmp_path, monkeypatch):
+def test_the_solution_is_written_if_the_reader_of_stdout_closes_it(tiny, tmp_path, monkeypatch):
     output, (reader, writer) = tmp_path / "out.txt", os.pipe()
     os.close(reader)
     with open(writer, "w") as closed:
@@ -301,7 +301,7 @@ def test_outputs_may_be_devices_and_streams(tiny, capfd):
     assert '"problem"' in capfd.readouterr().out
 
 
-def test_a_solution_on_standard_output_is_alone_there(tiny, tmp_path, capfd):
+def test_a_solution_on_standard_output_has_no_other_output_beside_it(tiny, tmp_path, capfd):
     assert run([str(tiny), "--max-iterations", "1", "--output", "/dev/stdout"]) == 0
     captured = capfd.readouterr()
     (tmp_path / "out.txt").write_text(captured.out)
@@ -328,7 +328,7 @@ def test_not_enough_memory_is_one_line(tiny, capsys, monkeypatch):
     assert capsys.readouterr().err == "error: not enough memory\n"
 
 
-def test_a_log_goes_where_a_link_points_and_into_a_pipe(tiny, tmp_path):
+def test_a_log_is_written_to_the_target_of_a_link_and_to_a_pipe(tiny, tmp_path):
     target, link, pipe = tmp_path / "log.json", tmp_path / "link.json", tmp_path / "pipe"
     link.symlink_to(target)
     os.mkfifo(pipe)
@@ -356,7 +356,7 @@ def test_ctrl_c_before_or_after_the_iterations_is_one_line(moment, tiny, capsys,
     assert capsys.readouterr().err == "interrupted\n"
 
 
-# What does not
+# Errors
 
 
 def check_one_line(status: int, error: str) -> None:
@@ -440,7 +440,7 @@ def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(kind, tiny, t
 
 
 @pytest.mark.parametrize("argv", [["--dtype", "float16"], ["--max-iterations", "many"], ["--no-such-option", "1"]])
-def test_what_the_parser_refuses_is_status_2_and_nothing_on_stdout(argv, capsys):
+def test_parser_errors_have_status_2_and_print_nothing_on_stdout(argv, capsys):
     with pytest.raises(SystemExit) as caught:
         run(argv)
     assert caught.value.code == 2
@@ -450,7 +450,7 @@ def test_what_the_parser_refuses_is_status_2_and_nothing_on_stdout(argv, capsys)
 
 
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])
-def test_the_heading_says_where_cameras_are_damped_otherwise_than_points(factor, said):
+def test_the_heading_reports_a_different_damping_of_cameras(factor, said):
     args = SimpleNamespace(policy="mine.safetensors", dtype="float64", method="lm", linear_solver="auto")
     text = table.heading("scene", support.tiny(), args, StepOptions(coordinates=Coordinates(camera_damping=factor)))
     assert ("cameras damped by 0.01 lambda" in text) == said

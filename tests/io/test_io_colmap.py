@@ -223,7 +223,7 @@ def test_a_name_with_a_dot_is_a_folder_and_a_file_says_what_it_lacks(tmp_path, c
     assert "has no place" not in capsys.readouterr().out
     assert run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "flat.txt.gz")]) == 0
     lost = "which images share a lens, which numbers of a lens stay as they are, weights of observations"
-    assert f"note: that file has no place for: {lost}\n" in capsys.readouterr().out
+    assert f"note: that file cannot store: {lost}\n" in capsys.readouterr().out
 
 
 def test_robust_losses_and_the_search_for_points_work_with_shared_lenses(tmp_path, capsys):
