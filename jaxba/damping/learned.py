@@ -22,7 +22,7 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.linear.step import Effort
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 FORMAT = "jaxba-policy-1"
 """Kind and version of a policy file, in its metadata."""
@@ -42,7 +42,7 @@ class Layer(NamedTuple):
     bias: Float[AnyArray, " outputs"]
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Learned:
     """The mean action of a trained actor. Its weights are traced: another policy of the same shape never recompiles."""

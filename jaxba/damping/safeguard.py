@@ -14,6 +14,7 @@ from jaxba.damping.policy import DampingPolicy, ProblemInfo, effort_of
 from jaxba.damping.rules import Ceres
 from jaxba.linear.step import Effort
 from jaxba.lm.records import StepInfo
+from jaxba.typing import register_pytree
 
 
 class _State(NamedTuple):
@@ -23,7 +24,7 @@ class _State(NamedTuple):
     engaged: Bool[Array, ""]
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Safeguard:
     """Runs `inner` until it has been rejected `patience` times in a row; from then on Ceres' rule decides.

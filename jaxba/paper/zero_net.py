@@ -31,6 +31,7 @@ from jaxba.game.scene_bank import Bank
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
+from jaxba.typing import register_pytree
 
 STEEPEST = 1.0
 """Largest slope of a cost's decimal logarithm in the action that a scene may contribute, so that one diverging step
@@ -39,7 +40,7 @@ does not outweigh a batch; a step whose cost is no number counts as that steep, 
 _DAMPING, _PRESENT = StepFacts._fields.index("damping"), StepFacts._fields.index("present")
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class ZeroNet:
     """A damping policy: ReLU layers from the last states, actions and rewards to one action."""
