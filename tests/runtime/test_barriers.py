@@ -83,6 +83,7 @@ def test_derivatives_pass_through_what_is_computed_apart():
     np.testing.assert_allclose(there, here, rtol=1e-13)
 
 
+@pytest.mark.xla
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
 def test_what_is_computed_apart_is_a_computation_of_its_own():
     """So nothing is fused with it: what would be one kernel without is two, and a branch."""

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
+from compilations import Compilations
 from jax.experimental.compilation_cache import compilation_cache
 from support import solve
-from test_programs import Compilations
 
 from jaxba import make_policy
 from jaxba.io import write_problem
@@ -27,7 +27,10 @@ from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import CompiledTogether, Stage, program, run_alone
 from jaxba.solver.retriangulate import retriangulate
 
-pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="tried on a CPU alone")
+pytestmark = [
+    pytest.mark.xla,
+    pytest.mark.skipif(jax.default_backend() != "cpu", reason="tried on a CPU alone"),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -82,16 +85,16 @@ def call(x, power=1):
 @pytest.mark.parametrize(
     "how",
     [
-        {"damping": "learned", "compilation": "auto"},
-        {"damping": "ceres", "dtype": "mixed"},
-        {"damping": "learned", "dtype": "float32"},
-        {"damping": "learned", "method": "stba"},
-        {"damping": "learned", "method": "ddlm"},
-        {"damping": "learned", "method": "deeplm"},
-        {"damping": "learned", "linear_solver": "sparse"},
-        {"damping": "ceres", "linear_solver": "implicit"},
-        {"damping": "ceres", "method": "poba"},
-        {"damping": "learned", "pad": True},
+        {"policy": "learned", "compilation": "auto"},
+        {"policy": "ceres", "dtype": "mixed"},
+        {"policy": "learned", "dtype": "float32"},
+        {"policy": "learned", "method": "stba"},
+        {"policy": "learned", "method": "ddlm"},
+        {"policy": "learned", "method": "deeplm"},
+        {"policy": "learned", "linear_solver": "sparse"},
+        {"policy": "ceres", "linear_solver": "implicit"},
+        {"policy": "ceres", "method": "poba"},
+        {"policy": "learned", "pad": True},
     ],
     ids=str,
 )

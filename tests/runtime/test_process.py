@@ -20,6 +20,7 @@ def mappings() -> int:
     return len(Path("/proc/self/maps").read_text().splitlines())
 
 
+@pytest.mark.xla
 @linux
 def test_programs_are_dropped_near_the_limit_and_only_there():
     @jax.jit
@@ -56,8 +57,8 @@ def test_a_solve_that_compiled_looks_after_the_mappings_of_its_process(monkeypat
 
 ARENAS = """
 import ctypes, sys, threading
-from jaxba import host
-if not host.keep_memory():
+from jaxba.runtime import process
+if not process.keep_memory():
     sys.exit(3)  # no glibc
 import jax
 assert not jax.config.values["jax_cpu_enable_async_dispatch"]
