@@ -94,7 +94,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from jaxba.runtime.process import calm_blas
+    from jaxba.runtime.process import single_blas_thread
 
-    with calm_blas():
+    with single_blas_thread():
         main()

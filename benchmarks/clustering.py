@@ -43,7 +43,7 @@ def main() -> None:
         for name in args.methods.split(","):
             options = make_method(name).options(StepOptions())
             graph, drawing = _clustering_seconds(problem, options.cluster_cameras or 0)
-            with process.calm_blas():
+            with process.single_blas_thread():
                 iteration = _iteration_seconds(problem, name)
             started = time.perf_counter()
             layout_for(problem, options)

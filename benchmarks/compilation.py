@@ -1,13 +1,13 @@
-"""Seconds to compile the parts of a step and seconds that they take, in each way of compiling.
+"""Seconds to compile the parts of a step and seconds that they take, at each level of optimisation.
 
     python -m benchmarks.compilation PROBLEM ... [--solver learned] [--linear-solver auto] [--repeats 15]
     python -m benchmarks.compilation PROBLEM ... --whole
 
 PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The constants of
 `jaxba/runtime/compilation.py` follow from the last columns: after how many observations times iterations, in millions,
-what the better way takes longer to compile has paid. All ways in turns, in one process, without a compilation cache, at
-the start with lambda 1e-4. `--whole` takes the time of `jaxba-solve FILE` from start to end, with `--compilation auto`
-and `full` in turns.
+the longer compilation of the better level has paid. All levels in turns, in one process, without a compilation cache,
+at the start with lambda 1e-4. `--whole` takes the time of `jaxba-solve FILE` from start to end, with
+`--compilation auto` and `full` in turns.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from jaxba.lm import step
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.options import LinearSolverChoice
 from jaxba.runtime import process
-from jaxba.runtime.compilation import Way, options_of
-from jaxba.runtime.single_loop import in_haste
+from jaxba.runtime.compilation import Level, compiler_options
+from jaxba.runtime.fusion import fast_compilation
 from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.names import parse_solver
 from jaxba.structure.layout import layout_for
@@ -41,22 +41,22 @@ from jaxba.structure.layout import layout_for
 LONGEST = 10.0
 """Seconds of repeats of one program."""
 
-WAYS: tuple[Way, ...] = ("quick", "brisk", "full")
+LEVELS: tuple[Level, ...] = ("quick", "medium", "full")
 
-REPAID = (("quick", "brisk"), ("quick", "full"), ("brisk", "full"))
+REPAID = (("quick", "medium"), ("quick", "full"), ("medium", "full"))
 
 HEADING = (
     f"{'problem':28s} {'linear solver':13s} {'part':7s}"
-    + "".join(f" {way + ': compile s':>16s} {'run ms':>8s}" for way in WAYS)
-    + "".join(f" {worse + '->' + better:>12s}" for worse, better in REPAID)
+    + "".join(f" {level + ': compile s':>17s} {'run ms':>8s}" for level in LEVELS)
+    + "".join(f" {worse + '->' + better:>13s}" for worse, better in REPAID)
 )
 
 
-def measure(step: Any, arguments: tuple[Any, ...], way: Way, repeats: int) -> tuple[float, float]:
+def measure(step: Any, arguments: tuple[Any, ...], level: Level, repeats: int) -> tuple[float, float]:
     """Seconds of compilation, tracing included, and median seconds of a step."""
-    options: Any = options_of(way)
+    options: Any = compiler_options(level)
     started = time.perf_counter()
-    with in_haste(options is not None):
+    with fast_compilation(options is not None):
         lowered = jax.jit(step).lower(*arguments)
     compiled = lowered.compile(options)
     compile_s = time.perf_counter() - started
@@ -70,7 +70,7 @@ def measure(step: Any, arguments: tuple[Any, ...], way: Way, repeats: int) -> tu
 
 
 def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats: int) -> Iterator[str]:
-    """All ways for every part of a problem's step, as lines of the table."""
+    """All levels for every part of a problem's step, as lines of the table."""
     source = sources([location])[0]
     problem, name = source.read(), parse_solver(solver)
     policy, asked = name.build()
@@ -92,14 +92,14 @@ def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats:
                 "try_step": (lambda la, s, d, p: step.try_step(la, s, d, p, options), (*given, proposal)),
             }
         for part, (function, arguments) in parts.items():
-            measured = {way: measure(function, arguments, way, repeats) for way in WAYS}
+            measured = {level: measure(function, arguments, level, repeats) for level in LEVELS}
             line = f"{source.name[:28]:28s} {options.solver_name:13s} {part:7s}"
             for compile_s, run_s in measured.values():
-                line += f" {compile_s:16.2f} {1e3 * run_s:8.1f}"
+                line += f" {compile_s:17.2f} {1e3 * run_s:8.1f}"
             for worse, better in REPAID:
                 longer = measured[better][0] - measured[worse][0]
                 faster = 1e6 * (measured[worse][1] - measured[better][1]) / problem.num_observations
-                line += f" {longer / faster if faster > 0 else np.inf:12.1f}"
+                line += f" {longer / faster if faster > 0 else np.inf:13.1f}"
             yield line
 
 
@@ -110,13 +110,13 @@ WHOLE = (
 
 
 def whole(location: str) -> tuple[str, float]:
-    """One call of `jaxba-solve` each way, nothing cached, as a line of the table; and the ratio of their times."""
+    """One uncached call of `jaxba-solve` with each `--compilation`, as a line of the table; and the ratio of times."""
     cells, costs, seconds = f"{Path(location).name[:28]:28s}", [], []
     with tempfile.TemporaryDirectory() as folder:
-        for way in ("auto", "full"):
-            log = Path(folder) / f"{way}.json"
+        for compilation in ("auto", "full"):
+            log = Path(folder) / f"{compilation}.json"
             command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", location]
-            command += ["--compilation", way, "--log", str(log)]
+            command += ["--compilation", compilation, "--log", str(log)]
             started = time.perf_counter()
             subprocess.run(command, env={**os.environ, "JAXBA_CACHE": "off"}, check=True, capture_output=True)
             seconds.append(time.perf_counter() - started)
@@ -147,7 +147,7 @@ def main() -> None:
         return
     process.keep_memory()
     print(HEADING)
-    with process.calm_blas():
+    with process.single_blas_thread():
         for location in args.problem:
             for line in rows(location, args.solver, args.linear_solver, args.repeats):
                 print(line, flush=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxba.cli.common import prepare_process
 from jaxba.damping import DampingPolicy, Schedule, make_policy
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.evaluate import Score, score
 from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.rollout import Trajectories, play
@@ -51,7 +51,7 @@ def main() -> None:
     prepare_process()
     config = load(str(args.run / "config.yaml"))
     splits = read_banks(args.run / BANK)
-    with process.calm_blas():
+    with process.single_blas_thread():
         for kind, split in zip(config.bank.classes, splits, strict=True):
             count = min(args.scenes, len(split.held_out.initial_cost))
             bank = sieve(split.held_out, np.arange(count))

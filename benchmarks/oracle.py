@@ -28,7 +28,7 @@ from benchmarks.suite import real_problems
 from jaxba import DampingPolicy, LMState, SolveOptions, StepOptions, initial_state, lm_step, make_policy, solve
 from jaxba.bench.sources import sources
 from jaxba.cli.common import prepare_process
-from jaxba.damping.learned import Learned
+from jaxba.damping.learned import LearnedPolicy
 from jaxba.game.oracle import GRID, WIDTH
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
@@ -54,7 +54,7 @@ def main() -> None:
     prepare_process()
     policy, asked = parse_solver(args.solver).build()
     options = asked.step_options(policy)
-    if not isinstance(policy, Learned):
+    if not isinstance(policy, LearnedPolicy):
         parser.error(f"--solver {args.solver}: not a learned one")
     known = dict(line.split() for line in args.best.read_text().splitlines()) if args.best else {}
     rules = {
@@ -67,7 +67,7 @@ def main() -> None:
     rows = []
     for source in sources(args.problem or real_problems()):
         problem = source.read()
-        with process.calm_blas():
+        with process.single_blas_thread():
             runs = [search(problem, options, policy.min_gain, args.iterations, width) for width in (WIDTH, 1)]
             runs += [_play(problem, *rule) for rule in rules.values()]
         best = min(float(known.get(source.name, np.inf)), *(run.costs[-1] for run in runs))

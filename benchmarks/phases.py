@@ -166,5 +166,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    with process.calm_blas():
+    with process.single_blas_thread():
         main()

@@ -325,7 +325,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    from jaxba.runtime.process import calm_blas
+    from jaxba.runtime.process import single_blas_thread
 
-    with calm_blas():
+    with single_blas_thread():
         sys.exit(main())

@@ -24,7 +24,7 @@ except ModuleNotFoundError:
     sys.exit("this example needs sbx, which is no part of jaxba: pip install sbx-rl")
 
 from jaxba import StepOptions
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.env import GameConfig, make_game
 from jaxba.game.gym import GymVectorGame
 from jaxba.game.random_scenes import SceneClass

@@ -7,7 +7,6 @@ from jaxba.damping import (
     DampingPolicy,
     Geometric,
     ProblemInfo,
-    Safeguard,
     Schedule,
     make_policy,
 )
@@ -64,7 +63,6 @@ __all__ = [
     "ProblemInfo",
     "Refinement",
     "Retriangulation",
-    "Safeguard",
     "SceneConfig",
     "Schedule",
     "Solution",

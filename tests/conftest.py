@@ -17,8 +17,8 @@ import jaxtyping
 import pytest
 
 QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-"""`jaxba.runtime.compilation.HASTE["quick"]`, for all programs of a process and its children; not imported from there,
-since XLA reads its flags when JAX is first used."""
+"""`jaxba.runtime.compilation.COMPILER_OPTIONS["quick"]`, for all programs of a process and its children; not imported,
+because it must be set before jaxba is imported."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxba import BundleProblem, StepOptions
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.env import Game, GameConfig, make_game
 from jaxba.game.random_scenes import SceneClass, Scenes
 from jaxba.game.scene_bank import Bank, draft, sieve

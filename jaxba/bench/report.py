@@ -14,9 +14,10 @@ from typing import Any
 from jaxba.bench import plots, profile
 from jaxba.bench.profile import RELATIVE_TOLERANCES, Target
 from jaxba.bench.records import Record
-from jaxba.bench.summary import Summary, summarize, write_summary, write_text
+from jaxba.bench.summary import Summary, summarize, write_summary
 from jaxba.bench.tables import Table, tables
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.runtime.atomic import write_text
 
 _CSS = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; margin: 2rem auto; max-width: 76rem; padding: 0 1rem; }

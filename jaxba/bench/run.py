@@ -17,13 +17,13 @@ import jax
 import jaxba
 from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import SCENE_PREFIX, Source
-from jaxba.bench.summary import write_text
 from jaxba.damping.registry import SUFFIX
 from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.peers import require
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.runtime.atomic import write_text
 from jaxba.runtime.process import out_of_memory
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import SolverName, parse_solver

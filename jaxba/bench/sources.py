@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from jaxba.datasets.bal.places import resolve
+from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_problem
 from jaxba.io.files import display_name
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError

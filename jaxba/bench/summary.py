@@ -11,16 +11,15 @@ import json
 import math
 import os
 import statistics
-import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 from jaxba.bench import profile
 from jaxba.bench.profile import NEVER, Reach, Target
 from jaxba.bench.records import Record
 from jaxba.bench.virtual import best_reach, rules_of_one_step
+from jaxba.runtime.atomic import write_text
 
 YARDSTICKS = ("classic", "ceres")
 """Solvers that every other one is compared with: the paper's yardstick and what people use. Source: design."""
@@ -318,17 +317,3 @@ def _clean(value: Any) -> Any:
 def write_summary(path: str | os.PathLike[str], summary: Summary) -> None:
     """Writes `summary.json` atomically: readers see the old file or the whole new one. Raises OSError."""
     write_text(path, json.dumps(to_json(summary), indent=1, allow_nan=False, ensure_ascii=False) + "\n")
-
-
-def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Writes a UTF-8 text through a temporary file in the same folder and `os.replace`. Raises OSError."""
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".tmp", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,9 @@ FILE_WIDTH = 180
 DETAILS_WIDTH = 120
 """A narrower terminal gets no table of every problem; the report has it."""
 
+_VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)
+"""What `os.path.expandvars` fills in."""
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -34,8 +38,8 @@ class Arguments:
     runs."""
 
     suite: str | None = None
-    """YAML file with any of: problems (names, globs and $VARIABLES allowed), solvers, tolerance, repeats,
-    max_iterations."""
+    """A suite (methods, real, rules, synthetic), or the path of a YAML file with any of: problems (names, globs and
+    $VARIABLES allowed), solvers, tolerance, repeats, max_iterations."""
 
     solvers: str | None = None
     """Comma-separated names, [method+]policy[+refineK|+embedded][@dtype], or with the extra `ceres`
@@ -173,20 +177,15 @@ def _number(text: str) -> float | str:
 
 
 def _with_suite(args: Arguments) -> Arguments:
-    """Fills what the command line leaves open from the suite file."""
+    """Fills what the command line leaves open from the suite."""
     if args.suite is None:
         return args
-    import yaml
+    from jaxba.io import configurations
 
     try:
-        text = Path(args.suite).read_text(encoding="utf-8")
-        suite = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise common.UsageError(f"--suite {args.suite}: {getattr(error, 'strerror', None) or 'not text'}") from None
-    except yaml.YAMLError as error:
-        place = getattr(error, "problem_mark", None)
-        where = f" line {place.line + 1}" if place else ""
-        raise common.UsageError(f"--suite {args.suite}{where}: not YAML") from None
+        suite = configurations.read("bench", args.suite)
+    except configurations.SettingsError as error:
+        raise common.UsageError(f"--suite: {error}") from None
     kinds: dict[str, tuple[type, ...]] = {
         "problems": (list,),
         "solvers": (list,),
@@ -194,8 +193,8 @@ def _with_suite(args: Arguments) -> Arguments:
         "repeats": (int,),
         "max_iterations": (int,),
     }
-    if not isinstance(suite, dict):
-        raise common.UsageError(f"--suite {args.suite}: must be a mapping with keys {', '.join(kinds)}")
+    if not suite:
+        raise common.UsageError(f"--suite {args.suite}: says nothing; known: {', '.join(kinds)}")
     for key, value in suite.items():
         if key not in kinds:
             raise common.UsageError(f"--suite {args.suite}: unknown key {key!r}; known: {', '.join(kinds)}")
@@ -213,12 +212,16 @@ def _with_suite(args: Arguments) -> Arguments:
 
 
 def _expand(args: Arguments, entry: str) -> list[str]:
+    """What an entry of a suite's problems stands for: its variables and its wildcards are filled in."""
+    for name in _VARIABLE.findall(entry):
+        if not os.environ.get(name):
+            raise common.UsageError(
+                f"--suite {args.suite}: {entry}: the environment variable {name}, a folder of problems, is not set"
+            )
     expanded = os.path.expandvars(entry)
-    if "$" in expanded:
-        raise common.UsageError(f"--suite {args.suite}: {entry}: the environment variable is not set")
     if not glob.has_magic(expanded):
         return [expanded]
     found = sorted(glob.glob(expanded))
     if not found:
-        raise common.UsageError(f"--suite {args.suite}: {entry}: no such file")
+        raise common.UsageError(f"--suite {args.suite}: {expanded}: no such file")
     return found

@@ -40,7 +40,7 @@ def run_command(
     print_all_names()
     try:
         parsed = tyro.cli(arguments, args=argv, description=description)
-        from jaxba.damping.learned import PolicyFileError
+        from jaxba.damping.policy_file import PolicyFileError
         from jaxba.damping.registry import UnknownPolicyError
         from jaxba.methods.registry import UnknownMethodError
         from jaxba.problem.bundle_problem import ProblemError
@@ -101,9 +101,8 @@ def prepare_process(*, untraced: bool = False) -> None:
     """Settings for speed: memory is kept, compiled programs are cached.
 
     Args:
-        untraced: whether programs are found without tracing them (`jaxba/runtime/executable_cache.py`), for a command
-        that runs few
-            programs, all of them through `programs.CompiledTogether`; else by their text, in JAX's cache.
+        untraced: whether cached programs are found without tracing them (`jaxba.runtime.executable_cache`), for a
+            command that runs few programs, all of them through `ParallelCompilation`; else JAX's cache is used.
     """
     from jaxba.runtime import process
 
@@ -118,7 +117,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
     """
     import jax
 
-    from jaxba.datasets.bal.places import user_cache
+    from jaxba.datasets.bal.paths import user_cache
     from jaxba.runtime import compilation
 
     choice = os.environ.get(CACHE_VARIABLE, "")
@@ -130,7 +129,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
     except OSError:
         return  # a home that cannot be written costs time, nothing else
     if untraced:
-        compilation.keep_in(folder)
+        compilation.use_cache(folder)
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

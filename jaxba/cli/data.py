@@ -72,7 +72,7 @@ def _data(args: Arguments) -> int:
         return _download(args.command)
     if isinstance(args.command, List):
         return _list(args.command)
-    from jaxba.datasets.bal.places import local_path
+    from jaxba.datasets.bal.paths import local_path
 
     print(local_path(args.command.name))
     return 0
@@ -83,7 +83,7 @@ def _list(args: List) -> int:
     from rich.table import Table
 
     from jaxba.datasets.bal.catalog import ENTRIES, select
-    from jaxba.datasets.bal.places import data_folder, stored
+    from jaxba.datasets.bal.paths import data_folder, downloaded_path
 
     console = Console()
     if not console.is_terminal:
@@ -93,7 +93,7 @@ def _list(args: List) -> int:
         table.add_column(title, no_wrap=True, justify="right" if title in ("cameras", "points") else "left")
     for entry in select(args.names) if args.names else ENTRIES:
         file = entry.file.partition("/")[2]
-        known, here = ("known" if entry.sha256 else "no"), ("yes" if stored(entry) else "no")
+        known, here = ("known" if entry.sha256 else "no"), ("yes" if downloaded_path(entry) else "no")
         table.add_row(entry.name, str(entry.cameras), str(entry.points), file, known, here)
     console.print(table)
     console.print(f"folder: {data_folder()}", highlight=False, markup=False, soft_wrap=True)
@@ -105,7 +105,7 @@ def _download(args: Download) -> int:
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
     from jaxba.datasets.bal.catalog import select
-    from jaxba.datasets.bal.places import data_folder
+    from jaxba.datasets.bal.paths import data_folder
 
     if not args.names:
         raise common.UsageError("name a problem or a family; jaxba-data list shows them")

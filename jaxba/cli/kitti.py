@@ -67,7 +67,7 @@ class Arguments:
     """A point needs two rays that meet at this angle, degrees."""
 
     max_error: float = 3.0
-    """Largest reprojection error of a point's sighting, pixels; before the noise of noisy-poses."""
+    """Largest reprojection error of a point's observation, pixels; before the noise of noisy-poses."""
 
     min_views: int = 2
     """Key-frames that must see a point."""
@@ -155,10 +155,10 @@ def _build(args: Arguments) -> int:
     except ImportError as error:
         raise common.UsageError(str(error)) from None
     from jaxba.datasets.kitti.build import BuildOptions, build
-    from jaxba.datasets.kitti.front import FrontOptions
+    from jaxba.datasets.kitti.frontend import FrontEndOptions
+    from jaxba.datasets.kitti.result_cache import ResultCache
     from jaxba.datasets.kitti.sequence import poses_of, read_poses, read_sequence
     from jaxba.datasets.kitti.triangulate import Filters
-    from jaxba.datasets.kitti.work import Work
 
     sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
     poses = None
@@ -166,7 +166,7 @@ def _build(args: Arguments) -> int:
         table, name = read_poses(args.poses), args.poses
         poses_of(table, sequence.numbers, sequence.calibration, name)  # complains before any work
         poses = lambda frames: poses_of(table, frames, sequence.calibration, name)
-    front = FrontOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
+    front = FrontEndOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
     options = BuildOptions(
         front,
         args.keyframes,
@@ -177,10 +177,10 @@ def _build(args: Arguments) -> int:
         args.min_views,
     )
     console = _console()
-    work = Work(Path(args.work) if args.work else stem.with_suffix(".work"))
+    cache = ResultCache(Path(args.work) if args.work else stem.with_suffix(".work"))
     try:
         with _Progress(console) as progress:
-            built = build(sequence, options, work, poses, progress.report)
+            built = build(sequence, options, cache, poses, progress.report)
         parts = _parts(built, args)
         files = [_write(part, path, sequence, args) for part, path in parts]
     except KeyboardInterrupt:
@@ -212,22 +212,22 @@ def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
 
 
 def _write(part: Any, path: str, sequence: Any, args: Arguments) -> str:
-    """The side file, then the problem: who finds a problem finds its frames."""
+    """Writes the sidecar file, then the problem, so that no problem is without its frames."""
     from jaxba import __version__
-    from jaxba.datasets.kitti.assemble import side_facts
-    from jaxba.datasets.kitti.evaluate import write_side
+    from jaxba.datasets.kitti.assemble import sidecar_contents
+    from jaxba.datasets.kitti.evaluate import write_sidecar
     from jaxba.datasets.kitti.opencv import cv2
     from jaxba.io import write_problem
 
     times = None if sequence.times is None else dict(zip(sequence.numbers, sequence.times.tolist(), strict=True))
-    facts = side_facts(
+    facts = sidecar_contents(
         part,
         sequence.calibration,
         times=None if times is None else [times[number] for number in part.frames],
         options=asdict(args),
         versions={"jaxba": __version__, "opencv": cv2.__version__},
     )
-    write_side(path, facts)
+    write_sidecar(path, facts)
     write_problem(part.problem, path)
     return path
 
@@ -261,10 +261,10 @@ def _evaluate(args: EvaluateArguments) -> int:
     if not args.lengths or not all(length > 0 for length in args.lengths):
         raise common.UsageError("--lengths must be positive")
     from jaxba.bench.plots import save_figure
-    from jaxba.bench.summary import write_text
     from jaxba.datasets.kitti import evaluate, plots
+    from jaxba.runtime.atomic import write_text
 
-    side = evaluate.read_side(args.problem)
+    side = evaluate.read_sidecar(args.problem)
     truth = None if args.poses is None else evaluate.truth_of(side, args.poses)
     results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
     path = None if truth is None else truth[:, :, 3]

@@ -89,8 +89,8 @@ def _open(folder: Path, config: Any) -> None:
     Raises:
         UsageError: it holds a run with other settings, or cannot be written.
     """
-    from jaxba.bench.summary import write_text
     from jaxba.paper import config as configs
+    from jaxba.runtime.atomic import write_text
     from jaxba.training import settings
 
     path = folder / configs.CONFIG
@@ -119,7 +119,7 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
 
     jax.config.update("jax_enable_x64", True)  # the game counts in float64, the networks in float32
     status = 0
-    with process.calm_blas():
+    with process.single_blas_thread():
         shop = Workshop(config, folder, lambda words: console.print(f"  {words}"))
         seconds = _read_times(folder)
         wanted = [piece for name, piece in PIECES.items() if not args.only or name in args.only]
@@ -165,6 +165,6 @@ def _read_times(folder: Path) -> dict[str, tuple[float, float]]:
 
 
 def _write_times(folder: Path, seconds: dict[str, tuple[float, float]]) -> None:
-    from jaxba.bench.summary import write_text
+    from jaxba.runtime.atomic import write_text
 
     write_text(folder / TIMES, json.dumps(seconds, indent=1) + "\n")

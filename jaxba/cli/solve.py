@@ -177,7 +177,7 @@ def _solve(args: Arguments) -> int:
     from jaxba.bench.sources import embedded_sources
     from jaxba.cli import table
     from jaxba.damping import is_learned
-    from jaxba.datasets.bal.places import resolve
+    from jaxba.datasets.bal.paths import resolve
     from jaxba.io import read_problem, write_colmap, write_problem
     from jaxba.io.files import open_output
     from jaxba.lm.termination import Tolerances

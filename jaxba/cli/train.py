@@ -71,7 +71,11 @@ def _train(args: Arguments) -> int:
         raise common.UsageError(str(error)) from None
     common.prepare_process()
     console = _console()
-    with process.calm_blas(), Interrupt("chunk", gentle=False) as interrupt, _Progress(console, config) as progress:
+    with (
+        process.single_blas_thread(),
+        Interrupt("chunk", gentle=False) as interrupt,
+        _Progress(console, config) as progress,
+    ):
         try:
             work = task.build(config, folder, progress.stage)
             progress.rules = work.rules
@@ -117,7 +121,7 @@ def _again(folder: Path) -> str:
 
 def _write_policy(folder: Path, config: Any, work: Any, best: Any) -> None:
     from jaxba import __version__
-    from jaxba.damping.learned import save_policy
+    from jaxba.damping.policy_file import save_policy
     from jaxba.training.config import to_yaml
 
     facts = {

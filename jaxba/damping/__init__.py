@@ -1,10 +1,10 @@
 """Damping policies: who chooses lambda."""
 
-from jaxba.damping.learned import Learned, PolicyFileError, load_policy, save_policy
+from jaxba.damping.learned import LearnedPolicy
 from jaxba.damping.policy import DampingPolicy, ProblemInfo, decides_effort, effort_of
+from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
 from jaxba.damping.registry import LEARNED, LEARNED_PLAIN, POLICIES, UnknownPolicyError, is_learned, make_policy
 from jaxba.damping.rules import Ceres, Classic, Geometric, Schedule
-from jaxba.damping.safeguard import Safeguard
 
 __all__ = [
     "LEARNED",
@@ -14,10 +14,9 @@ __all__ = [
     "Classic",
     "DampingPolicy",
     "Geometric",
-    "Learned",
+    "LearnedPolicy",
     "PolicyFileError",
     "ProblemInfo",
-    "Safeguard",
     "Schedule",
     "UnknownPolicyError",
     "decides_effort",

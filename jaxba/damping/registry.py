@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from jaxba.damping.learned import load_policy
 from jaxba.damping.policy import DampingPolicy
+from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
 
 POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {

@@ -3,8 +3,8 @@
 | | |
 | --- | --- |
 | state | a scene of the bank, its cameras and points, the agent's memory of the episode |
-| observation | `damping.agent.observe` |
-| action | numbers in (-1, 1): lambda by `damping.agent.damping_of`, guard included; the effort if the agent has it |
+| observation | `damping.features.observe` |
+| action | numbers in (-1, 1): lambda by `damping.guard.damping_of`; the effort if the agent has it |
 | terminated | accepted cost within `tolerance` of the scene's best known; or the limit, where that counts as failure |
 | truncated | the limit, where it does not |
 | reward | `GameConfig.reward` |
@@ -23,7 +23,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping.agent import AgentConfig, Memory, action_of, begin, damping_of, observe, record, with_effort
+from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.features import Memory, begin, observation_size, observe, record
+from jaxba.damping.guard import GuardState, action_of, damping_of, effort_for
 from jaxba.damping.rules import Ceres
 from jaxba.game.protocol import Step
 from jaxba.game.random_scenes import SceneClass
@@ -49,9 +51,6 @@ product of the reduced system takes 20 to 25 of an implicit step's 351 ms on a s
 BONUS_DECAY = 0.01
 """Share of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023, ablation."""
 
-SHAPING_FLOOR = 1e-4
-"""Distance to the best cost, relative to it, below which the shaping potential is flat."""
-
 
 @dataclass(frozen=True)
 class GameConfig:
@@ -67,19 +66,8 @@ class GameConfig:
     bonus: float = 10.0
     """Added where the episode ends in success. Source: Belder et al. 2023."""
 
-    repair_cost: float = 0.0
-    """Charged by `duration` for each camera round or further trial of a step, relative to a linear solve. By the clock
-    it would be 0.4, but then giving up is cheaper than crossing a valley (docs/game-tried.md)."""
-
     scale: float = 0.1
     """Factor on every reward, so that returns stay within a few units."""
-
-    shaping: float = 0.0
-    """Reward per decade of distance to the best cost that an iteration takes off; a potential, which leaves the best
-    policy what it is (Ng, Harada, Russell 1999)."""
-
-    discount: float = 0.99
-    """Of the shaping's potential; must be the agent's."""
 
     tolerance: float = 1e-3
     """Success: accepted cost at most (1 + tolerance) times the best known."""
@@ -97,9 +85,8 @@ class GameConfig:
             raise ValueError("max_iterations, tolerance and scale must be positive")
         if not self.tolerance < 1:
             raise ValueError(f"tolerance must be below 1, is {self.tolerance}: starts would be successes")
-        for name in ("bonus", "repair_cost", "shaping"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must not be negative, is {getattr(self, name)}")
+        if not self.bonus >= 0:
+            raise ValueError(f"bonus must not be negative, is {self.bonus}")
 
 
 class Episode(NamedTuple):
@@ -145,7 +132,7 @@ class Game:
     @property
     def observation_size(self) -> int:
         """Features of an observation."""
-        return self.config.agent.observation_size
+        return observation_size(self.config.agent)
 
     @property
     def action_size(self) -> int:
@@ -183,11 +170,11 @@ class Game:
         agent = self.config.agent
         layout = class_layout(kind, self.options)
         own = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
-        memory = with_effort(agent, episode.memory, action)
-        damping = damping_of(agent, memory, action[0])
-        turn, effort = memory.iteration, memory.effort
-        state, step = lm_step(own, episode.state, damping, self.options, agent.min_gain, turn, effort)
-        return Episode(episode.scene, state, record(agent, memory, step)), step
+        guard = episode.memory.guard
+        damping, effort = damping_of(agent, guard, action[0]), effort_for(agent, guard, action)
+        state, step = lm_step(own, episode.state, damping, self.options, agent.min_gain, guard.iteration, effort)
+        memory = record(agent, episode.memory._replace(effort=effort), step)
+        return Episode(episode.scene, state, memory), step
 
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
         """Plays one action everywhere."""
@@ -209,42 +196,35 @@ class Game:
         best = bank.best_cost[episode.scene]
         after, step = self.iterate(kind, bank, episode, action)
         success = step.cost <= best * (1 + rules.tolerance)
-        limit = after.memory.iteration >= rules.max_iterations
+        limit = after.memory.guard.iteration >= rules.max_iterations
         terminated = success | (limit & rules.limit_is_failure)
         truncated = limit & ~terminated
-        reward = self._reward(step, after.memory, best, success, terminated)
+        reward = self._reward(step, after.memory, best, success)
         fresh = self._fresh(bank, key)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
         single = lambda x: jnp.asarray(x, jnp.float32)
         metrics = {
-            "length": single(after.memory.iteration),
+            "length": single(after.memory.guard.iteration),
             "success": single(success),
-            "rejections": single(after.memory.rejections),
+            "rejections": single(after.memory.guard.rejections),
             "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
         }
         see = lambda episode: observe(rules.agent, episode.memory)
         return following, Step(see(following), single(reward), terminated, truncated, see(after), metrics)
 
-    def _reward(
-        self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""], terminated: Bool[Array, ""]
-    ) -> Array:
+    def _reward(self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]) -> Array:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
             points = self.options.refinement.points if memory.effort is None else memory.effort.point_iterations
             inner = CG_ITERATION_COST * step.cg_iterations if rules.agent.effort == "points+forcing" else 0.0
-            reward = bonus - (1 + POINT_ITERATION_COST * points + rules.repair_cost * step.repairs + inner)
+            reward = bonus - (1 + POINT_ITERATION_COST * points + inner)
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":
-            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.iteration - 1))
+            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.guard.iteration - 1))
         else:
             reward = bonus - jnp.log10(step.cost / best)
-        if rules.shaping:
-            height = lambda cost: -jnp.log10(jnp.maximum(cost / best - 1, SHAPING_FLOOR))
-            reward += rules.shaping * (
-                jnp.where(terminated, 0.0, rules.discount) * height(step.cost) - height(step.previous_cost)
-            )
         return rules.scale * reward
 
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
@@ -255,18 +235,18 @@ class Game:
         """
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
-        memory = jax.tree.map(lambda *x: jnp.concatenate(x), *(part.memory for part in state.episodes))
-        rule = jax.vmap(lambda m: _rule_damping(agent, m))(memory) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
-        action = jax.vmap(lambda m, decades: action_of(agent, m, decades))(memory, rule)
+        guard = jax.tree.map(lambda *x: jnp.concatenate(x), *(part.memory.guard for part in state.episodes))
+        rule = jax.vmap(_rule_damping)(guard) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
+        action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
         return uniform.at[1::2, 0].set(action[1::2])
 
 
-def _rule_damping(agent: AgentConfig, memory: Memory) -> Array:
+def _rule_damping(guard: GuardState) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
-    shrink = Ceres().after_success(memory.gain)
-    factor = jnp.where(memory.iteration == 0, 1.0, jnp.where(memory.row > 0, 2.0**memory.row, shrink))
-    return memory.damping + jnp.log10(factor)
+    shrink, rejections = Ceres().after_success(guard.gain), guard.consecutive_rejections
+    factor = jnp.where(guard.iteration == 0, 1.0, jnp.where(rejections > 0, 2.0**rejections, shrink))
+    return guard.damping + jnp.log10(factor)
 
 
 def make_game(

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxba.damping.features import FEATURE_LIMIT
 from jaxba.game.env import Game
 
 try:
@@ -22,14 +23,11 @@ try:
 except ModuleNotFoundError:
     raise ImportError("this needs Gymnasium: pip install jaxba[gym]") from None
 
-SCALE_FREE_LIMIT = 2.0
-"""Bound of every feature of a scale-free observation (`damping.agent.observe`)."""
-
 
 def observation_space(game: Game) -> spaces.Box:
     """What one scene's observation may be."""
     agent = game.config.agent
-    limit = SCALE_FREE_LIMIT if agent.observation == "scale-free" else np.inf
+    limit = FEATURE_LIMIT if agent.observation == "scale-free" else np.inf
     return spaces.Box(-limit, limit, (game.observation_size,), np.float32)
 
 

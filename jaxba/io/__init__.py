@@ -1,4 +1,4 @@
-"""Problems to and from files: BAL text, Bundler and COLMAP models, PLY point clouds."""
+"""Readers and writers: BAL text, Bundler and COLMAP models, PLY point clouds; configurations found by name."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ def write_problem(problem: BundleProblem, path: StrPath) -> None:
 
 
 def check_output(path: StrPath) -> None:
-    """Refuses a name under which `read_problem` would not find what `write_problem` writes.
+    """Refuses a name that `read_problem` would not read as the format that `write_problem` writes.
 
     Raises:
-        ProblemError: the name is that of a Bundler model; in one line.
+        ProblemError: the name is that of a Bundler model; one line.
     """
     if _kind(path) == ".out":
         raise ProblemError(f"cannot write {display_name(path)}: Bundler models are only read; .txt is for BAL")

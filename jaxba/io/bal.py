@@ -1,8 +1,8 @@
 """BAL files, the text format of "Bundle Adjustment in the Large".
 
-The numbers, whatever whitespace separates them, are: cameras, points, observations (counts); for each observation its
-camera, its point, and its x and y in pixels; for each camera 9 numbers; for each point 3. There is no place for
-covariances. Source: Agarwal et al. 2010, https://grail.cs.washington.edu/projects/bal/
+The numbers, separated by any whitespace, are: the counts of cameras, points and observations; for each observation its
+camera, its point, and its x and y in pixels; for each camera 9 numbers; for each point 3. Covariances cannot be stored.
+Source: Agarwal et al. 2010, https://grail.cs.washington.edu/projects/bal/
 """
 
 from __future__ import annotations
@@ -15,9 +15,7 @@ import numpy as np
 from jaxba.io.files import StrPath, display_name, open_input, open_output
 from jaxba.io.text import NumberReader
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
-
-MAX_COUNT = 2**31 - 1
-"""Largest count in a header: indices are int32."""
+from jaxba.typing import LARGEST_COUNT
 
 _WRITE_ROWS = 1 << 15  # lines formatted at once
 _COUNTS = ("cameras", "points", "observations")
@@ -26,10 +24,10 @@ _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translati
 
 
 def read_bal(path: StrPath) -> BundleProblem:
-    """Reads a BAL file, plain or compressed by bzip2, gzip or xz (told by its first bytes).
+    """Reads a BAL file, plain or compressed by bzip2, gzip or xz (recognised by its first bytes).
 
-    Numbers are decimal and correctly rounded, so `write_bal` and `read_bal` together change no bit. Counts in the
-    header allocate nothing: memory follows what the file really holds.
+    Decimal numbers are rounded correctly, so a problem that is written and read back is the same bit by bit. Counts in
+    the header allocate nothing: memory is proportional to what the file really holds.
 
     Args:
         path: the file; may be a pipe.
@@ -45,9 +43,9 @@ def read_bal(path: StrPath) -> BundleProblem:
 def write_bal(problem: BundleProblem, path: StrPath) -> None:
     """Writes a BAL file that reads back bit by bit; compressed if the name ends in `.bz2`, `.gz` or `.xz`.
 
-    The file appears whole or not at all. BAL has no place for covariances, weights or shared lenses:
-    `problem.whitening` and `problem.lenses` are **not** written, and the problem reads back with the identity and a
-    free lens for every camera.
+    The file is replaced whole or not at all. BAL cannot store covariances, weights or shared intrinsics:
+    `problem.whitening` and `problem.lenses` are **not** written, and the problem reads back without whitening and with
+    free intrinsics of its own for every camera.
 
     Args:
         problem: of NumPy or JAX arrays; float32 is written as the float64 of the same value.
@@ -73,7 +71,7 @@ def write_bal(problem: BundleProblem, path: StrPath) -> None:
 
 def _read(reader: NumberReader) -> BundleProblem:
     (ordinal, header), *_ = reader.rows(1, 3)
-    counts = reader.integers(range(ordinal, 3), header[0], 1, MAX_COUNT).tolist()
+    counts = reader.integers(range(ordinal, 3), header[0], 1, LARGEST_COUNT).tolist()
     num_cameras, num_points, num_observations = counts
     reader.field = partial(_field, counts)
     camera_index, point_index, observations = [], [], []
@@ -93,7 +91,7 @@ def _read(reader: NumberReader) -> BundleProblem:
 
 
 def _field(counts: Sequence[int], ordinal: int) -> str:
-    """What the number of an ordinal is, by the counts of the header (no counts while it is being read)."""
+    """Description of the number at an ordinal, given the counts of the header (none while it is being read)."""
     if ordinal < 3:
         return f"number of {_COUNTS[ordinal]}"
     cameras, _, observations = counts

@@ -1,4 +1,4 @@
-"""Bundler models (`bundle.out`, version 0.3): cameras with rotation matrices, points with the views of each.
+"""Bundler models (`bundle.out`, version 0.3): cameras with rotation matrices, and for each point the views of it.
 
 The camera is BAL's: it looks down -z and `z = f (1 + k1 |p|^2 + k2 |p|^4) p` with `p = -P.xy / P.z`, pixels from the
 image centre, y upwards. Source: Snavely, "Bundler v0.4 User's Manual", https://www.cs.cornell.edu/~snavely/bundler/
@@ -17,6 +17,7 @@ from jaxba.io.files import READ_ERRORS, StrPath, display_name, open_input, reaso
 from jaxba.io.text import NumberReader
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import angle_axis
+from jaxba.typing import LARGEST_COUNT
 
 HEADER = b"# Bundle file v0.3"
 """First line of every file of this version."""
@@ -24,7 +25,6 @@ HEADER = b"# Bundle file v0.3"
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of `R R^T - I` that still counts as rounding; Bundler writes 11 digits, other programs fewer."""
 
-_MAX_COUNT = 2**31 - 1  # indices are int32
 _CAMERA = ("f", "k1", "k2", *(f"R{row}{column}" for row in "123" for column in "123"), "t1", "t2", "t3")
 _POINT = ("x", "y", "z", "red", "green", "blue", "number of views")
 _VIEW = ("camera index", "key", "x", "y")
@@ -33,8 +33,8 @@ _VIEW = ("camera index", "key", "x", "y")
 def read_bundler(path: StrPath) -> BundleProblem:
     """Reads a Bundler model of version 0.3, plain or compressed by bzip2, gzip or xz.
 
-    Cameras that Bundler could not register (f = 0) are dropped and the others numbered anew. Points are kept
-    even when fewer than two cameras see them. Colours and key numbers are ignored.
+    Cameras that Bundler could not register (f = 0) are dropped and the others renumbered. Points are kept even when
+    fewer than two cameras see them. Colours and key-point numbers are ignored.
 
     Args:
         path: the file; may be a pipe.
@@ -51,7 +51,7 @@ def read_bundler(path: StrPath) -> BundleProblem:
 
 
 def _after_header(blocks: Iterator[bytes], name: str) -> Iterator[bytes]:
-    """The blocks without the first line, which must be the header's."""
+    """The blocks after the first line, which must be the header."""
     line = b""
     try:
         while b"\n" not in line and len(line) <= len(HEADER) + 2 and (block := next(blocks, None)) is not None:
@@ -74,7 +74,7 @@ def _read(reader: NumberReader) -> BundleProblem:
             reader.missing()
 
     need(2)
-    num_cameras, num_points = reader.integers(range(2), values[:2], 1, _MAX_COUNT).tolist()
+    num_cameras, num_points = reader.integers(range(2), values[:2], 1, LARGEST_COUNT).tolist()
     reader.field = partial(_field, num_cameras, starts)
     position = 2 + len(_CAMERA) * num_cameras
     need(position)
@@ -83,8 +83,8 @@ def _read(reader: NumberReader) -> BundleProblem:
         starts.append(position)
         need(position + len(_POINT))
         views = float(values[position + 6])
-        if not 0 <= views <= _MAX_COUNT or not views.is_integer():
-            reader.integers([position + 6], values[position + 6 : position + 7], 0, _MAX_COUNT)
+        if not 0 <= views <= LARGEST_COUNT or not views.is_integer():
+            reader.integers([position + 6], values[position + 6 : position + 7], 0, LARGEST_COUNT)
         position += len(_POINT) + len(_VIEW) * int(views)
         need(position)
     first_view = np.array(starts) + len(_POINT)
@@ -110,7 +110,7 @@ def _read(reader: NumberReader) -> BundleProblem:
 
 
 def _check_cameras(reader: NumberReader, cameras: np.ndarray, camera_index: np.ndarray) -> np.ndarray:
-    """Which cameras are registered, shape (cameras,); these have a rotation matrix and only these are seen."""
+    """Mask (cameras,) of registered cameras, after a check that they have rotations and that views name no others."""
     registered = cameras[:, 0] != 0
     used = np.bincount(camera_index, minlength=len(cameras)) > 0
     rotations = cameras[:, 3:12].reshape(-1, 3, 3)
@@ -127,7 +127,7 @@ def _check_cameras(reader: NumberReader, cameras: np.ndarray, camera_index: np.n
 
 
 def _field(num_cameras: int, starts: Sequence[int], ordinal: int) -> str:
-    """What the number of an ordinal is; `starts` are the ordinals of the first numbers of points."""
+    """Description of the number at an ordinal; `starts` are the ordinals of the first numbers of points."""
     if ordinal < 2:
         return f"number of {('cameras', 'points')[ordinal]}"
     camera, part = divmod(ordinal - 2, len(_CAMERA))

@@ -1,8 +1,8 @@
 """COLMAP models: a folder of cameras, images and points, binary or text. Needs the extra `colmap`.
 
-COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards; pixels of a problem count from the
-principal point, which stays. What COLMAP calls a camera is a lens here (`jaxba.lenses`): its images share it, and what
-its model lacks stays zero. Source: COLMAP, doc/cameras.rst and doc/format.rst.
+COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards; pixels of a problem are relative to the
+principal point, which is not optimised. What COLMAP calls a camera is a lens here (`jaxba.problem.intrinsics`): its
+images share it, and parameters that its model lacks stay zero. Source: COLMAP, doc/cameras.rst and doc/format.rst.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ MODELS = {
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
 }
-"""Models of a lens that can be optimised, and their parameters. PINHOLE keeps the ratio of its focal lengths."""
+"""Camera models that can be optimised, and their parameters. PINHOLE keeps the ratio of its focal lengths."""
 
-_NUMBERS = ("f", "k1", "k2")
-_STEP = 1e-6  # of a direction, for the derivative of a lens that stays
-_LEAST_SPREAD = 1e-6  # determinant of that derivative below which an image folds
+_PARAMETERS = ("f", "k1", "k2")  # of a lens
+_STEP = 1e-6  # in the image plane, for the derivative of a distortion that is not optimised
+_SMALLEST_DETERMINANT = 1e-6  # of that derivative; below it the image folds over itself
 
 
 class _Index(NamedTuple):
-    """Which number of a problem is which of a model."""
+    """Ids in a model of the cameras, lenses and points of a problem, in the problem's order."""
 
-    images: list[int]  # ids of registered images: cameras
-    lenses: list[int]  # ids of their cameras
-    points: list[int]  # ids
+    images: list[int]  # registered images, which are the problem's cameras
+    lenses: list[int]  # COLMAP's cameras
+    points: list[int]
 
 
 def is_colmap(path: StrPath) -> bool:
@@ -50,13 +50,13 @@ def is_colmap(path: StrPath) -> bool:
 def read_colmap(folder: StrPath) -> BundleProblem:
     """Reads a COLMAP model.
 
-    Cameras are the registered images by id, points come by id. Lenses of the `MODELS` are optimised, shared by their
-    images. A lens of another model stays: its pixels are undistorted at once, and errors weighed so that to first
-    order they are those of the image, in pixels.
+    Cameras are the registered images, by id, and points are sorted by id. Intrinsics of the `MODELS` are optimised,
+    shared by their images. Those of any other model are fixed: their pixels are undistorted once, and residuals are
+    weighted so that to first order they are those of the distorted image, in pixels.
 
     Raises:
-        ProblemError: no model, one that COLMAP cannot read, rigs of several cameras, or nothing is observed; in one
-            line that names the folder; or pycolmap is not installed.
+        ProblemError: no model, one that COLMAP cannot read, rigs of several cameras, or nothing is observed; one line
+            that names the folder; or pycolmap is not installed.
     """
     name = display_name(folder)
     model = _load(folder)
@@ -65,8 +65,8 @@ def read_colmap(folder: StrPath) -> BundleProblem:
     tracks = [model.point3D(identity).track.elements for identity in index.points]
     views = np.array([(view.image_id, view.point2D_idx) for track in tracks for view in track]).reshape(-1, 2)
     point_index = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
-    here = np.isin(views[:, 0], index.images)
-    views, point_index = views[here], point_index[here]
+    registered = np.isin(views[:, 0], index.images)
+    views, point_index = views[registered], point_index[registered]
     if not len(views):
         raise ProblemError(f"{name}: no image sees a point")
     camera_index = np.array([number_of[identity] for identity in views[:, 0].tolist()])
@@ -77,8 +77,9 @@ def read_colmap(folder: StrPath) -> BundleProblem:
     lens = np.searchsorted(index.lenses, [model.image(identity).camera_id for identity in index.images])
     poses = [model.image(identity).cam_from_world() for identity in index.images]
     quaternions = np.array([pose.rotation.quat for pose in poses])  # xyzw
-    shifts = np.array([pose.translation for pose in poses]) * COLMAP_FLIP
-    numbers, free = np.zeros((len(index.lenses), LENS_SIZE)), np.zeros((len(index.lenses), LENS_SIZE), bool)
+    translations = np.array([pose.translation for pose in poses]) * COLMAP_FLIP
+    intrinsics = np.zeros((len(index.lenses), LENS_SIZE))
+    free = np.zeros((len(index.lenses), LENS_SIZE), bool)
     observations, whitening = np.empty_like(pixels), np.tile(np.eye(2), (len(pixels), 1, 1))
     for number, seen in _groups(lens[camera_index], len(index.lenses)):
         camera = model.camera(index.lenses[number])
@@ -87,47 +88,47 @@ def read_colmap(folder: StrPath) -> BundleProblem:
         parameters = MODELS.get(camera.model.name)
         if parameters:
             named = dict(zip(parameters, camera.params, strict=True))
-            numbers[number] = [named.get(one, 0.0) for one in _NUMBERS]
-            free[number] = [one in named for one in _NUMBERS]
+            intrinsics[number] = [named.get(one, 0.0) for one in _PARAMETERS]
+            free[number] = [one in named for one in _PARAMETERS]
             ratio = named.get("fy", named["f"]) / named["f"]
             observations[seen] = (pixels[seen] - [named["cx"], named["cy"]]) / [1.0, ratio]
             whitening[seen, 1, 1] = ratio
         else:
-            numbers[number, 0] = camera.mean_focal_length()
+            intrinsics[number, 0] = camera.mean_focal_length()
             observations[seen], whitening[seen] = _undistorted(camera, pixels[seen], label)
     covariance = None
     if (whitening != np.eye(2)).any():
         root = np.linalg.inv(whitening)
         covariance = root @ root.transpose(0, 2, 1)
         covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    own = len(index.lenses) == len(index.images)
+    unshared = len(index.lenses) == len(index.images)
     try:
         return BundleProblem.create(
-            np.hstack([bal_rotations(quaternions), shifts, numbers[lens]]),
+            np.hstack([bal_rotations(quaternions), translations, intrinsics[lens]]),
             np.array([model.point3D(point).xyz for point in index.points]),
             observations * COLMAP_FLIP[:2],
             camera_index,
             point_index,
             covariance=covariance,
-            lenses=None if own and free.all() else Lenses(lens, free),
+            lenses=None if unshared and free.all() else Lenses(lens, free),
         )
     except ProblemError as error:
         raise ProblemError(f"{name}: {error}") from error
 
 
 def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath) -> None:
-    """Writes a model with the poses, points and lenses of a problem, and everything else as in another model.
+    """Writes a model with the poses, points and intrinsics of a problem, and everything else from another model.
 
-    Its files appear whole, one after the other, when all have been written elsewhere and read back: binary ones, or
-    text where the other model is text and no binary one is there.
+    All files are first written to a temporary folder and read back; then each replaces the old one whole. They are
+    binary, or text where the other model is text and the folder holds no binary one.
 
     Args:
-        problem: what `read_colmap` made of the other model, with other cameras and points.
-        folder: where to write; made if it does not exist, and may be that of the other model.
+        problem: as `read_colmap` made it from the other model, with optimised cameras and points.
+        folder: where to write; made if it does not exist, and may be the folder of the other model.
         like: the other model.
 
     Raises:
-        ProblemError: the problem is not one of that model, images of one camera have different lenses, the folder
+        ProblemError: the problem is not one of that model, images of one camera have different intrinsics, the folder
             cannot be written, or pycolmap is not installed.
     """
     model = _load(like)
@@ -138,11 +139,11 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath) -> None
     if (problem.num_cameras, problem.num_points, problem.num_observations) != counts:
         raise ProblemError(f"cannot write {display_name(folder)}: the problem is not one of {display_name(like)}")
     cameras = np.asarray(problem.cameras, np.float64)
-    quaternions, shifts = colmap_quaternions(cameras[:, :3]), cameras[:, 3:6] * COLMAP_FLIP
+    quaternions, translations = colmap_quaternions(cameras[:, :3]), cameras[:, 3:6] * COLMAP_FLIP
     named: dict[int, np.ndarray] = {}
     for number, identity in enumerate(index.images):
         image: Any = model.image(identity)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quaternions[number]), shifts[number])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(quaternions[number]), translations[number])
         image.frame.set_cam_from_world(image.camera_id, pose)
         lens = named.setdefault(image.camera_id, cameras[number, 6:])
         if (lens != cameras[number, 6:]).any():
@@ -150,45 +151,45 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath) -> None
                 f"cannot write {display_name(folder)}: images of camera {image.camera_id} have different f, k1 or k2"
             )
     for identity, lens in named.items():
-        _set_lens(model.camera(identity), dict(zip(_NUMBERS, lens, strict=True)))
+        _set_lens(model.camera(identity), dict(zip(_PARAMETERS, lens, strict=True)))
     for identity, position in zip(index.points, np.asarray(problem.points, np.float64), strict=True):
         model.point3D(identity).xyz = position
     model.update_point_3d_errors()
     target = Path(folder)
-    beside = target if target.is_dir() else target.absolute().parent  # a folder that may be written, on the same disk
-    text = not _is_binary(like) and not _is_binary(target)  # COLMAP would not look at text beside a binary model
+    beside = target if target.is_dir() else target.absolute().parent  # writable, and on the same file system
+    text = not _is_binary(like) and not _is_binary(target)  # COLMAP ignores text files beside a binary model
     try:
         with tempfile.TemporaryDirectory(dir=beside, prefix=".jaxba-") as temporary:
             (model.write_text if text else model.write_binary)(temporary)
-            written = pycolmap.Reconstruction(temporary)  # a full disk may have cut it short
+            written = pycolmap.Reconstruction(temporary)  # fails if a full disk has cut it short
             if _observations(written) != counts[2] or written.num_points3D() != counts[1]:
                 raise OSError("it cannot be read back")
             target.mkdir(exist_ok=True)
             for file in sorted(Path(temporary).iterdir()):
                 os.replace(file, target / file.name)
-    except Exception as error:  # what C++ throws comes as any of Python's
+    except Exception as error:  # exceptions of C++ arrive as any of Python's
         raise ProblemError(f"cannot write {display_name(folder)}: {reason(error)}") from error
 
 
-def _set_lens(camera: Any, numbers: dict[str, float]) -> None:
-    """Gives a lens new numbers, as far as its model has and knows them; the others stay bit by bit."""
+def _set_lens(camera: Any, new: dict[str, float]) -> None:
+    """Sets the parameters of a lens that its model has; the others stay as they are, bit by bit."""
     parameters = MODELS.get(camera.model.name)
     if parameters is None:
         return
     values = dict(zip(parameters, camera.params, strict=True))
-    if "fy" in values and values["f"] != numbers["f"]:
-        values["fy"] *= numbers["f"] / values["f"]
-    camera.params = [numbers.get(one, values[one]) for one in parameters]
+    if "fy" in values and values["f"] != new["f"]:
+        values["fy"] *= new["f"] / values["f"]
+    camera.params = [new.get(one, values[one]) for one in parameters]
 
 
 def _observations(model: Any) -> int:
-    """How many observations of a model are of registered images."""
+    """Number of observations of a model in registered images."""
     registered = set(model.reg_image_ids())
     return sum(view.image_id in registered for p in model.points3D.values() for view in p.track.elements)
 
 
 def _groups(numbers: np.ndarray, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Every number below `count`, and where it stands."""
+    """Every number below `count`, with its positions in `numbers`."""
     order = np.argsort(numbers, kind="stable")
     return enumerate(np.split(order, np.searchsorted(numbers[order], np.arange(1, count))))
 
@@ -199,7 +200,7 @@ def _is_binary(folder: StrPath) -> bool:
 
 
 def _check(camera: Any, name: str) -> None:
-    """Refuses a lens that is none."""
+    """Refuses a lens without a focal length, or with parameters that cannot be."""
     if camera.is_spherical():
         raise ProblemError(f"{name}: {camera.model.name} has no focal length and cannot be used")
     focal = np.asarray(camera.params)[list(camera.focal_length_idxs())]
@@ -217,12 +218,12 @@ def _load(folder: StrPath) -> Any:
         raise ProblemError(f"{name}: COLMAP models need pycolmap: pip install jaxba[colmap]") from None
     try:
         return pycolmap.Reconstruction(os.fspath(folder))
-    except Exception as error:  # what C++ throws comes as any of Python's
+    except Exception as error:  # exceptions of C++ arrive as any of Python's
         raise ProblemError(f"cannot read {name}: COLMAP says: {reason(error)}") from error
 
 
 def _index(model: Any, name: str) -> _Index:
-    """Registered images, their lenses and all points, each in the order of their ids."""
+    """Registered images, their lenses and all points, each sorted by id."""
     images = sorted(model.reg_image_ids())
     for identity in images:
         image = model.image(identity)
@@ -235,15 +236,15 @@ def _index(model: Any, name: str) -> _Index:
 def _undistorted(
     camera: Any, pixels: Float[np.ndarray, "n 2"], name: str
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
-    """Pixels that a lens without distortion would have seen, and derivatives of the true ones by these."""
+    """Undistorted pixels, and the derivatives of the distorted pixels with respect to them."""
     focal = camera.mean_focal_length()
     plane = np.asarray(camera.cam_from_img(pixels))
     image = lambda p: np.asarray(camera.img_from_cam(np.column_stack([p, np.ones(len(p))])))
     steps = _STEP * np.eye(2)
     rates = np.stack([(image(plane + step) - image(plane - step)) / (2 * _STEP * focal) for step in steps], axis=2)
     finite = np.isfinite(np.column_stack([plane, rates.reshape(-1, 4)])).all(axis=1)
-    spread = np.abs(np.linalg.det(np.where(finite.reshape(-1, 1, 1), rates, 0.0)))
-    bad = spread < _LEAST_SPREAD
+    determinant = np.abs(np.linalg.det(np.where(finite.reshape(-1, 1, 1), rates, 0.0)))
+    bad = determinant < _SMALLEST_DETERMINANT
     if bad.any():
         shown = ", ".join(f"{x:g}" for x in pixels[bad][0])
         raise ProblemError(f"{name} ({camera.model.name}) has no direction for pixel {shown}")

@@ -1,4 +1,4 @@
-"""Bytes in and out: compression, whole-or-nothing output, and errors a person can read."""
+"""Files in and out: compression, output that replaces a file whole or not at all, and readable errors."""
 
 from __future__ import annotations
 
@@ -6,30 +6,29 @@ import bz2
 import gzip
 import lzma
 import os
-import secrets
-import shutil
 import stat
 import sys
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from io import BufferedReader
 from typing import IO, Any, BinaryIO, TypeAlias
 
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.runtime.atomic import atomic_write
 
 StrPath: TypeAlias = str | os.PathLike[str]
 
 BLOCK_BYTES = 1 << 22
-"""Text handed to a parser at once, in bytes. 4 MiB keeps its arrays near the cache; memory then follows the result."""
+"""Bytes that a parser gets at once. With 4 MiB its arrays stay near the cache, and memory is that of the result."""
 
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError)
-"""What reading and decompressing a file raises when the file, not this program, is at fault."""
+"""Errors of reading and decompressing a file that are the fault of the file, not of this program."""
 
 STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")
 """Names of open streams; links to files where a shell redirects them."""
 
-_NUMBERS = {"/dev/stdout": 1, "/dev/stderr": 2}
+_DESCRIPTORS = {"/dev/stdout": 1, "/dev/stderr": 2}
 
 _MAGIC = {".bz2": b"BZh", ".gz": b"\x1f\x8b", ".xz": b"\xfd7zXZ\0"}
 
@@ -41,12 +40,12 @@ def strip_compression(path: StrPath) -> str:
 
 
 def display_name(path: StrPath) -> str:
-    """The path as it may stand in a message of one line: control characters and stray bytes are escaped."""
+    """The path for a message of one line: control characters and undecodable bytes are escaped."""
     return _one_line(os.fspath(path))
 
 
 def reason(error: BaseException) -> str:
-    """One line on why reading or writing failed."""
+    """Why reading or writing failed, in one line."""
     if isinstance(error, MemoryError):
         return "not enough memory"
     if isinstance(error, OSError) and error.strerror:
@@ -56,12 +55,12 @@ def reason(error: BaseException) -> str:
 
 @contextmanager
 def open_input(path: StrPath) -> Iterator[Iterator[bytes]]:
-    """Blocks of a file's bytes, decompressed where its first bytes say bzip2, gzip or xz, whatever its name.
+    """Blocks of a file's bytes, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name.
 
     The iterator raises one of `READ_ERRORS` at damaged, cut-short or trailing compressed data.
 
     Raises:
-        ProblemError: the file cannot be opened or read, or its name promises a compression that it does not have.
+        ProblemError: the file cannot be opened or read, or is not compressed as its name says.
     """
     name = display_name(path)
     with ExitStack() as stack:
@@ -80,11 +79,10 @@ def open_input(path: StrPath) -> Iterator[Iterator[bytes]]:
 
 @contextmanager
 def open_output(path: StrPath) -> Iterator[BinaryIO]:
-    """A stream whose bytes become the file at the end of the block, or not at all; compressed as the name says.
+    """A stream whose bytes become the file at the end of the block, or not at all (`atomic_write`).
 
-    They go to a temporary file in the same folder, which then replaces the target (of a symbolic link, what it points
-    to, with its permissions) and is removed if anything fails. A device or pipe, such as standard output, is written
-    straight away, an open stream from where it stands.
+    They are compressed if the name ends in `.bz2`, `.gz` or `.xz`. A device or pipe, such as standard output, is
+    written directly, an open stream from its current position.
 
     Raises:
         ProblemError: the file cannot be written.
@@ -97,17 +95,8 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
             with _open_stream(os.fspath(path)) as file, _compressor(file, path) as stream:
                 yield stream
             return
-        temporary = os.path.join(os.path.dirname(target), f".jaxba-{secrets.token_hex(8)}.tmp")
-        try:
-            with open(temporary, "xb") as file, _compressor(file, path) as stream:
-                yield stream
-            if os.path.exists(target):
-                shutil.copymode(target, temporary)
-            os.replace(temporary, target)
-        except BaseException:
-            with suppress(OSError):
-                os.unlink(temporary)
-            raise
+        with atomic_write(path) as file, _compressor(file, path) as stream:
+            yield stream
     except ProblemError:
         raise
     except (OSError, ValueError) as error:
@@ -115,19 +104,19 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
 
 
 def stream_number(path: StrPath) -> int | None:
-    """The file descriptor that a name such as `/dev/stdout` stands for; None for every other name."""
+    """The file descriptor of a name such as `/dev/stdout`; None for every other name."""
     name = os.fspath(path)
     number = name.removeprefix("/dev/fd/")
-    return _NUMBERS.get(name, int(number) if number != name and number.isdecimal() else None)
+    return _DESCRIPTORS.get(name, int(number) if number != name and number.isdecimal() else None)
 
 
 def _open_stream(path: str) -> BinaryIO:
     number = stream_number(path)
     if number is None:
         return open(path, "wb")
-    for stream in (sys.stdout, sys.stderr):  # what was said before comes first
+    for stream in (sys.stdout, sys.stderr):  # earlier output must come first
         stream.flush()
-    return os.fdopen(os.dup(number), "wb")  # opened by its name, a redirected file would be written from its start
+    return os.fdopen(os.dup(number), "wb")  # opening a redirected file by name would start at its beginning
 
 
 def _blocks(file: BufferedReader, suffix: str, name: str) -> Iterator[bytes]:
@@ -144,7 +133,7 @@ def _blocks(file: BufferedReader, suffix: str, name: str) -> Iterator[bytes]:
 
 
 def _decompressed(file: IO[bytes], new_decoder: Callable[[], Any]) -> Iterator[bytes]:
-    """Blocks of all streams of a file. BZ2File and LZMAFile would keep silent about garbage after the first one."""
+    """Blocks of all streams of a file. BZ2File and LZMAFile would ignore garbage after the first one."""
     rest = file.read(BLOCK_BYTES)
     while rest:
         decoder = new_decoder()

@@ -21,7 +21,7 @@ _WRITE_ROWS = 1 << 15
 def write_ply(problem: BundleProblem, path: StrPath, *, ascii: bool = False) -> None:
     """Writes the points (grey), then the camera centres (green), as coloured vertices in scene units.
 
-    The file appears whole or not at all; it is compressed if the name ends in `.bz2`, `.gz` or `.xz`.
+    The file is replaced whole or not at all; it is compressed if the name ends in `.bz2`, `.gz` or `.xz`.
 
     Args:
         problem: of NumPy or JAX arrays.

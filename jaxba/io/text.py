@@ -1,4 +1,4 @@
-"""Whitespace-separated numbers of a text: read a block at a time, and every complaint names its line."""
+"""Reader of whitespace-separated numbers, a block at a time; every error names its line."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from jaxba.io.files import READ_ERRORS, reason
 from jaxba.problem.bundle_problem import ProblemError
 
 MAX_WORD_BYTES = 1 << 16
-"""A longer run of bytes without whitespace at the end of a block ends the reading. No number needs more than about
-1100 characters; without the bound a large file without whitespace would be gathered in memory as one word."""
+"""Longest word that may be cut by the end of a block. No number needs more than about 1100 characters; without the
+bound a large file without whitespace would be collected in memory as one word."""
 
 _WORD = re.compile(rb"[^ \t\n\r\v\f]+")
 _NUMBER = re.compile(rb"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf|infinity)", re.IGNORECASE)
@@ -30,7 +30,7 @@ class NumberReader:
     """The numbers of a text in their order, as float64, correctly rounded.
 
     A number's *ordinal* is its position in the file, from 0. Only the text of numbers that were not taken yet (and of
-    the last block) is kept, so memory follows the result and not the file.
+    the last block) is kept, so memory is that of the result, not of the file.
     """
 
     def __init__(self, blocks: Iterable[bytes], name: str, field: Callable[[int], str], *, line: int = 1):
@@ -39,7 +39,7 @@ class NumberReader:
         Args:
             blocks: the bytes, cut anywhere.
             name: file name for messages.
-            field: what the number of an ordinal is, such as "number of cameras"; may be exchanged while reading.
+            field: describes the number at an ordinal, such as "number of cameras"; may be replaced while reading.
             line: number of the line on which `blocks` start.
         """
         self.name = name
@@ -115,14 +115,14 @@ class NumberReader:
         return values.astype(np.int32)
 
     def missing(self) -> NoReturn:
-        """Says why there are no more numbers than those that were read."""
+        """Raises a `ProblemError` that says why there are no more numbers than those that were read."""
         ordinal = self._taken + self._size
         if self._complaint is not None:
             self.fail(ordinal, self._complaint)
         raise ProblemError(f"{self.name} line {self._last_line}: the file ends before the {self.field(ordinal)}")
 
     def fail(self, ordinal: int, complaint: str, *, field: str | None = None) -> NoReturn:
-        """Raises a `ProblemError` about the number (or bad word) of an ordinal that is still kept."""
+        """Raises a `ProblemError` about the number (or bad word) at an ordinal whose text is still kept."""
         piece = next(piece for piece in reversed(self._pieces) if piece.ordinal <= ordinal)
         offset = int(np.flatnonzero(_word_starts(_spaces(piece.text)))[ordinal - piece.ordinal])
         line = piece.line + piece.text.count(b"\n", 0, offset)
@@ -165,7 +165,7 @@ class NumberReader:
 
 
 def _spaces(text: bytes) -> np.ndarray:
-    """Which bytes are whitespace as C's isspace() has it, shape (bytes,)."""
+    """Mask (bytes,) of the whitespace, as defined by isspace() of C."""
     codes = np.frombuffer(text, np.uint8)
     return (codes == 32) | (codes - np.uint8(9) < 5)
 
@@ -177,16 +177,16 @@ def _word_starts(spaces: np.ndarray) -> np.ndarray:
 
 
 def _parse(text: bytes, count: int) -> tuple[np.ndarray, str | None]:
-    """The numbers of `text`, which has `count` words, up to a bad one, and what is wrong with that one."""
+    """The numbers of a text of `count` words up to the first bad one, and what is wrong with that one, if any."""
     if count == 0:
         return np.empty(0), None
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # what NumPy before 2.3 says instead of the ValueError
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy before 2.3 warns instead of raising ValueError
             values = np.fromstring(text, dtype=np.float64, sep=" ")
     except (ValueError, DeprecationWarning):
         values = np.empty(0)
-    if values.size != count:  # one of the words is no number: look for it, word by word
+    if values.size != count:  # one of the words is no number: search it word by word
         good = []
         for word in _WORD.findall(text):
             if not _NUMBER.fullmatch(word):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.runtime.barriers import apart
+from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.segment_sums import outer_sum, take_rows, tree_sum
 
@@ -24,12 +24,12 @@ def pair_products(
     def batch(parts: tuple[Array, Array, Array]) -> Array:
         *sides, sums = parts
         left, right = (take_rows(rows, side).reshape(side.shape[0], -1, width) for side in sides)
-        products = apart(outer_sum, left, right, index=sums)
-        return apart(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums)
+        products = compute_unfused(outer_sum, left, right, index=sums)
+        return compute_unfused(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums)
 
     # one batch after the other, so that what is gathered and its products stay in cache
     partial = lax.map(batch, (pairs.left, pairs.right, pairs.sums)).reshape(-1, width * width)
-    return apart(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums)
+    return compute_unfused(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums)
 
 
 def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks square"], width: int) -> Float[Array, "n n"]:

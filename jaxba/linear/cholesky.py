@@ -1,9 +1,9 @@
 """Cholesky factorisation and solution of one dense system.
 
 On a CPU the factorisation of a large system runs in panels whose updates are matrix products: these use all cores and
-the widest vectors, LAPACK's own one core (`host.calm_blas` says why). The diagonal block of a panel is inverted, so
-that the rows below are a product too. Source: Golub and Van Loan, "Matrix Computations", section 4.2.9 (blocked
-left-looking Cholesky); inverted diagonal blocks as in MAGMA's trsm.
+the widest vectors, LAPACK's own one core (`process.single_blas_thread` says why). The diagonal block of a panel is
+inverted, so that the rows below are a product too. Source: Golub and Van Loan, "Matrix Computations", section 4.2.9
+(blocked left-looking Cholesky); inverted diagonal blocks as in MAGMA's trsm.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.linear.two_level import Anchor, coarse_preconditioner
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import Preconditioner
-from jaxba.runtime.barriers import materialized
+from jaxba.runtime.fusion import fusion_barrier
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
@@ -69,7 +69,7 @@ def diagonal_blocks(
     f00 = jnp.sqrt(jnp.maximum(1 - dot(over, over), 0))
     f10 = -dot(over, under) / jnp.where(f00 > 0, f00, 1)
     f11 = jnp.sqrt(jnp.maximum(1 - dot(under, under) - f10 * f10, 0))
-    f00, f10, f11 = materialized(jnp.stack([f00, f10, f11]))
+    f00, f10, f11 = fusion_barrier(jnp.stack([f00, f10, f11]))
     first, second = linear.camera_jacobian
     columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
     level, *levels = layout.camera_levels

@@ -28,7 +28,7 @@ from jaxba.linear.two_level import Anchor
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
-from jaxba.runtime.barriers import apart
+from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.density import has_few_points
 from jaxba.structure.layout import Layout, PairLayout
 from jaxba.structure.segment_sums import take_rows, tree_sum
@@ -126,7 +126,7 @@ def reduced_blocks(
         own = jnp.concatenate([own.reshape(-1, 81), jnp.zeros((1, 81), own.dtype)])
         return (take_rows(own, pairs.block_camera) - products).reshape(-1, 9, 9)
 
-    return apart(subtracted, system.blocks, products, index=pairs.block_row)
+    return compute_unfused(subtracted, system.blocks, products, index=pairs.block_row)
 
 
 def solve_dense(

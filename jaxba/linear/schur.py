@@ -23,7 +23,7 @@ from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
-from jaxba.runtime.single_loop import together
+from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_each, take_rows, tree_sum
 from jaxba.structure.shared_intrinsics import LensTies
@@ -89,7 +89,7 @@ def eliminate_points(
     def projected(factor: Array, jacobian: list[list[Array]]) -> list[Array]:
         return [entry for row in jacobian for entry in Cholesky3(*factor).forward(row)]
 
-    rows = together(projected, at_slot, linear.point_jacobian)
+    rows = compute_in_one_loop(projected, at_slot, linear.point_jacobian)
     return PointSystem(factor, gradient, diagonal, solved, [rows[:3], rows[3:]])
 
 
@@ -148,7 +148,7 @@ def apply_reduced(
         over, under = (sum(row[i] * at_slot[i] for i in range(3)) for row in projected)
         return [first[a] * over + second[a] * under for a in range(9)]
 
-    rows = as_rows(together(lifted, at_slot, points.projected, *linear.camera_jacobian))
+    rows = as_rows(compute_in_one_loop(lifted, at_slot, points.projected, *linear.camera_jacobian))
     return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(rows, layout.camera_levels)
 
 
@@ -178,7 +178,7 @@ def project_to_points(
         over, under = (sum(row[a] * at_slot[a] for a in range(9)) for row in jacobian)
         return [projected[0][i] * over + projected[1][i] * under for i in range(3)]
 
-    return point_sums(layout, together(inner, at_slot, points.projected, linear.camera_jacobian))
+    return point_sums(layout, compute_in_one_loop(inner, at_slot, points.projected, linear.camera_jacobian))
 
 
 def jacobian_product(

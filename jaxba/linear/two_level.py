@@ -25,7 +25,7 @@ from jaxba.linear.blocks import dense_blocks, pair_products
 from jaxba.linear.cholesky import factor_panels
 from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.model.linearize import Linearization
-from jaxba.runtime.barriers import apart
+from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.camera_clusters import ClusterLayout
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
@@ -127,7 +127,7 @@ def _shared_rows(
     moved = [[first[k] * over[i] + second[k] * under[i] for k in range(3)] for i in range(3)]
     lens = [[high[6 + k] * over[i] + low[6 + k] * under[i] for k in range(3)] for i in range(3)]
     columns = [column for i in range(3) for column in moved[i] + lens[i]]
-    sums = apart(lambda rows: tree_sum(rows, clusters.levels), as_rows(columns), index=clusters.point).T
+    sums = compute_unfused(lambda rows: tree_sum(rows, clusters.levels), as_rows(columns), index=clusters.point).T
     x, y, z = take_each(positions, clusters.point)
     rows = []
     for i in range(3):

@@ -29,7 +29,7 @@ from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, damping
 from jaxba.lm.method import DampedSystem, MethodStep
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import StepOptions, check_count
-from jaxba.runtime.barriers import after
+from jaxba.runtime.fusion import computed_after
 from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
@@ -208,6 +208,6 @@ def repair(
 ) -> Float[Array, "cameras 9"]:
     """Richardson steps `x + B^-1 (b - S x)` on the true system: the error shrinks by the spectral radius of
     `B^-1 E C^-1 E^T`, which is below one."""
-    inverse = block_inverse(after(step, system.blocks))
+    inverse = block_inverse(computed_after(step, system.blocks))
     again = lambda _, x: x + inverse(system.right - apply_reduced(layout, linear, points, system, x))
     return lax.fori_loop(0, rounds, again, step)

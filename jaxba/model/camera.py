@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.runtime.barriers import materialized
+from jaxba.runtime.fusion import fusion_barrier
 from jaxba.typing import AnyArray
 
 SMALL_ANGLE_SQUARED = 1e-6
@@ -35,7 +35,7 @@ class Frames(NamedTuple):
     def stored(self) -> Frames:
         """The same, made once for all that read it; of arrays."""
         rotation, translation = jnp.asarray(self.rotation), jnp.asarray(self.translation)
-        table = materialized(jnp.stack([*rotation.reshape(9, -1), *translation, self.focal, self.k1, self.k2]))
+        table = fusion_barrier(jnp.stack([*rotation.reshape(9, -1), *translation, self.focal, self.k1, self.k2]))
         return Frames(table[:9].reshape(rotation.shape), table[9:12], *table[12:])
 
     def at(self, index: Int[AnyArray, "..."]) -> Frames:

@@ -12,8 +12,8 @@ from jaxba.model import camera
 from jaxba.model.observations import Views, view_terms
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
-from jaxba.runtime.barriers import apart
 from jaxba.runtime.compilation import traced_once
+from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take, total
 
@@ -75,7 +75,7 @@ def cost(
 ) -> Float[Array, ""]:
     """The objective `1/2 sum rho(|Sigma^(-1/2) r|^2)`, pixels squared (design, section 2)."""
     # fused with their sum, the costs would go to a library, and slowly
-    return apart(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
+    return compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
 
 
 def point_terms(views: Views, loss: Loss) -> list[Array]:

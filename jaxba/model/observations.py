@@ -10,8 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba.model import camera
-from jaxba.runtime.barriers import materialized
-from jaxba.runtime.single_loop import in_haste, together
+from jaxba.runtime.fusion import compute_in_one_loop, fast_compilation, fusion_barrier
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sums, take_each
 from jaxba.typing import AnyArray
@@ -29,11 +28,11 @@ class Views(NamedTuple):
     def projected(self) -> camera.Projection:
         """Where the points are seen; in haste stored, since every vector that needs it has a loop of its own then."""
         projection = camera.project(self.frames, self.points, self.mask)
-        return projection.stacked() if in_haste.value else projection
+        return projection.stacked() if fast_compilation.value else projection
 
     def kept(self, rows: list[Array]) -> list[Array]:
         """The same vectors, which several others need; in haste stored."""
-        return list(materialized(jnp.stack(rows))) if in_haste.value else rows
+        return list(fusion_barrier(jnp.stack(rows))) if fast_compilation.value else rows
 
 
 Terms = Callable[..., list[Array]]
@@ -53,7 +52,9 @@ def view_terms(
         slots: what else they follow from.
     """
     at_slots = jnp.stack(take_each(points, layout.slot_point))
-    return together(terms, Views(frames, at_slots, layout.slot_mask, layout.pixels, layout.whitening), *slots)
+    return compute_in_one_loop(
+        terms, Views(frames, at_slots, layout.slot_mask, layout.pixels, layout.whitening), *slots
+    )
 
 
 def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Float[Array, " points"]]]:

@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxba.damping import Learned, load_policy, save_policy
+from jaxba.damping import LearnedPolicy, load_policy, save_policy
 from jaxba.game.env import Game, make_game
 from jaxba.game.scene_bank import Bank, Split, sieve
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.atomic import atomic_write
 from jaxba.training import config as train_configs
 from jaxba.training import driver, task
 from jaxba.training.config import TrainConfig
@@ -69,7 +70,7 @@ def train_config(config: PaperConfig, agent: Agent, seed: int) -> TrainConfig:
 
 def trained(
     config: PaperConfig, agent: Agent, seed: int, folder: Path, say: Callable[[str], None]
-) -> tuple[Learned, bool]:
+) -> tuple[LearnedPolicy, bool]:
     """The policy of an agent, trained now if that is not done.
 
     Args:
@@ -143,6 +144,5 @@ def _share(config: PaperConfig, folder: Path, own: Path, say: Callable[[str], No
     _shared(config, folder, say)
     for name in (task.BANK, task.RULES):
         if not (own / name).is_file():
-            part = own / f"{name}.part"
-            shutil.copyfile(folder / SCENES / name, part)
-            part.replace(own / name)
+            with open(folder / SCENES / name, "rb") as source, atomic_write(own / name) as file:
+                shutil.copyfileobj(source, file)

@@ -1,15 +1,14 @@
 """What a reproduction run depends on, and the YAML files that say it.
 
-Presets lie in `jaxba/presets/paper` as package data; `configs/paper` in the repository is a link to that folder.
+A file in `configs/paper` states differences to the file that it extends, or to the defaults of the classes
+(jaxba/io/configurations.py).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from importlib import resources
-from pathlib import Path
-from typing import Any
 
+from jaxba.io import configurations
 from jaxba.training import settings
 from jaxba.training.settings import SettingsError
 
@@ -169,23 +168,11 @@ def load(name: str) -> PaperConfig:
         name: a preset (`preset_names`), or the path of a YAML file: anything with a slash or an ending.
 
     Raises:
-        SettingsError: no such file, not YAML, an unknown key or an impossible value; one line.
+        SettingsError: no such file or base, not YAML, an unknown key or an impossible value; one line.
     """
-    import yaml
-
-    path: Any = Path(name)
-    if len(path.parts) == 1 and not path.suffix:
-        path = _presets() / f"{name}.yaml"
-        if not path.is_file():
-            raise SettingsError(f"no configuration {name!r}; known: {', '.join(preset_names())}, or the path of a file")
+    data = configurations.read("paper", name)
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise SettingsError(f"{name}: {error.strerror or 'cannot be read'}") from None
-    except (UnicodeDecodeError, yaml.YAMLError):
-        raise SettingsError(f"{name}: not YAML") from None
-    try:
-        return settings.read(PaperConfig, {} if data is None else data)
+        return settings.read(PaperConfig, data)
     except SettingsError as error:
         raise SettingsError(f"{name}: {error}") from None
 
@@ -199,8 +186,4 @@ def to_yaml(config: PaperConfig) -> str:
 
 def preset_names() -> list[str]:
     """Names that `load` finds without a path."""
-    return sorted(Path(item.name).stem for item in _presets().iterdir() if item.name.endswith(".yaml"))
-
-
-def _presets() -> Any:
-    return resources.files("jaxba") / "presets" / "paper"
+    return configurations.names("paper")

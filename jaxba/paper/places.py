@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jaxba.bench.sources import Source
-from jaxba.datasets.bal.places import resolve
+from jaxba.datasets.bal.paths import resolve
 from jaxba.paper.config import FamilyConfig, RealConfig
 from jaxba.paper.subproblem import Cut
 from jaxba.problem.bundle_problem import ProblemError

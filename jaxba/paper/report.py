@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from jaxba.bench.run import machine
-from jaxba.bench.summary import write_text
 from jaxba.bench.tables import number
 from jaxba.paper.claims import CRITERION
 from jaxba.paper.config import to_yaml
 from jaxba.paper.markdown import Section, claims_table, table
 from jaxba.paper.pieces import figures
 from jaxba.paper.workshop import Workshop
+from jaxba.runtime.atomic import atomic_write, write_text
 
 ALONE = 0.9
 """Processor seconds per second from which on a program was not held up by others."""
@@ -106,9 +105,8 @@ def write(
         pictures.mkdir(parents=True, exist_ok=True)
     for source in drawn:
         target = pictures / source.name
-        part = target.with_suffix(".part")
-        shutil.copyfile(source, part)
-        part.replace(target)
+        with atomic_write(target) as file:
+            file.write(source.read_bytes())
         files.append(target)
     text = _text(shop, sections, command, seconds).replace(f"]({figures.FIGURES}/", f"]({path.stem}/")
     write_text(path, text)

@@ -22,7 +22,9 @@ import optax
 from jax import Array, lax
 from jaxtyping import Float
 
-from jaxba.damping.agent import AgentConfig, Memory, StepFacts, begin, damping_of, record
+from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.features import Memory, StepFeatures, begin, record
+from jaxba.damping.guard import damping_of
 from jaxba.damping.learned import Layer
 from jaxba.damping.policy import ProblemInfo
 from jaxba.game.env import Episode, Game
@@ -31,13 +33,14 @@ from jaxba.game.scene_bank import Bank
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
+from jaxba.runtime.atomic import atomic_write
 from jaxba.typing import register_pytree
 
 STEEPEST = 1.0
 """Largest slope of a cost's decimal logarithm in the action that a scene may contribute, so that one diverging step
 does not outweigh a batch; a step whose cost is no number counts as that steep, towards a larger lambda."""
 
-_DAMPING, _PRESENT = StepFacts._fields.index("damping"), StepFacts._fields.index("present")
+_DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields.index("present")
 
 
 @register_pytree
@@ -66,18 +69,18 @@ class ZeroNet:
     def init(self, info: ProblemInfo) -> tuple[Memory, Float[Array, ""]]:
         """See `DampingPolicy`."""
         memory = begin(self.config, info)
-        return memory, damping_of(self.config, memory, self.act(memory))
+        return memory, damping_of(self.config, memory.guard, self.act(memory))
 
     def propose(self, state: Memory, step: StepInfo) -> tuple[Memory, Float[Array, ""]]:
         """See `DampingPolicy`."""
         memory = record(self.config, state, step)
-        return memory, damping_of(self.config, memory, self.act(memory))
+        return memory, damping_of(self.config, memory.guard, self.act(memory))
 
 
 def inputs(memory: Memory) -> Float[Array, " features"]:
     """Last errors, last actions as decades of lambda, last rewards: -1 an iteration, 0 where there was none yet."""
-    facts = memory.facts
-    return jnp.concatenate([memory.errors, facts[:, _DAMPING], -facts[:, _PRESENT]]).astype(jnp.float32)
+    steps = memory.steps
+    return jnp.concatenate([memory.errors, steps[:, _DAMPING], -steps[:, _PRESENT]]).astype(jnp.float32)
 
 
 def fresh(config: ZeroNetConfig, agent: AgentConfig, key: Array) -> ZeroNet:
@@ -161,7 +164,7 @@ def _train(
         change, optimiser = adam.update(gradient, state.adam, state.layers)
         key, *keys = jax.random.split(state.key, 1 + config.batch)
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, Tolerances().ftol)
-        done = converged | (after.memory.iteration >= config.max_iterations)
+        done = converged | (after.memory.guard.iteration >= config.max_iterations)
         new = jax.vmap(another)(jnp.stack(keys))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
         episodes = jax.tree.map(pick, new, after)
@@ -182,15 +185,13 @@ def parameters(net: ZeroNet) -> int:
 
 def save(path: Any, net: ZeroNet) -> None:
     """Writes the weights, whole or not at all."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with atomic_write(path) as file:
         arrays: dict[str, Any] = {
             f"{name}{k}": np.asarray(getattr(layer, name))
             for k, layer in enumerate(net.layers)
             for name in Layer._fields
         }
         np.savez(file, **arrays)
-    part.replace(path)
 
 
 def restore(path: Any, agent: AgentConfig) -> ZeroNet:

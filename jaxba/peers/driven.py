@@ -26,7 +26,7 @@ from jaxba.peers.verdict import Told, Verdict
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.loop import after_step
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution
@@ -103,7 +103,7 @@ def drive_ceres(
     last = _Last()
     options.callbacks = [last]
     options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
-    with jax.enable_x64(True), process.calm_blas(), CompileClock() as clock:
+    with jax.enable_x64(True), process.single_blas_thread(), CompileClock() as clock:
         started = time.perf_counter()
         state, damping = _init(policy, _problem_info(problem, run.initial_cost, max_iterations))
         # everything is compiled before the clock starts

@@ -1,7 +1,7 @@
 """The BAL camera on the host: rotations, centres, projection and cost in float64 NumPy.
 
-This is the reference that readers, generators and tests use; the solver has its own code for devices.
-Large problems are worked through in pieces, so that memory beyond the result stays small.
+Readers, scene generators and tests use this; the solver has its own code for devices (`jaxba.model.camera`). Large
+problems are processed in chunks, so that memory beyond the result stays small.
 """
 
 from __future__ import annotations
@@ -15,20 +15,24 @@ from jaxtyping import Float
 from jaxba.problem.bundle_problem import BundleProblem
 
 Array = np.ndarray | jax.Array
-"""What a problem may hold; every result here is a NumPy array."""
+"""Arrays of a problem; every result here is a NumPy array."""
 
 CHUNK = 1 << 19
-"""Observations handled at once: some 100 MB of temporaries, measured no slower than larger pieces."""
+"""Observations processed at once: some 100 MB of temporaries, measured no slower than larger chunks."""
 
 COLMAP_FLIP = np.array([1.0, -1.0, -1.0])
-"""BAL's axes of a camera to COLMAP's, which looks down +z with y downwards; for pixels its first two."""
+"""Signs that take the axes of a BAL camera (looks down -z, y upwards) to those of COLMAP (+z, y downwards), and back.
+The first two are those of pixels."""
+
+_HALF_TURN_X = np.array([1.0, 0.0, 0.0, 0.0])
+"""The rotation `diag(COLMAP_FLIP)` as a quaternion xyzw."""
 
 
 def rotation_matrices(vectors: Float[Array, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
     """Rotation matrices of angle-axis vectors (radians), by Rodrigues' formula.
 
-    `R = I + a [w] + b [w]^2` with `a = sin(t)/t` and `b = (1 - cos t)/t^2`, t the angle. Both are
-    written with `sinc`, which is exact at zero and does not cancel near it.
+    `R = I + a [w] + b [w]^2` with `a = sin(t)/t` and `b = (1 - cos t)/t^2`, t the angle. Both are written with `sinc`,
+    which is exact at zero and does not cancel near it. Every solve needs this, so it does not wait for SciPy's import.
     """
     w = np.asarray(vectors, dtype=np.float64)
     angle = np.linalg.norm(w, axis=1)
@@ -42,50 +46,37 @@ def rotation_matrices(vectors: Float[Array, "n 3"]) -> Float[np.ndarray, "n 3 3"
 
 
 def angle_axis(rotations: Float[Array, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
-    """Angle-axis vectors (radians, length at most pi) of rotation matrices.
+    """Angle-axis vectors (radians, length at most pi) of rotation matrices, to full precision also near 0 and pi.
 
-    Goes by the unit quaternion, taken from its largest component (Shepperd 1978), so it keeps full
-    precision near the angles 0 and pi. At exactly pi either sign of the axis may come back.
+    At exactly pi either sign of the axis may come back. A matrix that is a rotation only to the digits of a file is
+    replaced by a rotation near it.
+
+    Raises:
+        ValueError: a determinant is not positive.
     """
-    r = np.asarray(rotations, dtype=np.float64)
-    quaternion = _quaternions(r)
-    quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)
-    sine = np.linalg.norm(quaternion[:, 1:], axis=1)
-    angle = 2 * np.arctan2(sine, quaternion[:, 0])
-    scale = np.divide(angle, sine, out=np.full(len(r), 2.0), where=sine > 0)  # 2 is the limit at zero
-    return scale[:, None] * quaternion[:, 1:]
+    from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
 
-
-def _quaternions(r: np.ndarray) -> np.ndarray:
-    """Unit quaternions (w, x, y, z) of rotation matrices; the sign is arbitrary."""
-    trace = np.trace(r, axis1=1, axis2=2)
-    # Row i of the symmetric matrix 4 q q^T is q scaled by 4 q_i; the one with the largest q_i is safe to normalise.
-    outer = np.empty((len(r), 4, 4))
-    outer[:, 0, 0] = 1 + trace
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        outer[:, 1 + i, 1 + i] = 1 + 2 * r[:, i, i] - trace
-        outer[:, 0, 1 + i] = outer[:, 1 + i, 0] = r[:, k, j] - r[:, j, k]
-        outer[:, 1 + i, 1 + j] = outer[:, 1 + j, 1 + i] = r[:, i, j] + r[:, j, i]
-    largest = np.argmax(np.diagonal(outer, axis1=1, axis2=2), axis=1)
-    rows = outer[np.arange(len(r)), largest]
-    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return Rotation.from_matrix(np.array(rotations, dtype=np.float64)).as_rotvec()  # SciPy takes no read-only arrays
 
 
 def colmap_quaternions(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
-    """Unit quaternions xyzw of `diag(1, -1, -1) R(w)` for angle-axis vectors w: `i q`, where i turns by pi about x."""
-    half = 0.5 * vectors
-    angle = np.linalg.norm(half, axis=1)
-    x, y, z = (np.sinc(angle / np.pi)[:, None] * half).T
-    return np.column_stack([np.cos(angle), -z, y, -x])
+    """Unit quaternions xyzw of `diag(1, -1, -1) R(w)` for angle-axis vectors w: COLMAP's rotations of BAL's cameras."""
+    from scipy.spatial.transform import Rotation
+
+    return (Rotation.from_quat(_HALF_TURN_X) * Rotation.from_rotvec(np.array(vectors))).as_quat()
 
 
 def bal_rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
-    """Angle-axis vectors, of length pi at most: the inverse of `colmap_quaternions`."""
-    x, y, z, w = np.where(quaternions[:, :1] < 0, -1.0, 1.0).T * quaternions.T
-    vector = np.column_stack([-w, z, -y])
-    sine = np.linalg.norm(vector, axis=1)
-    scale = np.divide(2 * np.arctan2(sine, x), sine, out=np.full(len(sine), 2.0), where=sine > 0)  # 2: limit at zero
-    return scale[:, None] * vector
+    """Angle-axis vectors, of length at most pi: the inverse of `colmap_quaternions`.
+
+    The norm of a quaternion does not matter; where it is zero or not finite the vector is NaN.
+    """
+    from scipy.spatial.transform import Rotation
+
+    norm = np.linalg.norm(quaternions, axis=1, keepdims=True)
+    valid = np.isfinite(norm) & (norm > 0)
+    rotations = Rotation.from_quat(_HALF_TURN_X) * Rotation.from_quat(np.where(valid, quaternions, _HALF_TURN_X))
+    return np.where(valid, rotations.as_rotvec(), np.nan)
 
 
 def camera_centers(cameras: Float[Array, "cameras 9"]) -> Float[np.ndarray, "cameras 3"]:
@@ -99,24 +90,38 @@ def translations(rotations: Float[np.ndarray, "n 3 3"], centers: Float[np.ndarra
     return -np.einsum("nij,nj->ni", rotations, centers)
 
 
+def perspective(local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    """Image plane coordinates `(X/Z, Y/Z)` of points in the frame of a camera, also behind it; not finite where Z is 0.
+
+    BAL's camera looks down -z, so that its coordinates are the negative of these.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return local[:, :2] / local[:, 2:]
+
+
+def radial_distortion(square: np.ndarray, k1: np.ndarray, k2: np.ndarray) -> np.ndarray:
+    """Factor `1 + k1 r^2 + k2 r^4` at the squared radius r^2 in the image plane. Shapes broadcast."""
+    return 1 + square * (k1 + square * k2)
+
+
 def distort(plane: Float[np.ndarray, "n 2"], intrinsics: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """Pixels of directions `p = -P.xy / P.z` under the intrinsics `(f, k1, k2)`: `f (1 + k1 |p|^2 + k2 |p|^4) p`."""
+    """Pixels of image plane coordinates p under the intrinsics `(f, k1, k2)`: `f (1 + k1 |p|^2 + k2 |p|^4) p`."""
     square = np.einsum("ni,ni->n", plane, plane)
     focal, k1, k2 = intrinsics.T
-    return (focal * (1 + square * (k1 + k2 * square)))[:, None] * plane
+    return (focal * radial_distortion(square, k1, k2))[:, None] * plane
 
 
 def project(problem: BundleProblem) -> Float[np.ndarray, "observations 2"]:
     """Predicted pixels of every observation.
 
-    Points behind a camera are projected by the same formula, as BAL does; a point at depth zero gives
-    a result that is not finite.
+    Points behind a camera are projected by the same formula, as BAL does; a point at depth zero gives a result that is
+    not finite.
     """
     predicted = np.empty((problem.num_observations, 2))
     intrinsics = np.asarray(problem.cameras, dtype=np.float64)[:, 6:]
     for part, camera, local in _camera_frames(problem):
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            predicted[part] = distort(local[:, :2] / -local[:, 2:], intrinsics[camera])
+        with np.errstate(invalid="ignore", over="ignore"):
+            predicted[part] = distort(-perspective(local), intrinsics[camera])
     return predicted
 
 
@@ -143,7 +148,7 @@ def cost(problem: BundleProblem) -> float:
 
 
 def _camera_frames(problem: BundleProblem) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
-    """Observations in pieces: their slice, their camera (n,), and their point in its frame `R X + t` (n, 3)."""
+    """Observations in chunks: their slice, their cameras (n,), and their points in these frames `R X + t` (n, 3)."""
     cameras = np.asarray(problem.cameras, dtype=np.float64)
     points = np.asarray(problem.points, dtype=np.float64)
     camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)

@@ -10,7 +10,7 @@ from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
 from jaxba.model.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
-from jaxba.runtime.barriers import apart
+from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
@@ -42,7 +42,7 @@ def refine_cameras(
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # XLA would add up a camera's costs anew for every number that depends on them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
-    own_cost = lambda costs: apart(each_sum, costs, index=layout.slot_camera)
+    own_cost = lambda costs: compute_unfused(each_sum, costs, index=layout.slot_camera)
     before = own_cost(linear.costs)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

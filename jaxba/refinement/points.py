@@ -30,7 +30,7 @@ from jaxba.model import camera
 from jaxba.model.linearize import point_terms
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
-from jaxba.runtime.single_loop import together
+from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sum
 
@@ -124,7 +124,7 @@ def refine_points(
             return [x - d for x, d in zip(points, factor.backward(factor.forward(list(gradient))), strict=True)]
 
         factor = cholesky3(matrix)
-        return jnp.stack(together(moved, best.points, factor, best.system[6:]))
+        return jnp.stack(compute_in_one_loop(moved, best.points, factor, best.system[6:]))
 
     def body(carry: _Carry) -> _Carry:
         *system, costs, nearness = (found := one_pass(carry.trial, terms, *fronts))[:11]

@@ -1,12 +1,11 @@
-"""How XLA compiles programs on a CPU: with all optimisation, or in a third to half of the time.
+"""How well XLA optimises programs on a CPU: fully, or less and in a third to half of the time.
 
-Compiling takes longer than most solves. A program made without LLVM's optimisation, and without XLA's newer kernel
+Compiling takes longer than most solves. A program compiled without LLVM's optimisation, and without XLA's newer kernel
 emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly; with
-LLVM's first level alone, in half of the time, it is nearly as fast as with all (`python -m benchmarks.compilation`,
-docs/performance.md). So who has one problem to solve starts with one of these, and pays for a better program only where
-so many iterations come that it would have been cheaper from the start: as with skis that may be rented or bought, that
-is never much dearer than the better of the two. The parts of a step are programs of their own, since they gain
-differently, and are compiled beside each other.
+LLVM's first level alone, in half of the time, it is nearly as fast as with all (`python -m benchmarks.compilation`). So
+a single solve starts with one of these, and compiles a better program only after as many iterations as would have paid
+for it from the start: as with skis that may be rented or bought, that costs at most about twice the better choice. The
+parts of a step are programs of their own, since they gain differently, and are compiled in parallel.
 """
 
 from __future__ import annotations
@@ -21,171 +20,176 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
 
 import jax
+from jax import monitoring
 
-from jaxba.runtime.executable_cache import Store, Stored, compiled_here
-from jaxba.runtime.single_loop import in_haste
+from jaxba.runtime.executable_cache import CachedExecutable, ExecutableCache, watch_compilation
+from jaxba.runtime.fusion import fast_compilation
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 Compilation = Literal["full", "quick", "auto"]
-"""`full`: all optimisation. `quick`: hardly any. `auto`: by the number of observations hardly any or little, and all
-after as many iterations as pay for it."""
+"""`full`: all optimisation. `quick`: hardly any. `auto`: at first hardly any or medium, by the number of observations,
+and full after as many iterations as pay for it."""
 
 COMPILATIONS: tuple[str, ...] = get_args(Compilation)
 
-Way = Literal["full", "brisk", "quick"]
-"""How one program is compiled."""
+Level = Literal["full", "medium", "quick"]
+"""How much one program is optimised."""
 
-HASTE: dict[Way, dict[str, bool | int]] = {
-    "brisk": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
+COMPILER_OPTIONS: dict[Level, dict[str, bool | int]] = {
+    "medium": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
     "quick": {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
 }
-"""XLA's options. Without the older emitters a level alone saves half as much."""
+"""XLA's options of the levels below full. With the newer emitters a lower level saves only half as much."""
 
-Part = Literal["factored", "iterated", "try_step", "round"]
-"""What is compiled by itself: a linear solve by factorisation or by an iteration, the verdict on its step, or a round
-of domain decomposition."""
+Part = Literal["factorization", "iterative", "acceptance", "decomposition"]
+"""What is compiled by itself: a linear solve by factorisation or by an iterative method, the test whether its step is
+accepted, or a round of domain decomposition."""
+
+COMPILE_EVENTS = "/jax/core/compile/"
+"""Prefix of the durations that JAX reports while it traces, lowers and compiles."""
 
 
 class Stage(NamedTuple):
-    """A way of compiling, and how often a program is run so before the next better one is made."""
+    """A level, and how often a program is run at it before the next better one is compiled."""
 
-    way: Way
+    level: Level
     runs: int
 
 
-class Pays(NamedTuple):
-    """When a better program pays for its compilation (`python -m benchmarks.compilation`, docs/performance.md)."""
+class BreakEven(NamedTuple):
+    """When a better program pays for its compilation, as `python -m benchmarks.compilation` measures it."""
 
     typical: int
-    """Runs, counted as `REPAIR` says, that a solve may well take: a program that would not last so long is left out. Of
-    the fifteen real problems nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one
-    to three repairs each. Chosen with whole calls of eight problems in sight (docs/performance.md)."""
+    """Runs, counted with `RUNS_PER_REPAIR`, that a solve may well take: a level that would not last so long is left
+    out. Of fifteen real problems nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with
+    one to three repairs each. Chosen by the time of whole solves of eight problems."""
 
     quick: int
-    """Observations times runs of a quick program after which the brisk one has paid for its compilation."""
+    """Observations times runs at level quick after which compiling at level medium has paid."""
 
-    brisk: int
-    """The same of a brisk program, after which the optimised one has."""
+    medium: int
+    """The same from medium to full."""
 
 
-PAYS: dict[Part, Pays] = {
-    "factored": Pays(typical=5, quick=220_000, brisk=4_000_000),
-    "iterated": Pays(typical=8, quick=1_000_000, brisk=15_000_000),
-    "try_step": Pays(typical=80, quick=7_000_000, brisk=30_000_000),
-    "round": Pays(typical=8, quick=1_600_000, brisk=8_000_000),
+BREAK_EVEN: dict[Part, BreakEven] = {
+    "factorization": BreakEven(typical=5, quick=220_000, medium=4_000_000),
+    "iterative": BreakEven(typical=8, quick=1_000_000, medium=15_000_000),
+    "acceptance": BreakEven(typical=80, quick=7_000_000, medium=30_000_000),
+    "decomposition": BreakEven(typical=8, quick=1_600_000, medium=8_000_000),
 }
 
-REPAIR = 2
-"""How often a verdict counts for each camera round or further trial that it takes: a quick one takes 0.6 us longer
-for an observation, the verdict without any 0.1 to 0.5 (on the two sequences of KITTI)."""
+RUNS_PER_REPAIR = 2
+"""How many runs of the acceptance test a repair (a camera round or a further trial) counts for. At level quick a repair
+takes 0.6 us longer per observation than at level full, the test without any 0.1 to 0.5 (two sequences of KITTI)."""
 
 
 def stages(part: Part, observations: int) -> tuple[Stage, ...]:
-    """How a part of a step for so many observations is compiled, one way after the other, before the optimised one."""
-    typical, *repaid = PAYS[part]
-    ways: tuple[Way, ...] = ("quick", "brisk")
-    found = [Stage(way, count // max(1, observations)) for way, count in zip(ways, repaid, strict=True)]
+    """Levels at which a part of a step is compiled, one after the other, before it is compiled fully."""
+    typical, *break_even = BREAK_EVEN[part]
+    levels: tuple[Level, ...] = ("quick", "medium")
+    found = [Stage(level, count // max(1, observations)) for level, count in zip(levels, break_even, strict=True)]
     return tuple(stage for stage in found if stage.runs >= typical)
 
 
-def way_after(runs: int, before: tuple[Stage, ...]) -> Way:
-    """How a program is compiled that was run so often; after its stages it is optimised."""
-    for way, count in before:
+def level_after(runs: int, before: tuple[Stage, ...]) -> Level:
+    """The level of a program that was run so often; `full` when all stages before are over."""
+    for level, count in before:
         if runs < count:
-            return way
+            return level
         runs -= count
     return "full"
 
 
 @functools.cache
-def options_of(way: Way) -> dict[str, bool | int] | None:
-    """XLA's options; None where there is no such way, on a GPU or in another jaxlib, and for `full`."""
-    if way not in HASTE or jax.default_backend() != "cpu":
+def compiler_options(level: Level) -> dict[str, bool | int] | None:
+    """XLA's options for a level; None for `full`, and where XLA has no such options: on a GPU or in another jaxlib."""
+    if level not in COMPILER_OPTIONS or jax.default_backend() != "cpu":
         return None
-    options = dict(HASTE[way])
+    options = dict(COMPILER_OPTIONS[level])
     try:
         jax.jit(lambda: 0, compiler_options=options).lower().compile()
-    except jax.errors.JaxRuntimeError:  # an option that it does not know
+    except jax.errors.JaxRuntimeError:  # an unknown option
         return None
     return options
 
 
 class Program:
-    """A function compiled by `jax.jit` for every shape of its arguments, which are given by position."""
+    """A function compiled by `jax.jit` at a level, for every shape of its arguments, which are given by position."""
 
-    def __init__(self, function: Callable[..., Any], static: tuple[str, ...], way: Way) -> None:
+    def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
-        self.options: Any = options_of(way)
+        self.options: Any = compiler_options(level)
         self.jitted = jax.jit(function, static_argnames=static, compiler_options=self.options)
         self._static = [name if name in static else None for name in inspect.signature(function).parameters]
 
     def __call__(self, *arguments: Any) -> Any:
-        with in_haste(self.options is not None):
+        with fast_compilation(self.options is not None):
             return self.jitted(*arguments)
 
     def lower(self, *arguments: Any) -> tuple[Any, Any]:
-        """What is compiled, and shapes and types of its results."""
-        with in_haste(self.options is not None):
+        """The lowered program, not yet compiled, and shapes and types of its results."""
+        with fast_compilation(self.options is not None):
             traced = self.jitted.trace(*arguments)
             return traced.lower(), traced.out_info
 
-    def parted(self, arguments: tuple[Any, ...]) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    def split(self, arguments: tuple[Any, ...]) -> tuple[dict[str, Any], tuple[Any, ...]]:
         """Static arguments by name, and the others."""
         named = list(zip(self._static, arguments, strict=False))
         return {name: x for name, x in named if name}, tuple(x for name, x in named if not name)
 
 
 @functools.cache
-def program(function: Callable[..., Any], *static: str, way: Way = "full") -> Program:
-    """The function compiled, one program for each way of compiling.
+def program(function: Callable[..., Any], *static: str, level: Level = "full") -> Program:
+    """The program of a function: one and the same for equal arguments.
 
     Args:
         function: what it computes.
         static: names of its static arguments.
-        way: optimised or hardly, if that can be had.
+        level: how much it is optimised; full where XLA does not know the options of a lower level.
     """
-    return Program(function, static, way)
+    return Program(function, static, level)
 
 
-_store: Store | None = None
+_cache: ExecutableCache | None = None
 
 
-def keep_in(folder: Path | None) -> None:
-    """Has `CompiledTogether` look for programs in a folder, and leave them there for later processes.
+def use_cache(folder: Path | None) -> None:
+    """Makes `ParallelCompilation` read compiled programs from a folder, and store new ones there for later processes.
 
-    For solves with a callback or compiled quickly (`solve(compilation="auto")`): the loop as one program has JAX's own
+    For solves with a callback or with `solve(compilation="auto")` or `"quick"`: the loop as one program has JAX's own
     compilation cache. Where that is switched on it is the only one.
 
     Args:
-        folder: exists and can be written, by nobody else; None keeps nothing.
+        folder: must exist and be writable by nobody else; None switches the cache off.
     """
-    global _store
-    _store = None if folder is None else Store(folder)
+    global _cache
+    _cache = None if folder is None else ExecutableCache(folder)
 
 
-class CompiledTogether:
-    """A context in which programs are compiled beside each other, and not run; `run` compiles nothing then.
+class ParallelCompilation:
+    """A context in which programs are compiled in parallel, and not run; `run` then runs them without compiling.
 
-    XLA compiles one program on little more than one core. Who leaves the context compiles what is still waiting, in the
-    thread that will run it: the memory that this takes is then there for running (`host.keep_memory`). It may be
-    entered again for more; a program is compiled once, for the arguments that it was given first.
+    XLA compiles one program on little more than one core. The thread that leaves the context compiles what is still
+    waiting; it is the one that runs the programs, so that the memory that compiling took is reused for running
+    (`process.keep_memory`). The context may be entered again for more programs. A program is compiled once, for the
+    arguments that it was given first.
     """
 
     def __init__(self) -> None:
-        self.loaded: dict[Program, Stored] = {}
-        """What was on disk."""
-        self._proven: set[Program] = set()
-        self._known: dict[Program, Any] = {}  # shapes and types of results
+        self.loaded: dict[Program, CachedExecutable] = {}
+        """Programs that were read from disk."""
+        self._verified: set[Program] = set()  # of these, the ones that have run once
+        self._results: dict[Program, Any] = {}  # shapes and types of results
 
-    def __enter__(self) -> CompiledTogether:
+    def __enter__(self) -> ParallelCompilation:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
         self._waiting: deque[Callable[[], None]] = deque()
         self._jobs: list[Future[None]] = []
         return self
 
     def __call__(self, function: Program, *arguments: Any) -> Any:
-        """Has a program compiled for such arguments.
+        """Starts to compile a program for such arguments.
 
         Args:
             function: what `program` returned.
@@ -194,30 +198,30 @@ class CompiledTogether:
         Returns:
             Shapes and types of its results, to be arguments of the next.
         """
-        if function not in self._known:
-            self._known[function] = self._begin(function, *arguments)
-        return self._known[function]
+        if function not in self._results:
+            self._results[function] = self._begin(function, *arguments)
+        return self._results[function]
 
     def _begin(self, function: Program, *arguments: Any) -> Any:
-        store, place = None if jax.config.values.get("jax_compilation_cache_dir") else _store, None
-        if store is not None:
-            static, given = function.parted(arguments)
-            place = store.place(function.function, static, given, function.options)
-            if (stored := store.load(place, given)) is not None:
+        cache, path = None if jax.config.values.get("jax_compilation_cache_dir") else _cache, None
+        if cache is not None:
+            static, given = function.split(arguments)
+            path = cache.path_for(function.function, static, given, function.options)
+            if (stored := cache.load(path, given)) is not None:
                 self.loaded[function] = stored
                 return stored.out
         lowered, out = function.lower(*arguments)
 
-        def compile_and_keep() -> None:
-            if store is None:
+        def compile_and_store() -> None:
+            if cache is None:
                 lowered.compile()
                 return
-            with compiled_here() as is_new:
+            with watch_compilation() as was_compiled:
                 compiled = lowered.compile()
-            if is_new():
-                store.save(place, compiled, out)
+            if was_compiled():
+                cache.save(path, compiled, out)
 
-        self._waiting.append(compile_and_keep)
+        self._waiting.append(compile_and_store)
         self._jobs.append(self._pool.submit(self._compile_next))
         return out
 
@@ -226,17 +230,17 @@ class CompiledTogether:
         stored = self.loaded.get(function)
         if stored is None:
             return function(*arguments)
-        given = function.parted(arguments)[1]
-        if function in self._proven:
+        given = function.split(arguments)[1]
+        if function in self._verified:
             return stored.run(*given)
         try:
             result = jax.block_until_ready(stored.run(*given))
         except Exception:  # XLA finds some damage only when it runs a program
             del self.loaded[function]
-            if _store is not None:
-                _store.drop(stored)
+            if _cache is not None:
+                _cache.remove(stored)
             return function(*arguments)
-        self._proven.add(function)
+        self._verified.add(function)
         return result
 
     def _compile_next(self) -> None:
@@ -258,19 +262,42 @@ class CompiledTogether:
                 job.result()
 
 
-def run_alone(function: Program, *arguments: Any) -> Any:
-    """What a program computes, for one that is needed once; as `CompiledTogether` it looks for it on disk."""
-    with CompiledTogether() as together:
-        together(function, *arguments)
-    return together.run(function, *arguments)
+def compile_and_run(function: Program, *arguments: Any) -> Any:
+    """What a program computes, for one that runs once; it is read from the cache of `use_cache` if it is there."""
+    with ParallelCompilation() as compile_programs:
+        compile_programs(function, *arguments)
+    return compile_programs.run(function, *arguments)
 
 
 def traced_once(*static: str) -> Callable[[Function], Function]:
-    """Decorates what a program contains several times: traced once for arguments of equal types, and called.
+    """Decorates a function that a program contains several times: it is traced once for arguments of equal types.
 
-    XLA inlines the calls, so that the program is the same; two fifths of the time to trace a step went into copies.
+    XLA inlines the calls, so that the program is the same; without it two fifths of the time to trace a step went into
+    tracing the same functions again.
 
     Args:
         static: names of its static arguments.
     """
     return lambda function: cast(Function, jax.jit(function, static_argnames=static))
+
+
+class CompileClock:
+    """Adds up the time that JAX spends on tracing and compiling while its context is open.
+
+    `seconds` may be read at any moment. Compilation in other threads counts too. Tracing one function inside another is
+    reported by both, so the sum can slightly exceed the wall time.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def _listen(self, event: str, duration_secs: float, **_: Any) -> None:
+        if event.startswith(COMPILE_EVENTS):
+            self.seconds += duration_secs
+
+    def __enter__(self) -> CompileClock:
+        monitoring.register_event_duration_secs_listener(self._listen)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        monitoring.unregister_event_duration_listener(self._listen)

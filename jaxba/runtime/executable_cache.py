@@ -1,8 +1,8 @@
-"""Compiled programs on disk, found by what is asked of them, so that a later process does not even trace them.
+"""Compiled programs on disk, found without tracing them.
 
-JAX's own compilation cache is asked with a program's text, which takes tracing and lowering to know: two thirds of what
-is left of compilation where everything is at hand (docs/performance.md). Here the question is what the text follows
-from: the function, the types of its arguments, its static arguments, this package's source, JAX, and the machine.
+JAX's own compilation cache needs a program's text, which takes tracing and lowering: two thirds of what is left of
+compilation where every program is cached. Here the key is what the text follows from: the function, the types of its
+arguments, its static arguments, this package's source, JAX, and the machine.
 """
 
 from __future__ import annotations
@@ -28,13 +28,15 @@ import numpy as np
 from jax import monitoring
 from jax.experimental import serialize_executable
 
-ENDING = ".jaxba-program"
+from jaxba.runtime.atomic import TEMPORARY, atomic_write
+
+SUFFIX = ".jaxba-program"
 
 LIMIT = 1 << 30
-"""Bytes that a folder's programs may have; what was not used for longest goes first."""
+"""Bytes that a folder's programs may have; the least recently used are removed first."""
 
 ABANDONED_S = 3600.0
-"""Age of a half-written file whose writer must have been killed."""
+"""Age of a temporary file whose writer must have been killed."""
 
 IN_MEMORY = 16
 """Programs read from disk that a process keeps: a solve has six."""
@@ -43,28 +45,28 @@ _PRIVATE = ("jax_compilation_cache", "jax_persistent_cache")
 """Settings of JAX that change no program."""
 
 
-class Stored(NamedTuple):
+class CachedExecutable(NamedTuple):
     """A compiled program and what it returns."""
 
     run: Callable[..., Any]  # takes the arguments that are not static
     out: Any  # shapes and types
-    place: Path
+    path: Path
 
 
-class Store:
-    """Programs in a folder. Like JAX's cache it holds native code: read it from a folder that nobody else writes to."""
+class ExecutableCache:
+    """Programs in a folder. Like JAX's cache it holds native code: use a folder that nobody else writes to."""
 
     def __init__(self, folder: Path) -> None:
         """Args:
         folder: where they are; that it can be written is not needed.
         """
         self.folder = folder
-        self._source = _source()  # of what runs, as nearly as can be told: it may be edited while the process goes on
+        self._source = _source()  # read now: the files may be edited while the process goes on
 
-    def place(
+    def path_for(
         self, function: Callable[..., Any], static: dict[str, Any], arguments: tuple[Any, ...], options: Any = None
     ) -> Path | None:
-        """Where a program is kept, whether it is there or not.
+        """The file of a program, whether it exists or not.
 
         Args:
             function: of this package; what it computes follows from its arguments and the source.
@@ -73,44 +75,45 @@ class Store:
             options: XLA's, for this program.
 
         Returns:
-            A path; None where it cannot be told what a program is by what is asked: where a function or a class of
-            somebody else is part of it, a user's own damping rule for instance.
+            A path; None where the key would not determine the program: where a function or class from outside this
+            package is part of it, a user's own damping rule for instance.
         """
         try:
             leaves, tree = jax.tree.flatten(arguments)
-            asked = [_named(function), _text(static), _text(options), _tree_text(tree), *map(_type_text, leaves)]
-        except _Unknown:
+            key = [_name(function), _describe(static), _describe(options), _describe_tree(tree)]
+            key += map(_describe_type, leaves)
+        except _UnknownSource:
             return None
-        digest = hashlib.sha256("\n".join([*asked, _circumstances(), self._source]).encode()).hexdigest()
-        return self.folder / f"{function.__name__}-{digest[:40]}{ENDING}"
+        digest = hashlib.sha256("\n".join([*key, _environment(), self._source]).encode()).hexdigest()
+        return self.folder / f"{function.__name__}-{digest[:40]}{SUFFIX}"
 
-    def load(self, place: Path | None, arguments: tuple[Any, ...]) -> Stored | None:
-        """The program of that place; None where there is none, or none that can be read.
+    def load(self, path: Path | None, arguments: tuple[Any, ...]) -> CachedExecutable | None:
+        """The program of a file; None where there is none, or none that can be read.
 
         Args:
-            place: what `place` returned.
+            path: what `path_for` returned.
             arguments: those that are not static, as given there.
         """
-        if place is None or not place.is_file():
+        if path is None or not path.is_file():
             return None
         try:
-            stored = _load(place, jax.tree.structure((arguments, {})))
-        except Exception:  # of another version, damaged, or gone: it is compiled anew and written over
+            stored = _load(path, jax.tree.structure((arguments, {})))
+        except Exception:  # of another version, damaged, or gone: it is compiled anew and overwritten
             return None
-        with contextlib.suppress(OSError):  # a folder of somebody else
-            os.utime(place)
+        with contextlib.suppress(OSError):  # the folder may belong to another user
+            os.utime(path)
         return stored
 
-    def save(self, place: Path | None, compiled: jax.stages.Compiled, out: Any) -> None:
-        """Writes a program whole or not at all; what cannot be written is left.
+    def save(self, path: Path | None, compiled: jax.stages.Compiled, out: Any) -> None:
+        """Writes a program, whole or not at all; does nothing if it cannot be written.
 
         Args:
-            place: where to.
-            compiled: what was compiled in this process (`compiled_here`); of what JAX has read from its own cache, XLA
-                writes a file that lacks some of its functions.
+            path: what `path_for` returned.
+            compiled: compiled in this process (`watch_compilation`): a program that JAX has read from its own cache is
+                serialised without some of its functions.
             out: shapes and types of its results.
         """
-        if place is None:
+        if path is None:
             return
         try:
             code, _, _ = serialize_executable.serialize(compiled)
@@ -118,37 +121,36 @@ class Store:
             content = zlib.compress(pickle.dumps((shapes, code)), 1)
         except Exception:  # one that calls Python, for instance, exists in its process alone
             return
-        part = place.with_name(f".{place.name}.{os.getpid()}.{threading.get_ident()}.tmp")
         with contextlib.suppress(OSError):
-            try:
-                part.write_bytes(content)
-                part.replace(place)
-            finally:
-                part.unlink(missing_ok=True)
-            self._tidy()
+            with atomic_write(path) as file:
+                file.write(content)
+            self._evict()
 
-    def drop(self, stored: Stored) -> None:
+    def remove(self, stored: CachedExecutable) -> None:
         """Removes a program that could be read, but not run."""
         _load.cache_clear()
         with contextlib.suppress(OSError):
-            stored.place.unlink()
+            stored.path.unlink()
 
-    def _tidy(self) -> None:
-        """Removes what was not used for longest, down to `LIMIT`, and what was never finished."""
-        for part in self.folder.glob(f".*{ENDING}.*.tmp"):
+    def _evict(self) -> None:
+        """Removes the least recently used programs, down to `LIMIT`, and what was never finished."""
+        for part in self.folder.glob(TEMPORARY.format("*")):
             if part.stat().st_mtime < time.time() - ABANDONED_S:
                 part.unlink(missing_ok=True)
-        found = sorted(((file.stat(), file) for file in self.folder.glob(f"*{ENDING}")), key=lambda f: -f[0].st_mtime)
+        found = sorted(((file.stat(), file) for file in self.folder.glob(f"*{SUFFIX}")), key=lambda f: -f[0].st_mtime)
         total = 0
-        for facts, file in found:
-            total += facts.st_size
+        for status, file in found:
+            total += status.st_size
             if total > LIMIT:
                 file.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def compiled_here() -> Iterator[Callable[[], bool]]:
-    """A context that can tell whether this thread compiled a program in it, instead of reading it from JAX's cache."""
+def watch_compilation() -> Iterator[Callable[[], bool]]:
+    """Gives a function that tells whether this thread has compiled a program within the context.
+
+    False where JAX read the program from its own cache instead.
+    """
     thread, events = threading.get_ident(), set()
 
     def listen(event: str, *_: Any, **__: Any) -> None:
@@ -166,63 +168,63 @@ def compiled_here() -> Iterator[Callable[[], bool]]:
 
 
 @functools.lru_cache(maxsize=IN_MEMORY)
-def _load(place: Path, given: Any) -> Stored:
-    out, code = pickle.loads(zlib.decompress(place.read_bytes()))
-    _find_lapack()
+def _load(path: Path, given: Any) -> CachedExecutable:
+    out, code = pickle.loads(zlib.decompress(path.read_bytes()))
+    _register_lapack()
     devices = jax.devices()[:1]
     run = serialize_executable.deserialize_and_load(code, given, jax.tree.structure(out), execution_devices=devices)
-    return Stored(run, out, place)
+    return CachedExecutable(run, out, path)
 
 
 @functools.cache
-def _find_lapack() -> None:
+def _register_lapack() -> None:
     """jaxlib looks up LAPACK's routines when it first lowers a call of one; a program that calls one before crashes."""
     jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.float32))
 
 
-class _Unknown(Exception):
-    """Something whose text does not say all that there is to know of it."""
+class _UnknownSource(Exception):
+    """A function or value whose description does not determine what it computes."""
 
 
-def _named(thing: Any) -> str:
+def _name(thing: Any) -> str:
     """Name of a function or class whose source is known."""
     module, name = thing.__module__, thing.__qualname__
     if module.split(".")[0] not in ("jaxba", "builtins") or "<" in name:
-        raise _Unknown(f"{module}.{name}")
+        raise _UnknownSource(f"{module}.{name}")
     return f"{module}.{name}"
 
 
-def _text(value: Any) -> str:
-    """All there is to know of a static value."""
+def _describe(value: Any) -> str:
+    """A text that differs for different static values."""
     if value is None or isinstance(value, (str, bool, int, float, np.dtype)):
         return repr(value)
     if isinstance(value, (tuple, list)):
-        return f"({', '.join(map(_text, value))})"
+        return f"({', '.join(map(_describe, value))})"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{_text(key)}: {_text(value[key])}' for key in sorted(value))}}}"
+        return f"{{{', '.join(f'{_describe(key)}: {_describe(value[key])}' for key in sorted(value))}}}"
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
-        return f"{_named(type(value))}{_text(dict(fields))}"
-    raise _Unknown(repr(value))
+        return f"{_name(type(value))}{_describe(dict(fields))}"
+    raise _UnknownSource(repr(value))
 
 
-def _tree_text(tree: Any) -> str:
-    """The same of a pytree's structure."""
+def _describe_tree(tree: Any) -> str:
+    """The same for the structure of a pytree."""
     node = tree.node_data()
     if node is None:
         return "*"
-    kind, facts = node
-    return f"{_named(kind)} {_text(facts)} [{', '.join(map(_tree_text, tree.children()))}]"
+    kind, metadata = node
+    return f"{_name(kind)} {_describe(metadata)} [{', '.join(map(_describe_tree, tree.children()))}]"
 
 
-def _type_text(leaf: Any) -> str:
+def _describe_type(leaf: Any) -> str:
     if not hasattr(leaf, "dtype"):
         return type(leaf).__name__
     return f"{leaf.dtype}{leaf.shape}{'weak' if getattr(leaf, 'weak_type', False) else ''}"
 
 
-def _circumstances() -> str:
-    """All else that decides what a program is."""
+def _environment() -> str:
+    """Everything outside a program that decides how it is compiled: JAX's settings, XLA's flags, the machine."""
     settings = {name: value for name, value in jax.config.values.items() if not name.startswith(_PRIVATE)}
     settings["float"] = jnp.result_type(float)  # whether this thread has x64 on
     return f"{sorted(settings.items())}\n{os.environ.get('XLA_FLAGS', '')}\n{_machine()}"
@@ -230,12 +232,12 @@ def _circumstances() -> str:
 
 @functools.cache
 def _machine() -> str:
-    facts = [jax.__version__, jaxlib.__version__, platform.machine(), str(os.cpu_count())]
-    facts += [f"{device.platform} {device.device_kind} {device.client.platform_version}" for device in jax.devices()]
+    names = [jax.__version__, jaxlib.__version__, platform.machine(), str(os.cpu_count())]
+    names += [f"{device.platform} {device.device_kind} {device.client.platform_version}" for device in jax.devices()]
     cpus = Path("/proc/cpuinfo")
     lines = cpus.read_text().splitlines() if cpus.is_file() else []
-    abilities = sorted({line for line in lines if line.startswith(("flags", "Features"))})
-    return "\n".join([*facts, *(abilities or [platform.node()])])  # else a folder may be shared with another processor
+    features = sorted({line for line in lines if line.startswith(("flags", "Features"))})
+    return "\n".join([*names, *(features or [platform.node()])])  # else a folder may be shared with another processor
 
 
 def _source() -> str:

@@ -1,4 +1,7 @@
-"""Settings of the process that make XLA on a CPU faster; the commands use them, a library user may."""
+"""Memory, threads and memory mappings of the process, set so that XLA on a CPU is fast and does not run out of them.
+
+The commands use all of these; a library user may.
+"""
 
 from __future__ import annotations
 
@@ -16,27 +19,28 @@ _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
 
 
 MAPPINGS_SHARE = 0.4
-"""One problem under sixteen solvers took a tenth of the limit."""
+"""Share of the limit of memory mappings from which on programs are dropped. One problem under sixteen solvers took a
+tenth of the limit."""
 
 
 GROWTH_SHARE = 0.1
-"""What must have come since programs were dropped last, so that mappings of others do not drop them again and again."""
+"""Growth, as a share of the limit, since programs were dropped last, below which they are not dropped again: mappings
+that are not JAX's stay."""
 
-_kept = 0
+_mappings_left = 0
 """Mappings that were left when programs were dropped last."""
 
 
 def keep_memory() -> bool:
-    """Tells glibc to keep freed memory instead of handing it back to the system.
+    """Makes glibc keep freed memory instead of returning it to the system.
 
     XLA allocates the temporaries of a program anew at every call. Above 32 MiB glibc maps fresh pages for them each
-    time, and touching those costs more than the arithmetic (measured: docs/optimisations.md). Memory then stays with
-    the process until it ends.
+    time, and the page faults cost more than the arithmetic. Memory then stays with the process until it ends.
 
-    That holds for glibc's main arena, the one of the process's first thread; another thread's holds 64 MiB and is given
-    back when it empties. So XLA is told to run programs in the thread that calls them, for which no program may have
-    run before. (One arena for all threads does as well, but those that compile then wait for each other: 7.8 s instead
-    of 4.9 s for the step of `learned` on Ladybug-49.)
+    That holds for glibc's main arena, the one of the process's first thread; the arena of another thread holds 64 MiB
+    and is returned when it empties. So XLA is set to run programs in the thread that calls them, which must be done
+    before any program runs. (A single arena for all threads would do as well, but threads that compile would wait for
+    each other: 7.8 s instead of 4.9 s for the step of `learned` on Ladybug-49.)
 
     Returns:
         Whether it took effect; false where the C library is another one.
@@ -62,32 +66,33 @@ def out_of_memory(error: Exception) -> bool:
 
 
 def release_programs(share: float | None = None) -> bool:
-    """Drops JAX's compiled programs if they come near what Linux lets a process map.
+    """Drops JAX's compiled programs if the process comes near Linux's limit of memory mappings.
 
     XLA maps a few pages for every kernel of a program, some thousands for a solver and a problem. At `vm.max_map_count`
-    (65,530 unless set) the next compilation ends the process with a segmentation fault, as a benchmark of fifteen
-    problems and a dozen solvers did. What is dropped comes back from the compilation cache when it is needed again.
+    (65,530 unless set) the next compilation ends the process with a segmentation fault, which a benchmark of fifteen
+    problems and a dozen solvers reaches. A dropped program is read from the compilation cache, or compiled again, when
+    it is needed again.
 
     Args:
-        share: of the limit from which on programs are dropped; `MAPPINGS_SHARE` if None.
+        share: of the limit, from which on programs are dropped; `MAPPINGS_SHARE` if None.
 
     Returns:
-        Whether they were; false where the system does not tell.
+        Whether they were dropped; false where the system does not report mappings.
     """
-    global _kept
+    global _mappings_left
     share = MAPPINGS_SHARE if share is None else share
     try:
         limit = int(Path("/proc/sys/vm/max_map_count").read_text())
         count = _mappings()
     except (OSError, ValueError):
         return False
-    if count <= share * limit or (share and count < _kept + GROWTH_SHARE * limit):
+    if count <= share * limit or (share and count < _mappings_left + GROWTH_SHARE * limit):
         return False
     import jax
 
     jax.clear_caches()
     gc.collect()
-    _kept = _mappings()
+    _mappings_left = _mappings()
     return True
 
 
@@ -97,11 +102,11 @@ def _mappings() -> int:
 
 
 @contextlib.contextmanager
-def calm_blas() -> Iterator[None]:
-    """One BLAS thread for as long as the context is open.
+def single_blas_thread() -> Iterator[None]:
+    """A context in which BLAS uses one thread.
 
-    XLA on a CPU factors matrices with SciPy's OpenBLAS, whose threads keep spinning after each call. XLA's own threads
-    then share the processor with them; beside another busy process an iteration became ten times slower.
+    XLA on a CPU factors matrices with SciPy's OpenBLAS, whose threads keep spinning after each call and take the
+    processor from XLA's own threads; beside another busy process an iteration became ten times slower.
     """
     import scipy.linalg.cython_lapack  # noqa: F401  # loads the library whose threads are limited
 

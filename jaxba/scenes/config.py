@@ -1,4 +1,4 @@
-"""What a random scene is like: the options, their checks and named sizes."""
+"""Options of a random scene, their checks, and named configurations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from jaxba.problem.bundle_problem import ProblemError
 
 Trajectory = Literal["forward", "lateral", "orbit", "photos"]
-"""How the cameras stand to each other; see `SceneConfig.trajectory`."""
+"""Arrangement of the cameras; see `SceneConfig.trajectory`."""
 
 VIEW_MARGIN = 1.25
 """Half-width of the cone in which distortion must be monotone, relative to the image without distortion."""
@@ -18,7 +18,7 @@ VIEW_MARGIN = 1.25
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """A random scene and how far from the truth its start is. Lengths are in steps of the camera path."""
+    """A random scene, and how far its initial values are from the truth. Lengths are in steps of the camera path."""
 
     cameras: int = 150
     """Number of cameras, at least 2."""
@@ -40,13 +40,13 @@ class SceneConfig:
     """Distance between neighbouring cameras in scene units: the unit of every length below."""
 
     lap: int = 400
-    """Cameras of a round of the forward and lateral path, four equal sides; a longer path comes back."""
+    """Cameras in one round of the forward and lateral path, four equal sides; a longer path repeats it."""
 
     position_jitter: float = 0.1
     """Sigma of a camera's distance from the smooth path, in steps."""
 
     rotation_jitter: float = 0.02
-    """Sigma of a camera's rotation about the smooth path's, in radians."""
+    """Sigma of a camera's rotation relative to that of the smooth path, in radians."""
 
     min_depth: float = 1.0
     """Nearest points, in steps."""
@@ -58,7 +58,7 @@ class SceneConfig:
     """Chance that a camera in the middle of a track misses the point although it could see it."""
 
     revisit_share: float = 0.05
-    """Share of the points that are also matched on another round, where the path comes back."""
+    """Share of the points that are also matched on another round of the path (loop closure)."""
 
     image_width: float = 1280.0
     """Width of the images in pixels."""
@@ -79,10 +79,10 @@ class SceneConfig:
     """Sigma of the measurements in pixels, per coordinate (BAL's optima: 0.6 to 0.9)."""
 
     outlier_share: float = 0.0
-    """Share of the observations that are also moved by a wrong match."""
+    """Share of the observations that are outliers."""
 
     outlier_size: float = 30.0
-    """A wrong match moves each coordinate by up to this many pixels, uniformly."""
+    """An outlier moves each coordinate by up to this many pixels, uniformly."""
 
     start_rotation: float = 0.002
     """Sigma of the start's camera rotations, in radians per axis."""
@@ -97,8 +97,8 @@ class SceneConfig:
     """Sigma of the start's focal lengths, relative."""
 
     start_drift: float = 0.0
-    """Sigma of the turn that the start's path adds up at each camera, in radians per axis. Points drift
-    with the first camera that sees them, so nearby residuals stay small: slow to undo, like odometry."""
+    """Sigma of the rotation by which the start's path drifts at each camera, in radians per axis. Points drift with the
+    first camera that sees them, so residuals stay small, as with odometry, and many iterations are needed."""
 
     @property
     def total(self) -> int:
@@ -107,7 +107,7 @@ class SceneConfig:
 
 
 def check(config: SceneConfig) -> None:
-    """Refuses options that no scene can meet.
+    """Refuses options that no scene can satisfy.
 
     Raises:
         ProblemError: with one line that names the option.
@@ -154,11 +154,12 @@ def _check_ranges(config: SceneConfig) -> None:
         raise ProblemError("k1 and k2 fold the image over itself: bring them nearer to 0 or lengthen focal")
 
 
-WRONG_SHARE, WRONG_SIZE = 0.002, 10.0
-"""A few wrong matches give BAL's slow tail: Ceres' rule needs 16 iterations on our Ladybug-49 with, 11 without."""
+OUTLIER_SHARE, OUTLIER_SIZE = 0.002, 10.0
+"""A few outliers give the slow convergence of BAL: Ceres' rule needs 16 iterations on `ladybug-49` with them, 11
+without."""
 
 STREET_DRIFT = 0.3
-"""Times `cameras^-1.5`, the start's drift per camera on a street: its end is then off by 0.2 steps, however long."""
+"""Times `cameras^-1.5`, the start's drift per camera on a street: its end is then off by 0.2 steps at any length."""
 
 
 def _street(cameras: int, points: int, observations: int) -> SceneConfig:
@@ -175,8 +176,8 @@ def _street(cameras: int, points: int, observations: int) -> SceneConfig:
         k1=(0.0, 0.0),
         noise=0.65,
         start_drift=STREET_DRIFT * cameras**-1.5,
-        outlier_share=WRONG_SHARE,
-        outlier_size=WRONG_SIZE,
+        outlier_share=OUTLIER_SHARE,
+        outlier_size=OUTLIER_SIZE,
     )
 
 
@@ -194,8 +195,8 @@ def _photos(cameras: int, points: int, observations: int) -> SceneConfig:
         image_height=1200.0,
         focal=(1000.0, 3000.0),
         noise=0.8,
-        outlier_share=WRONG_SHARE,
-        outlier_size=WRONG_SIZE,
+        outlier_share=OUTLIER_SHARE,
+        outlier_size=OUTLIER_SIZE,
     )
 
 
@@ -210,12 +211,12 @@ LIKE: dict[str, SceneConfig] = {
     "venice-1778": _photos(1778, 993923, 5001946),
     "final-13682": _photos(13682, 4456117, 28987644),
 }
-"""Random scenes with the exact counts of known problems (BAL's header lines), plus small ones: `paper` is
-the 10 cameras and 10 points, all visible, of the paper behind this project."""
+"""Random scenes with the exact counts of known problems (BAL's header lines), plus small ones: `paper` has the 10
+cameras and 10 points, all visible, of the paper that this project reproduces."""
 
 
 def like(name: str) -> SceneConfig:
-    """The options of a named scene.
+    """The configuration of a name in `LIKE`.
 
     Raises:
         ProblemError: no such name; the message lists the known ones.

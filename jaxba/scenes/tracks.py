@@ -8,19 +8,19 @@ import numpy as np
 from jaxtyping import Int
 
 TAIL_EXPONENT = 1.4
-"""Exponent of the power law. Maximum-likelihood fits of `k^-a exp(-b k)` gave 1.29 on BAL's Trafalgar-21, 1.33
-on stereo odometry of KITTI 00 and 1.54 on BAL's Ladybug-49; the cut-off b follows from the mean."""
+"""Exponent a of the power law. Maximum-likelihood fits gave 1.29 on BAL's Trafalgar-21, 1.33 on stereo odometry of
+KITTI 00 and 1.54 on BAL's Ladybug-49; the cut-off b follows from the mean."""
 
 MIN_LENGTH = 2
-"""A point needs two views to have a position."""
+"""Views that determine the position of a point."""
 
 
 @lru_cache(maxsize=64)
 def track_lengths(points: int, observations: int, longest: int) -> Int[np.ndarray, " points"]:
-    """Numbers of views, longest first, that add up to `observations`; read-only.
+    """Numbers of views of each point, longest first, that add up to `observations`; read-only.
 
-    A truncated power law with exponential cut-off, `p(k) ~ k^-a exp(-b k)` for 2 <= k <= longest, met
-    by counting rather than by drawing, so that its histogram has no noise.
+    A truncated power law with exponential cut-off, `p(k) ~ k^-a exp(-b k)` for 2 <= k <= longest. Lengths are not
+    drawn: each occurs as often as is expected, so that the histogram has no noise.
 
     Args:
         points: how many lengths.
@@ -42,7 +42,7 @@ def track_lengths(points: int, observations: int, longest: int) -> Int[np.ndarra
 
 
 def _shares(sizes: np.ndarray, mean: float) -> np.ndarray:
-    """Probabilities of the sizes whose expectation is `mean`: bisection for the cut-off."""
+    """Probabilities of the sizes, with the cut-off found by bisection so that their mean is `mean`."""
 
     def shares(cutoff: float) -> np.ndarray:
         logarithm = -TAIL_EXPONENT * np.log(sizes) - cutoff * (sizes - MIN_LENGTH)

@@ -1,4 +1,4 @@
-"""Where the cameras of a random scene stand and what they look at."""
+"""Poses of the cameras of a random scene, and the depths of the points that they see."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from jaxba.problem.geometry import angle_axis, rotation_matrices, translations
 from jaxba.scenes.config import SceneConfig
 
 CORNER_SHARE = 0.4
-"""Part of a street that bends. With 400 cameras a round the view turns by 2.25 degrees a camera there."""
+"""Part of a street that bends. With 400 cameras in a round the view rotates there by 2.25 degrees per camera."""
 
 FIRST_CORNER = 0.3
-"""The path starts this part of a side along, so that short paths bend too."""
+"""Where on its side the path starts, as a part of the side, so that short paths bend too."""
 
 ORBIT_WAVE = 0.2
-"""Height of an orbit's rise and fall relative to its radius, so that the centres are in no plane."""
+"""Amplitude of an orbit's height relative to its radius, so that the centres do not lie in a plane."""
 
 PHOTO_SPREAD = 0.4
 """Sigma of the logarithm of a photographer's distance: most stand within a factor of 2."""
@@ -31,12 +31,12 @@ RELIEF = 1.5
 
 
 Depth = float | np.ndarray
-"""Scene units: one for all cameras, or one for each."""
+"""In scene units: one for all cameras, or one for each."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """Cameras in the order of the path, and the depths at which each one finds its points."""
+    """Cameras in the order of the path, and the depths at which each one sees new points."""
 
     rotations: Float[np.ndarray, "cameras 3 3"]
     """World to camera; a camera looks down its -z, x to the right, y up."""
@@ -54,10 +54,10 @@ class Path:
     """Depth of the points that most other cameras see too, in scene units."""
 
     lap: int
-    """The path is at the same place again after this many cameras; 0 where it never is."""
+    """Cameras after which the path returns to the same position; 0 where it never does."""
 
-    labels: Int[np.ndarray, " cameras"]
-    """Number in the problem of the camera at each place of the path."""
+    index: Int[np.ndarray, " cameras"]
+    """Camera index in the problem of each camera along the path."""
 
 
 def make_path(config: SceneConfig, rng: np.random.Generator) -> Path:
@@ -81,10 +81,10 @@ def true_cameras(config: SceneConfig, path: Path, rng: np.random.Generator) -> F
 
 
 def _streets(config: SceneConfig, rng: np.random.Generator) -> Path:
-    """Round after round of a square with rounded corners; lateral looks to the outside of it."""
+    """Rounds of a square with rounded corners; lateral cameras look outwards."""
     side = max(round(config.lap / 4), 1)
-    place = np.arange(config.cameras) / side + FIRST_CORNER
-    block, within = np.divmod(place, 1.0)
+    sides = np.arange(config.cameras) / side + FIRST_CORNER
+    block, within = np.divmod(sides, 1.0)
     heading = np.pi / 2 * (block + np.clip((within - 1 + CORNER_SHARE) / CORNER_SHARE, 0, 1))
     ahead = _directions(heading)
     centers = config.step * (np.cumsum(ahead, axis=0) - ahead)
@@ -95,7 +95,7 @@ def _streets(config: SceneConfig, rng: np.random.Generator) -> Path:
 
 
 def _orbit(config: SceneConfig, rng: np.random.Generator) -> Path:
-    """Round after round about the origin, which every camera looks at."""
+    """Rounds about the origin, which every camera looks at."""
     radius = np.sqrt(config.min_depth * config.max_depth)
     lap = max(round(2 * np.pi * radius), 1)
     angle = 2 * np.pi * np.arange(config.cameras) / lap
@@ -109,18 +109,18 @@ def _orbit(config: SceneConfig, rng: np.random.Generator) -> Path:
 
 
 def _photos(config: SceneConfig, rng: np.random.Generator) -> Path:
-    """Photographs of places along a facade (the plane z = 0), from many sides and distances, shuffled."""
+    """Photographs of points along a facade (the plane z = 0), from many sides and distances, in random order."""
     count = config.cameras
-    places = np.zeros((count, 3))
-    places[:, 0] = np.cumsum(rng.exponential(config.step, count))
+    targets = np.zeros((count, 3))
+    targets[:, 0] = np.cumsum(rng.exponential(config.step, count))
     low, high = np.log(config.min_depth), np.log(config.max_depth)
     distance = np.clip((low + high) / 2 + PHOTO_SPREAD * rng.standard_normal(count), low, high)
     focus = config.step * np.exp(distance)
     side = -_directions(rng.uniform(-PHOTO_ANGLE, PHOTO_ANGLE, count))
-    centers = places + focus[:, None] * side
+    centers = targets + focus[:, None] * side
     centers[:, 1] += config.step * rng.standard_normal(count)
-    path = _path(places - centers, centers, focus / RELIEF, focus * RELIEF, focus, 0)
-    return replace(path, labels=rng.permutation(count).astype(np.int32))
+    path = _path(targets - centers, centers, focus / RELIEF, focus * RELIEF, focus, 0)
+    return replace(path, index=rng.permutation(count).astype(np.int32))
 
 
 def _path(view: np.ndarray, centers: np.ndarray, near: Depth, far: Depth, focus: Depth, lap: int) -> Path:

@@ -1,4 +1,4 @@
-"""Places points where cameras see them and chooses the cameras of every track."""
+"""Places points where enough cameras see them, and chooses the cameras of every track."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import ProblemError
-from jaxba.problem.geometry import rotation_matrices
+from jaxba.problem.geometry import radial_distortion, rotation_matrices
 from jaxba.scenes.config import VIEW_MARGIN, SceneConfig
 from jaxba.scenes.tracks import MIN_LENGTH
 from jaxba.scenes.trajectory import Path
@@ -17,10 +17,11 @@ BUDGET = 1 << 20
 """Candidate views handled at once: some 100 MB of temporaries."""
 
 ATTEMPTS = 24
-"""Tries to place a point where enough cameras see it; each looks nearer to the focus of the view than the last."""
+"""Attempts to place a point where enough cameras see it; each is nearer to the focus of the view than the last."""
 
 WINDOW = 2.5
-"""Candidate cameras per view wanted. Two sides of the path would be 2 at its ends; the rest is for missed views."""
+"""Candidate cameras per wanted view. At an end of the path half of the candidates do not exist, which takes 2; the rest
+is for missed views."""
 
 NEAREST = 0.5
 """A view nearer than this part of min_depth does not count."""
@@ -34,20 +35,20 @@ MIN_VIEWS = 4
 
 @dataclass(frozen=True)
 class Views:
-    """Where points are and who sees them."""
+    """Points, and which cameras see them."""
 
     points: Float[np.ndarray, "points 3"]
     """Scene units."""
 
     camera_index: Int[np.ndarray, " observations"]
-    """Place on the path of each observation's camera."""
+    """Camera of each observation, by its position along the path."""
 
     point_index: Int[np.ndarray, " observations"]
     """Point of each observation."""
 
 
-class Rig:
-    """The true cameras, stored for fast tests of visibility."""
+class TrueCameras:
+    """The true cameras, laid out for fast tests of visibility."""
 
     def __init__(self, config: SceneConfig, path: Path, cameras: Float[np.ndarray, "cameras 9"]):
         self.config, self.path, self.count = config, path, len(cameras)
@@ -58,7 +59,7 @@ class Rig:
         self.half = np.array([config.image_width, config.image_height]) / 2
 
     def sample(self, reference: np.ndarray, effort: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
-        """Points that the reference cameras (n,) see; an effort near 1 goes to the middle of their view."""
+        """Random points in view of the reference cameras (n,); an effort near 1 keeps to the middle of the view."""
         near, far, focus = (np.log(depth[reference]) for depth in (self.path.near, self.path.far, self.path.focus))
         depth = np.exp((1 - effort) * rng.uniform(near, far) + effort * focus)
         local = np.empty((len(reference), 3))
@@ -68,7 +69,7 @@ class Rig:
         return np.einsum("nji,nj->ni", self.rotations[reference], local - self.translations[reference])
 
     def sees(self, points: Float[np.ndarray, "n 3"], cameras: Int[np.ndarray, "n k"]) -> Bool[np.ndarray, "n k"]:
-        """Whether each candidate camera has the row's point in front of it and in its image."""
+        """Whether the point of each row is in front of, and in the image of, each candidate camera of the row."""
         x, y, z = (points[:, axis, None] for axis in range(3))
         across, upwards, behind = (
             a[cameras] * x + b[cameras] * y + c[cameras] * z + d[cameras] for a, b, c, d in self.rows.transpose(1, 0, 2)
@@ -80,34 +81,34 @@ class Rig:
         px, py = across * inverse, upwards * inverse
         square = px * px + py * py
         focal = self.focal[cameras]
-        scale = focal * (1 + square * (self.k1[cameras] + square * self.k2[cameras]))
+        scale = focal * radial_distortion(square, self.k1[cameras], self.k2[cameras])
         for p, half in ((px, self.half[0]), (py, self.half[1])):
             good &= (np.abs(p) * focal <= VIEW_MARGIN * half) & (np.abs(p) * scale <= half)
         return good
 
 
-def place_points(rig: Rig, lengths: Int[np.ndarray, " points"], rng: np.random.Generator) -> Views:
-    """Points with the wanted numbers of views, which add up exactly.
+def place_points(scene: TrueCameras, lengths: Int[np.ndarray, " points"], rng: np.random.Generator) -> Views:
+    """Places points so that the total number of views is exactly the wanted one.
 
     Args:
-        rig: the cameras.
-        lengths: wanted views, longest first. Where the cameras cannot see a point that often, it gets
-            as many views as there are, and others, that could have more, get the rest.
+        scene: the true cameras.
+        lengths: wanted views of each point, longest first. A point that fewer cameras can see gets as many views as
+            there are; the rest go to points that more cameras can see.
         rng: source of the randomness.
 
     Raises:
         ProblemError: the cameras overlap too little for so many views.
     """
     count = len(lengths)
-    reference = rng.permutation(np.arange(count, dtype=np.int32) % rig.count)
+    reference = rng.permutation(np.arange(count, dtype=np.int32) % scene.count)
     points = np.empty((count, 3))
     cameras, owners = [], []
     missing, start = 0, 0
     while start < count:
-        part = _next_part(lengths, start, _width(rig, int(lengths[start])))
-        points[part], candidates, visible = _place(rig, lengths[part], reference[part], rng)
+        part = _next_part(lengths, start, _width(scene, int(lengths[start])))
+        points[part], candidates, visible = _place(scene, lengths[part], reference[part], rng)
         taken, missing = _balance(lengths[part], visible.sum(axis=1), missing, rng)
-        chosen = _choose(visible, taken, rig.config.gap_share, rng)
+        chosen = _choose(visible, taken, scene.config.gap_share, rng)
         cameras.append(candidates[chosen])
         owners.append(np.repeat(np.arange(part.start, part.stop, dtype=np.int32), taken))
         start = part.stop
@@ -117,37 +118,37 @@ def place_points(rig: Rig, lengths: Int[np.ndarray, " points"], rng: np.random.G
             "(ask for fewer observations, deepen max_depth or shorten focal)"
         )
     views = Views(points, np.concatenate(cameras), np.concatenate(owners))
-    return _feed(rig, views, rng)
+    return _rebalance(scene, views, rng)
 
 
-def _width(rig: Rig, longest: int) -> int:
+def _width(scene: TrueCameras, longest: int) -> int:
     """Candidate cameras for tracks of up to `longest` views; an odd number."""
-    wanted = WINDOW * longest / max(1 - rig.config.gap_share, 1 / WINDOW) + 4
-    return int(min(2 * (wanted // 2) + 1, 2 * rig.count - 1))
+    wanted = WINDOW * longest / max(1 - scene.config.gap_share, 1 / WINDOW) + 4
+    return int(min(2 * (wanted // 2) + 1, 2 * scene.count - 1))
 
 
 def _next_part(lengths: np.ndarray, start: int, width: int) -> slice:
-    """Points from `start` on that share a window: within the memory budget and of similar length."""
+    """Points from `start` on that are placed at once: within the memory budget and of similar track length."""
     stop = min(start + max(BUDGET // width, 1), len(lengths))
     similar = np.searchsorted(-lengths[start:stop], -(lengths[start] // 2), side="right")
     return slice(start, start + int(similar))
 
 
-def _place(rig: Rig, lengths: np.ndarray, reference: np.ndarray, rng: np.random.Generator) -> tuple:
+def _place(scene: TrueCameras, lengths: np.ndarray, reference: np.ndarray, rng: np.random.Generator) -> tuple:
     """Points (n, 3), candidate cameras (n, k) and which of them see the point (n, k).
 
-    The best try of each point is kept. In the second half of the tries other reference cameras are
-    taken, since one in a bend of the path may never share a point with enough others.
+    The best attempt of each point is kept. The second half of the attempts takes other reference cameras, since one in
+    a bend of the path may never share a point with enough others.
     """
-    count, width = len(lengths), _width(rig, int(lengths[0]))
+    count, width = len(lengths), _width(scene, int(lengths[0]))
     points, seen = np.empty((count, 3)), np.zeros(count, dtype=int)
     candidates, visible = np.zeros((count, width), dtype=np.int32), np.zeros((count, width), dtype=bool)
     todo = np.arange(count)
     for attempt in range(ATTEMPTS):
-        first = reference[todo] if attempt < ATTEMPTS // 2 else rng.integers(rig.count, size=todo.size)
-        trial = rig.sample(first, attempt / ATTEMPTS, rng)
-        cameras, inside = _window(rig, first, width, rng)
-        views = rig.sees(trial, cameras) & inside
+        first = reference[todo] if attempt < ATTEMPTS // 2 else rng.integers(scene.count, size=todo.size)
+        trial = scene.sample(first, attempt / ATTEMPTS, rng)
+        cameras, inside = _window(scene, first, width, rng)
+        views = scene.sees(trial, cameras) & inside
         number = views.sum(axis=1)
         better = np.flatnonzero(number > seen[todo])
         rows = todo[better]
@@ -161,28 +162,30 @@ def _place(rig: Rig, lengths: np.ndarray, reference: np.ndarray, rng: np.random.
     return points, candidates, visible
 
 
-def _window(rig: Rig, reference: np.ndarray, width: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _window(
+    scene: TrueCameras, reference: np.ndarray, width: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Cameras around the reference, nearest first (n, width), and which of them exist.
 
-    For a share of the rows every other column is around the same place on another round of the path.
+    For a share of the rows every other column is around the same position on another round of the path.
     """
     column = np.arange(width)
     offset = (column + 1) // 2 * np.where(column % 2, 1, -1)
     cameras = reference[:, None] + offset.astype(np.int32)
-    lap, share = rig.path.lap, rig.config.revisit_share
-    if share > 0 and width < lap < rig.count:
+    lap, share = scene.path.lap, scene.config.revisit_share
+    if share > 0 and width < lap < scene.count:
         rows = np.flatnonzero(rng.random(len(reference)) < share)
-        here = reference[rows]
-        there = np.where(here + lap < rig.count, here + lap, here - lap)
-        there = np.where(there < 0, here, there)
-        pair = np.where(column % 2, there[:, None], here[:, None]) + offset[column // 2]
-        cameras[rows] = np.where((there != here)[:, None], pair, cameras[rows])
-    inside = (cameras >= 0) & (cameras < rig.count)
+        near = reference[rows]
+        other = np.where(near + lap < scene.count, near + lap, near - lap)
+        other = np.where(other < 0, near, other)
+        pair = np.where(column % 2, other[:, None], near[:, None]) + offset[column // 2]
+        cameras[rows] = np.where((other != near)[:, None], pair, cameras[rows])
+    inside = (cameras >= 0) & (cameras < scene.count)
     return np.where(inside, cameras, 0).astype(np.int32), inside
 
 
 def _balance(wanted: np.ndarray, possible: np.ndarray, missing: int, rng: np.random.Generator) -> tuple:
-    """Views of each point, at most the possible ones, and how many are still missing from the sum."""
+    """Numbers of views of each point, at most the possible ones, and how many are still missing from the total."""
     taken = np.minimum(wanted, possible)
     missing += int(wanted.sum() - taken.sum())
     while missing:
@@ -195,7 +198,7 @@ def _balance(wanted: np.ndarray, possible: np.ndarray, missing: int, rng: np.ran
 
 
 def _choose(visible: np.ndarray, taken: np.ndarray, gap_share: float, rng: np.random.Generator) -> np.ndarray:
-    """Picks `taken` of the visible candidates of each row (n, k), nearest first, leaving gaps where it can."""
+    """Mask (n, k) of `taken` visible candidates of each row, nearest first, with gaps where enough are visible."""
     skipped = rng.random(visible.shape, dtype=np.float32) < gap_share
     skipped[:, 0] = False  # the reference camera
     first = visible & ~skipped
@@ -205,21 +208,21 @@ def _choose(visible: np.ndarray, taken: np.ndarray, gap_share: float, rng: np.ra
     return first | rest
 
 
-def _feed(rig: Rig, views: Views, rng: np.random.Generator) -> Views:
-    """Gives cameras that see fewer than four points views from the cameras that see most, where they can see them."""
+def _rebalance(scene: TrueCameras, views: Views, rng: np.random.Generator) -> Views:
+    """Moves views from cameras that see most points to those that see fewer than four, where these see the point."""
     owner, points = views.camera_index, views.points
-    load = np.bincount(owner, minlength=rig.count)
+    load = np.bincount(owner, minlength=scene.count)
     for poor in np.flatnonzero(load < MIN_VIEWS):
         known = views.point_index[owner == poor]
-        could = rig.sees(points, np.full((len(points), 1), poor))[:, 0]
+        could = scene.sees(points, np.full((len(points), 1), poor))[:, 0]
         could[known] = False
         for point in rng.permutation(np.flatnonzero(could)):
             if load[poor] >= MIN_VIEWS:
                 break
             track = np.flatnonzero(views.point_index == point)
-            richest = track[np.argmax(load[owner[track]])]
-            if load[owner[richest]] > MIN_VIEWS:
-                load[owner[richest]] -= 1
+            fullest = track[np.argmax(load[owner[track]])]
+            if load[owner[fullest]] > MIN_VIEWS:
+                load[owner[fullest]] -= 1
                 load[poor] += 1
-                owner[richest] = poor
+                owner[fullest] = poor
     return views

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.loop import History
 from jaxba.solver.options import SolveOptions

@@ -23,8 +23,15 @@ from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.options import StepOptions
-from jaxba.runtime.compilation import REPAIR, CompiledTogether, Stage, Way, program, way_after
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import (
+    RUNS_PER_REPAIR,
+    CompileClock,
+    Level,
+    ParallelCompilation,
+    Stage,
+    level_after,
+    program,
+)
 from jaxba.solver.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.structure.layout import Layout, turns_of
 
@@ -48,18 +55,20 @@ class _Loop(NamedTuple):
 
     def start(self, call: Callable[..., Any], state: LMState) -> Carry:
         """The carry before the first iteration."""
-        inform = program(problem_info, "options", "max_iterations", way="quick")
+        inform = program(problem_info, "options", "max_iterations", level="quick")
         info = call(inform, self.layout, state, self.options, self.max_iterations)
         # without the parameters what is the policy's compiles once for all problems
-        return call(program(begin, way="quick"), info, self.policy, None)._replace(state=state)
+        return call(program(begin, level="quick"), info, self.policy, None)._replace(state=state)
 
-    def iterate(self, call: Callable[..., Any], carry: Carry, ways: Mapping[str, Way]) -> tuple[Carry, StepInfo, Any]:
-        """One iteration, its parts compiled in these ways: the carry after it, its record, and that for the host."""
+    def iterate(
+        self, call: Callable[..., Any], carry: Carry, levels: Mapping[str, Level]
+    ) -> tuple[Carry, StepInfo, Any]:
+        """One iteration, its parts compiled at these levels: the carry after it, its record, and that for the host."""
         state, options = carry.state, self.options
         effort = None
         if decides_effort(self.policy):
-            effort = call(program(effort_of, way="quick"), self.policy, carry.policy)
-        part = lambda name, function: program(function, "options", way=ways[name])
+            effort = call(program(effort_of, level="quick"), self.policy, carry.policy)
+        part = lambda name, function: program(function, "options", level=levels[name])
         min_gain = jnp.asarray(self.policy.min_gain, state.cost.dtype)
         if options.single_solve:
             given = (self.layout, state, carry.damping)
@@ -77,7 +86,7 @@ class _Loop(NamedTuple):
             limit,
             jnp.asarray(turns_of(self.layout)),
         )
-        carry, facts = call(program(_advance_and_tell, way="quick"), *own)
+        carry, facts = call(program(_advance_and_tell, level="quick"), *own)
         return carry._replace(state=state), step, facts
 
 
@@ -103,7 +112,7 @@ def run_stepwise(
         max_iterations: limit of linear solves.
         callback: sees every record; a true answer ends the solve.
         stages: how each part of a step is compiled before it is optimised, `propose` and `try_step`, or `round`. A
-            camera round or a further trial counts `programs.REPAIR` times more than a run.
+            camera round or a further trial counts for `RUNS_PER_REPAIR` more runs.
 
     Returns:
         Final carry, histories of as many entries as there were iterations, how many of these had a part
@@ -112,35 +121,36 @@ def run_stepwise(
     loop = _Loop(layout, policy, tolerances, options, max_iterations)
     runs = dict.fromkeys(stages, 0)
 
-    def ways_now() -> dict[str, Way]:
-        return {name: way_after(runs[name], of_part) for name, of_part in stages.items()}
+    def levels_now() -> dict[str, Level]:
+        return {name: level_after(runs[name], of_part) for name, of_part in stages.items()}
 
-    optimised = lambda ways: set(ways.values()) == {"full"}
-    ways = ways_now()
+    optimised = lambda levels: set(levels.values()) == {"full"}
+    levels = levels_now()
     started = time.perf_counter()
-    with CompileClock() as clock, CompiledTogether() as together:
-        loop.iterate(together, loop.start(together, state), ways)
-    run = together.run
+    with CompileClock() as clock, ParallelCompilation() as compile_programs:
+        loop.iterate(compile_programs, loop.start(compile_programs, state), levels)
+    run = compile_programs.run
     carry = jax.block_until_ready(loop.start(run, state))
     compile_s = 0.0
-    if clock.seconds > 0 or together.loaded:
-        if optimised(ways):  # a program's first run touches its memory for the first time; the time of others is wanted
-            jax.block_until_ready(loop.iterate(run, carry, ways)[2])
+    if clock.seconds > 0 or compile_programs.loaded:
+        # a program's first run touches its memory for the first time; it is the time of later runs that is reported
+        if optimised(levels):
+            jax.block_until_ready(loop.iterate(run, carry, levels)[2])
         compile_s = time.perf_counter() - started
     records, quick_iterations = [], 0
     started, waited = time.perf_counter(), 0.0
     while True:
-        if ways != (now := ways_now()):
-            ways, began = now, time.perf_counter()
-            with together:
-                loop.iterate(together, carry, ways)
+        if levels != (now := levels_now()):
+            levels, began = now, time.perf_counter()
+            with compile_programs:
+                loop.iterate(compile_programs, carry, levels)
             waited += time.perf_counter() - began
-        carry, step, facts = loop.iterate(run, carry, ways)
+        carry, step, facts = loop.iterate(run, carry, levels)
         step, end = _told(facts, step)
         records.append(step)
-        quick_iterations += not optimised(ways)
+        quick_iterations += not optimised(levels)
         for name in runs:
-            runs[name] += 1 + REPAIR * int(step.repairs) if name == "try_step" else 1
+            runs[name] += 1 + RUNS_PER_REPAIR * int(step.repairs) if name == "try_step" else 1
         wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - waited, step))
         if end != Termination.RUNNING:
             break

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import cast, get_args
 
 from jaxba.damping import DampingPolicy, is_learned, make_policy
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.policy import trained_step
 from jaxba.damping.registry import LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
 from jaxba.methods.registry import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method

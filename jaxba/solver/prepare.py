@@ -18,8 +18,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
-from jaxba.runtime.compilation import program, run_alone
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.names import fitting_policy
 from jaxba.solver.options import SolveOptions
@@ -101,15 +100,15 @@ def prepare(
     if step.mixed_precision and step.method is not None:
         raise ProblemError("mixed types are for plain LM; methods have float64 or float32")
     dtype = jnp.dtype("float32" if options.dtype == "float32" else "float64")
-    with jax.enable_x64(options.dtype != "float32"), process.calm_blas():
+    with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
         started = time.perf_counter()
         offset = far_middle(problem)
         here = problem if offset is None else shift(problem, -offset)
         with CompileClock() as clock:
             layout = jax.device_put(layout_for(problem, step, capacity))
-            initial = program(initial_state, "options", "dtype", way="quick")
+            initial = program(initial_state, "options", "dtype", level="quick")
             begin = here if capacity is None else padded_parameters(here, capacity)
-            state = jax.block_until_ready(run_alone(initial, layout, begin, step, dtype))
+            state = jax.block_until_ready(compile_and_run(initial, layout, begin, step, dtype))
         setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))

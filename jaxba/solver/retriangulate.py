@@ -31,7 +31,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
-from jaxba.runtime.compilation import program, run_alone, stages, way_after
+from jaxba.runtime.compilation import compile_and_run, level_after, program, stages
 from jaxba.solver.prepare import explain_start
 from jaxba.structure.layout import Layout, build_layout
 
@@ -97,7 +97,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Raises:
         ProblemError: the cost is not finite.
     """
-    with jax.enable_x64(True), process.calm_blas():
+    with jax.enable_x64(True), process.single_blas_thread():
         layout = build_layout(problem, pairs=False, grid=False)
         order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
         real = order < problem.num_points  # the layout has an empty point besides
@@ -105,10 +105,10 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
         origin = np.zeros((3, len(order)))
         origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
-        way = way_after(VERDICTS, stages("try_step", problem.num_observations))
-        search = program(_search, "loss", way=way)
+        level = level_after(VERDICTS, stages("acceptance", problem.num_observations))
+        search = program(_search, "loss", level=level)
         given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss())
-        found = jax.device_get(run_alone(search, *given))
+        found = jax.device_get(compile_and_run(search, *given))
         process.release_programs()  # many problems in one process would end it
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem))

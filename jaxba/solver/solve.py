@@ -22,8 +22,7 @@ from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
-from jaxba.runtime.compilation import Part, Stage, options_of, stages
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock, Part, Stage, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord, run_stepwise
 from jaxba.solver.loop import Carry, History, solve_loop
 from jaxba.solver.options import SolveOptions
@@ -114,7 +113,7 @@ def solve(
             step asked for cannot hold the problem's lenses.
     """
     options = SolveOptions() if options is None else options
-    with jax.enable_x64(options.dtype != "float32"), process.calm_blas():
+    with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
         prepared = prepare(problem, options, policy=policy)
         layout, state, step_options = prepared.layout, prepared.state, prepared.options
         before = _stages(options.compilation, problem, step_options)
@@ -147,11 +146,11 @@ def solve(
 
 def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
     """How each part of a step is compiled before it is optimised."""
-    parts: dict[str, Part] = {"round": "round"}
+    parts: dict[str, Part] = {"round": "decomposition"}
     if options.single_solve:
         factors = options.forms_reduced_system and options.truncated is None
-        parts = {"propose": "factored" if factors else "iterated", "try_step": "try_step"}
-    if compilation == "full" or options_of("quick") is None:
+        parts = {"propose": "factorization" if factors else "iterative", "try_step": "acceptance"}
+    if compilation == "full" or compiler_options("quick") is None:
         return dict.fromkeys(parts, ())
     if compilation == "quick":
         return dict.fromkeys(parts, (Stage("quick", sys.maxsize),))

@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.runtime.single_loop import in_haste, sum_each
+from jaxba.runtime.fusion import fast_compilation, sum_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.typing import AnyArray
 
@@ -86,11 +86,13 @@ def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "
 
 def point_sums(layout: Layout, rows: list[Float[Array, " slots"]]) -> list[Float[Array, " points"]]:
     """`point_sum` of vectors that are stored one by one: they are summed where they are, all at once."""
-    if layout.point_levels is not None or in_haste.value:
+    if layout.point_levels is not None or fast_compilation.value:
         return list(point_sum(layout, jnp.stack(rows)))
     parts, start = [], 0
     for bucket in layout.buckets:
         end = start + math.prod(bucket)
-        parts.append([sums.reshape(-1) for sums in sum_each([row[start:end].reshape(bucket) for row in rows], 1)])
+        parts.append(
+            [sums.reshape(-1) for sums in sum_in_one_loop([row[start:end].reshape(bucket) for row in rows], 1)]
+        )
         start = end
     return [jnp.concatenate(pieces) for pieces in zip(*parts, strict=True)]

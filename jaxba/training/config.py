@@ -1,8 +1,7 @@
 """Everything that a training run depends on, and the YAML files that say it.
 
-A file states differences to the defaults of the classes; a run writes all of it into its folder. The presets lie in
-`jaxba/presets/train` as package data, where an installed jaxba finds them; `configs/train` in the repository is a link
-to that folder, so that there is one copy.
+A file in `configs/train` states differences to the file that it extends, or to the defaults of the classes
+(jaxba/io/configurations.py); a run writes all settings into its folder.
 """
 
 from __future__ import annotations
@@ -10,14 +9,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib import resources
-from pathlib import Path
-from typing import Any
 
-from jaxba.damping.agent import AgentConfig, EffortMode
-from jaxba.damping.learned import LARGEST_FILE
+from jaxba.damping.agent_config import AgentConfig, EffortMode
+from jaxba.damping.features import observation_size
+from jaxba.damping.policy_file import LARGEST_FILE
 from jaxba.game.env import GameConfig
 from jaxba.game.scene_bank import BankConfig
+from jaxba.io import configurations
 from jaxba.methods.registry import DEFAULT_METHOD, MethodName, make_method
 from jaxba.problem.options import StepOptions
 from jaxba.training import settings
@@ -102,8 +100,6 @@ class TrainConfig:
         _check_agent(self.sac)
         _check_size(self.sac, self.game.agent)
         _check_effort(self.game.agent.effort, self.method, self.step_options)
-        if self.game.shaping and self.game.discount != self.sac.gamma:
-            raise ValueError(f"game.discount must be sac.gamma, {self.sac.gamma}, where there is shaping")
 
 
 def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None:
@@ -136,7 +132,7 @@ def _check_agent(sac: SacConfig) -> None:
 
 def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
     """A policy that is too large for its file would be noticed when all is trained."""
-    sizes = [agent.observation_size, *[sac.width] * sac.layers, 2 * agent.action_size]
+    sizes = [observation_size(agent), *[sac.width] * sac.layers, 2 * agent.action_size]
     numbers = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     if 4 * numbers > LARGEST_FILE - METADATA_BYTES:
         raise ValueError(
@@ -153,29 +149,21 @@ def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
         overrides: `key.key=value` each, the value in YAML; they win over the file.
 
     Raises:
-        SettingsError: no such file, not YAML, an unknown key or an impossible value.
+        SettingsError: no such file or base, not YAML, an unknown key or an impossible value; one line.
     """
-    text = _text(name)
-    data = _parse(text, name)
-    if data is None:
-        data = {}
-    if not isinstance(data, dict):
-        raise SettingsError(f"{name}: must be a mapping with keys such as {', '.join(_KEYS)}")
+    data = configurations.read("train", name)
     for override in overrides:
         key, equals, value = override.partition("=")
         if not equals or not key:
             raise SettingsError(f"--set {override}: must be key=value")
         try:
-            settings.assign(data, key.strip(), _parse(value, "the value"), TrainConfig)
+            settings.assign(data, key.strip(), configurations.parse(value, "the value"), TrainConfig)
         except SettingsError as error:
             raise SettingsError(f"--set {override}: {error}") from None
     try:
         return settings.read(TrainConfig, data)
     except SettingsError as error:
         raise SettingsError(f"{name}{' with --set' if overrides else ''}: {error}") from None
-
-
-_KEYS = tuple(settings.field_types(TrainConfig))
 
 
 def to_yaml(config: TrainConfig) -> str:
@@ -187,33 +175,4 @@ def to_yaml(config: TrainConfig) -> str:
 
 def preset_names() -> list[str]:
     """Names that `load` finds without a path."""
-    return sorted(Path(item.name).stem for item in _presets().iterdir() if item.name.endswith(".yaml"))
-
-
-def _presets() -> Any:
-    return resources.files("jaxba") / "presets" / "train"
-
-
-def _text(name: str) -> str:
-    path: Any = Path(name)
-    if len(path.parts) == 1 and not path.suffix:
-        path = _presets() / f"{name}.yaml"
-        if not path.is_file():
-            raise SettingsError(f"no configuration {name!r}; known: {', '.join(preset_names())}, or the path of a file")
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise SettingsError(f"{name}: {error.strerror or 'cannot be read'}") from None
-    except UnicodeDecodeError:
-        raise SettingsError(f"{name}: not text") from None
-
-
-def _parse(text: str, name: str) -> Any:
-    import yaml
-
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
-        raise SettingsError(f"{name}{where}: not YAML") from None
+    return configurations.names("train")

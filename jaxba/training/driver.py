@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxba.runtime.atomic import TEMPORARY, write_text
 from jaxba.training import checkpoint, settings
 from jaxba.training.config import TrainConfig, load, to_yaml
 from jaxba.training.log import Log, Row
@@ -107,9 +108,7 @@ def prepare_folder(
         folder.mkdir(parents=True, exist_ok=True)
         if not resume and _others(folder):
             raise TrainError(f"{folder} is not empty; --out names another folder")
-        part = path.with_suffix(".part")
-        part.write_text(to_yaml(config), encoding="utf-8")
-        part.replace(path)
+        write_text(path, to_yaml(config))
     except OSError as error:
         raise TrainError(f"{folder}: {error.strerror or error}") from None
     return config
@@ -117,7 +116,7 @@ def prepare_folder(
 
 def _others(folder: Path) -> bool:
     """Whether there is more than the configuration of a run that never came to anything."""
-    return any(item.stem != Path(CONFIG).stem for item in folder.iterdir())
+    return any(item.name != CONFIG and not item.match(TEMPORARY.format("*")) for item in folder.iterdir())
 
 
 def train(

@@ -14,14 +14,12 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from jaxba.io.configurations import SettingsError
+
 Settings = TypeVar("Settings")
 
 _SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 """Numbers such as 3e-4, which YAML 1.1 takes for text."""
-
-
-class SettingsError(ValueError):
-    """Settings that cannot be used. The message is one line for a person."""
 
 
 def read(kind: type[Settings], data: Any, path: str = "") -> Settings:

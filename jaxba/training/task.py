@@ -16,13 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.learned import Learned, learned_from
+from jaxba.damping.learned import LearnedPolicy, learned_from
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.atomic import atomic_write
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig
 from jaxba.training.driver import TrainError
@@ -62,7 +63,7 @@ class Task:
         """Scores of the yardsticks, `virtual best` among them."""
         return self._scores({})
 
-    def policy(self, actor: Any) -> Learned:
+    def policy(self, actor: Any) -> LearnedPolicy:
         """The policy of an actor's parameters."""
         return learned_from(self.config.game.agent, actor)
 
@@ -162,10 +163,8 @@ def _write_banks(path: Path, splits: list[Split]) -> None:
 
 
 def _write(path: Path, arrays: dict[str, Any]) -> None:
-    part = path.with_suffix(".part")
-    with part.open("wb") as file:
+    with atomic_write(path) as file:
         np.savez(file, **arrays)
-    part.replace(path)
 
 
 def read_banks(path: Path) -> list[Split]:

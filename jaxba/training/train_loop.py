@@ -80,7 +80,16 @@ def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions
     return after, step
 
 
-def _start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
+@functools.partial(jax.jit, static_argnames=("sac", "loop"))
+def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
+    """A fresh agent, and a replay buffer with `warmup_steps` demonstrated transitions.
+
+    Args:
+        sac: static.
+        loop: static.
+        env: a pytree; its arrays are traced.
+        key: decides everything: the same key gives the same numbers, bit for bit, on the same machine.
+    """
     TRACES["start"] += 1
     key, learner_key, reset_key, warmup_key = jax.random.split(key, 4)
     env_state, observation = env.reset(reset_key)
@@ -103,9 +112,23 @@ def _start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> Lo
     return jax.lax.scan(body, state, jax.random.split(warmup_key, steps))[0]
 
 
-def _run_chunk(
+@functools.partial(jax.jit, static_argnames=("sac", "loop"), donate_argnames=("state",))
+def run_chunk(
     sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
 ) -> tuple[LoopState, dict[str, Float[Array, ""]]]:
+    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step` updates.
+
+    Args:
+        sac: static.
+        loop: static.
+        env: the one of `start`.
+        state: is used up: its memory becomes the result's.
+
+    Returns:
+        The state after, and means over the chunk: those of `sac.update`; `reward` of a step; `action_mean`,
+        `action_std`; `episodes`, the number of episodes that ended, and `episode/NAME`, the mean over those of what
+        the environment says about them (0 where none ended); `dropped`, transitions with numbers that are not finite.
+    """
     TRACES["run_chunk"] += 1
 
     def body(state: LoopState, _: None) -> tuple[LoopState, tuple[dict[str, Array], dict[str, Array], Array]]:
@@ -134,50 +157,3 @@ def _run_chunk(
     for name, values in sums.items():
         metrics[f"episode/{name}"] = jnp.sum(values) / jnp.maximum(metrics["episodes"], 1)
     return state, metrics
-
-
-@functools.partial(jax.jit, static_argnames=("sac", "loop"))
-def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
-    """A fresh agent, and a replay buffer with `warmup_steps` demonstrated transitions.
-
-    Args:
-        sac: static.
-        loop: static.
-        env: a pytree; its arrays are traced.
-        key: decides everything: the same key gives the same numbers, bit for bit, on the same machine.
-    """
-    return _start(sac, loop, env, key)
-
-
-@functools.partial(jax.jit, static_argnames=("sac", "loop"), donate_argnames=("state",))
-def run_chunk(
-    sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
-) -> tuple[LoopState, dict[str, Float[Array, ""]]]:
-    """`steps_per_chunk` vector steps of every environment, each followed by `updates_per_step` updates.
-
-    Args:
-        sac: static.
-        loop: static.
-        env: the one of `start`.
-        state: is used up: its memory becomes the result's.
-
-    Returns:
-        The state after, and means over the chunk: those of `sac.update`; `reward` of a step; `action_mean`,
-        `action_std`; `episodes`, the number of episodes that ended, and `episode/NAME`, the mean over those of what
-        the environment says about them (0 where none ended); `dropped`, transitions with numbers that are not finite.
-    """
-    return _run_chunk(sac, loop, env, state)
-
-
-@functools.partial(jax.jit, static_argnames=("sac", "loop"))
-def start_seeds(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
-    """`start` for every key along the first axis. The environment is shared."""
-    return jax.vmap(lambda key: _start(sac, loop, env, key))(keys)
-
-
-@functools.partial(jax.jit, static_argnames=("sac", "loop"), donate_argnames=("states",))
-def run_chunk_seeds(
-    sac: SacConfig, loop: LoopConfig, env: Environment, states: LoopState
-) -> tuple[LoopState, dict[str, Float[Array, " seeds"]]]:
-    """`run_chunk` for every state along the first axis, as one program: agents of several seeds side by side."""
-    return jax.vmap(lambda state: _run_chunk(sac, loop, env, state))(states)

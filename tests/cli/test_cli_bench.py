@@ -368,6 +368,10 @@ BAD = {
     "tolerance 0": (["scene:tiny", "--tolerance", "0"], "--tolerance must lie between 0 and 1"),
     "tolerance 1": (["scene:tiny", "--tolerance", "1"], "--tolerance must lie between 0 and 1"),
     "missing suite": (["--suite", "no-such-suite.yaml"], "No such file"),
+    "unknown suite": (
+        ["--suite", "rule"],
+        "no configuration 'rule'; known: methods, real, rules, synthetic, or the path",
+    ),
 }
 
 
@@ -378,12 +382,41 @@ def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(kind, tmp_pat
     assert not (tmp_path / "run").exists()
 
 
+def test_a_suite_is_found_by_its_name(tmp_path, undrawn, capsys):
+    status = bench(tmp_path / "run", "scene:tiny", "--suite", "synthetic", "--repeats", "1", "--max-iterations", "1")
+    assert status == 0
+    assert [line["solver"] for line in lines(tmp_path / "run")] == [
+        "classic",
+        "ceres",
+        "nielsen",
+        "gtsam",
+        "ceres+refine3",
+    ]
+
+
+def test_a_suite_of_real_problems_says_which_variable_names_their_folder(tmp_path, monkeypatch, capsys):
+    wanted = (
+        "--suite rules: $JAXBA_DATA/bal/problem-*.bz2: the environment variable JAXBA_DATA, a folder of problems, is"
+    )
+    for value in (None, ""):
+        monkeypatch.delenv("JAXBA_DATA", raising=False)
+        if value is not None:
+            monkeypatch.setenv("JAXBA_DATA", value)
+        check_one_line(bench(tmp_path / "run", "--suite", "rules"), capsys.readouterr().err, wanted)
+    monkeypatch.setenv("JAXBA_DATA", str(tmp_path))
+    wanted = f"--suite rules: {tmp_path}/bal/problem-*.bz2: no such file"
+    check_one_line(bench(tmp_path / "run", "--suite", "rules"), capsys.readouterr().err, wanted)
+
+
 BAD_SUITES = {
     "unknown key": ({"problem": ["scene:tiny"]}, "unknown key 'problem'; known: problems, solvers"),
     "wrong type": ({"problems": "scene:tiny"}, "problems is 'scene:tiny', not a list"),
     "wrong number": ({"problems": ["scene:tiny"], "repeats": 1.5}, "repeats is 1.5"),
     "truth as number": ({"problems": ["scene:tiny"], "repeats": True}, "repeats is True"),
-    "unset variable": ({"problems": ["$JAXBA_NO_SUCH_VARIABLE/x.txt"]}, "the environment variable is not set"),
+    "unset variable": (
+        {"problems": ["$JAXBA_NO_SUCH_VARIABLE/x.txt"]},
+        "/x.txt: the environment variable JAXBA_NO_SUCH_VARIABLE, a folder of problems, is not set",
+    ),
     "glob without match": ({"problems": ["no-such-folder/*.txt"]}, "no such file"),
     "unknown solver": ({"problems": ["scene:tiny"], "solvers": ["cerse"]}, "unknown damping policy"),
     "bad tolerance": ({"problems": ["scene:tiny"], "tolerance": 2.0}, "--tolerance must lie between 0 and 1"),

@@ -13,7 +13,7 @@ import pytest
 from safetensors import safe_open
 
 from jaxba.cli.train import run
-from jaxba.damping.learned import load_policy
+from jaxba.damping.policy_file import load_policy
 from jaxba.game import rollout
 from jaxba.game.scene_bank import TooFewScenes
 from jaxba.training import log, task

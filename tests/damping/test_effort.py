@@ -8,15 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from agent_steps import ACCEPTED, REJECTED, after, info
 from support import solve, start, step, tiny
-from test_agent import ACCEPTED, REJECTED, after, info
 from test_learned import random_policy
 from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 
-from jaxba import Ceres, Safeguard, Schedule, StepOptions, lm_step
-from jaxba.damping import effort_of
-from jaxba.damping.agent import FORCING, AgentConfig, begin, observe, with_effort
-from jaxba.damping.learned import Layer, Learned, PolicyFileError, load_policy, save_policy
+from jaxba import Schedule, StepOptions, lm_step
+from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.features import begin, observation_size, observe
+from jaxba.damping.guard import FORCING, effort_for
+from jaxba.damping.learned import Layer, LearnedPolicy
+from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
 from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
 from jaxba.linear.step import Effort
 from jaxba.methods.deeplm import GlobalConjugateGradients
@@ -30,7 +32,7 @@ BOTH = replace(POINTS, effort="points+forcing")
 _step = jax.jit(lm_step, static_argnames=("options",))
 _jitted_reset = jax.jit(lambda game, key: game.reset(key))
 _jitted_play = jax.jit(lambda game, state, action: game.step(state, action))
-_with_effort = jax.jit(with_effort, static_argnums=0)
+_effort_for = jax.jit(effort_for, static_argnums=0)
 
 
 def effort(points: int, forcing: float | None = None) -> Effort:
@@ -93,7 +95,7 @@ def test_a_step_with_another_forcing_term_is_that_of_options_with_it(solver):
 
 
 def _chosen(config: AgentConfig, memory, *action: float) -> tuple[int, float | None]:
-    found = _with_effort(config, memory, jnp.asarray(action, jnp.float32)).effort
+    found = _effort_for(config, memory.guard, jnp.asarray(action, jnp.float32))
     return int(found.point_iterations), None if found.forcing is None else float(jnp.log10(found.forcing))
 
 
@@ -104,14 +106,14 @@ def test_an_action_ranges_from_no_point_iteration_to_all_and_over_the_forcing_te
     assert [points for points, _ in found] == [0, 1, 2, 3]
     np.testing.assert_allclose([forcing for _, forcing in found], np.interp([-1, -0.4, 0.4, 1], [-1, 1], FORCING))
     assert _chosen(POINTS, begin(POINTS, info()), 0.3, -1) == (0, None)
-    assert with_effort(AGENT, begin(AGENT, info()), jnp.zeros(1)).effort is None
+    assert effort_for(AGENT, begin(AGENT, info()).guard, jnp.zeros(1)) is None
 
 
 def test_the_guards_rule_has_the_whole_effort():
-    config = replace(BOTH, guard="pause", patience=2)
+    config = replace(BOTH, patience=2)
     memory = begin(config, info())
     least, full = (0, FORCING[1]), (3, FORCING[0])
-    for accepted, expected in ((REJECTED, least), (REJECTED, full), (ACCEPTED, least)):
+    for accepted, expected in ((REJECTED, least), (REJECTED, full), (ACCEPTED, full)):
         memory = after(config, memory, accepted, -3.0)
         np.testing.assert_allclose(_chosen(config, memory, -1, -1, 1), expected)
 
@@ -121,12 +123,12 @@ def test_the_effort_of_the_last_step_is_observed():
         memory = begin(config, info())
         seen = []
         for share in (-1.0, 1.0):
-            chosen = with_effort(config, memory, jnp.full(config.action_size, share, jnp.float32))
-            seen.append(np.asarray(observe(config, after(config, chosen, ACCEPTED, -3.0))))
-            assert seen[-1].shape == (config.observation_size,)
-        assert config.observation_size == AGENT.observation_size + config.action_size - 1
+            chosen = effort_for(config, memory.guard, jnp.full(config.action_size, share, jnp.float32))
+            seen.append(np.asarray(observe(config, after(config, memory._replace(effort=chosen), ACCEPTED, -3.0))))
+            assert seen[-1].shape == (observation_size(config),)
+        assert observation_size(config) == observation_size(AGENT) + config.action_size - 1
         different = np.flatnonzero(seen[0] != seen[1])
-        np.testing.assert_array_equal(different, np.arange(AGENT.observation_size, config.observation_size))
+        np.testing.assert_array_equal(different, np.arange(observation_size(AGENT), observation_size(config)))
 
 
 # Policies
@@ -139,7 +141,7 @@ def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_on
     bias = np.arctanh([1 / 6, -0.4]).astype(np.float32)  # a lambda of 1e-3, and one of three
     zero[-1] = zero[-1]._replace(bias=np.concatenate([bias, bias]))
     path = tmp_path / "two.safetensors"
-    save_policy(path, Learned(tuple(zero), config))
+    save_policy(path, LearnedPolicy(tuple(zero), config))
     options = config.step_options(StepOptions())
     rule = Schedule(values=(1e-3,), min_gain=config.min_gain)
     expected = solve(
@@ -149,14 +151,6 @@ def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_on
         found = solve(tiny(), load_policy(path), options, max_iterations=8, callback=callback).history
         np.testing.assert_allclose(found.damping, 1e-3, rtol=1e-5)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-5)
-
-
-def test_a_safeguard_lets_the_policy_inside_decide_the_effort():
-    policy = random_policy(4, POINTS)
-    inner, _ = policy.init(info())
-    state, _ = Safeguard(policy).init(info())
-    assert effort_of(Safeguard(policy), state) == effort_of(policy, inner) is not None
-    assert effort_of(Safeguard(Ceres()), Safeguard(Ceres()).init(info())[0]) is None
 
 
 def test_a_file_with_too_few_numbers_for_its_effort_is_refused(tmp_path):

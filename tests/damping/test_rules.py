@@ -1,4 +1,4 @@
-"""Damping rules against the formulas of their sources, the safeguard, and names."""
+"""Damping rules against the formulas of their sources, and names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import step_info
 
-from jaxba import POLICIES, Ceres, Classic, DampingPolicy, Geometric, ProblemInfo, Safeguard, Schedule, make_policy
+from jaxba import POLICIES, Ceres, Classic, DampingPolicy, Geometric, ProblemInfo, Schedule, make_policy
 from jaxba.damping import UnknownPolicyError
 
 count = lambda n: jnp.asarray(n, jnp.int32)
@@ -149,57 +149,6 @@ def test_gauss_newton_is_next_to_no_damping():
     assert lambdas(make_policy("gauss-newton"), [(True, 1.0), REJECTED]) == [1e-10] * 3
 
 
-# Safeguard
-
-
-class TestSafeguard:
-    """A policy that insists on a bad lambda, and what happens to it."""
-
-    stubborn = Schedule(values=(1e-12,))
-
-    @pytest.mark.parametrize("patience", [1, 2, 3, 5])
-    def test_it_hands_over_after_so_many_rejections_in_a_row_and_not_before(self, patience):
-        found = lambdas(Safeguard(self.stubborn, patience=patience), [REJECTED] * (patience + 2))
-        assert found[:patience] == [1e-12] * patience
-        assert found[patience] == Ceres().initial
-        np.testing.assert_allclose(found[patience:], [1e-4, 2e-4, 8e-4], rtol=1e-14)
-
-    @settings(max_examples=50, deadline=None)
-    @given(histories, st.integers(1, 4))
-    def test_before_the_hand_over_the_inner_policy_decides_and_after_it_ceres_does(self, steps, patience):
-        inner = Schedule(values=(1e-6, 3.0, 1e-2))
-        rejected = np.cumsum([not accepted for accepted, _ in steps])
-        streaks, streak = [], 0
-        for accepted, _ in steps:
-            streak = 0 if accepted else streak + 1
-            streaks.append(streak)
-        end = next((i for i, s in enumerate(streaks) if s >= patience), None)
-        plain, found = lambdas(inner, steps), lambdas(Safeguard(inner, patience=patience), steps)
-        if end is None:
-            assert found == plain
-            return
-        assert rejected[end] >= patience
-        assert found[: end + 1] == plain[: end + 1]
-        opening = max(Ceres().initial, 2 * plain[end])
-        np.testing.assert_allclose(found[end + 1 :], lambdas(Ceres(initial=opening), steps[end + 1 :]), rtol=1e-12)
-
-    def test_one_accepted_step_starts_the_count_anew(self):
-        found = lambdas(Safeguard(self.stubborn, patience=3), [REJECTED, REJECTED, (True, 1.0)] * 6)
-        assert set(found) == {1e-12}
-
-    def test_it_never_opens_below_what_was_just_rejected(self):
-        found = lambdas(Safeguard(Schedule(values=(5.0,)), patience=2), [REJECTED] * 4)
-        np.testing.assert_allclose(found, [5, 5, 10, 20, 80], rtol=1e-14)
-
-    def test_the_hand_over_lasts(self):
-        found = lambdas(Safeguard(self.stubborn, patience=2), [REJECTED] * 2 + [(True, 1.0)] * 6)
-        np.testing.assert_allclose(found[2:], 1e-4 / 3.0 ** np.arange(7), rtol=1e-13)
-
-    def test_it_takes_the_threshold_of_the_guarded_policy(self):
-        assert Safeguard(make_policy("theseus")).min_gain == 0.1
-        assert Safeguard(Classic()).min_gain == 0
-
-
 # Pytrees
 
 
@@ -208,7 +157,6 @@ ALL = {
     "classic": lambda x: Classic(initial=x),
     "geometric": lambda x: Geometric(x, 0.5, 2.0, 0.0, 1e9 * x),
     "schedule": lambda x: Schedule(values=(x, 2 * x)),
-    "safeguard": lambda x: Safeguard(Schedule(values=(x,)), patience=int(1 + 10 * x), fallback=Ceres(initial=x)),
 }
 
 

@@ -15,7 +15,7 @@ from jaxba import ProblemError, write_bal
 from jaxba.bench.sources import sources
 from jaxba.cli import bench, data, solve
 from jaxba.datasets.bal.catalog import ENTRIES, find, select
-from jaxba.datasets.bal.places import data_folder, local_path, resolve
+from jaxba.datasets.bal.paths import data_folder, local_path, resolve
 from jaxba.scenes.config import LIKE
 
 
@@ -94,10 +94,10 @@ def test_an_unknown_name_is_refused_with_close_ones(name, hint):
     assert hint in str(caught.value)
 
 
-# Places
+# Paths
 
 
-def test_problems_lie_beside_the_compiled_programs_unless_told_otherwise(monkeypatch, tmp_path):
+def test_problems_lie_beside_the_compiled_programs_by_default(monkeypatch, tmp_path):
     monkeypatch.delenv("JAXBA_BAL", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert data_folder() == tmp_path / "jaxba" / "bal"
@@ -136,7 +136,7 @@ def test_path_of_what_is_not_here_says_how_to_get_it(folder, capsys):
     check_one_line(capsys.readouterr().err, "get it with: jaxba-data download ladybug-49")
 
 
-def test_list_tells_what_is_here(stored, capsys):
+def test_list_shows_what_is_here(stored, capsys):
     assert data.run(["list"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert lines[0] == ["name", "cameras", "points", "file", "sha256", "here"]

@@ -15,7 +15,7 @@ from kitti_scene import OTHER, SMALL, Camera, cv2, render, textures, write_seque
 from jaxba import BundleProblem, read_bal
 from jaxba.cli.kitti import run
 from jaxba.cli.solve import run as solve
-from jaxba.datasets.kitti import front, klt
+from jaxba.datasets.kitti import frontend, klt
 from jaxba.datasets.kitti.features import KeyPoints, detect, essential, match
 from jaxba.datasets.kitti.sequence import Calibration, image_reader, read_sequence
 from jaxba.io import write_problem
@@ -67,7 +67,7 @@ def known_motion() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return local[:, :2] / local[:, 2:], after[:, :2] / after[:, 2:], turn
 
 
-def test_wrong_matches_are_told_from_right_ones_by_the_epipolar_geometry():
+def test_the_epipolar_geometry_separates_wrong_matches_from_right_ones():
     first, second, turn = known_motion()
     second = second + 1e-4 * np.random.default_rng(1).standard_normal(second.shape)
     second[:60] = np.random.default_rng(2).uniform(-0.5, 0.5, (60, 2))
@@ -127,13 +127,13 @@ def test_a_blank_image_has_no_key_points(features):
     assert len(match(found, found)) == 0
 
 
-def test_followed_points_are_where_the_geometry_says(rendered):
+def test_tracked_points_are_where_the_geometry_says(rendered):
     """Corners of the first frame move as their plane demands."""
     poses = kitti_scene.path(2)
     first, second = (cv2.imread(str(image(rendered[SMALL], i)), 0) for i in (0, 1))
     calibration = Calibration(SMALL.fx, SMALL.fy, SMALL.cx, SMALL.cy)
-    points = klt.start(first, 600)
-    after, old = klt.follow(first, second, points, 600, calibration, 0)
+    points = klt.detect_corners(first, 600)
+    after, old = klt.track(first, second, points, 600, calibration, 0)
     assert old > 100
     assert (np.diff(after.tracks) > 0).all()
     _, a, b = np.intersect1d(points.tracks, after.tracks, return_indices=True)
@@ -153,7 +153,7 @@ def test_followed_points_are_where_the_geometry_says(rendered):
 
 def test_new_corners_keep_their_distance(rendered):
     first = cv2.imread(str(image(rendered[SMALL], 0)), 0)
-    pixels = klt.start(first, 600).pixels
+    pixels = klt.detect_corners(first, 600).pixels
     gaps = np.linalg.norm(pixels[:, None] - pixels, axis=2) + 1e9 * np.eye(len(pixels))
     assert gaps.min() >= klt.DISTANCE
 
@@ -242,8 +242,8 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(sequence, tmp_path, monke
     whole, broken = tmp_path / "a.txt", tmp_path / "b.txt"
     options = ("--features", features, "--keypoints", "700")
     assert build(sequence, whole, *options) == 0
-    calls, name = [], "_verify" if features == "sift" else "follow"
-    original = getattr(front, name)
+    calls, name = [], "_verify" if features == "sift" else "track"
+    original = getattr(frontend, name)
 
     def killed(*arguments):
         calls.append(1)
@@ -251,14 +251,14 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(sequence, tmp_path, monke
             raise KeyboardInterrupt
         return original(*arguments)
 
-    monkeypatch.setattr(front, name, killed)
+    monkeypatch.setattr(frontend, name, killed)
     assert build(sequence, broken, *options) == 130
     assert "run the same command again" in capsys.readouterr().out
     assert not broken.exists()
     stored = sorted((tmp_path / "b.work").iterdir())
     stored[1].write_bytes(stored[1].read_bytes()[:100])  # cut short: made anew
     assert not [path for path in stored if path.suffix != ".npz"]
-    monkeypatch.setattr(front, name, original)
+    monkeypatch.setattr(frontend, name, original)
     before = len(calls)
     assert build(sequence, broken, *options) == 0
     assert len(calls) == before
@@ -268,7 +268,7 @@ def test_a_killed_run_goes_on_and_gives_the_same_bytes(sequence, tmp_path, monke
     )
 
 
-def test_a_changed_image_is_not_taken_from_the_work_folder(sequence, tmp_path):
+def test_a_changed_image_is_not_taken_from_the_cache(sequence, tmp_path):
     out = tmp_path / "p.txt"
     assert build(sequence, out) == 0
     first = out.read_bytes()
@@ -429,7 +429,7 @@ def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, caps
     short.write_text("1 0 0 0 0 1 0 0 0 0 1 0\n")
     capsys.readouterr()
     for arguments, words in (
-        ([str(out), str(other)], "the side file names"),
+        ([str(out), str(other)], "the sidecar file names"),
         ([str(out), str(tmp_path / "none.txt")], "No such file"),
         ([str(tmp_path / "none.txt")], "jaxba-kitti writes it"),
         ([str(out), "--poses", str(short)], "has 1 poses"),
@@ -442,7 +442,7 @@ def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, caps
         assert not (tmp_path / "e").exists()
     (tmp_path / "p.frames.json").write_text("{}")
     assert run(["evaluate", str(out)]) == 2
-    assert "is no side file" in capsys.readouterr().err
+    assert "is not a sidecar file" in capsys.readouterr().err
 
 
 def test_an_error_that_is_not_finite_is_said_in_one_line(rendered, tmp_path, capsys):

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.datasets.kitti import keyframes
 from jaxba.datasets.kitti.assemble import assemble, poses_of_cameras, windows
+from jaxba.datasets.kitti.initial_poses import drift
 from jaxba.datasets.kitti.odometry import Odometry, visual_odometry
 from jaxba.datasets.kitti.sequence import Calibration
-from jaxba.datasets.kitti.starts import drift
 from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
-from jaxba.datasets.kitti.triangulate import Filters, Sightings, Views, triangulate, triangulate_robustly
+from jaxba.datasets.kitti.triangulate import Filters, Observations, Views, triangulate, triangulate_robustly
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 
@@ -32,17 +32,17 @@ def street(views: int = 6, points: int = 40, seed: int = 0) -> tuple[np.ndarray,
     return poses, Views(inverse, -np.einsum("nij,nj->ni", inverse, centers)), local + centers[0]
 
 
-def sight(views: Views, points: np.ndarray) -> Sightings:
+def sight(views: Views, points: np.ndarray) -> Observations:
     """Every point seen in every view."""
     count = len(views.rotation)
     camera, track = np.tile(np.arange(count), len(points)), np.repeat(np.arange(len(points)), count)
     local = np.einsum("nij,nj->ni", views.rotation[camera], points[track]) + views.translation[camera]
-    return Sightings(camera, track, local[:, :2] / local[:, 2:])
+    return Observations(camera, track, local[:, :2] / local[:, 2:])
 
 
-def as_tracks(sightings: Sightings) -> Tracks:
-    pixels = sightings.rays * [CALIBRATION.fx, CALIBRATION.fy] + [CALIBRATION.cx, CALIBRATION.cy]
-    return Tracks(sightings.camera, sightings.track, pixels)
+def as_tracks(observations: Observations) -> Tracks:
+    pixels = observations.rays * [CALIBRATION.fx, CALIBRATION.fy] + [CALIBRATION.cx, CALIBRATION.cy]
+    return Tracks(observations.camera, observations.track, pixels)
 
 
 # Tracks
@@ -177,7 +177,7 @@ def steps_of(found: Odometry) -> np.ndarray:
     return lengths / lengths[0]
 
 
-def test_the_few_known_points_that_two_views_share_tell_the_length_of_the_step():
+def test_the_few_known_points_that_two_views_share_give_the_length_of_the_step():
     """View 4 is 2.5 steps away from view 3 and knows 8 points of it, too few to be placed by them."""
     tracks = drive([1.0, 1.0, 1.0, 2.5], [[0, 1, 2, 3], [3, 4], [0, 1, 2, 3, 4]])
     tracks = tracks.keep((tracks.track < 160 + 8), 2)
@@ -186,7 +186,7 @@ def test_the_few_known_points_that_two_views_share_tell_the_length_of_the_step()
     np.testing.assert_allclose(steps_of(found), [1, 1, 1, 2.5], rtol=0.03)
 
 
-def test_without_known_points_a_step_has_the_pace_of_the_steps_before():
+def test_without_known_points_a_step_has_the_speed_of_the_steps_before():
     """View 4 is three frames after view 3 and shares no known point with it."""
     tracks = drive([1.0, 1.0, 1.0, 3.0], [[0, 1, 2, 3], [3, 4]])
     found = visual_odometry(tracks, 5, CALIBRATION, Filters(), 0, (0, 1, 2, 3, 6))
@@ -228,25 +228,25 @@ def test_wrong_matches_of_the_first_views_do_not_make_the_start():
 
 def test_exact_rays_give_exact_points():
     _, views, points = street()
-    sightings = sight(views, points)
-    found = triangulate(views, sightings)
+    observations = sight(views, points)
+    found = triangulate(views, observations)
     np.testing.assert_allclose(found.points, points, rtol=1e-9)
     assert found.error.max() < 1e-12
-    local = np.einsum("nij,nj->ni", views.rotation[sightings.camera], points[sightings.track])
-    np.testing.assert_allclose(found.depth, (local + views.translation[sightings.camera])[:, 2], rtol=1e-8)
+    local = np.einsum("nij,nj->ni", views.rotation[observations.camera], points[observations.track])
+    np.testing.assert_allclose(found.depth, (local + views.translation[observations.camera])[:, 2], rtol=1e-8)
 
 
 def test_noisy_rays_give_the_least_squares_point():
     """The same minimum by SciPy."""
     _, views, points = street(points=5)
-    sightings = sight(views, points)
-    rays = sightings.rays + 1e-3 * np.random.default_rng(2).standard_normal(sightings.rays.shape)
-    found = triangulate(views, Sightings(sightings.camera, sightings.track, rays))
+    observations = sight(views, points)
+    rays = observations.rays + 1e-3 * np.random.default_rng(2).standard_normal(observations.rays.shape)
+    found = triangulate(views, Observations(observations.camera, observations.track, rays))
     for track in range(5):
-        rows = sightings.track == track
+        rows = observations.track == track
 
         def residual(x, rows=rows):
-            local = views.rotation[sightings.camera[rows]] @ x + views.translation[sightings.camera[rows]]
+            local = views.rotation[observations.camera[rows]] @ x + views.translation[observations.camera[rows]]
             return (local[:, :2] / local[:, 2:] - rays[rows]).ravel()
 
         best = least_squares(residual, points[track], xtol=1e-15, ftol=1e-15, gtol=1e-15)
@@ -269,29 +269,31 @@ def test_filters_refuse_points_behind_far_and_wrong():
     behind[0] = points[0] - [0, 0, 200]
     far[1] = points[1] + [0, 0, 5000]
     where = np.array([behind[0], far[1], points[2], points[3]])
-    sightings = sight(views, where)
-    rays = sightings.rays.copy()
-    wrong = np.flatnonzero((sightings.track == 2) & (sightings.camera == 3))
+    observations = sight(views, where)
+    rays = observations.rays.copy()
+    wrong = np.flatnonzero((observations.track == 2) & (observations.camera == 3))
     rays[wrong] += 0.1
-    spoiled = Sightings(sightings.camera, sightings.track, rays)
+    spoiled = Observations(observations.camera, observations.track, rays)
     good = triangulate(views, spoiled).good(spoiled.track, Filters(), focal)
     assert good.tolist() == [False, False, False, True]
 
 
-def test_one_wrong_sighting_costs_a_long_track_only_itself():
+def test_one_wrong_observation_costs_a_long_track_only_itself():
     _, views, points = street(views=8, points=3)
-    sightings = sight(views, points)
-    rays = sightings.rays.copy()
-    wrong = np.flatnonzero((sightings.track == 1) & (sightings.camera == 7))
+    observations = sight(views, points)
+    rays = observations.rays.copy()
+    wrong = np.flatnonzero((observations.track == 1) & (observations.camera == 7))
     rays[wrong] += 6 / 700
-    found, keep = triangulate_robustly(views, Sightings(sightings.camera, sightings.track, rays), Filters(), 700.0)
+    found, keep = triangulate_robustly(
+        views, Observations(observations.camera, observations.track, rays), Filters(), 700.0
+    )
     assert np.flatnonzero(~keep).tolist() == wrong.tolist()
     np.testing.assert_allclose(found, points, rtol=1e-6)
 
 
 def test_no_tracks_are_no_error():
     _, views, _ = street()
-    empty = Sightings(np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
+    empty = Observations(np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
     points, keep = triangulate_robustly(views, empty, Filters(), 700.0)
     assert points.shape == (0, 3)
     assert keep.shape == (0,)
@@ -330,15 +332,15 @@ def test_a_sigma_that_makes_no_sense_is_refused(sigmas):
 
 
 def test_the_problem_reprojects_exactly_through_bals_camera():
-    """`jaxba.geometry`'s camera looks down -z with y up; fy differs from fx."""
+    """The camera of BAL looks down -z with y up; fy differs from fx."""
     _, views, points = street()
-    sightings = sight(views, points)
-    made = assemble(as_tracks(sightings), views, CALIBRATION, (3, 4, 5, 6, 7, 9), NEARLY_ALL, 2)
+    observations = sight(views, points)
+    made = assemble(as_tracks(observations), views, CALIBRATION, (3, 4, 5, 6, 7, 9), NEARLY_ALL, 2)
     problem = made.problem
     assert made.frames == (3, 4, 5, 6, 7, 9)
-    assert (problem.num_points, problem.num_observations) == (len(points), len(sightings.track))
+    assert (problem.num_points, problem.num_observations) == (len(points), len(observations.track))
     np.testing.assert_allclose(geometry.residuals(problem), 0, atol=1e-6)
-    np.testing.assert_allclose(problem.observations, CALIBRATION.fx * sightings.rays * [1, -1], atol=1e-9)
+    np.testing.assert_allclose(problem.observations, CALIBRATION.fx * observations.rays * [1, -1], atol=1e-9)
     assert (geometry.depths(problem) > 0).all()
     assert (problem.cameras[:, 6:] == [CALIBRATION.fx, 0, 0]).all()
 
@@ -351,9 +353,9 @@ def test_cameras_and_poses_are_the_same_thing():
 
 def test_points_drift_with_the_first_camera_that_sees_them():
     poses, views, points = street()
-    sightings = sight(views, points)
-    late = sightings.camera >= np.where(sightings.track % 2, 2, 0)  # odd points are first seen by camera 2
-    tracks = as_tracks(Sightings(*(part[late] for part in sightings)))
+    observations = sight(views, points)
+    late = observations.camera >= np.where(observations.track % 2, 2, 0)  # odd points are first seen by camera 2
+    tracks = as_tracks(Observations(*(part[late] for part in observations)))
     noisy = drift(poses, 0.3, 0.1, 5)
     inverse = noisy[:, :, :3].transpose(0, 2, 1)
     start = Views(inverse, -np.einsum("nij,nj->ni", inverse, noisy[:, :, 3]))

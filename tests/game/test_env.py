@@ -18,9 +18,10 @@ from support import same_bits, solve
 from tiny_game import AGENT, KIND, RULES, grid, problem_of, tiny_bank, tiny_game
 
 from jaxba import StepOptions, make_method, make_policy
-from jaxba.damping.agent import begin, damping_of, observe
-from jaxba.damping.learned import Layer, Learned
-from jaxba.game.env import POINT_ITERATION_COST, SHAPING_FLOOR, Game, GameConfig
+from jaxba.damping.features import begin, observation_size, observe
+from jaxba.damping.guard import damping_of
+from jaxba.damping.learned import Layer, LearnedPolicy
+from jaxba.game.env import POINT_ITERATION_COST, Game, GameConfig
 from jaxba.game.evaluate import evaluate, play_all, score, scores
 from jaxba.game.protocol import Environment
 from jaxba.game.random_scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
@@ -249,9 +250,9 @@ def test_a_network_meets_in_a_solve_what_it_meets_in_the_game(method):
     """Each of its lambdas in a solve is the one it chose in the game, so its observations were the same."""
     options = make_method(method).options(StepOptions())
     rng = np.random.default_rng(2)
-    size = AGENT.observation_size
+    size = observation_size(AGENT)
     draw = lambda *shape: rng.normal(size=shape).astype(np.float32)
-    policy = Learned((Layer(draw(size, 8), draw(8)), Layer(draw(8, 2), draw(2))), AGENT)
+    policy = LearnedPolicy((Layer(draw(size, 8), draw(8)), Layer(draw(8, 2), draw(2))), AGENT)
     bank = tiny_bank()
     found = play(KIND, bank, policy, options, LIMIT)
     limit = int(bank.info.max_iterations[0])
@@ -295,7 +296,7 @@ def random_game(limit_is_failure: bool):
 def test_the_game_keeps_the_contract_of_an_environment():
     game, found = random_game(False)
     assert isinstance(game, Environment)
-    assert (game.num_envs, game.observation_size, game.action_size) == (ENVS, AGENT.observation_size, 1)
+    assert (game.num_envs, game.observation_size, game.action_size) == (ENVS, observation_size(AGENT), 1)
     for _, seen, _, step in found:
         assert seen.shape == step.observation.shape == step.final_observation.shape == (ENVS, game.observation_size)
         assert seen.dtype == step.observation.dtype == step.reward.dtype == np.float32
@@ -319,13 +320,13 @@ def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else(limit_is_f
         (episodes,) = before.episodes
         best = np.asarray(bank.best_cost)[episodes.scene]
         cost = np.array([_alone(game, episodes, action, e) for e in range(ENVS)]) if k < 12 else None
-        at_limit = episodes.memory.iteration + 1 >= RULES.max_iterations
+        at_limit = episodes.memory.guard.iteration + 1 >= RULES.max_iterations
         success = step.metrics["success"] > 0
         if cost is not None:
             np.testing.assert_array_equal(success, cost <= best * (1 + RULES.tolerance))
         np.testing.assert_array_equal(step.terminated, success | (at_limit if limit_is_failure else False))
         np.testing.assert_array_equal(step.truncated, False if limit_is_failure else at_limit & ~success)
-        np.testing.assert_array_equal(step.metrics["length"], episodes.memory.iteration + 1)
+        np.testing.assert_array_equal(step.metrics["length"], episodes.memory.guard.iteration + 1)
         goals, limits = goals + success.sum(), limits + (at_limit & ~success).sum()
     assert goals >= 5
     assert limits >= 5
@@ -365,7 +366,7 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
                 np.testing.assert_allclose(step.final_observation[e], observe(AGENT, after.memory), atol=1e-5)
         if k + 1 < len(found):
             (following,) = found[k + 1][0].episodes
-            assert (following.memory.iteration[done] == 0).all()
+            assert (following.memory.guard.iteration[done] == 0).all()
             np.testing.assert_array_equal(
                 following.state.cost[done], np.asarray(tiny_bank().initial_cost)[following.scene[done]]
             )
@@ -374,27 +375,15 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
     assert len(scenes) > 10  # of the whole bank, not the same ones again
 
 
-def _reward(
-    config: GameConfig,
-    cost: float,
-    before: float,
-    best: float,
-    iteration: int,
-    success: bool,
-    over: bool,
-    repairs: int = 0,
-):
+def _reward(config: GameConfig, cost: float, best: float, iteration: int, success: bool):
     """By hand; `iteration` counts from one."""
     bonus = config.bonus if success else 0.0
     value = {
-        "duration": bonus - 1 - config.repair_cost * repairs,  # no point iterations in this game
+        "duration": bonus - 1,  # no point iterations in this game
         "constant": bonus - 1,
         "reduction": bonus * (1 - 0.01 * (iteration - 1)),
         "reversed": bonus - np.log10(cost / best),
     }[config.reward]
-    if config.shaping:
-        far = lambda c: np.log10(max(c / best - 1, SHAPING_FLOOR))
-        value += config.shaping * (far(before) - (0.0 if over else config.discount * far(cost)))
     return config.scale * value
 
 
@@ -402,15 +391,11 @@ def _reward(
     "config",
     [
         replace(RULES, reward="duration"),
-        replace(RULES, reward="duration", repair_cost=0.4),
         replace(RULES, reward="constant", bonus=3.0, scale=1.0),
         replace(RULES, reward="reduction"),
         replace(RULES, reward="reversed"),
-        replace(RULES, reward="constant", shaping=0.5, limit_is_failure=True),
     ],
-    ids=lambda config: (
-        config.reward + ("+shaping" if config.shaping else "") + ("+repairs" if config.repair_cost else "")
-    ),
+    ids=lambda config: config.reward,
 )
 def test_rewards_are_those_of_the_contract(config):
     """By `Game._reward` alone, on made-up steps: no program of its own for each."""
@@ -425,17 +410,14 @@ def test_rewards_are_those_of_the_contract(config):
         (1.0, 1.2, 1.0, 3),
     ):
         success = cost <= best * (1 + config.tolerance)
-        over = success or (config.limit_is_failure and iteration >= config.max_iterations)
-        repairs = iteration - 1
-        step = step_info(True, cost=cost, previous_cost=before)._replace(repairs=jnp.asarray(repairs, jnp.int32))
+        step = step_info(True, cost=cost, previous_cost=before)
         found = game._reward(
             step,
-            memory._replace(iteration=jnp.asarray(iteration, jnp.int32)),
+            memory._replace(guard=memory.guard._replace(iteration=jnp.asarray(iteration, jnp.int32))),
             jnp.asarray(best),
             jnp.asarray(success),
-            jnp.asarray(over),
         )
-        want = _reward(config, cost, before, best, iteration, success, over, repairs)
+        want = _reward(config, cost, best, iteration, success)
         np.testing.assert_allclose(found, want, rtol=1e-9)
 
 
@@ -449,7 +431,7 @@ def test_a_point_iteration_costs_a_tenth_of_a_linear_solve():
     game = dataclasses.replace(tiny_game(), options=StepOptions(refinement=Refinement(points=3)))
     memory = begin(AGENT, tiny_info())
     no = jnp.asarray(False)
-    found = game._reward(step_info(True, cost=5.0, previous_cost=9.0), memory, jnp.asarray(1.0), no, no)
+    found = game._reward(step_info(True, cost=5.0, previous_cost=9.0), memory, jnp.asarray(1.0), no)
     np.testing.assert_allclose(found, -RULES.scale * (1 + 3 * POINT_ITERATION_COST))
     assert POINT_ITERATION_COST == 0.1
 
@@ -465,9 +447,7 @@ def test_the_game_pays_what_it_says():
             success = bool(step.metrics["success"][e])
             best = float(np.asarray(tiny_bank().best_cost)[episodes.scene[e]])
             cost = best if step.terminated[e] or step.truncated[e] else float(following.state.cost[e])
-            want = _reward(
-                game.config, cost, float(episodes.state.cost[e]), best, int(step.metrics["length"][e]), success, False
-            )
+            want = _reward(game.config, cost, best, int(step.metrics["length"][e]), success)
             np.testing.assert_allclose(step.reward[e], want, rtol=1e-5)
             checked += 1
     assert checked == 49 * ENVS
@@ -491,16 +471,18 @@ def _shifted(bank: Bank) -> Bank:
     return jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), bank)
 
 
-@pytest.mark.parametrize("action", ["absolute", "relative"])
-def test_demonstrations_are_actions_of_which_some_follow_ceres_rule(action):
-    agent = replace(AGENT, action=action)
-    game = tiny_game(replace(RULES, agent=agent), 8)
+def test_demonstrations_are_actions_of_which_some_follow_ceres_rule():
+    game = tiny_game(envs=8)
     state, _ = _jitted_reset(game, jax.random.key(0))
     found = np.asarray(game.demonstrate(state, jax.random.key(1)))
     assert found.shape == (8, 1)
     assert (np.abs(found) < 1).all()
     lambdas = [
-        float(damping_of(agent, jax.tree.map(lambda x, e=e: x[e], state.episodes[0].memory), jnp.asarray(found[e, 0])))
+        float(
+            damping_of(
+                AGENT, jax.tree.map(lambda x, e=e: x[e], state.episodes[0].memory.guard), jnp.asarray(found[e, 0])
+            )
+        )
         for e in range(8)
     ]
     np.testing.assert_allclose([lambdas[1], lambdas[5]], 1e-4, rtol=1e-4)  # Ceres' first lambda
@@ -516,7 +498,7 @@ def test_demonstrations_are_actions_of_which_some_follow_ceres_rule(action):
         {"tolerance": 0.0},
         {"scale": -1.0},
         {"tolerance": -1e-3},
-        {"repair_cost": -0.1},
+        {"bonus": -0.1},
     ],
 )
 @pytest.mark.usefixtures("unchecked")

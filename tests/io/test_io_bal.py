@@ -114,7 +114,7 @@ def test_whitening_is_not_written(tmp_path):
     assert read_bal(tmp_path / "a.txt").whitening is None
 
 
-def test_compression_is_told_by_content_when_the_name_is_silent(tmp_path):
+def test_compression_is_recognised_by_content_whatever_the_name(tmp_path):
     problem = random_problem(0)
     for suffix in SUFFIXES[1:]:
         write_bal(problem, tmp_path / f"a{suffix}")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxba.linear.band_cholesky import band_factor, band_factor_and_solve, band_rows
-from jaxba.runtime.process import calm_blas
+from jaxba.runtime.process import single_blas_thread
 from jaxba.structure.camera_ordering import TILE_CAMERAS, Band, band_of
 
 solve = jax.jit(band_factor_and_solve)
@@ -31,7 +31,7 @@ SHAPES = [
 @pytest.fixture(autouse=True, scope="module")
 def one_blas_thread():
     """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with calm_blas():
+    with single_blas_thread():
         yield
 
 

@@ -12,7 +12,7 @@ from support import start, step
 
 from jaxba import BundleProblem, StepOptions
 from jaxba.problem.options import ConjugateGradients
-from jaxba.runtime.process import calm_blas
+from jaxba.runtime.process import single_blas_thread
 from jaxba.scenes import SceneConfig, random_scene
 from jaxba.structure.layout import layout_for
 
@@ -33,7 +33,7 @@ DAMPING = 1e-4
 @pytest.fixture(autouse=True, scope="module")
 def one_blas_thread():
     """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with calm_blas():
+    with single_blas_thread():
         yield
 
 

@@ -24,7 +24,7 @@ from jaxba.linear.two_level import MODES, Anchor, camera_modes, cluster_sum, coa
 from jaxba.model import camera
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates
-from jaxba.runtime.process import calm_blas
+from jaxba.runtime.process import single_blas_thread
 from jaxba.structure import camera_clusters
 from jaxba.structure.layout import layout_for
 
@@ -35,7 +35,7 @@ IDENTITY = Coordinates(rotation="manifold", scaling="identity")
 @pytest.fixture(autouse=True, scope="module")
 def one_blas_thread():
     """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with calm_blas():
+    with single_blas_thread():
         yield
 
 

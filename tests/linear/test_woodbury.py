@@ -12,7 +12,7 @@ from jaxba import StepOptions, build_layout, initial_state, like, lm_step, rando
 from jaxba.linear import reduced_system
 from jaxba.linear.schur import CameraSystem
 from jaxba.linear.woodbury import capacitance_solve
-from jaxba.runtime.process import calm_blas
+from jaxba.runtime.process import single_blas_thread
 from jaxba.structure.density import has_few_points
 
 CAMERAS, COLUMNS = 4, 6
@@ -21,7 +21,7 @@ CAMERAS, COLUMNS = 4, 6
 @pytest.fixture(autouse=True, scope="module")
 def one_blas_thread():
     """Beside another busy process several threads make a dense factorisation fifty times slower."""
-    with calm_blas():
+    with single_blas_thread():
         yield
 
 

@@ -34,7 +34,7 @@ from jaxba.methods.stba import (
 )
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock
 from jaxba.structure.layout import partition_of
 
 CLUSTERED = StepOptions(method=StochasticClusters(cluster_cameras=2))

@@ -15,7 +15,7 @@ from jaxba import BundleProblem, Loss, StepOptions, build_layout, initial_state
 from jaxba.model.linearize import point_terms, slot_frames
 from jaxba.model.observations import point_passes
 from jaxba.refinement.points import refine_points
-from jaxba.runtime.single_loop import in_haste
+from jaxba.runtime.fusion import fast_compilation
 from jaxba.structure.layout import Layout
 from jaxba.structure.padding import capacity_of
 
@@ -49,7 +49,7 @@ def sums(layout: Layout, problem: BundleProblem, loss: Loss, haste: bool, dtype:
 
     columns = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = columns < problem.num_points
-    with in_haste(haste):
+    with fast_compilation(haste):
         values = np.asarray(jax.jit(found)(layout, problem))
     result = np.zeros((len(values), problem.num_points))
     result[:, columns[real]] = values[:, : len(columns)][:, real]
@@ -111,7 +111,7 @@ def test_vectors_over_slots_reach_the_slots_they_belong_to():
     truth = np.bincount(np.asarray(layout.slot_point), numbers, minlength=layout.num_points)
 
     for haste in (True, False):
-        with in_haste(haste):
+        with fast_compilation(haste):
             one_pass = point_passes(layout, slot_frames(layout, state.cameras))
             found = one_pass(state.points, lambda views, number: [number], jnp.asarray(numbers))[0]
         np.testing.assert_array_equal(found, truth)
@@ -123,7 +123,7 @@ def test_point_iterations_are_the_same_in_haste(loss):
     layout, state = start(problem)
 
     def found(haste: bool):
-        with in_haste(haste):
+        with fast_compilation(haste):
             frames = slot_frames(layout, state.cameras)
             return jax.jit(lambda layout, points: refine_points(layout, frames, points, loss, 3))(layout, state.points)
 

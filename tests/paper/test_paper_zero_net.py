@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from tiny_game import tiny_bank, tiny_game
 
-from jaxba.damping.agent import AgentConfig, damping_of
+from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.guard import damping_of
 from jaxba.damping.learned import Layer
 from jaxba.game.env import GameConfig
 from jaxba.paper import zero_net
@@ -60,7 +61,7 @@ def test_the_slope_of_the_next_cost_is_that_of_differences(scene, action):
     expected = (next_cost(episode, action + h) - next_cost(episode, action - h)) / (2 * h)
     assert float(change) == pytest.approx(next_cost(episode, action), abs=1e-9)
     assert float(slope) == pytest.approx(expected, rel=1e-4, abs=1e-6)
-    assert int(after.memory.iteration) == 2
+    assert int(after.memory.guard.iteration) == 2
     assert float(step.damping) == pytest.approx(10 ** (-2 + 4 * action))
 
 
@@ -88,7 +89,7 @@ def test_the_network_sees_errors_actions_and_rewards_of_the_last_steps():
     rms = lambda cost: np.sqrt(2 * float(cost) / float(first.info.observations))
     errors = [min(rms(cost), 1000.0) for cost in (step.cost, one.state.cost, first.cost)]
     assert seen[0] == pytest.approx(errors, rel=1e-6)
-    decades = [np.log10(float(damping_of(AGENT, first, jnp.asarray(a)))) for a in (-0.5, 0.25)]
+    decades = [np.log10(float(damping_of(AGENT, first.guard, jnp.asarray(a)))) for a in (-0.5, 0.25)]
     assert seen[1] == pytest.approx([*((d + 4) / 6 for d in decades), 0.0], abs=1e-6)
     assert seen[2].tolist() == [-1.0, -1.0, 0.0]
 

@@ -34,7 +34,7 @@ from jaxba.bench.records import read_records
 from jaxba.cli.bench import run as run_bench
 from jaxba.problem import geometry
 from jaxba.problem.options import Coordinates, Refinement
-from jaxba.runtime.compile_clock import CompileClock
+from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.names import parse_solver
 
 pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")

@@ -11,7 +11,7 @@ from jaxba import peers
 from jaxba.bench import run as bench_run
 from jaxba.bench.sources import sources
 from jaxba.cli.bench import run
-from jaxba.damping import Learned, UnknownPolicyError
+from jaxba.damping import LearnedPolicy, UnknownPolicyError
 from jaxba.problem.options import StepOptions
 from jaxba.solver.names import PEERS, SolverName, SolverNameError, parse_solver
 
@@ -68,7 +68,7 @@ def test_what_is_no_peer_is_one_clear_line(text, error, message):
 
 def test_without_embedded_iterations_a_policy_for_lambda_alone_drives_a_peer():
     policy, options = parse_solver("pyceres:dense+learned+refine0").build()
-    assert isinstance(policy, Learned)
+    assert isinstance(policy, LearnedPolicy)
     assert (policy.config.refine_points, policy.config.trials, policy.config.camera_rounds) == (0, 1, 0)
     assert options == StepOptions()
 
@@ -76,8 +76,8 @@ def test_without_embedded_iterations_a_policy_for_lambda_alone_drives_a_peer():
 def test_a_learned_policy_brings_its_embedded_iterations_to_a_peer():
     policy, options = parse_solver("pyceres:dense+learned").build()
     ours, same = parse_solver("learned").build()
-    assert isinstance(policy, Learned)
-    assert isinstance(ours, Learned)
+    assert isinstance(policy, LearnedPolicy)
+    assert isinstance(ours, LearnedPolicy)
     assert policy.config == ours.config
     assert options == same
 

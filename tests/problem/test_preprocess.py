@@ -13,7 +13,17 @@ from support import solve
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import angle_axis, camera_centers, cost, depths, project, residuals, rotation_matrices
+from jaxba.problem.geometry import (
+    angle_axis,
+    bal_rotations,
+    camera_centers,
+    colmap_quaternions,
+    cost,
+    depths,
+    project,
+    residuals,
+    rotation_matrices,
+)
 from jaxba.problem.preprocess import FAR, drop_invalid, far_middle, normalize, perturb, poba_start, shift
 
 DATA = os.environ.get("JAXBA_DATA")
@@ -83,9 +93,32 @@ def test_angle_axis_near_half_a_turn_is_the_same_rotation(angle):
     np.testing.assert_allclose(rotation_matrices(vectors), matrices, atol=1e-14)
 
 
-def test_angle_axis_equals_scipy_on_random_rotations():
-    rotations = Rotation.from_quat(np.random.default_rng(5).standard_normal((1000, 4)))
-    np.testing.assert_allclose(angle_axis(rotations.as_matrix()), rotations.as_rotvec(), atol=1e-13)
+@pytest.mark.parametrize("angle", [*ANGLES, 4.0, 7.0])
+def test_colmaps_quaternions_are_the_rotations_after_a_half_turn_about_x(angle):
+    vectors = angle * axes(5, 50)
+    vectors.setflags(write=False)  # as arrays of JAX are on the host
+    found = Rotation.from_quat(colmap_quaternions(vectors)).as_matrix()
+    np.testing.assert_allclose(found, np.diag([1, -1, -1]) @ rotation_matrices(vectors), atol=4e-15)
+
+
+@pytest.mark.parametrize("angle", ANGLES[:-1])
+def test_rotations_come_back_from_colmaps_quaternions_of_any_sign_and_norm(angle):
+    vectors = angle * axes(6, 50)
+    for scale in (1.0, -1.0, 0.3):
+        found = bal_rotations(scale * colmap_quaternions(vectors))
+        np.testing.assert_allclose(found, vectors, rtol=1e-15, atol=2e-15)
+
+
+def test_a_half_turn_comes_back_from_colmaps_quaternions_with_either_sign():
+    vectors = np.pi * axes(7, 50)
+    found = bal_rotations(colmap_quaternions(vectors))
+    np.testing.assert_allclose(found * np.sign((found * vectors).sum(1, keepdims=True)), vectors, atol=2e-15)
+
+
+def test_a_quaternion_that_is_no_rotation_gives_no_number():
+    found = bal_rotations(np.array([[np.nan, 0, 0, 1], [0, 0, 0, 0], [1, 0, 0, 0]]))
+    np.testing.assert_array_equal(np.isnan(found), [[True] * 3, [True] * 3, [False] * 3])
+    np.testing.assert_array_equal(found[2], 0)
 
 
 # Cameras

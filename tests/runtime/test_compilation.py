@@ -1,4 +1,4 @@
-"""Quickly compiled programs: they compute the same, give way to optimised ones, and can be switched off."""
+"""Programs compiled at lower levels: they compute the same, are replaced by optimised ones, and can be switched off."""
 
 from __future__ import annotations
 
@@ -20,45 +20,45 @@ from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import compilation
 from jaxba.runtime.compilation import (
-    PAYS,
-    CompiledTogether,
+    BREAK_EVEN,
+    Level,
+    ParallelCompilation,
     Part,
     Program,
     Stage,
-    Way,
-    options_of,
+    compiler_options,
+    level_after,
     program,
     stages,
-    way_after,
 )
 
 pytestmark = pytest.mark.step
 
-on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU has a quick way")
+on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU has lower levels")
 
 
 @pytest.mark.parametrize("part", get_args(Part))
-def test_the_more_observations_the_better_programs_are_compiled_and_the_sooner(part):
-    typical, quick, brisk = PAYS[part]
-    assert stages(part, 1) == (("quick", quick), ("brisk", brisk))
-    assert stages(part, 100) == (("quick", quick // 100), ("brisk", brisk // 100))
-    assert stages(part, quick // typical) == (("quick", typical), ("brisk", brisk // (quick // typical)))
-    assert [way for way, _ in stages(part, quick // (typical - 1))] == ["brisk"]
-    assert stages(part, brisk // typical) == (("brisk", typical),)
-    assert stages(part, brisk // (typical - 1)) == stages(part, 10**9) == ()
+def test_more_observations_mean_better_levels_and_shorter_stages(part):
+    typical, quick, medium = BREAK_EVEN[part]
+    assert stages(part, 1) == (("quick", quick), ("medium", medium))
+    assert stages(part, 100) == (("quick", quick // 100), ("medium", medium // 100))
+    assert stages(part, quick // typical) == (("quick", typical), ("medium", medium // (quick // typical)))
+    assert [level for level, _ in stages(part, quick // (typical - 1))] == ["medium"]
+    assert stages(part, medium // typical) == (("medium", typical),)
+    assert stages(part, medium // (typical - 1)) == stages(part, 10**9) == ()
     assert sum(runs for _, runs in stages(part, 31_843)) > 100, "Ladybug-49 converges before that"
 
 
-def test_a_program_gives_way_to_a_better_one_when_it_was_run_often_enough():
-    both = (Stage("quick", 2), Stage("brisk", 3))
-    assert [way_after(runs, both) for runs in range(7)] == ["quick"] * 2 + ["brisk"] * 3 + ["full"] * 2
-    assert way_after(0, ()) == "full"
+def test_a_program_is_replaced_by_a_better_one_after_its_runs():
+    both = (Stage("quick", 2), Stage("medium", 3))
+    assert [level_after(runs, both) for runs in range(7)] == ["quick"] * 2 + ["medium"] * 3 + ["full"] * 2
+    assert level_after(0, ()) == "full"
 
 
 @on_a_cpu
-def test_this_jaxlib_knows_both_hasty_ways():
-    assert {way: options_of(way) for way in ("quick", "brisk")} == compilation.HASTE
-    assert options_of("full") is None
+def test_this_jaxlib_knows_the_options_of_both_lower_levels():
+    assert {level: compiler_options(level) for level in ("quick", "medium")} == compilation.COMPILER_OPTIONS
+    assert compiler_options("full") is None
 
 
 @pytest.mark.fully_compiled
@@ -77,11 +77,11 @@ def test_this_jaxlib_knows_both_hasty_ways():
     ],
     ids=str,
 )
-def test_a_quickly_compiled_solve_is_the_same_solve(how):
+def test_a_solve_compiled_at_level_quick_is_the_same_solve(how):
     full = solve(support.tiny(), **how, max_iterations=8, callback=lambda record: None)
     quick = solve(support.tiny(), **how, max_iterations=8, compilation="quick")
     assert full.quick_iterations == 0
-    assert quick.quick_iterations == (quick.iterations if options_of("quick") else 0)
+    assert quick.quick_iterations == (quick.iterations if compiler_options("quick") else 0)
     assert (quick.iterations, quick.accepted, quick.termination) == (full.iterations, full.accepted, full.termination)
     np.testing.assert_allclose(quick.history.cost, full.history.cost, rtol=1e-8)
     # a network of, among others, the last digits of a decrease
@@ -91,13 +91,19 @@ def test_a_quickly_compiled_solve_is_the_same_solve(how):
 @pytest.mark.fully_compiled
 @on_a_cpu
 @pytest.mark.parametrize("how", [{}, {"linear_solver": "implicit"}, {"method": "ddlm"}, {"method": "stba"}], ids=str)
-def test_a_briskly_compiled_solve_is_the_same_solve(how, monkeypatch):
+def test_a_solve_compiled_at_level_medium_is_the_same_solve(how, monkeypatch):
     full = solve(support.tiny(), "learned", **how, max_iterations=8, callback=lambda record: None)
-    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("brisk", 100),))
-    brisk = solve(support.tiny(), "learned", **how, max_iterations=8, compilation="auto")
-    assert (full.quick_iterations, brisk.quick_iterations) == (0, brisk.iterations)
-    assert (brisk.iterations, brisk.accepted, brisk.termination) == (full.iterations, full.accepted, full.termination)
-    np.testing.assert_allclose(brisk.history.cost, full.history.cost, rtol=1e-8)
+    monkeypatch.setattr(
+        importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("medium", 100),)
+    )
+    medium = solve(support.tiny(), "learned", **how, max_iterations=8, compilation="auto")
+    assert (full.quick_iterations, medium.quick_iterations) == (0, medium.iterations)
+    assert (medium.iterations, medium.accepted, medium.termination) == (
+        full.iterations,
+        full.accepted,
+        full.termination,
+    )
+    np.testing.assert_allclose(medium.history.cost, full.history.cost, rtol=1e-8)
 
 
 @pytest.mark.xla
@@ -146,22 +152,22 @@ class Failing(Program):
 
 
 def _compile(functions):
-    with CompiledTogether() as together:
+    with ParallelCompilation() as compile_programs:
         for function in functions:
-            together(function)
+            compile_programs(function)
 
 
-def test_a_failed_compilation_is_told_whoever_was_at_it():
+def test_a_failed_compilation_is_raised_whichever_thread_it_was_in():
     for count in (1, 2, 5):
         with pytest.raises(RuntimeError, match="no memory left"):
             _compile([Failing() for _ in range(count)])
 
 
 def test_nothing_more_is_compiled_after_an_error():
-    def interrupted():  # not by a signal: who starts tests in the background may have them ignore it
+    def interrupted():  # not by a signal: tests started in the background may ignore it
         raise KeyboardInterrupt
 
-    def slow():  # programs are compiled once each, so that these are as many; all that one does is to take its time
+    def slow():  # a program is compiled once, so each is a new one; it only takes its time
         program = Failing()
         program.compile = lambda: compiled.append(time.sleep(0.05))
         return program
@@ -177,10 +183,10 @@ def test_nothing_more_is_compiled_after_an_error():
 @pytest.mark.fully_compiled
 @on_a_cpu
 @pytest.mark.parametrize("watched", [True, False])
-def test_the_optimised_program_takes_over_without_a_trace(watched, monkeypatch):
+def test_the_optimised_program_takes_over_and_the_records_go_on(watched, monkeypatch):
     full = solve(support.tiny(), "ceres")
     assert full.iterations > 2
-    before = {"factored": (Stage("quick", 1),), "try_step": (Stage("quick", 1), Stage("brisk", 1))}
+    before = {"factorization": (Stage("quick", 1),), "acceptance": (Stage("quick", 1), Stage("medium", 1))}
     monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: before[part])
     records = []
     callback = records.append if watched else None
@@ -197,8 +203,8 @@ def test_the_optimised_program_takes_over_without_a_trace(watched, monkeypatch):
 
 @pytest.mark.xla
 @on_a_cpu
-def test_a_second_quick_solve_compiles_nothing_and_each_way_has_its_program():
-    assert len({program(propose, "options", way=way) for way in get_args(Way)}) == 3
+def test_a_second_quick_solve_compiles_nothing_and_each_level_has_its_program():
+    assert len({program(propose, "options", level=level) for level in get_args(Level)}) == 3
     solve(support.paper(0), "ceres", max_iterations=3, compilation="quick")
     with Compilations() as seen:
         again = solve(support.paper(1), "ceres", max_iterations=3, compilation="quick")
@@ -213,23 +219,23 @@ def test_a_callback_stops_a_quick_solve():
 
 
 @on_a_cpu
-def test_iterations_of_solves_in_turns_are_added():
+def test_iterations_of_alternating_solves_are_added():
     turns = solve_and_retriangulate(support.tiny(), "ceres", SolveOptions(compilation="quick"))
     assert turns.quick_iterations == turns.iterations
 
 
 def test_where_the_options_are_unknown_programs_are_optimised(monkeypatch):
-    monkeypatch.setitem(compilation.HASTE, "quick", {"xla_no_such_option": True})
-    assert options_of.__wrapped__("quick") is None
+    monkeypatch.setitem(compilation.COMPILER_OPTIONS, "quick", {"xla_no_such_option": True})
+    assert compiler_options.__wrapped__("quick") is None
 
 
-def test_an_unknown_way_is_refused_in_one_line(unchecked):
+def test_an_unknown_choice_is_refused_in_one_line(unchecked):
     with pytest.raises(ValueError, match="compilation must be one of full, quick, auto, not 'fast'"):
         solve(support.tiny(), compilation="fast")
 
 
 @on_a_cpu
-def test_the_command_says_where_iterations_were_slow_by_design(tmp_path, capsys, monkeypatch):
+def test_the_command_reports_iterations_of_lower_levels(tmp_path, capsys, monkeypatch):
     path = tmp_path / "tiny.txt"
     write_problem(support.tiny(), path)
     fast = [str(path), "--max-iterations", "3", "--policy", "ceres", "--ftol", "0"]

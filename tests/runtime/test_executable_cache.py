@@ -1,4 +1,4 @@
-"""Compiled programs on disk: a later process finds them, runs the same ones, and mistakes none for another."""
+"""Compiled programs on disk: a later process finds them, runs the same ones, and confuses none with another."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from jaxba.io import write_problem
 from jaxba.lm.step import try_step
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import compilation, executable_cache
-from jaxba.runtime.compilation import CompiledTogether, Stage, program, run_alone
+from jaxba.runtime.compilation import ParallelCompilation, Stage, compile_and_run, program
 from jaxba.solver.retriangulate import retriangulate
 
 pytestmark = [
@@ -35,12 +35,12 @@ pytestmark = [
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path):
-    """Where programs are kept, and not in JAX's cache."""
+    """The folder of the cache; JAX's own is switched off."""
     cache = jax.config.values["jax_compilation_cache_dir"]
     use_cache_of_jax(None)
-    compilation.keep_in(tmp_path)
+    compilation.use_cache(tmp_path)
     yield tmp_path
-    compilation.keep_in(None)
+    compilation.use_cache(None)
     use_cache_of_jax(cache)
 
 
@@ -51,24 +51,24 @@ def use_cache_of_jax(folder):
 
 
 def forget():
-    """What a new process does not know."""
+    """Drops what a new process would not have in memory."""
     jax.clear_caches()
     executable_cache._load.cache_clear()
 
 
 def kept(folder):
-    return sorted(folder.glob(f"*{executable_cache.ENDING}"))
+    return sorted(folder.glob(f"*{executable_cache.SUFFIX}"))
 
 
 def double(x, power):
     return 2 * x**power
 
 
-double.__module__ = "jaxba.somewhere"  # others' functions are not kept
+double.__module__ = "jaxba.somewhere"  # functions of other packages are not stored
 
 
 class Rule(NamedTuple):
-    """As somebody might write one."""
+    """A pytree of a user."""
 
     value: jax.Array
 
@@ -79,7 +79,7 @@ class Choice:
 
 
 def call(x, power=1):
-    return run_alone(program(double, "power"), x, power)
+    return compile_and_run(program(double, "power"), x, power)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def call(x, power=1):
     ],
     ids=str,
 )
-def test_every_solve_finds_all_its_programs_and_repeats_itself_bit_by_bit(how, folder):
+def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how, folder):
     once = lambda: solve(support.tiny(), **how, max_iterations=4, callback=lambda record: None)
     first = once()
     count = len(kept(folder))
@@ -122,7 +122,7 @@ def test_every_solve_finds_all_its_programs_and_repeats_itself_bit_by_bit(how, f
     assert support.same_bits(first.problem, again.problem)
 
 
-def test_a_search_for_points_is_kept_too(folder):
+def test_retriangulation_is_stored_too(folder):
     first = retriangulate(support.tiny())
     assert len(kept(folder)) == 1
     forget()
@@ -156,15 +156,15 @@ def test_a_second_call_of_the_command_traces_no_step_and_writes_the_same_file(tm
         command = [sys.executable, "-c", COUNTING, str(problem), "--output", str(output)]
         environment = {**os.environ, "JAXBA_CACHE": str(folder)}
         environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-        told = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
-        ends.append((told.splitlines()[-1], output.read_bytes()))
+        printed = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+        ends.append((printed.splitlines()[-1], output.read_bytes()))
     assert ends[0][0] != "traced 0"
     assert ends[1][0] == "traced 0"
     assert ends[0][1] == ends[1][1]
 
 
 @pytest.mark.parametrize("content", [b"", b"no program", None], ids=["empty", "something else", "cut off"])
-def test_a_damaged_file_costs_a_compilation_and_is_mended(content, folder):
+def test_a_damaged_file_is_compiled_and_written_again(content, folder):
     x = jnp.arange(3.0)
     expected = np.asarray(call(x))
     (file,) = kept(folder)
@@ -178,39 +178,39 @@ def test_a_damaged_file_costs_a_compilation_and_is_mended(content, folder):
     assert "double" not in seen.names
 
 
-def test_another_question_is_another_program(folder, monkeypatch):
-    store = executable_cache.Store(folder)
+def test_everything_that_changes_a_program_changes_its_file(folder, monkeypatch):
+    cache = executable_cache.ExecutableCache(folder)
     x = jnp.arange(3.0)
-    place = functools.partial(store.place, double, {"power": 1}, (x,))
+    path = functools.partial(cache.path_for, double, {"power": 1}, (x,))
     layout, _ = support.start(support.tiny())
     fewer = dataclasses.replace(layout, buckets=layout.buckets[1:])
     learned = make_policy("learned")
     stricter = dataclasses.replace(learned, config=dataclasses.replace(learned.config, min_gain=0.2))
     others = [
-        store.place(try_step, {"power": 1}, (x,)),
-        *(store.place(double, {}, (tree,)) for tree in (layout, fewer, learned, stricter)),
-        store.place(double, {"power": 2}, (x,)),
-        store.place(double, {"power": StepOptions()}, (x,)),
-        store.place(double, {"power": StepOptions(refinement=Refinement(trials=2))}, (x,)),
-        store.place(double, {"power": 1}, (x.astype(jnp.float32),)),
-        store.place(double, {"power": 1}, (jnp.arange(4.0),)),
-        store.place(double, {"power": 1}, (1.0,)),
-        store.place(double, {"power": 1}, ((x,),)),
-        place({"xla_backend_optimization_level": 0}),
+        cache.path_for(try_step, {"power": 1}, (x,)),
+        *(cache.path_for(double, {}, (tree,)) for tree in (layout, fewer, learned, stricter)),
+        cache.path_for(double, {"power": 2}, (x,)),
+        cache.path_for(double, {"power": StepOptions()}, (x,)),
+        cache.path_for(double, {"power": StepOptions(refinement=Refinement(trials=2))}, (x,)),
+        cache.path_for(double, {"power": 1}, (x.astype(jnp.float32),)),
+        cache.path_for(double, {"power": 1}, (jnp.arange(4.0),)),
+        cache.path_for(double, {"power": 1}, (1.0,)),
+        cache.path_for(double, {"power": 1}, ((x,),)),
+        path({"xla_backend_optimization_level": 0}),
     ]
     with jax.enable_x64(False):
-        others.append(place())
+        others.append(path())
     with monkeypatch.context() as patch:
         patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
-        others.append(place())
+        others.append(path())
     with monkeypatch.context() as patch:
         patch.setattr(executable_cache, "_source", lambda: "another version of this package")
-        others.append(executable_cache.Store(folder).place(double, {"power": 1}, (x,)))
+        others.append(executable_cache.ExecutableCache(folder).path_for(double, {"power": 1}, (x,)))
     with monkeypatch.context() as patch:
         patch.setattr(executable_cache, "_machine", lambda: "another machine")
-        others.append(place())
-    assert len({place(), *others}) == 1 + len(others)
-    assert place() == store.place(double, {"power": 1}, (jax.ShapeDtypeStruct((3,), x.dtype),))
+        others.append(path())
+    assert len({path(), *others}) == 1 + len(others)
+    assert path() == cache.path_for(double, {"power": 1}, (jax.ShapeDtypeStruct((3,), x.dtype),))
 
 
 @pytest.mark.parametrize(
@@ -227,11 +227,11 @@ def test_another_question_is_another_program(folder, monkeypatch):
     ],
     ids=["builtin", "lambda", "class", "inside", "tree", "in a tree", "function", "nameless"],
 )
-def test_what_is_somebody_elses_is_not_kept(function, static, argument, folder):
-    assert executable_cache.Store(folder).place(function, static, (argument,)) is None
+def test_programs_with_code_of_other_packages_are_not_stored(function, static, argument, folder):
+    assert executable_cache.ExecutableCache(folder).path_for(function, static, (argument,)) is None
 
 
-def test_two_rules_of_a_user_are_not_mistaken_for_each_other(folder):
+def test_two_rules_of_a_user_are_not_confused(folder):
     def rule(factor):
         @jax.tree_util.register_dataclass
         @dataclasses.dataclass(frozen=True)
@@ -251,7 +251,7 @@ def test_two_rules_of_a_user_are_not_mistaken_for_each_other(folder):
     assert not {"begin", "_advance_and_tell"} & names
 
 
-def test_what_cannot_be_run_is_compiled_anew_and_mended(folder):
+def test_a_program_that_cannot_run_is_compiled_and_written_again(folder):
     call(jnp.arange(4.0))
     (other,) = kept(folder)
     content = other.read_bytes()
@@ -266,13 +266,13 @@ def test_what_cannot_be_run_is_compiled_anew_and_mended(folder):
     assert file.exists()
 
 
-def test_what_jax_has_read_from_its_cache_is_not_written(folder, tmp_path):
+def test_a_program_from_the_cache_of_jax_is_not_written(folder, tmp_path):
     use_cache_of_jax(str(tmp_path / "of-jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     try:
         call(jnp.arange(3.0))
         jax.config.update("jax_compilation_cache_dir", None)  # what it has opened stays open
-        for count in (1, 0):  # the folder's name is part of the question, so that the first is compiled
+        for count in (1, 0):  # the folder's name is part of JAX's key, so that the first is compiled
             forget()
             np.testing.assert_array_equal(call(jnp.arange(3.0)), [0, 2, 4])
             assert len(kept(folder)) == count
@@ -282,7 +282,7 @@ def test_what_jax_has_read_from_its_cache_is_not_written(folder, tmp_path):
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
-def test_both_ways_of_compiling_are_kept(folder, monkeypatch):
+def test_programs_of_both_levels_are_stored(folder, monkeypatch):
     monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("quick", 1),))
     once = lambda: solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
     first = once()
@@ -295,18 +295,18 @@ def test_both_ways_of_compiling_are_kept(folder, monkeypatch):
     assert support.same_bits(first.history, again.history)
 
 
-def test_a_folder_that_is_gone_costs_time_and_nothing_else(tmp_path):
-    compilation.keep_in(tmp_path / "gone")
+def test_a_missing_folder_is_no_error(tmp_path):
+    compilation.use_cache(tmp_path / "gone")
     np.testing.assert_array_equal(call(jnp.arange(3.0)), [0, 2, 4])
 
 
-def test_beside_the_cache_of_jax_nothing_is_kept(folder, tmp_path):
+def test_nothing_is_stored_while_the_cache_of_jax_is_on(folder, tmp_path):
     use_cache_of_jax(str(tmp_path / "of-jax"))
     np.testing.assert_array_equal(call(jnp.arange(3.0)), [0, 2, 4])
     assert not kept(folder)
 
 
-def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
+def test_the_least_recently_used_program_is_removed_first(folder, monkeypatch):
     for k in range(3):
         call(jnp.arange(3.0), k)
         for file in kept(folder):
@@ -322,16 +322,16 @@ def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
     assert oldest.exists()
 
 
-def test_a_program_is_run_with_any_static_argument_in_any_place(folder):
+def test_a_static_argument_may_stand_anywhere(folder):
     def third(x, power, y):
         return x**power + y
 
     third.__qualname__, third.__module__ = "third", "jaxba.somewhere"
     function = program(third, "power")
     for _ in range(2):
-        with CompiledTogether() as together:
-            out = together(function, jnp.arange(3.0), 2, jnp.ones(3))
+        with ParallelCompilation() as compile_programs:
+            out = compile_programs(function, jnp.arange(3.0), 2, jnp.ones(3))
         assert (out.shape, out.dtype) == ((3,), jnp.float64)
-        np.testing.assert_array_equal(together.run(function, jnp.arange(3.0), 2, jnp.ones(3)), [1, 2, 5])
+        np.testing.assert_array_equal(compile_programs.run(function, jnp.arange(3.0), 2, jnp.ones(3)), [1, 2, 5])
         forget()
     assert len(kept(folder)) == 1

@@ -1,4 +1,4 @@
-"""Settings of the process."""
+"""Memory, threads and memory mappings of the process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import jaxba
 from jaxba.runtime import process
 
-linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux tells the mappings of a process")
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux reports the mappings of a process")
 
 
 def mappings() -> int:
@@ -45,7 +45,7 @@ def test_dropping_programs_gives_their_mappings_back():
     assert mappings() - before < 0.5 * (during - before)
 
 
-def test_a_solve_that_compiled_looks_after_the_mappings_of_its_process(monkeypatch):
+def test_only_a_solve_that_compiled_checks_the_mappings(monkeypatch):
     problem, called = jaxba.random_scene(jaxba.like("tiny"), 0), []
     monkeypatch.setattr(process, "release_programs", lambda: called.append(1))
     jax.clear_caches()

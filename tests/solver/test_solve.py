@@ -16,7 +16,6 @@ from jaxba import (
     Ceres,
     Classic,
     Loss,
-    Safeguard,
     Schedule,
     StepOptions,
     Termination,
@@ -426,21 +425,6 @@ def test_one_observation_is_solved_exactly():
     solution = stepwise(support.single())
     assert solution.final_cost < 1e-9
     assert np.isfinite(solution.problem.cameras).all()
-
-
-def test_a_guarded_policy_loses_no_more_than_its_patience():
-    """A lambda that fails at once: after three rejections the solve is Ceres' own, three iterations later."""
-    problem = support.tiny()
-    noise = np.random.default_rng(0).normal(size=problem.points.shape)
-    problem = problem.replace(points=problem.points + 2.0 * noise)
-    rule = Ceres(min_gain=0.0)
-    stubborn = Schedule(values=(1e-8,))
-    assert stepwise(problem, stubborn).termination == Termination.STALLED
-    plain, guarded = stepwise(problem, rule), stepwise(problem, Safeguard(stubborn, patience=3, fallback=rule))
-    assert not guarded.history.accepted[:3].any()
-    assert guarded.iterations == plain.iterations + 3
-    np.testing.assert_allclose(guarded.history.cost[3:], plain.history.cost, rtol=1e-9)
-    np.testing.assert_allclose(guarded.history.damping[3:], plain.history.damping, rtol=1e-9)
 
 
 # Choices and mistakes

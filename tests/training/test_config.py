@@ -7,14 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from jaxba.damping.agent import AgentConfig
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.random_scenes import SceneClass
 from jaxba.problem.options import StepOptions
 from jaxba.training import config, settings
 from jaxba.training.config import SettingsError, TrainConfig, load, to_yaml
 from jaxba.training.sac import SacConfig
-
-REPOSITORY = Path(__file__).parents[2]
 
 
 def written(folder: Path, text: str) -> str:
@@ -44,9 +42,19 @@ def test_what_is_written_reads_as_the_same_configuration(name, tmp_path):
     assert hash(found) == hash(load(name))
 
 
-def test_the_repository_shows_the_presets_of_the_package():
-    for name in config.preset_names():
-        assert load(str(REPOSITORY / "configs" / "train" / f"{name}.yaml")) == load(name)
+def test_policies_for_lambda_alone_learn_as_the_default_and_differ_in_the_step():
+    step = ("min_gain", "refine_points", "trials", "camera_rounds", "pattern_moves", "camera_damping")
+    step += ("lens_step", "point_starts", "remembered_steps")
+    plain, driver = load("plain"), load("driver")
+    assert settings.differences(load("default"), plain) == [f"game.agent.{name}" for name in step]
+    assert settings.differences(plain, driver) == ["game.agent.camera_damping"]
+    assert (plain.game.agent.camera_damping, driver.game.agent.camera_damping) == (0.1, 1.0)
+
+
+def test_a_file_may_extend_a_preset_and_overrides_win_over_both(tmp_path):
+    path = written(tmp_path, "extends: plain\nseed: 3\ngame: {agent: {trials: 2}}\n")
+    found = load(path, ["seed=4"])
+    assert found == load("plain", ["seed=4", "game.agent.trials=2"])
 
 
 def test_the_preset_of_the_paper_is_the_papers_setting():
@@ -54,7 +62,7 @@ def test_the_preset_of_the_paper_is_the_papers_setting():
     assert found.sac == SacConfig.paper()
     assert found.bank.classes == (SceneClass(10, 10, "paper"),)
     agent = found.game.agent
-    assert (agent.observation, agent.action, agent.guard, agent.refine_points) == ("paper", "absolute", "off", 0)
+    assert (agent.observation, agent.guard, agent.refine_points) == ("paper", "off", 0)
     assert (agent.low, agent.high, agent.history) == (-10.0, 2.0, 5)
     assert agent.step_options(StepOptions()) == StepOptions()  # plain LM steps
     assert (found.game.reward, found.game.bonus, found.loop.warmup_steps) == ("duration", 10.0, 500)
@@ -140,7 +148,6 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("bank.warm_share=2", "bank: warm_share must be 0 to 1, is 2"),
         ("game.tolerance=100", "game: tolerance must be below 1, is 100"),
         ("game.bonus=-5", "game: bonus must not be negative, is -5"),
-        ("game.shaping=-1", "game: shaping must not be negative, is -1"),
         ("bank.dtype=float16", "bank.dtype must be float64 or float32"),
     ],
 )
@@ -148,15 +155,10 @@ def test_impossible_settings_are_one_line_that_names_the_key(override, message):
     assert message in refused(override)
 
 
-def test_shaping_must_discount_as_the_agent_does():
-    load("default", ["game.shaping=0.1", "game.discount=0.9", "sac.gamma=0.9"])
-    assert "game.discount must be sac.gamma" in refused("game.shaping=0.1", "game.discount=0.9", "sac.gamma=0.95")
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("- 1\n- 2\n", "must be a mapping with keys such as seed"),
+        ("- 1\n- 2\n", "must be a mapping of settings to their values"),
         ("seed: 1\nsac: [\n", "line 3: not YAML"),
         ("seed: 1\nsac:\n  with: 3\n", "unknown key sac.with; did you mean width"),
     ],

@@ -12,7 +12,6 @@ import pytest
 import toys
 
 from jaxba.training import sac
-from jaxba.training import train_loop as training
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import TRACES, LoopConfig, LoopState, run_chunk, start
 
@@ -227,19 +226,6 @@ def test_the_same_key_gives_the_same_numbers_and_a_run_goes_on_from_its_state() 
     assert_equal(one, again)
     other = start(TWIN, LONG, toys.BOTH, jax.random.key(1))
     assert not np.array_equal(other.replay.rows, start(TWIN, LONG, toys.BOTH, jax.random.key(0)).replay.rows)
-
-
-def test_seeds_side_by_side_are_the_single_runs() -> None:
-    keys = jax.random.split(jax.random.key(5), 2)
-    states = training.start_seeds(LEARNS, SHORT, toys.BOTH, keys)
-    after, metrics = training.run_chunk_seeds(LEARNS, SHORT, toys.BOTH, copied(states))
-    for i in range(2):
-        single = start(LEARNS, SHORT, toys.BOTH, keys[i])
-        close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
-        jax.tree.map(close, plain(single), plain(jax.tree.map(lambda x, i=i: x[i], states)))
-        single, means = run_chunk(LEARNS, SHORT, toys.BOTH, single)
-        jax.tree.map(close, plain(single), plain(jax.tree.map(lambda x, i=i: x[i], after)))
-        jax.tree.map(close, means, {name: value[i] for name, value in metrics.items()})
 
 
 @pytest.mark.parametrize("name", ["replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"])

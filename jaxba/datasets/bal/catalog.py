@@ -21,25 +21,25 @@ class Entry:
     points: int
 
     sha256: str | None
-    """Checksum of the compressed file in hexadecimal digits; None where nobody published one."""
+    """Checksum of the compressed file in hexadecimal digits; None where none is published."""
 
     @property
     def name(self) -> str:
-        """Family and number of cameras, as papers write it; no two problems share them."""
+        """Family and number of cameras, as in papers; unique."""
         return f"{self.family}-{self.cameras}"
 
     @property
     def file(self) -> str:
-        """Place of the file below the folder of the data set, on the server as in the cache."""
+        """Path of the file relative to the folder of the data set, on the server and in the cache."""
         return f"{self.family}/problem-{self.cameras}-{self.points}-pre.txt.bz2"
 
 
 ENTRIES = tuple(Entry(family, *row) for family, rows in PROBLEMS.items() for row in rows)
-"""The whole data set, family by family, by size."""
+"""The whole data set, sorted by family and size."""
 
 
 def find(name: str) -> Entry:
-    """The problem of a name.
+    """The problem with a name.
 
     Raises:
         ProblemError: no such name; the message suggests the closest ones.
@@ -51,7 +51,7 @@ def find(name: str) -> Entry:
 
 
 def select(names: Sequence[str]) -> list[Entry]:
-    """The problems of names, each once; the name of a family stands for all of it.
+    """The problems with some names, without duplicates; the name of a family stands for all of its problems.
 
     Raises:
         ProblemError: as `find` does.
@@ -67,7 +67,7 @@ def select(names: Sequence[str]) -> list[Entry]:
 
 
 def _unknown(name: str, known: list[str]) -> str:
-    """One line that suggests names: of a family, those with the nearest number of cameras."""
+    """One line that suggests similar names; within a family, those with the nearest numbers of cameras."""
     family, _, cameras = name.lower().partition("-")
     if family in PROBLEMS and cameras.isdecimal():
         nearest = sorted(PROBLEMS[family], key=lambda row: abs(row[0] - int(cameras)))[:3]

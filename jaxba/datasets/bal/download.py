@@ -1,7 +1,7 @@
 """Downloads of BAL problems into the cache folder. Needs the extra `data`.
 
-pooch decides what is missing, checks the checksum and moves the file to its place; `transfer` continues what broke off,
-which pooch does not.
+pooch finds what is missing, compares the checksum and moves the file to its final name; `transfer` resumes interrupted
+downloads, which pooch cannot.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ except ModuleNotFoundError:
     raise ImportError("this needs pooch: pip install jaxba[data]") from None
 try:
     import fcntl
-except ModuleNotFoundError:  # not a POSIX system: two downloads of one file at once are then not kept apart
+except ModuleNotFoundError:  # not a POSIX system: there two processes must not download the same file
     fcntl = None
 
 __all__ = ["BASE_URL", "DownloadError", "UnreachableError", "fetch", "partial_path"]
@@ -36,32 +36,33 @@ BASE_URL = "https://grail.cs.washington.edu/projects/bal/data"
 def fetch(
     entry: Entry, folder: Path, report: Report, base_url: str = BASE_URL, use_checksum: bool = True
 ) -> tuple[Path, bool]:
-    """The path of a problem, downloaded where it is missing or differs from its checksum.
+    """The path of a problem, downloaded if it is missing or has a wrong checksum.
 
-    The file appears in its place whole and checked, or not at all. What a broken connection leaves waits beside it
-    under a hidden name for the next call. Without a checksum the file must unpack and its header fit its name.
+    The file appears under its name complete and checked, or not at all. After a broken connection the part that was
+    received stays beside it under a hidden name, and the next call resumes it. A file without a checksum must
+    decompress, and its header must have the counts of its name.
 
     Args:
         entry: the problem.
-        folder: of the whole data set; made where it is missing.
-        report: progress, as `download_rest` tells it.
+        folder: of the whole data set; created if it is missing.
+        report: called with the progress, see `download_rest`.
         base_url: folder of the families on a server.
-        use_checksum: false to treat a known checksum as unknown, for a mirror that compressed the files anew.
+        use_checksum: false to ignore known checksums, for a mirror that has compressed the files again.
 
     Returns:
         The path, and whether anything had to be downloaded.
 
     Raises:
-        DownloadError: in one line.
+        DownloadError: the download failed; one line.
     """
     known = f"sha256:{entry.sha256}" if use_checksum and entry.sha256 else None
     registry: dict[str, Any] = {entry.file: known}  # pooch compares nothing where it finds None
     cache = pooch.Pooch(path=folder, base_url=base_url.rstrip("/") + "/", registry=registry)
     pooch.get_logger().setLevel("ERROR")
-    target, partial, came = folder / entry.file, partial_path(entry, folder), []
+    target, partial, requested = folder / entry.file, partial_path(entry, folder), []
 
     def downloader(url: str, output_file: Any, _: Any) -> None:
-        came.append(url)
+        requested.append(url)
         download_rest(url, partial, report)
         if known is None:
             _check(partial, entry)
@@ -70,26 +71,26 @@ def fetch(
     try:
         if not (target.is_file() and (known is None or pooch.file_hash(str(target)) == entry.sha256)):
             target.parent.mkdir(parents=True, exist_ok=True)
-            with _alone(partial):
+            with _locked(partial):
                 cache.fetch(entry.file, downloader=cast(Any, downloader))
     except DownloadError:
         raise
-    except ValueError as error:  # pooch's word for a wrong checksum
+    except ValueError as error:  # pooch raises it for a wrong checksum
         message = f"{cache.get_url(entry.file)}: the file has a wrong checksum and was removed"
         raise DownloadError(message) from error
     except OSError as error:
         raise DownloadError(f"cannot write to {folder}: {reason(error)}") from error
-    return target, bool(came)
+    return target, bool(requested)
 
 
 def partial_path(entry: Entry, folder: Path) -> Path:
-    """Where an unfinished download waits. A pattern such as problem-* does not find it."""
+    """Path of an unfinished download. It is hidden, so that a pattern such as problem-* does not match it."""
     target = folder / entry.file
     return target.with_name(f".{target.name.removesuffix('.txt.bz2')}.part.bz2")
 
 
 def _check(partial: Path, entry: Entry) -> None:
-    """Removes and refuses a file that does not unpack or whose header has other counts than its name."""
+    """Removes and refuses a file that does not decompress, or whose header has other counts than its name."""
     head, why = b"", "its header does not fit its name"
     try:
         with open_input(partial) as blocks:
@@ -104,8 +105,8 @@ def _check(partial: Path, entry: Entry) -> None:
 
 
 @contextmanager
-def _alone(partial: Path) -> Iterator[None]:
-    """Waits until no other process works on a partial file, and keeps others waiting."""
+def _locked(partial: Path) -> Iterator[None]:
+    """Holds the lock of a partial file, so that one process at a time works on it."""
     if fcntl is None:
         yield
         return
@@ -118,7 +119,7 @@ def _alone(partial: Path) -> Iterator[None]:
             except FileNotFoundError:
                 ours = False
             if not ours:
-                continue  # whoever had it has removed it
+                continue  # the previous holder has removed it
             try:
                 yield
             finally:

@@ -1,4 +1,4 @@
-"""A file over HTTP that can be continued: what has come stays, only the rest is asked for (RFC 9110, section 14)."""
+"""Resumable downloads over HTTP: what was received is kept, and only the rest is requested (RFC 9110, section 14)."""
 
 from __future__ import annotations
 
@@ -14,48 +14,51 @@ from urllib3.exceptions import HTTPError
 from jaxba.io.files import display_name, reason
 
 TIMEOUT_S = 30.0
-"""Silence of the server, at the start or on the way, after which a download is given up."""
+"""Time without any data from the server after which a download fails."""
 
 BLOCK_BYTES = 1 << 16
-"""Bytes from one report of progress to the next; less than that is lost where a connection breaks."""
+"""Bytes between two reports of progress; a broken connection loses fewer than that."""
 
 Report = Callable[[int, int | None], object]
-"""Called with the bytes at hand and the bytes of the whole file, or None where the server does not tell."""
+"""Called with the bytes received so far, and the size of the whole file or None if the server does not report it."""
 
 
 class DownloadError(ValueError):
-    """A download that failed. The message is one line for a person."""
+    """A download that failed. The message is one line for the user."""
 
 
 class UnreachableError(DownloadError):
-    """The server cannot be reached: other files of it will not come either."""
+    """The server cannot be reached: no other file of it can be downloaded either."""
 
 
 def download_rest(url: str, partial: Path, report: Report) -> None:
-    """Brings a partial file to its full length. Where the server does not continue files, it starts anew.
+    """Downloads the missing rest of a partial file, or all of it if the server does not resume.
 
     Args:
         url: http or https.
-        partial: what has come so far; may be missing. It keeps what has come if this fails.
-        report: told after every block.
+        partial: the file so far; may be missing. After a failure it keeps what was received.
+        report: called after every block.
 
     Raises:
-        UnreachableError: no answer.
+        UnreachableError: no response.
         DownloadError: the server has no such file, the connection broke, or the file cannot be written.
     """
     have = partial.stat().st_size if partial.exists() else 0
     with requests.Session() as session, ExitStack() as stack:
-        answer = stack.enter_context(_ask(session, url, have))
-        if have and not _continues(answer, have):
-            if answer.status_code == requests.codes.requested_range_not_satisfiable and _range_total(answer) == have:
+        response = stack.enter_context(_request(session, url, have))
+        if have and not _continues(response, have):
+            if (
+                response.status_code == requests.codes.requested_range_not_satisfiable
+                and _range_total(response) == have
+            ):
                 return  # nothing is missing
             have = 0
-            if answer.status_code != requests.codes.ok:
-                answer = stack.enter_context(_ask(session, url, 0))
-        _store(answer, partial, have, report)
+            if response.status_code != requests.codes.ok:
+                response = stack.enter_context(_request(session, url, 0))
+        _append(response, partial, have, report)
 
 
-def _ask(session: requests.Session, url: str, have: int) -> requests.Response:
+def _request(session: requests.Session, url: str, have: int) -> requests.Response:
     headers = {"Accept-Encoding": "identity"}  # lengths are those of the file
     if have:
         headers["Range"] = f"bytes={have}-"
@@ -68,28 +71,28 @@ def _ask(session: requests.Session, url: str, have: int) -> requests.Response:
         raise UnreachableError(message) from error
 
 
-def _continues(answer: requests.Response, have: int) -> bool:
-    """Whether the answer is the part from byte `have` on."""
-    span = re.match(r"bytes (\d+)-", answer.headers.get("Content-Range", ""))
-    return answer.status_code == requests.codes.partial_content and span is not None and int(span[1]) == have
+def _continues(response: requests.Response, have: int) -> bool:
+    """Whether the response holds the part from byte `have` on."""
+    span = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
+    return response.status_code == requests.codes.partial_content and span is not None and int(span[1]) == have
 
 
-def _range_total(answer: requests.Response) -> int | None:
-    total = answer.headers.get("Content-Range", "").rpartition("/")[2]
+def _range_total(response: requests.Response) -> int | None:
+    total = response.headers.get("Content-Range", "").rpartition("/")[2]
     return int(total) if total.isdecimal() else None
 
 
-def _store(answer: requests.Response, partial: Path, have: int, report: Report) -> None:
-    if answer.status_code not in (requests.codes.ok, requests.codes.partial_content):
-        raise DownloadError(f"{answer.url}: the server answers {answer.status_code} {answer.reason}")
-    length = answer.headers.get("Content-Length", "")
-    total = have + int(length) if length.isdecimal() else _range_total(answer)
+def _append(response: requests.Response, partial: Path, have: int, report: Report) -> None:
+    if response.status_code not in (requests.codes.ok, requests.codes.partial_content):
+        raise DownloadError(f"{response.url}: the server answers {response.status_code} {response.reason}")
+    length = response.headers.get("Content-Length", "")
+    total = have + int(length) if length.isdecimal() else _range_total(response)
     broken: Exception | None = None
     try:
         with open(partial, "r+b" if have else "wb") as file:
             file.seek(have)
             report(have, total)
-            for block in answer.raw.stream(BLOCK_BYTES, decode_content=False):
+            for block in response.raw.stream(BLOCK_BYTES, decode_content=False):
                 file.write(block)
                 have += len(block)
                 report(have, total)
@@ -98,12 +101,12 @@ def _store(answer: requests.Response, partial: Path, have: int, report: Report) 
     except OSError as error:
         raise DownloadError(f"cannot write {display_name(partial)}: {reason(error)}") from error
     if broken or (total is not None and have < total):
-        message = f"{answer.url}: the connection broke after {have:,} bytes; the same command goes on from there"
+        message = f"{response.url}: the connection broke after {have:,} bytes; the same command goes on from there"
         raise DownloadError(message) from broken
 
 
 def _cause(error: BaseException) -> str:
-    """What the system said of a failed connection, in a few words, below all that libraries wrap around it."""
+    """The system's reason for a failed connection, without what libraries wrap around it."""
     if isinstance(error, requests.Timeout):
         return f"no answer in {TIMEOUT_S:g} s"
     if isinstance(error, requests.exceptions.SSLError):

@@ -9,20 +9,20 @@ from jaxtyping import Float
 
 from jaxba.datasets.kitti.sequence import Calibration
 from jaxba.datasets.kitti.tracks import Tracks
-from jaxba.datasets.kitti.triangulate import Filters, Sightings, Views, triangulate_robustly
+from jaxba.datasets.kitti.triangulate import Filters, Observations, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, camera_centers, rotation_matrices
 
 FLIP = np.diag(COLMAP_FLIP)
 """From axes x right, y down, z forward (KITTI, as COLMAP) to x right, y up, z backward (BAL)."""
 
-MIN_SIGHTINGS = 10
-"""Sightings that a camera needs: twice as many numbers as its 9 parameters, and a little more."""
+MIN_OBSERVATIONS = 10
+"""Observations that a camera needs: 20 residuals for its 9 parameters."""
 
 
 @dataclass(frozen=True)
 class Assembled:
-    """A problem and where its cameras come from."""
+    """A problem and the frames of its cameras."""
 
     problem: BundleProblem
     frames: tuple[int, ...]
@@ -49,21 +49,21 @@ def assemble(
         calibration: of all views.
         frames: frame number of each view.
         filters: for points.
-        min_views: sightings that a point needs.
-        start: where the cameras of the problem stand, if not at `views`, which then only choose and triangulate the
-            points. Every point moves with the first camera that sees it, as a map drifts with the one who draws it.
+        min_views: observations that a point needs.
+        start: initial poses of the cameras of the problem, if not `views`, from which the points are then still
+            triangulated and filtered. Every point moves with the first camera that sees it, as in odometry.
 
     Raises:
         ProblemError: a camera would see fewer than 10 points.
     """
     rays = calibration.rays(tracks.pixels)
-    sightings = Sightings(tracks.image, tracks.track, rays)
-    points, keep = triangulate_robustly(views, sightings, filters, calibration.fx, min_views)
+    observations = Observations(tracks.image, tracks.track, rays)
+    points, keep = triangulate_robustly(views, observations, filters, calibration.fx, min_views)
     seen = np.bincount(tracks.image[keep], minlength=len(frames))
-    if seen.min() < MIN_SIGHTINGS:
+    if seen.min() < MIN_OBSERVATIONS:
         bad = int(seen.argmin())
         raise ProblemError(
-            f"too few points: frame {frames[bad]} sees {seen[bad]} good ones, at least {MIN_SIGHTINGS} are needed; "
+            f"too few points: frame {frames[bad]} sees {seen[bad]} good ones, at least {MIN_OBSERVATIONS} are needed; "
             "choose other --frames, --features or --start, or a smaller --min-angle"
         )
     names, point_index = np.unique(tracks.track[keep], return_inverse=True)
@@ -90,11 +90,11 @@ def poses_of_cameras(cameras: Float[np.ndarray, "cameras 9"]) -> Float[np.ndarra
 def windows(whole: Assembled, size: int, stride: int, min_views: int) -> list[Assembled]:
     """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before.
 
-    The last one ends with the last camera, so it may start less than `stride` after its predecessor. A window keeps
-    the points that it sees `min_views` times.
+    The last one ends with the last camera, so it may start less than `stride` after the one before. A window keeps the
+    points that its cameras see `min_views` times.
 
     Raises:
-        ProblemError: the sizes make no sense.
+        ProblemError: the size or stride is out of range.
     """
     cameras = whole.problem.num_cameras
     if not 2 <= size <= cameras:
@@ -122,6 +122,6 @@ def _window(whole: Assembled, first: int, end: int, min_views: int) -> Assembled
     return replace(whole, problem=part, frames=whole.frames[first:end])
 
 
-def side_facts(part: Assembled, calibration: Calibration, **facts: object) -> dict[str, object]:
-    """What the side file of a problem holds."""
-    return {"format": 1, "frames": list(part.frames), "calibration": asdict(calibration), **facts}
+def sidecar_contents(part: Assembled, calibration: Calibration, **extra: object) -> dict[str, object]:
+    """Contents of the sidecar file of a problem."""
+    return {"format": 1, "frames": list(part.frames), "calibration": asdict(calibration), **extra}

@@ -1,4 +1,4 @@
-"""All of the way: from a sequence to problems with a start."""
+"""The whole pipeline: from a sequence to a problem with initial poses and points."""
 
 from __future__ import annotations
 
@@ -10,81 +10,81 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.datasets.kitti.assemble import Assembled, assemble
-from jaxba.datasets.kitti.front import FrontOptions, Report, link
+from jaxba.datasets.kitti.frontend import FrontEndOptions, Report, link
+from jaxba.datasets.kitti.initial_poses import drift
 from jaxba.datasets.kitti.keyframes import choose
 from jaxba.datasets.kitti.odometry import views_of_poses, visual_odometry
+from jaxba.datasets.kitti.result_cache import ResultCache
 from jaxba.datasets.kitti.sequence import Sequence
-from jaxba.datasets.kitti.starts import drift
 from jaxba.datasets.kitti.triangulate import Filters
-from jaxba.datasets.kitti.work import Work
 
 Start = Literal["vo", "poses", "noisy-poses"]
 
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """What a problem depends on, beside the sequence."""
+    """Options of `build`."""
 
-    front: FrontOptions = field(default_factory=FrontOptions)
-    """Of the tracks."""
+    front: FrontEndOptions = field(default_factory=FrontEndOptions)
+    """Options of the tracks."""
 
     keyframes: str = "auto"
     """`auto`, `all` or N for every N-th frame."""
 
     start: Start = "vo"
-    """Where the poses come from."""
+    """Source of the initial poses."""
 
     rotation_sigma: float = 0.1
-    """Of `noisy-poses`: degrees a key-frame."""
+    """Of `noisy-poses`: degrees per key-frame."""
 
     translation_sigma: float = 0.05
-    """Of `noisy-poses`: share of the motion's length."""
+    """Of `noisy-poses`: relative to the length of the motion."""
 
     filters: Filters = field(default_factory=Filters)
-    """Of the points."""
+    """Options of the points."""
 
     min_views: int = 2
-    """Sightings that a point needs."""
+    """Observations that a point needs."""
 
 
 @dataclass(frozen=True)
 class Built:
-    """A problem and how it came about."""
+    """A problem, and what `build` has to report of it."""
 
     whole: Assembled
     frames: int
     """Frames of the sequence's range."""
 
     dropped: tuple[int, ...]
-    """Frame numbers that could not be linked with the others."""
+    """Frame numbers that could not be matched with the others."""
 
     tracks: int
     """Tracks over the key-frames, of which not all became points."""
 
     restarts: tuple[int, ...] = ()
-    """Frame numbers that visual odometry placed relative to the key-frame beside, without enough known points."""
+    """Frame numbers whose pose comes from the neighbouring key-frame alone, for lack of known points."""
 
 
 def build(
     sequence: Sequence,
     options: BuildOptions,
-    work: Work,
+    cache: ResultCache,
     poses_of_frames: Callable[[tuple[int, ...]], Float[np.ndarray, "frames 3 4"]] | None,
     report: Report,
 ) -> Built:
-    """Makes the problem of a sequence. Equal arguments give equal numbers, whatever the work folder holds already.
+    """Makes the problem of a sequence. Equal arguments give equal numbers, whatever the cache holds.
 
     Args:
         sequence: the frames.
-        options: how.
-        work: where results of single frames are kept.
-        poses_of_frames: camera-to-world poses of frames by their numbers; needed for starts from poses.
-        report: told about progress.
+        options: of tracks, key-frames, poses and points.
+        cache: of the results of single frames.
+        poses_of_frames: camera-to-world poses of frames by their numbers; needed where the initial poses are given.
+        report: called with the progress.
 
     Raises:
         ProblemError: an image cannot be read, frames share too little, or the camera does not move.
     """
-    linked = link(sequence, options.front, work, report)
+    linked = link(sequence, options.front, cache, report)
     numbers = tuple(sequence.numbers[i] for i in linked.frames)
     chosen = choose(linked.tracks, len(numbers), options.keyframes, sequence.calibration, numbers)
     frames = tuple(numbers[i] for i in chosen)

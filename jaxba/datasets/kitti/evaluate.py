@@ -1,4 +1,4 @@
-"""A problem and its solutions against ground truth: numbers, pictures, and trajectories for other tools."""
+"""Errors of a problem and its solutions against the ground truth, and their trajectories for other tools."""
 
 from __future__ import annotations
 
@@ -21,69 +21,69 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 
 @dataclass(frozen=True)
-class SideFile:
-    """What a problem's arrays do not tell."""
+class Sidecar:
+    """Data of a problem that are not in its arrays."""
 
     frames: tuple[int, ...]
     """Frame number of every camera."""
 
     calibration: Calibration
-    """With which the images were taken."""
+    """Calibration of the images."""
 
-    facts: Mapping[str, Any]
-    """Everything else in the file."""
+    contents: Mapping[str, Any]
+    """The whole file."""
 
 
 class Scores(NamedTuple):
     """Errors of one trajectory, in metres and degrees; see `trajectory`."""
 
-    scale: float  # metres a unit of the trajectory
+    scale: float  # metres per unit of the trajectory
     absolute: trajectory.Errors
     relative: trajectory.RelativeErrors
     segments: trajectory.SegmentErrors | None
 
 
 class Evaluated(NamedTuple):
-    """One file."""
+    """A problem or solution and its errors."""
 
     name: str
     problem: BundleProblem
-    poses: Float[np.ndarray, "cameras 3 4"]  # after alignment, where there is a truth
+    poses: Float[np.ndarray, "cameras 3 4"]  # aligned with the truth, or with the first camera
     points: Float[np.ndarray, "points 3"]  # the same
     rms: float  # reprojection error, pixels
     scores: Scores | None
 
 
-def side_path(path: StrPath) -> Path:
-    """Name of the side file of a problem: `kitti00.txt.bz2` has `kitti00.frames.json`."""
+def sidecar_path(path: StrPath) -> Path:
+    """Path of the sidecar file of a problem: `kitti00.txt.bz2` has `kitti00.frames.json`."""
     return Path(strip_compression(path)).with_suffix(".frames.json")
 
 
-def write_side(path: StrPath, facts: Mapping[str, Any]) -> None:
-    """Writes the side file of a problem. Raises ProblemError."""
-    with open_output(side_path(path)) as file:
-        file.write((json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
+def write_sidecar(path: StrPath, contents: Mapping[str, Any]) -> None:
+    """Writes the sidecar file of a problem. Raises ProblemError."""
+    with open_output(sidecar_path(path)) as file:
+        file.write((json.dumps(contents, indent=1, allow_nan=False) + "\n").encode())
 
 
-def read_side(path: StrPath) -> SideFile:
-    """Reads the side file of a problem.
+def read_sidecar(path: StrPath) -> Sidecar:
+    """Reads the sidecar file of a problem.
 
     Raises:
-        ProblemError: there is none, or it is none of `jaxba-kitti`.
+        ProblemError: there is none, or it was not written by `jaxba-kitti`.
     """
-    side = side_path(path)
+    side = sidecar_path(path)
     try:
-        facts = json.loads(side.read_text(encoding="utf-8"))
-        calibration = Calibration(**{**facts["calibration"], "offset": tuple(facts["calibration"]["offset"])})
-        frames = tuple(int(number) for number in facts["frames"])
+        contents = json.loads(side.read_text(encoding="utf-8"))
+        calibration = Calibration(**{**contents["calibration"], "offset": tuple(contents["calibration"]["offset"])})
+        frames = tuple(int(number) for number in contents["frames"])
     except OSError as error:
         raise ProblemError(f"{display_name(side)}: cannot be read: {reason(error)}; jaxba-kitti writes it") from None
     except (ValueError, KeyError, TypeError):
-        raise ProblemError(f"{display_name(side)}: is no side file of jaxba-kitti") from None
-    return SideFile(frames, calibration, facts)
+        raise ProblemError(f"{display_name(side)}: is not a sidecar file of jaxba-kitti") from None
+    return Sidecar(frames, calibration, contents)
 
 
-def truth_of(side: SideFile, path: StrPath) -> Float[np.ndarray, "cameras 3 4"]:
+def truth_of(side: Sidecar, path: StrPath) -> Float[np.ndarray, "cameras 3 4"]:
     """True poses of a problem's cameras, from the file of the whole sequence. Raises ProblemError."""
     return poses_of(read_poses(path), side.frames, side.calibration, display_name(path))
 
@@ -106,20 +106,20 @@ def score(
 
 def evaluate(
     paths: Sequence[StrPath],
-    side: SideFile,
+    side: Sidecar,
     truth: Float[np.ndarray, "cameras 3 4"] | None,
     lengths: tuple[float, ...] = trajectory.DEVKIT_LENGTHS,
 ) -> list[Evaluated]:
     """A problem and its solutions, each aligned with the truth on its own; without a truth, with the first camera.
 
     Raises:
-        ProblemError: a file cannot be read, has other cameras than the side file, or cannot be aligned.
+        ProblemError: a file cannot be read, has other cameras than the sidecar file, or cannot be aligned.
     """
     results = []
     for path in paths:
         problem = read_problem(path)
         if problem.num_cameras != len(side.frames):
-            counts = f"{problem.num_cameras} cameras, the side file names {len(side.frames)} frames"
+            counts = f"{problem.num_cameras} cameras, the sidecar file names {len(side.frames)} frames"
             raise ProblemError(f"{display_name(path)}: has {counts}")
         poses, points = poses_of_cameras(np.asarray(problem.cameras)), np.asarray(problem.points)
         scores = None
@@ -137,13 +137,13 @@ def evaluate(
 
 
 def _numbers(scores: Scores) -> list[float]:
-    """All errors of a trajectory."""
+    """All errors of a trajectory, in one list."""
     parts = (scores.absolute, scores.relative.translation, scores.relative.rotation, scores.segments or ())
     return [scores.scale, *(float(number) for part in parts for number in part)]
 
 
-def as_json(results: Sequence[Evaluated], side: SideFile) -> dict[str, Any]:
-    """The numbers of `evaluate`, for files."""
+def as_json(results: Sequence[Evaluated], side: Sidecar) -> dict[str, Any]:
+    """Results of `evaluate` for a JSON file."""
     return {
         "frames": list(side.frames),
         "results": [
@@ -171,6 +171,6 @@ def _scores_json(scores: Scores) -> dict[str, Any]:
 
 
 def write_poses(path: StrPath, poses: Float[np.ndarray, "cameras 3 4"]) -> None:
-    """A line of 12 numbers a pose, as KITTI and evo read them. Raises ProblemError."""
+    """Writes 12 numbers per line and pose, as KITTI and evo read them. Raises ProblemError."""
     with open_output(path) as file:
         file.write("".join(" ".join(map(repr, row)) + "\n" for row in poses.reshape(-1, 12).tolist()).encode())

@@ -13,7 +13,7 @@ from jaxba.datasets.kitti.sequence import Calibration
 Features = Literal["sift", "orb", "klt"]
 
 SIFT_CONTRAST = 0.02
-"""Half of OpenCV's threshold: asphalt and shadow have little contrast."""
+"""Contrast threshold, half of OpenCV's: asphalt and shadow have little contrast."""
 
 ORB_FAST = 10
 """FAST threshold in grey levels, half of OpenCV's, for the same reason."""
@@ -31,18 +31,18 @@ ORB_BORDER = 31
 """OpenCV finds nothing nearer to the border, and fails on images too small for its pyramid (`edgeThreshold`)."""
 
 MIN_ESSENTIAL = 8
-"""Fewer matches say nothing about the geometry: five determine it."""
+"""Fewer matches cannot verify a geometry that five determine."""
 
 
 class KeyPoints(NamedTuple):
     """Key-points of an image, the strongest first."""
 
-    pixels: Float[np.ndarray, "n 2"]  # from the centre of the first pixel, x to the right, y down
+    pixels: Float[np.ndarray, "n 2"]  # relative to the centre of the first pixel, x to the right, y down
     descriptors: np.ndarray  # uint8, [n, 128] (SIFT) or [n, 32] (ORB, bits)
 
 
 class Verified(NamedTuple):
-    """Matches of two images that agree with one motion of the camera."""
+    """Matches of two images that are consistent with one motion of the camera."""
 
     first: Int[np.ndarray, " m"]  # key-points of the first image
     second: Int[np.ndarray, " m"]
@@ -69,13 +69,13 @@ def detect(image: np.ndarray, features: Features, count: int) -> KeyPoints:
     pixels = np.array([key.pt for key in found], np.float64)
     response = np.array([key.response for key in found])
     order = np.lexsort((pixels[:, 1], pixels[:, 0], -response))  # the order of detectors may depend on threads
-    _, unique = np.unique(pixels[order], axis=0, return_index=True)  # SIFT repeats a place for every orientation
+    _, unique = np.unique(pixels[order], axis=0, return_index=True)  # SIFT repeats a key-point for every orientation
     keep = order[np.sort(unique)][:count]
     return KeyPoints(pixels[keep], np.asarray(descriptors)[keep].astype(np.uint8))
 
 
 def match(first: KeyPoints, second: KeyPoints) -> Int[np.ndarray, "m 2"]:
-    """Pairs of key-points that are each other's nearest, by a clear margin (ratio test) on both sides.
+    """Mutual nearest neighbours that pass the ratio test in both directions.
 
     Distances are Euclidean (SIFT, 128 numbers) or Hamming (ORB, 256 bits). All numbers are integers below 2^24, so
     float32 is exact and the order of summation does not matter.
@@ -101,9 +101,9 @@ def match(first: KeyPoints, second: KeyPoints) -> Int[np.ndarray, "m 2"]:
 def epipolar_inliers(
     first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], calibration: Calibration, seed: int
 ) -> np.ndarray:
-    """Which matched pixels agree with one essential matrix, shape (m,), by RANSAC.
+    """Which matched pixels are consistent with one essential matrix, shape (m,), by RANSAC.
 
-    The pixels are brought to a camera with equal focal lengths, so that a distance means the same along both axes.
+    Distances are measured in rays, in which both axes have the same scale.
     """
     if len(first) < MIN_ESSENTIAL:
         return np.zeros(len(first), bool)
@@ -114,7 +114,7 @@ def epipolar_inliers(
 def essential(
     first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], threshold: float, seed: int
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Essential matrix of two views by the five-point method and RANSAC, and which rays agree with it.
+    """Essential matrix of two views by the five-point method and RANSAC, and which rays are consistent with it.
 
     Args:
         first: rays `(X / Z, Y / Z)` in the first view.

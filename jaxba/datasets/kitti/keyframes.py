@@ -11,35 +11,35 @@ from jaxtyping import Float
 from jaxba.datasets.kitti.sequence import Calibration
 from jaxba.datasets.kitti.tracks import Tracks
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.geometry import perspective
 
 PARALLAX = 10.0
-"""Median parallax in pixels at which `auto` takes a frame. VINS-Mono (Qin et al. 2018) takes 10 at 460 pixels focal
-length."""
+"""Median parallax in pixels from which on `auto` makes a frame a key-frame. VINS-Mono (Qin et al. 2018) uses 10 at a
+focal length of 460 pixels."""
 
 SHARE = 0.5
-"""... or when fewer than this share of the last key-frame's tracks are left."""
+"""... as it does when less than this share of the tracks of the last key-frame is left."""
 
 MIN_SHARED = 20
-"""Tracks that neighbouring key-frames must share for the pose of one to say anything about that of the other."""
+"""Tracks that neighbouring key-frames must share, to estimate their relative pose."""
 
 
 def parallax(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], focal: float) -> float:
-    """Median motion in pixels that no rotation of the camera explains; zero for a camera that only turns.
+    """Median image motion in pixels that no rotation of the camera explains; zero for a camera that only rotates.
 
-    The rotation is the best one in the least-squares sense between the rays, so far scenery may hide a little of a
-    translation.
+    The rotation is the least-squares fit to the rays, which absorbs a little of a translation where the scene is far.
 
     Args:
         first: rays `(X / Z, Y / Z)` in one view.
         second: the same in the other view.
         focal: pixels.
     """
-    turned = np.column_stack([first, np.ones(len(first))]) @ turn(first, second).T
-    return float(focal * np.median(np.linalg.norm(turned[:, :2] / turned[:, 2:] - second, axis=1)))
+    rotated = np.column_stack([first, np.ones(len(first))]) @ relative_rotation(first, second).T
+    return float(focal * np.median(np.linalg.norm(perspective(rotated) - second, axis=1)))
 
 
-def turn(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation that brings the rays of one view nearest to those of another.
+def relative_rotation(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3 3"]:
+    """The least-squares rotation from the rays of one view to those of another.
 
     Source: Kabsch 1976.
     """

@@ -1,4 +1,4 @@
-"""Points followed from image to image: Shi-Tomasi corners on a grid, pyramidal Lucas-Kanade, forward and backward."""
+"""Points tracked from image to image: Shi-Tomasi corners on a grid, pyramidal Lucas-Kanade, forward-backward check."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from jaxba.datasets.kitti.opencv import cv2
 from jaxba.datasets.kitti.sequence import Calibration
 
 WINDOW = 21
-"""Side of the window that is followed, pixels. Source: OpenCV's default."""
+"""Side of the tracked window, pixels. Source: OpenCV's default."""
 
 LEVELS = 4
-"""Halvings of the image: motions of up to some 150 pixels between frames."""
+"""Levels of the image pyramid above the image: for motions of up to some 150 pixels between frames."""
 
 ROUND_TRIP = 0.7
-"""Pixels between a point and itself followed there and back. Source: Kalal et al. 2010, "Forward-backward error"."""
+"""Largest distance in pixels of a point from itself tracked forward and backward. Source: Kalal et al. 2010,
+"Forward-backward error"."""
 
 CELL = 48
-"""Side of a grid cell, pixels. Every cell gets its share of the corners."""
+"""Side of a grid cell, pixels. Every cell has the same number of corners."""
 
 DISTANCE = 8
 """Least distance between points, pixels."""
@@ -30,36 +31,36 @@ QUALITY = 0.003
 """Least eigenvalue of a corner, as a share of the image's largest."""
 
 
-class Followed(NamedTuple):
-    """Points that are seen in an image."""
+class TrackedPoints(NamedTuple):
+    """Points in an image."""
 
     tracks: Int[np.ndarray, " n"]  # numbers of their tracks, ascending
     pixels: Float[np.ndarray, "n 2"]
     next_track: np.ndarray  # number of the next new track, shape ()
 
 
-def start(image: np.ndarray, count: int) -> Followed:
-    """Corners of a first image."""
-    return _replenish(image, Followed(np.empty(0, np.int64), np.empty((0, 2)), np.array(0)), count)
+def detect_corners(image: np.ndarray, count: int) -> TrackedPoints:
+    """Corners of the first image."""
+    return _replenish(image, TrackedPoints(np.empty(0, np.int64), np.empty((0, 2)), np.array(0)), count)
 
 
-def follow(
-    before: np.ndarray, after: np.ndarray, points: Followed, count: int, calibration: Calibration, seed: int
-) -> tuple[Followed, int]:
-    """The points in the next image, with new corners where the grid has become empty, and how many are old.
+def track(
+    before: np.ndarray, after: np.ndarray, points: TrackedPoints, count: int, calibration: Calibration, seed: int
+) -> tuple[TrackedPoints, int]:
+    """The points in the next image, with new corners in empty cells of the grid, and how many are old.
 
     Args:
         before: grey image of `points`.
         after: the next one.
         points: in `before`.
-        count: corners wanted in an image.
+        count: number of points wanted in an image.
         calibration: for the check against the epipolar geometry.
         seed: of its samples.
     """
     found, good = _lucas_kanade(before, after, points.pixels)
     kept = np.flatnonzero(good)
     kept = kept[epipolar_inliers(points.pixels[kept], found[kept], calibration, seed)]
-    old = Followed(points.tracks[kept], found[kept], points.next_track)
+    old = TrackedPoints(points.tracks[kept], found[kept], points.next_track)
     return _replenish(after, old, count), len(kept)
 
 
@@ -81,8 +82,8 @@ def _lucas_kanade(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> 
     return found, (ok.ravel() > 0) & (ok_back.ravel() > 0) & (trip <= ROUND_TRIP) & inside
 
 
-def _replenish(image: np.ndarray, points: Followed, count: int) -> Followed:
-    """Adds corners in cells that have fewer than their share, none near a point that is there already."""
+def _replenish(image: np.ndarray, points: TrackedPoints, count: int) -> TrackedPoints:
+    """Adds corners in cells that have too few, none near an existing point."""
     height, width = image.shape
     response = np.asarray(cv2.cornerMinEigenVal(image, 3))
     peak = np.asarray(cv2.dilate(response, np.ones((2 * DISTANCE + 1, 2 * DISTANCE + 1), np.uint8)))
@@ -104,7 +105,7 @@ def _replenish(image: np.ndarray, points: Followed, count: int) -> Followed:
     load = np.bincount((old[:, 1] // CELL) * columns + old[:, 0] // CELL, minlength=cells)
     new = order[rank < (share - load)[cell[order]]]
     first = int(points.next_track)
-    return Followed(
+    return TrackedPoints(
         np.concatenate([points.tracks, first + np.arange(len(new))]),
         np.concatenate([points.pixels, np.stack([x[new], y[new]], axis=1).astype(np.float64)]),
         np.array(first + len(new)),

@@ -1,8 +1,9 @@
-"""Monocular visual odometry over key-frames: the poses from which bundle adjustment starts.
+"""Monocular visual odometry over key-frames: the initial poses of bundle adjustment.
 
-Two views with enough parallax are related by an essential matrix and their tracks triangulated; every other view is
-placed by the points that it sees (PnP), and new points are triangulated as soon as their rays open an angle. The scale
-is that of the first baseline, and nothing is adjusted: errors accumulate as they do.
+The relative pose of two views with enough parallax comes from an essential matrix, and their tracks are triangulated.
+The pose of every other view comes from the known points that it sees (PnP), and new points are triangulated as soon as
+the angle between their rays is large enough. The first baseline has length 1. Nothing is adjusted afterwards, so errors
+accumulate.
 """
 
 from __future__ import annotations
@@ -17,34 +18,35 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxba.datasets.kitti.features import essential
-from jaxba.datasets.kitti.front import MIN_MATCHES
-from jaxba.datasets.kitti.keyframes import parallax, turn
+from jaxba.datasets.kitti.frontend import MIN_MATCHES
+from jaxba.datasets.kitti.keyframes import parallax, relative_rotation
 from jaxba.datasets.kitti.opencv import cv2
 from jaxba.datasets.kitti.sequence import Calibration
 from jaxba.datasets.kitti.tracks import Tracks
-from jaxba.datasets.kitti.triangulate import Filters, Sightings, Triangulated, Views, triangulate
+from jaxba.datasets.kitti.triangulate import Filters, Observations, Triangulated, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.geometry import perspective
 
 BOOTSTRAP_ANGLE = 2.0
-"""Median angle in degrees between the rays of the first two views' points that is enough."""
+"""Median angle in degrees between the rays of the points of the first two views that is enough."""
 
 BOOTSTRAP_MOST = 20.0
-"""... and beyond which the essential matrix is wrong: the points would be as near as three baselines."""
+"""... and beyond which the essential matrix must be wrong: the points would be nearer than three baselines."""
 
 BOOTSTRAP_ENOUGH = 5.0
-"""Angle from which on more good points count and a larger angle does not."""
+"""Angle beyond which a pair of views is not rated higher."""
 
 BOOTSTRAP_SHARE = 0.5
-"""Share of the common tracks that must be good: a wrong motion fits few of them."""
+"""Share of the common tracks that must fit the motion: a wrong motion fits few of them."""
 
 BOOTSTRAP_LEAST = 0.5
-"""... and the least that is taken where no pair has more. Noise of a pixel is 0.1 degrees at KITTI's focal length."""
+"""... and the least angle, where no pair has more. Noise of a pixel is 0.1 degrees at KITTI's focal length."""
 
 BOOTSTRAP_REACH = 12
-"""Views after the first that are tried as second ones."""
+"""How many views after the first are tried as second ones."""
 
 MIN_POINTS = 15
-"""Points that a view must agree with to be placed by them, and that the first two views must give."""
+"""Inlier points that the pose of a view needs, and that the first two views must give."""
 
 PNP_PIXELS = 3.0
 """Reprojection error of an outlier."""
@@ -53,60 +55,60 @@ PNP_ITERATIONS = 300
 
 EPIPOLAR_PIXELS = 1.0
 
-SOFT_SHARE = 0.5
-"""Share of `EPIPOLAR_PIXELS` from which on the refined motion feels a distance less than squared."""
+SOFT_LOSS_SCALE = 0.5
+"""Scale of the robust loss of the refined motion, relative to `EPIPOLAR_PIXELS`."""
 
 FARTHEST = 1e9
-"""Depth in baselines up to which points say on which side of the cameras they are. OpenCV's 50 leaves out all points of
-a slow drive."""
+"""Depth in baselines up to which points are used to choose the motion that has them in front. With OpenCV's 50, a slow
+drive has none."""
 
 MIN_KNOWN = 3
-"""Known points that tell the length of a step: the median of three bears one wrong."""
+"""Known points that the length of a step needs: the median of three tolerates one outlier."""
 
 STILL_PIXELS = 1.0
-"""Median parallax of a camera that stands: key-points are found to less than a pixel."""
+"""Median parallax below which a camera stands still: key-points are accurate to less than a pixel."""
 
 MOVED_PIXELS = 3.0
-"""... and of one that surely moves."""
+"""... and from which on it surely moves."""
 
-PACE_STEPS = 5
-"""Steps whose median length a frame is taken where no known point is shared."""
+SPEED_STEPS = 5
+"""Steps whose median length per frame is used where two views share no known points."""
 
 
 class Odometry(NamedTuple):
-    """Poses of all views, and what happened."""
+    """Poses of all views, and how they were found."""
 
     views: Views  # world to camera, the first view at the origin
     bootstrap: tuple[int, int]
-    restarts: tuple[int, ...]  # views placed relative to their neighbour, without enough known points
+    restarts: tuple[int, ...]  # views whose pose comes from the neighbouring view, for lack of known points
 
 
 class _Map:
-    """What is known so far."""
+    """Poses and points that are known so far."""
 
     def __init__(self, tracks: Tracks, views: int, calibration: Calibration, filters: Filters, seed: int) -> None:
         self.tracks, self.calibration, self.filters, self.seed = tracks, calibration, filters, seed
         self.rays = calibration.rays(tracks.pixels)
         self.rotation = np.tile(np.eye(3), (views, 1, 1))
         self.translation = np.zeros((views, 3))
-        self.placed = np.zeros(views, bool)
+        self.has_pose = np.zeros(views, bool)
         self.points = np.full((tracks.count, 3), np.nan)
 
-    def place(self, view: int, rotation: np.ndarray, translation: np.ndarray) -> None:
-        self.rotation[view], self.translation[view], self.placed[view] = rotation, translation, True
+    def set_pose(self, view: int, rotation: np.ndarray, translation: np.ndarray) -> None:
+        self.rotation[view], self.translation[view], self.has_pose[view] = rotation, translation, True
 
     def triangulate(self, views: list[int]) -> None:
-        """Anew all tracks that these views see, from all views placed so far."""
+        """Triangulates again all tracks that these views see, from all views whose pose is known."""
         seen = np.unique(np.concatenate([self.tracks.track[self.tracks.rows_of_image(view)] for view in views]))
         rows = self.tracks.rows_of_tracks(seen)
-        rows = rows[self.placed[self.tracks.image[rows]]]
+        rows = rows[self.has_pose[self.tracks.image[rows]]]
         names, track = np.unique(self.tracks.track[rows], return_inverse=True)
         rows = rows[np.bincount(track)[track] >= 2]
         names, track = np.unique(self.tracks.track[rows], return_inverse=True)
         if not len(names):
             return
-        sightings = Sightings(self.tracks.image[rows], track, self.rays[rows])
-        found = triangulate(Views(self.rotation, self.translation), sightings)
+        observations = Observations(self.tracks.image[rows], track, self.rays[rows])
+        found = triangulate(Views(self.rotation, self.translation), observations)
         good = found.good(track, self.filters, self.calibration.fx)
         self.points[names[good]] = found.points[good]
         known = ~good & (np.bincount(track) > 2)  # two views alone may just be too close together
@@ -124,7 +126,7 @@ def visual_odometry(
 ) -> Odometry:
     """Poses of all views from tracks alone.
 
-    Views before the first pair with parallax (a car that stands still, or only turns) are placed afterwards.
+    The poses of views before the first pair with parallax (a car that stands still, or only rotates) are found last.
 
     Args:
         tracks: their images are the views, 0 to `views` - 1.
@@ -133,7 +135,7 @@ def visual_odometry(
         filters: for points.
         seed: of random samples.
         names: frame numbers of the views, for messages.
-        report: told how many views are placed.
+        report: called with the number of views whose pose is known.
 
     Raises:
         ProblemError: no pair of views has parallax, or a view shares too few tracks with its neighbour.
@@ -147,22 +149,21 @@ def visual_odometry(
         report(done + 2)
         pose = _resect(scene, view)
         if pose is None:
-            pose = _carry_on(scene, view, names)
+            pose = _pose_from_neighbour(scene, view, names)
             restarts.append(view)
-        scene.place(view, *pose)
+        scene.set_pose(view, *pose)
         scene.triangulate([view])
     # the first view becomes the origin
-    turn, shift = scene.rotation[0], scene.translation[0]
-    rotation = scene.rotation @ turn.T
-    translation = scene.translation - rotation @ shift
+    rotation = scene.rotation @ scene.rotation[0].T
+    translation = scene.translation - rotation @ scene.translation[0]
     return Odometry(Views(rotation, translation), (first, second), tuple(restarts))
 
 
 def _bootstrap(scene: _Map, views: int, names: tuple[int, ...]) -> tuple[int, int]:
-    """Places the two views from which everything else is placed: the best pair of the first view that has a good one.
+    """Sets the poses of the first two views: the best pair of the first view that has a good one.
 
-    Good pairs have many good points and parallax; the best one has the most of both. Without a good one, the best of
-    all pairs is taken.
+    A good pair has many inlier points and enough parallax; the best one has the largest product of both. If there is no
+    good pair, the best of all pairs is used.
     """
     best: tuple[bool, float, int, int, _Motion] | None = None
     largest, enough = 0.0, False
@@ -187,13 +188,13 @@ def _bootstrap(scene: _Map, views: int, names: tuple[int, ...]) -> tuple[int, in
             f"(at most {largest:.2f} degrees, {BOOTSTRAP_LEAST} are needed): the camera stands still or only turns"
         )
     _, _, i, j, motion = best
-    scene.place(i, np.eye(3), np.zeros(3))
-    scene.place(j, motion.rotation, motion.translation)
+    scene.set_pose(i, np.eye(3), np.zeros(3))
+    scene.set_pose(j, motion.rotation, motion.translation)
     return i, j
 
 
 class _Motion(NamedTuple):
-    """From one view to another."""
+    """Relative pose of two views."""
 
     rotation: np.ndarray
     translation: np.ndarray  # of length 1
@@ -203,7 +204,7 @@ class _Motion(NamedTuple):
 
 
 def _relative(scene: _Map, i: int, j: int) -> _Motion | None:
-    """Motion from view i to view j; None if they share little."""
+    """Motion from view i to view j; None if they share too few tracks."""
     a, b = scene.tracks.shared(i, j)
     if len(a) < MIN_POINTS:
         return None
@@ -226,7 +227,7 @@ def _relative(scene: _Map, i: int, j: int) -> _Motion | None:
 def _refine(
     rotation: np.ndarray, translation: np.ndarray, first: np.ndarray, second: np.ndarray, threshold: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The motion that fits all inliers, from that of five of them: three angles of the rotation, two of the direction.
+    """The motion that fits all inliers, from one that fits five: three angles of the rotation, two of the direction.
 
     Source of the distances: Sampson 1982; Hartley and Zisserman 2004, section 11.4.3.
     """
@@ -244,19 +245,19 @@ def _refine(
         norm = np.sqrt((lines[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
         return (lines * b).sum(1) / norm / threshold
 
-    return motion(least_squares(distances, np.zeros(5), loss="soft_l1", f_scale=SOFT_SHARE).x)
+    return motion(least_squares(distances, np.zeros(5), loss="soft_l1", f_scale=SOFT_LOSS_SCALE).x)
 
 
 def _two_views(scene: _Map, views: Views, first: np.ndarray, second: np.ndarray) -> tuple[Triangulated, np.ndarray]:
-    """Points of matched rays of two views, and which are good, whatever their angle."""
+    """Points of matched rays of two views, and which pass the filters, at any angle."""
     track = np.repeat(np.arange(len(first)), 2)
     rays = np.stack([first, second], axis=1).reshape(-1, 2)
-    found = triangulate(views, Sightings(np.tile([0, 1], len(first)), track, rays))
+    found = triangulate(views, Observations(np.tile([0, 1], len(first)), track, rays))
     return found, found.good(track, Filters(angle=0.0, pixels=scene.filters.pixels), scene.calibration.fx)
 
 
 def _neighbour(scene: _Map, view: int) -> int:
-    placed = np.flatnonzero(scene.placed)
+    placed = np.flatnonzero(scene.has_pose)
     return int(placed[np.argmin(np.abs(placed - view))])
 
 
@@ -267,7 +268,7 @@ def _resect(scene: _Map, view: int) -> tuple[np.ndarray, np.ndarray] | None:
     if len(rows) < MIN_POINTS:
         return None
     near = _neighbour(scene, view)
-    # in the frame of the neighbour, where coordinates are small
+    # in the frame of the neighbour, where coordinates are small and rounding errors too
     points = scene.points[scene.tracks.track[rows]] @ scene.rotation[near].T + scene.translation[near]
     rays = np.ascontiguousarray(scene.rays[rows])
     cv2.setRNGSeed(scene.seed)
@@ -284,12 +285,12 @@ def _resect(scene: _Map, view: int) -> tuple[np.ndarray, np.ndarray] | None:
     if not ok or inliers is None or len(inliers) < MIN_POINTS:
         return None
     chosen: np.ndarray = np.asarray(inliers).ravel()
-    for _ in range(2):  # refine, gather the inliers anew, refine
+    for _ in range(2):  # refine, find the inliers again, refine
         turn, shift = cv2.solvePnPRefineLM(points[chosen], rays[chosen], np.eye(3), np.zeros(4), turn, shift)
         rotation = np.asarray(cv2.Rodrigues(turn)[0])
         local = points @ rotation.T + np.asarray(shift).ravel()
-        with np.errstate(divide="ignore", invalid="ignore"):
-            error = np.linalg.norm(local[:, :2] / local[:, 2:] - rays, axis=1)
+        with np.errstate(invalid="ignore"):
+            error = np.linalg.norm(perspective(local) - rays, axis=1)
         chosen = np.flatnonzero((error * scene.calibration.fx <= PNP_PIXELS) & (local[:, 2] > 0))
         if len(chosen) < MIN_POINTS:
             return None
@@ -297,12 +298,12 @@ def _resect(scene: _Map, view: int) -> tuple[np.ndarray, np.ndarray] | None:
     return rotation @ scene.rotation[near], translation
 
 
-def _carry_on(scene: _Map, view: int, names: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a view relative to its neighbour alone, the length of the step by the points that both see."""
+def _pose_from_neighbour(scene: _Map, view: int, names: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a view from its neighbour alone, with the length of the step from the known points that both see."""
     near = _neighbour(scene, view)
     a, b = scene.tracks.shared(near, view)
     if len(a) >= MIN_POINTS and parallax(scene.rays[a], scene.rays[b], scene.calibration.fx) < STILL_PIXELS:
-        rotation, translation, step = turn(scene.rays[a], scene.rays[b]), np.zeros(3), 0.0
+        rotation, translation, step = relative_rotation(scene.rays[a], scene.rays[b]), np.zeros(3), 0.0
     else:
         found = _relative(scene, near, view)
         if found is None:
@@ -311,14 +312,14 @@ def _carry_on(scene: _Map, view: int, names: tuple[int, ...]) -> tuple[np.ndarra
                 f"motion badly, {MIN_POINTS} good ones are needed; choose other --frames or --features"
             )
         rotation, translation = found.rotation, found.translation
-        step = _known_length(scene, near, view, rotation, translation)
+        step = _step_length(scene, near, view, rotation, translation)
         if step is None:
-            step = _pace(scene, near, names) * abs(names[view] - names[near])
+            step = _speed(scene, near, names) * abs(names[view] - names[near])
     return rotation @ scene.rotation[near], rotation @ scene.translation[near] + step * translation
 
 
-def _known_length(scene: _Map, near: int, view: int, rotation: np.ndarray, translation: np.ndarray) -> float | None:
-    """Length of a step, whose direction is known, by the known points that both views see; None if they are too few."""
+def _step_length(scene: _Map, near: int, view: int, rotation: np.ndarray, translation: np.ndarray) -> float | None:
+    """Length of a step of known direction, from the known points that both views see; None if they are too few."""
     a, b = scene.tracks.shared(near, view)
     known = scene.points[scene.tracks.track[a]]
     use = np.isfinite(known[:, 0])
@@ -333,21 +334,21 @@ def _known_length(scene: _Map, near: int, view: int, rotation: np.ndarray, trans
     return length if length > 0 else None
 
 
-def _pace(scene: _Map, near: int, names: tuple[int, ...]) -> float:
-    """Median length a frame of the steps nearest to a view in which the camera moved."""
-    placed = np.flatnonzero(scene.placed)
+def _speed(scene: _Map, near: int, names: tuple[int, ...]) -> float:
+    """Median length per frame of the nearest steps in which the camera moved."""
+    placed = np.flatnonzero(scene.has_pose)
     centers = Views(scene.rotation, scene.translation).centers()
     steps = sorted(pairwise(placed.tolist()), key=lambda step: abs(step[0] + step[1] - 2 * near))
-    paces: list[float] = []
+    speeds: list[float] = []
     for i, j in steps:
         a, b = scene.tracks.shared(i, j)
         if len(a) >= MIN_POINTS and parallax(scene.rays[a], scene.rays[b], scene.calibration.fx) >= MOVED_PIXELS:
-            paces.append(float(np.linalg.norm(centers[j] - centers[i])) / abs(names[j] - names[i]))
-        if len(paces) == PACE_STEPS:
+            speeds.append(float(np.linalg.norm(centers[j] - centers[i])) / abs(names[j] - names[i]))
+        if len(speeds) == SPEED_STEPS:
             break
-    if not paces:  # nothing but the first two views, which are a step of 1
+    if not speeds:  # only the first two views, whose distance is 1
         return 1.0 / abs(names[placed[-1]] - names[placed[0]])
-    return float(np.median(paces))
+    return float(np.median(speeds))
 
 
 def views_of_poses(poses: Float[np.ndarray, "views 3 4"]) -> Views:

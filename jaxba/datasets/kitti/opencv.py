@@ -1,4 +1,4 @@
-"""OpenCV, or one line on how to get it. Needs the extra `kitti`."""
+"""OpenCV, or an error that says how to install it. Needs the extra `kitti`."""
 
 from __future__ import annotations
 

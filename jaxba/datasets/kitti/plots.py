@@ -1,4 +1,4 @@
-"""The scene from above: points black, the path red, the true path blue. Source: the paper's first figure."""
+"""Top view of a scene: points black, the path red, the true path blue, as in the first figure of the paper."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ TRUTH = "#7099C8"
 POINT = "#000000"
 
 MARGIN = 30.0
-"""Metres (or tenths of the path's extent, where there is no truth) of scene shown around the path."""
+"""Margin around the true path, metres."""
 
 
 class View(NamedTuple):
-    """What one panel shows, in the frame of the truth or of the first camera: x to the right, z forward."""
+    """Contents of a panel, in the frame of the truth or of the first camera: x to the right, z forward."""
 
     title: str
     points: Float[np.ndarray, "points 3"]
@@ -28,7 +28,7 @@ class View(NamedTuple):
 def plot_top_view(views: Sequence[View], truth: Float[np.ndarray, "poses 3"] | None) -> Figure:
     """A panel for each view, all with the same axes, equal along x and z.
 
-    Points far outside the paths are cut off: a few distant ones would shrink the road to a line.
+    Points far outside the paths are not shown: a few distant ones would shrink the road to a line.
 
     Args:
         views: of the same cameras, for example before and after bundle adjustment.

@@ -20,7 +20,7 @@ from jaxba.io.files import StrPath, display_name, reason
 from jaxba.problem.bundle_problem import ProblemError
 
 CALIBRATION_FILES = ("calib.txt", "K.txt")
-"""Looked for in this order: the development kit's lines `P0: 12 numbers`, or a bare 3 x 3 matrix."""
+"""Searched in this order: the development kit's lines `P0: 12 numbers`, or a bare 3 x 3 matrix."""
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -28,7 +28,7 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG file."""
 
 GREY_BITS = 8
-"""Of the images that key-points are found in."""
+"""Bits per pixel of the images in which key-points are detected."""
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of `R R^T - I` in a file of poses; KITTI writes 7 digits."""
@@ -45,7 +45,7 @@ class Calibration:
     """The same, vertically."""
 
     cx: float
-    """Principal point in pixels from the centre of the first pixel, to the right."""
+    """Principal point in pixels relative to the centre of the first pixel, to the right."""
 
     cy: float
     """The same, downwards."""
@@ -87,16 +87,16 @@ class Sequence:
 
 
 def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibration: StrPath | None = None) -> Sequence:
-    """The frames of a range, none of whose images is opened yet.
+    """The frames of a range. No image is opened yet.
 
     Args:
         folder: of the sequence.
         frames: `first:end` or `first:end:step` by frame number, the end not included, as a Python slice.
         camera: 0 and 1 are KITTI's grey cameras, 2 and 3 the coloured ones.
-        calibration: file of the camera's matrix, where it is not the folder's.
+        calibration: file of the camera matrix, if it is not that of the folder.
 
     Raises:
-        ProblemError: no folder, images or calibration, or a range outside of the sequence.
+        ProblemError: no folder, images or calibration, or a range outside the sequence.
     """
     root, name = Path(folder), display_name(folder)
     if not root.is_dir():
@@ -137,7 +137,7 @@ def read_calibration(folder: Path, camera: int = 0) -> Calibration:
 
 
 def read_poses(path: StrPath) -> Float[np.ndarray, "frames 3 4"]:
-    """Poses of camera 0, camera to world, a line of 12 numbers (a 3 x 4 matrix, row by row) a frame; metres.
+    """Poses of camera 0, camera to world, in metres, from a file of 12 numbers per line and frame (3 x 4, row by row).
 
     Raises:
         ProblemError: the file cannot be read, a line is malformed or holds no rotation.
@@ -162,7 +162,7 @@ def poses_of(
 ) -> Float[np.ndarray, "frames 3 4"]:
     """Camera-to-world poses of this camera at the frames with these numbers.
 
-    A camera beside camera 0 stands at `-offset` in its frame, so its path is not that of camera 0.
+    The centre of camera 0 is at `offset` in the frame of this camera, so their paths differ.
 
     Raises:
         ProblemError: there are fewer poses than frames.
@@ -242,9 +242,9 @@ Reader = Callable[[int], np.ndarray]
 
 
 def image_reader(sequence: Sequence) -> Reader:
-    """Reads images as grey; all must have the size of the first one.
+    """A reader of grey images, which must all have the size of the first one.
 
-    Images of 16 bits lose `spare_bits`.
+    Images of 16 bits are shifted to the right by `spare_bits`.
 
     Raises:
         ImportError: OpenCV is missing.
@@ -269,9 +269,9 @@ def image_reader(sequence: Sequence) -> Reader:
 
 
 def spare_bits(sequence: Sequence) -> int:
-    """Low bits that images of 16 bits lose, in all frames as many as make the first one fit into 8.
+    """Number of low bits to drop from every image, so that the first one fits into 8 bits.
 
-    Cameras of 10 or 12 bits leave the highest ones empty.
+    Cameras of 10 or 12 bits leave the highest bits of their 16-bit images empty.
 
     Raises:
         ProblemError: the first image cannot be read.
@@ -288,16 +288,18 @@ def _decode(path: Path) -> np.ndarray:
         data = path.read_bytes()
     except OSError as error:
         raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
-    whole = _whole_png(data) if path.suffix.lower() == ".png" else bool(data)  # libpng complains on its own
+    complete = (
+        _is_complete_png(data) if path.suffix.lower() == ".png" else bool(data)
+    )  # for a damaged one libpng prints warnings
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if whole else None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if complete else None
     if image is None:
         raise ProblemError(f"{display_name(path)}: is no image that can be decoded")
     return np.asarray(image)
 
 
-def _whole_png(data: bytes) -> bool:
-    """Whether the bytes are a PNG file whose chunks all have their checksums, up to the last one.
+def _is_complete_png(data: bytes) -> bool:
+    """Whether the bytes are a complete PNG file, and all its chunks have the right checksums.
 
     Source: the PNG specification (ISO/IEC 15948), section 5.3: length, name, content, CRC-32 of name and content.
     """
@@ -315,6 +317,6 @@ def _whole_png(data: bytes) -> bool:
 
 
 def stamp(path: StrPath) -> str:
-    """What tells one image file from another without opening it: absolute path, size and time of change."""
+    """Key of an image file that changes with it: absolute path, size and modification time."""
     status = os.stat(path)
     return f"{os.path.abspath(path)} {status.st_size} {status.st_mtime_ns}"

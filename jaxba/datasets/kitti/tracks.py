@@ -1,4 +1,4 @@
-"""Tracks: which key-points of which images are the same point of the scene."""
+"""Tracks: key-points of several images that are the same point of the scene."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from scipy.sparse.csgraph import connected_components
 
 @dataclass(frozen=True)
 class Tracks:
-    """A table of sightings, sorted by track and then by image; no track is twice in an image."""
+    """A table of observations, sorted by track and then by image; no track has two in one image."""
 
     image: Int[np.ndarray, " n"]
-    """Image of each sighting: a position in some list of images."""
+    """Image of each observation: an index into a list of images."""
 
     track: Int[np.ndarray, " n"]
-    """Its track, numbered from 0 without gaps."""
+    """Track of each observation, numbered from 0 without gaps."""
 
     pixels: Float[np.ndarray, "n 2"]
-    """Where, from the centre of the first pixel, x to the right, y down."""
+    """Pixels relative to the centre of the first one, x to the right, y down."""
 
     @property
     def count(self) -> int:
@@ -31,22 +31,22 @@ class Tracks:
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
     def lengths(self) -> Int[np.ndarray, " tracks"]:
-        """Sightings of each track."""
+        """Observations of each track."""
         return np.bincount(self.track, minlength=self.count)
 
     @cached_property
     def _by_image(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows in the order of their images, and where each image's begin (one more entry than images)."""
+        """Rows sorted by image, and the first one of each image (one more entry than images)."""
         order = np.argsort(self.image, kind="stable")
         return order, np.searchsorted(self.image[order], np.arange(int(self.image.max(initial=-1)) + 2))
 
     def rows_of_image(self, image: int) -> Int[np.ndarray, " m"]:
-        """Rows of the sightings in an image, in the order of their tracks."""
+        """Rows of the observations in an image, in the order of their tracks."""
         order, start = self._by_image
         return order[start[image] : start[image + 1]] if 0 <= image < len(start) - 1 else order[:0]
 
     def rows_of_tracks(self, tracks: Int[np.ndarray, " k"]) -> Int[np.ndarray, " m"]:
-        """Rows of all sightings of some tracks (in ascending order), in the order of the table."""
+        """Rows of all observations of some tracks (in ascending order), in the order of the table."""
         first, end = (np.searchsorted(self.track, tracks, side=side) for side in ("left", "right"))
         sizes = end - first
         return np.repeat(first - np.cumsum(sizes) + sizes, sizes) + np.arange(sizes.sum())
@@ -58,13 +58,13 @@ class Tracks:
         return rows_a[at_a], rows_b[at_b]
 
     def keep(self, rows: np.ndarray, min_views: int) -> Tracks:
-        """The sightings that a mask selects, of tracks that then still have `min_views`; tracks are numbered anew."""
+        """The observations that a mask selects, of tracks that then still have `min_views`; tracks are renumbered."""
         image, track, pixels = self.image[rows], self.track[rows], self.pixels[rows]
         long = np.bincount(track, minlength=self.count)[track] >= min_views
         return Tracks(image[long], np.unique(track[long], return_inverse=True)[1], pixels[long])
 
     def restrict(self, images: Sequence[int], min_views: int = 2) -> Tracks:
-        """The sightings of some images, which become numbers 0, 1, ...; tracks with fewer than `min_views` go."""
+        """The observations of some images, renumbered 0, 1, ...; tracks with fewer than `min_views` are dropped."""
         new = np.full(int(self.image.max(initial=-1)) + 1, -1)
         wanted = np.asarray(images, int)
         new[wanted[wanted < len(new)]] = np.flatnonzero(wanted < len(new))
@@ -73,7 +73,7 @@ class Tracks:
 
 
 def make_tracks(image: np.ndarray, track: np.ndarray, pixels: np.ndarray, min_views: int = 2) -> Tracks:
-    """A table of sightings in any order, their tracks with any numbers."""
+    """Tracks from observations in any order, with any numbers of tracks."""
     order = np.lexsort((image, track))
     track = np.unique(track[order], return_inverse=True)[1]
     table = Tracks(np.asarray(image)[order], track, np.asarray(pixels, np.float64)[order])
@@ -83,15 +83,15 @@ def make_tracks(image: np.ndarray, track: np.ndarray, pixels: np.ndarray, min_vi
 def join_matches(
     pixels: Sequence[Float[np.ndarray, "_ 2"]], matches: Mapping[tuple[int, int], Int[np.ndarray, "_ 2"]]
 ) -> Tracks:
-    """Tracks from matches of pairs of images: what is connected belongs together.
+    """Tracks from matches of pairs of images: the connected components of matched key-points.
 
-    A connected set with two key-points of one image cannot be one point. It is split into the chains that matches of
-    neighbouring images (the nearest that each was matched with) make of it: these are one to one, so a chain is never
-    twice in an image.
+    A component with two key-points of one image cannot be one point. It is split into the chains of matches between
+    neighbouring images (the nearest ones that were matched): these are one to one, so a chain has no two key-points of
+    one image.
 
     Args:
         pixels: key-points of every image.
-        matches: by pair of images (i < j), pairs of key-points, one to one.
+        matches: of each pair of images (i < j), pairs of key-points, one to one.
     """
     sizes = [len(points) for points in pixels]
     first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)

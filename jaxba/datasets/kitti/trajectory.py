@@ -1,4 +1,4 @@
-"""Trajectories compared: absolute and relative errors after a similarity alignment.
+"""Trajectory errors: absolute and relative, after a similarity alignment.
 
 A trajectory is a stack of camera-to-world poses `[R | c]`, shape (poses, 3, 4), in the order of time. Definitions are
 those of evo (`evo_ape -a -s`, `evo_rpe -a -s`) and of the KITTI odometry development kit; each function names its own.
@@ -22,8 +22,8 @@ DEVKIT_STEP = 10
 """Segments start at every tenth pose. Source: `step_size` there."""
 
 LEAST_SPREAD = 1e-12
-"""Second singular value of the covariance, as a share of the first, below which positions lie on a line and leave the
-rotation about it open."""
+"""Second singular value of the covariance, as a share of the first, below which the positions lie on a line, so that
+the rotation about it is undetermined."""
 
 
 class Similarity(NamedTuple):
@@ -34,11 +34,11 @@ class Similarity(NamedTuple):
     translation: Float[np.ndarray, "3"]
 
     def points(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Moves points."""
+        """Transforms points."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def poses(self, poses: Poses) -> Poses:
-        """Moves camera-to-world poses: centres as points, orientations by the rotation."""
+        """Transforms camera-to-world poses: centres as points, orientations by the rotation."""
         centers = self.points(poses[:, :, 3])
         return np.concatenate([self.rotation @ poses[:, :, :3], centers[:, :, None]], axis=2)
 
@@ -68,10 +68,10 @@ class SegmentErrors(NamedTuple):
 
 
 def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Similarity:
-    """The similarity that brings `source` nearest to `target` in the least-squares sense.
+    """The least-squares similarity from `source` to `target`.
 
     Raises:
-        ProblemError: fewer than three points, or all of them in one place or on one line.
+        ProblemError: fewer than three points, or all of them at one position or on one line.
 
     Source: Umeyama 1991, eqs. 38-42; evo's `geometry.umeyama_alignment` is the same.
     """
@@ -93,7 +93,7 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) 
 
 
 def align(estimate: Poses, truth: Poses) -> Poses:
-    """The estimate after the similarity that brings its centres nearest to the truth's. Raises as `umeyama`."""
+    """The estimate after the least-squares similarity from its centres to the true ones. Raises as `umeyama`."""
     return umeyama(estimate[:, :, 3], truth[:, :, 3]).poses(estimate)
 
 
@@ -117,7 +117,7 @@ def relative_errors(aligned: Poses, truth: Poses) -> RelativeErrors:
 def segment_errors(
     aligned: Poses, truth: Poses, lengths: tuple[float, ...] = DEVKIT_LENGTHS, step: int = DEVKIT_STEP
 ) -> SegmentErrors | None:
-    """Errors over stretches of the true path, per metre; None where the path is too short for all of them.
+    """Errors over segments of the true path, per metre; None if the path is too short for all of them.
 
     A segment of length L starts at every `step`-th pose and ends at the first one whose distance along the true path
     is larger by more than L.

@@ -1,4 +1,4 @@
-"""Points of the scene from their sightings by known cameras, many tracks at once.
+"""Triangulation of many tracks at once, from cameras with known poses.
 
 Cameras here look down +z: a point `X` of the world is at `R X + t`, and its ray is `(x / z, y / z)`.
 """
@@ -11,22 +11,24 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxba.problem.geometry import perspective
+
 GAUSS_NEWTON_STEPS = 6
-"""Refinements of a point after the linear solution; three are enough on most tracks."""
+"""Gauss-Newton steps of a point after the linear solution; three are enough on most tracks."""
 
 
 @dataclass(frozen=True)
 class Filters:
-    """Which triangulated points are good."""
+    """Criteria that a triangulated point must meet."""
 
     angle: float = 1.0
     """Least angle in degrees between two rays of a point."""
 
     pixels: float = 3.0
-    """Largest reprojection error of a sighting."""
+    """Largest reprojection error of an observation."""
 
     depth: float = 0.0
-    """Least depth in front of every camera, scene units."""
+    """Depth in front of every camera that it must exceed, scene units."""
 
 
 class Views(NamedTuple):
@@ -40,11 +42,11 @@ class Views(NamedTuple):
         return -np.einsum("nji,nj->ni", self.rotation, self.translation)
 
     def local(self, camera: np.ndarray, points: np.ndarray) -> Float[np.ndarray, "n 3"]:
-        """Points in the frames of cameras, both shape (n, ...)."""
+        """Points (n, 3) in the frames of cameras (n,)."""
         return np.einsum("nij,nj->ni", self.rotation[camera], points) + self.translation[camera]
 
 
-class Sightings(NamedTuple):
+class Observations(NamedTuple):
     """Rays of tracks, sorted by track; every track from 0 to the last one has at least one."""
 
     camera: Int[np.ndarray, " n"]
@@ -53,37 +55,37 @@ class Sightings(NamedTuple):
 
 
 class Triangulated(NamedTuple):
-    """Points and how well they fit."""
+    """Points and their errors."""
 
     points: Float[np.ndarray, "tracks 3"]
-    angle: Float[np.ndarray, " tracks"]  # largest between the ray of the first or last sighting and any other, degrees
-    depth: Float[np.ndarray, " n"]  # of each sighting
+    angle: Float[np.ndarray, " tracks"]  # largest between the first or last ray and any other, degrees
+    depth: Float[np.ndarray, " n"]  # of each observation
     error: Float[np.ndarray, " n"]  # distance of each ray from the point's, in units of the focal length
 
     def good(self, track: np.ndarray, filters: Filters, focal: float) -> Bool[np.ndarray, " tracks"]:
-        """Tracks whose point passes all filters in all sightings."""
+        """Tracks whose point passes all filters, in all observations."""
         bad = (self.depth <= filters.depth) | ~(self.error * focal <= filters.pixels)
         good = (self.angle >= filters.angle) & np.isfinite(self.points).all(axis=1)
         good[track[bad]] = False
         return good
 
 
-def triangulate(views: Views, sightings: Sightings) -> Triangulated:
-    """Points that minimise the squared distances between rays, found linearly and refined by Gauss-Newton.
+def triangulate(views: Views, observations: Observations) -> Triangulated:
+    """Points that minimise the squared reprojection errors: a linear solution, refined by Gauss-Newton.
 
     Source of the linear solution: Hartley and Zisserman, "Multiple View Geometry", section 12.2, with the world moved
     to the first camera of each track and scaled by its longest baseline.
     """
-    camera, track, rays = sightings
+    camera, track, rays = observations
     count = int(track[-1]) + 1 if len(track) else 0
     starts = np.searchsorted(track, np.arange(count))
     centers = views.centers()
     origin = centers[camera[starts]]
-    away = centers[camera] - origin[track]
-    scale = np.maximum.reduceat(np.linalg.norm(away, axis=1), starts) if count else np.empty(0)
+    baseline = centers[camera] - origin[track]
+    scale = np.maximum.reduceat(np.linalg.norm(baseline, axis=1), starts) if count else np.empty(0)
     scale = np.where(scale > 0, scale, 1.0)
     rotation = views.rotation[camera]
-    shift = -np.einsum("nij,nj->ni", rotation, away / scale[track, None])
+    shift = -np.einsum("nij,nj->ni", rotation, baseline / scale[track, None])
     rows = np.concatenate([rotation, shift[:, :, None]], axis=2)  # [n, 3, 4]
     lines = rays[:, :, None] * rows[:, 2:] - rows[:, :2]  # [n, 2, 4]
     normal = _sum(np.einsum("nki,nkj->nij", lines, lines), starts)
@@ -95,18 +97,17 @@ def triangulate(views: Views, sightings: Sightings) -> Triangulated:
         points = _refine(points, rotation, shift, track, rays, starts)
     points = points * scale[:, None] + origin
     local = views.local(camera, points[track])
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        error = np.linalg.norm(local[:, :2] / local[:, 2:] - rays, axis=1)
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = np.linalg.norm(perspective(local) - rays, axis=1)
     return Triangulated(points, _angles(points, centers[camera], track, starts), local[:, 2], error)
 
 
 def _refine(points, rotation, shift, track, rays, starts):
-    """One Gauss-Newton step of every point, kept where its own cost falls."""
+    """One Gauss-Newton step of every point, accepted where its own cost falls."""
 
     def residual(at):
         local = np.einsum("nij,nj->ni", rotation, at[track]) + shift
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            difference = local[:, :2] / local[:, 2:] - rays
+        difference = perspective(local) - rays
         cost = np.add.reduceat((difference**2).sum(axis=1), starts) if len(starts) else np.empty(0)
         return local, difference, cost
 
@@ -144,29 +145,29 @@ def _sum(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
 
 
 def triangulate_robustly(
-    views: Views, sightings: Sightings, filters: Filters, focal: float, min_views: int = 2
+    views: Views, observations: Observations, filters: Filters, focal: float, min_views: int = 2
 ) -> tuple[Float[np.ndarray, "tracks 3"], Bool[np.ndarray, " n"]]:
-    """Points of all tracks, and which sightings are good; a track without good sightings has no point.
+    """Points of all tracks, and which observations are good; the point of a track without any is meaningless.
 
-    A track that fails loses the sightings whose errors are too large and is tried once more.
+    A track that fails is triangulated once more without the observations whose errors are too large.
 
     Args:
         views: of all cameras.
-        sightings: of all tracks.
-        filters: what is good.
+        observations: of all tracks.
+        filters: for points.
         focal: pixels.
-        min_views: sightings that a point needs.
+        min_views: observations that a point needs.
     """
-    first = triangulate(views, sightings)
-    good = first.good(sightings.track, filters, focal)
-    points, keep = first.points.copy(), good[sightings.track]
+    first = triangulate(views, observations)
+    good = first.good(observations.track, filters, focal)
+    points, keep = first.points.copy(), good[observations.track]
     again = ~keep & (first.error * focal <= filters.pixels) & (first.depth > filters.depth)
-    again &= np.bincount(sightings.track[again], minlength=len(points))[sightings.track] >= min_views
+    again &= np.bincount(observations.track[again], minlength=len(points))[observations.track] >= min_views
     if again.any():
-        names, track = np.unique(sightings.track[again], return_inverse=True)
-        second = triangulate(views, Sightings(sightings.camera[again], track, sightings.rays[again]))
+        names, track = np.unique(observations.track[again], return_inverse=True)
+        second = triangulate(views, Observations(observations.camera[again], track, observations.rays[again]))
         fine = second.good(track, filters, focal)
         points[names[fine]] = second.points[fine]
         keep[np.flatnonzero(again)[fine[track]]] = True
-    keep &= np.bincount(sightings.track[keep], minlength=len(points))[sightings.track] >= min_views
+    keep &= np.bincount(observations.track[keep], minlength=len(points))[observations.track] >= min_views
     return points, keep

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from jaxba.bench.sources import Source, sources
 from jaxba.paper import places
 from jaxba.paper.workshop import Workshop
+from jaxba.runtime.atomic import atomic_write
 
 FIGURES = "figures"
 """Folder of the pictures inside the run's."""
@@ -37,10 +38,11 @@ def picture(shop: Workshop, figure: Figure, name: str, caption: str) -> str:
     folder = shop.folder / FIGURES
     folder.mkdir(parents=True, exist_ok=True)
     path: Path = folder / f"{name}.png"
-    part = path.with_suffix(".part")
-    for dpi in RESOLUTIONS:
-        figure.savefig(part, dpi=dpi, format="png")
-        if part.stat().st_size < LARGEST:
-            break
-    part.replace(path)
+    with atomic_write(path) as file:
+        for dpi in RESOLUTIONS:
+            file.seek(0)
+            file.truncate()
+            figure.savefig(file, dpi=dpi, format="png")
+            if file.tell() < LARGEST:
+                break
     return f"![{caption}]({FIGURES}/{name}.png)\n\n*{caption}*"

@@ -1,4 +1,4 @@
-"""Where downloaded problems lie, and how their names become paths."""
+"""Paths of downloaded problems, by their names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NAME = re.compile(rf"(?:{'|'.join(PROBLEMS)})-\d+", re.IGNORECASE)
 
 
 def user_cache(part: str) -> Path:
-    """A folder of jaxba's in the user's cache folder (that of the XDG base directory specification)."""
+    """A folder of this package within the user's cache folder, as the XDG base directory specification has it."""
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     return Path(base) / "jaxba" / part
 
@@ -27,8 +27,8 @@ def data_folder() -> Path:
     return Path(os.environ.get(FOLDER_VARIABLE) or user_cache("bal"))
 
 
-def stored(entry: Entry) -> Path | None:
-    """Path of a problem that has been downloaded."""
+def downloaded_path(entry: Entry) -> Path | None:
+    """Path of a problem if it has been downloaded, else None."""
     path = data_folder() / entry.file
     return path if path.is_file() else None
 
@@ -37,20 +37,20 @@ def local_path(name: str) -> Path:
     """Path of the downloaded problem of a name.
 
     Raises:
-        ProblemError: there is no problem of that name, or it has not been downloaded; one line that says what to do.
+        ProblemError: there is no problem of that name, or it has not been downloaded; one line that says how to.
     """
     entry = find(name)
-    path = stored(entry)
+    path = downloaded_path(entry)
     if path is None:
         raise ProblemError(f"{entry.name} is not here; get it with: jaxba-data download {entry.name}")
     return path
 
 
 def resolve(location: str) -> str:
-    """The path that a user means: a name such as ladybug-49, where no file is called so, is a downloaded problem.
+    """The path of a problem's name, such as ladybug-49, if no file is called so; every other location as it is.
 
     Raises:
-        ProblemError: as `local_path` does, for what has the form of a name.
+        ProblemError: as `local_path` does, for a location that has the form of a name.
     """
     if _NAME.fullmatch(location) and not os.path.lexists(location):
         return str(local_path(location))

@@ -1,7 +1,7 @@
-"""The work folder: results of single frames and pairs, so that a killed run goes on where it was.
+"""Cache of the results of single frames and pairs on disk, so that an interrupted run can be resumed.
 
-A file's name holds a hash of everything its content depends on, so nothing stale is ever read; the folder may be
-deleted at any time.
+The name of a file holds a hash of everything that its contents depend on, so no stale result is ever read. The folder
+may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from jaxba.problem.bundle_problem import ProblemError
 Result = TypeVar("Result", bound=tuple)
 
 VERSION = "1"
-"""To be raised with every change of what a stored result means."""
+"""To be changed with the meaning of stored results."""
 
 
 def digest(*parts: object) -> str:
-    """16 hexadecimal digits that stand for the parts, by their `repr`."""
+    """Hash of the `repr` of some values, 16 hexadecimal digits."""
     return hashlib.sha256("\0".join(map(repr, (VERSION, *parts))).encode()).hexdigest()[:16]
 
 
-class Work:
-    """Named tuples of arrays, one `.npz` file each."""
+class ResultCache:
+    """A folder of named tuples of arrays, one `.npz` file each."""
 
     def __init__(self, folder: Path) -> None:
-        """Makes the folder. Raises ProblemError where that fails."""
+        """Creates the folder. Raises ProblemError if that fails."""
         self.folder = folder
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -40,12 +40,12 @@ class Work:
             raise ProblemError(f"cannot make {display_name(folder)}: {reason(error)}") from None
 
     def get(self, name: str, kind: type[Result], make: Callable[[], Result]) -> Result:
-        """The stored tuple of this name; made and stored if there is none, or it cannot be read.
+        """The stored tuple of this name; computed and stored if there is none, or it cannot be read.
 
         Args:
-            name: of the file, without its ending; holds a `digest` of all that the result depends on.
+            name: of the file, without suffix; contains a `digest` of everything that the result depends on.
             kind: a named tuple of arrays.
-            make: called where needed.
+            make: computes the tuple.
 
         Raises:
             ProblemError: the file cannot be written, or what `make` raises.

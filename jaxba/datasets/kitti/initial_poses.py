@@ -1,4 +1,4 @@
-"""Starts from given poses: as they are, or with errors that accumulate as odometry's do."""
+"""Initial poses with errors that accumulate, as those of odometry do."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from jaxba.problem.bundle_problem import ProblemError
 def drift(
     poses: Float[np.ndarray, "views 3 4"], rotation_sigma: float, translation_sigma: float, seed: int
 ) -> Float[np.ndarray, "views 3 4"]:
-    """Poses whose every relative motion has an error of its own, so that the path walks away from the true one.
+    """Poses with an independent error in every relative motion, so that the path drifts away from the true one.
 
     The motion from one view to the next, `(R, t)`, becomes `(exp(w) R, t + e)`: w has `rotation_sigma` on every
     component, e has `translation_sigma` times the length of t. Variances grow linearly with the number of motions.
 
     Args:
         poses: camera to world.
-        rotation_sigma: degrees a motion.
-        translation_sigma: share of the motion's length.
+        rotation_sigma: degrees per motion.
+        translation_sigma: relative to the length of the motion.
         seed: the same seed gives the same numbers.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The front end: tracks over the frames of a sequence, a frame or pair at a time, each result kept on disk."""
+"""The front end: tracks over the frames of a sequence. The result of every frame and pair is cached on disk."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxba.datasets.kitti.features import Features, KeyPoints, Verified, detect, epipolar_inliers, match
-from jaxba.datasets.kitti.klt import Followed, follow, start
+from jaxba.datasets.kitti.klt import TrackedPoints, detect_corners, track
 from jaxba.datasets.kitti.opencv import cv2
+from jaxba.datasets.kitti.result_cache import ResultCache, digest
 from jaxba.datasets.kitti.sequence import Sequence, image_reader, spare_bits, stamp
 from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
-from jaxba.datasets.kitti.work import Work, digest
 from jaxba.problem.bundle_problem import ProblemError
 
 Report = Callable[[str, int, int], None]
-"""Told what is being done, how much of it is done, and how much there is."""
+"""Called with the name of a stage, how much of it is done, and how much there is."""
 
 MIN_MATCHES = 40
-"""Fewer verified matches link no frames: random matches of textured images reach some 15 inliers."""
+"""Verified matches that link two frames: random matches of textured images reach some 15 inliers."""
 
 
 @dataclass(frozen=True)
-class FrontOptions:
-    """What the tracks depend on, beside the images."""
+class FrontEndOptions:
+    """Options of the tracks."""
 
     features: Features = "sift"
-    """Kind of key-points, or `klt` for points that are followed."""
+    """Kind of key-points, or `klt` for points tracked by Lucas-Kanade."""
 
     keypoints: int = 2000
-    """Most key-points of a frame."""
+    """Largest number of key-points of a frame."""
 
     reach: int = 3
-    """Frames are matched with this many before them; KLT loses so many bad frames before it gives up."""
+    """Number of earlier frames that a frame is matched with; for KLT, of bad frames in a row after which it fails."""
 
     min_matches: int = MIN_MATCHES
     """Verified matches that link two frames."""
 
     seed: int = 0
-    """Of every random sample."""
+    """Seed of every random sample."""
 
 
 class Linked(NamedTuple):
@@ -52,27 +52,30 @@ class Linked(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """Result of following points over one step."""
+    """Result of tracking points from one frame to the next."""
 
     tracks: np.ndarray
     pixels: np.ndarray
     next_track: np.ndarray
-    old: np.ndarray  # how many were followed, shape ()
+    old: np.ndarray  # how many points were tracked, shape ()
 
 
-def link(sequence: Sequence, options: FrontOptions, work: Work, report: Report) -> Linked:
+def link(sequence: Sequence, options: FrontEndOptions, cache: ResultCache, report: Report) -> Linked:
     """Tracks over a sequence.
 
-    A frame that cannot be linked with one of the `reach` before it is left out; too many such frames in a row end it.
+    A frame that cannot be linked with one of the `reach` frames before it is left out; too many such frames in a row
+    are an error.
 
     Raises:
         ProblemError: an image cannot be read, or frames cannot be linked: the message names them.
     """
     stamps = [stamp(path) for path in sequence.images]
-    return (_follow if options.features == "klt" else _match)(sequence, options, work, report, stamps)
+    return (_track_points if options.features == "klt" else _match_features)(sequence, options, cache, report, stamps)
 
 
-def _match(sequence: Sequence, options: FrontOptions, work: Work, report: Report, stamps: list[str]) -> Linked:
+def _match_features(
+    sequence: Sequence, options: FrontEndOptions, cache: ResultCache, report: Report, stamps: list[str]
+) -> Linked:
     read = image_reader(sequence)
     kind = (options.features, options.keypoints, cv2.__version__, spare_bits(sequence))
     recent: deque[KeyPoints] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
@@ -81,22 +84,22 @@ def _match(sequence: Sequence, options: FrontOptions, work: Work, report: Report
     for j, number in enumerate(sequence.numbers):
         report("key-points and matches", j, len(sequence))
         key = digest("points", kind, stamps[j])
-        recent.append(work.get(f"points-{number:06d}-{key}", KeyPoints, lambda j=j: detect(read(j), *kind[:2])))
+        recent.append(cache.get(f"points-{number:06d}-{key}", KeyPoints, lambda j=j: detect(read(j), *kind[:2])))
         pixels.append(recent[-1].pixels)
         for i in range(max(j - options.reach, 0), j):
             key = digest("match", kind, stamps[i], stamps[j], asdict(sequence.calibration), options.seed)
             name = f"match-{sequence.numbers[i]:06d}-{number:06d}-{key}"
             make = lambda a=recent[i - j - 1], b=recent[-1]: _verify(a, b, sequence, options.seed)
-            matches[i, j] = np.stack(work.get(name, Verified, make), axis=1)
+            matches[i, j] = np.stack(cache.get(name, Verified, make), axis=1)
     linked = [0]
     for j in range(1, len(sequence)):
         before = [i for i in linked if j - i <= options.reach]
         if not before:
-            _give_up(sequence, options, linked[-1], {k: len(matches[i, k]) for i, k in matches if i == linked[-1]})
+            _fail(sequence, options, linked[-1], {k: len(matches[i, k]) for i, k in matches if i == linked[-1]})
         if any(len(matches[i, j]) >= options.min_matches for i in before):
             linked.append(j)
     if len(linked) < 2:
-        _give_up(sequence, options, 0, {k: len(matches[i, k]) for i, k in matches if i == 0})
+        _fail(sequence, options, 0, {k: len(matches[i, k]) for i, k in matches if i == 0})
     position = {frame: at for at, frame in enumerate(linked)}
     strong = {
         (position[i], position[j]): found
@@ -112,29 +115,31 @@ def _verify(a: KeyPoints, b: KeyPoints, sequence: Sequence, seed: int) -> Verifi
     return Verified(*pairs[good].T)
 
 
-def _follow(sequence: Sequence, options: FrontOptions, work: Work, report: Report, stamps: list[str]) -> Linked:
+def _track_points(
+    sequence: Sequence, options: FrontEndOptions, cache: ResultCache, report: Report, stamps: list[str]
+) -> Linked:
     read = image_reader(sequence)
     count, calibration = options.keypoints, sequence.calibration
     key = digest("klt", asdict(options), asdict(calibration), cv2.__version__, stamps[0])
     name = f"klt-{sequence.numbers[0]:06d}-{key}"
-    points = work.get(name, Followed, lambda: start(read(0), count))
+    points = cache.get(name, TrackedPoints, lambda: detect_corners(read(0), count))
     linked, seen, failed = [0], [points], {}
     for j in range(1, len(sequence)):
-        report("following", j, len(sequence))
+        report("tracking", j, len(sequence))
         i = linked[-1]
         key = digest(key, stamps[i], stamps[j])
 
-        def make(i: int = i, j: int = j, points: Followed = points) -> _Step:
-            found, old = follow(read(i), read(j), points, count, calibration, options.seed)
+        def make(i: int = i, j: int = j, points: TrackedPoints = points) -> _Step:
+            found, old = track(read(i), read(j), points, count, calibration, options.seed)
             return _Step(*found, np.array(old))
 
-        step = work.get(f"klt-{sequence.numbers[j]:06d}-{key}", _Step, make)
+        step = cache.get(f"klt-{sequence.numbers[j]:06d}-{key}", _Step, make)
         if int(step.old) < options.min_matches:
             failed[j] = int(step.old)
             if j - i >= options.reach or (j == len(sequence) - 1 and len(linked) == 1):
-                _give_up(sequence, options, i, failed)
+                _fail(sequence, options, i, failed)
             continue
-        points = Followed(*step[:3])
+        points = TrackedPoints(*step[:3])
         linked.append(j)
         seen.append(points)
         failed = {}
@@ -143,7 +148,7 @@ def _follow(sequence: Sequence, options: FrontOptions, work: Work, report: Repor
     return Linked(make_tracks(image, tracks, np.concatenate([p.pixels for p in seen])), tuple(linked))
 
 
-def _give_up(sequence: Sequence, options: FrontOptions, frame: int, counts: dict[int, int]) -> None:
+def _fail(sequence: Sequence, options: FrontEndOptions, frame: int, counts: dict[int, int]) -> None:
     number = sequence.numbers
     shares = ", ".join(f"{count} with frame {number[j]}" for j, count in sorted(counts.items()))
     raise ProblemError(

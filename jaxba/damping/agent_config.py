@@ -1,0 +1,150 @@
+"""How an agent is connected to the solver: what it observes, what its actions mean, and the step that it drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, get_args
+
+from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions
+
+Observation = Literal["scale-free", "paper", "duration"]
+GuardMode = Literal["off", "hand-over"]
+EffortMode = Literal["fixed", "points", "points+forcing"]
+
+LARGEST_ESCALATION = 12.0
+"""Decades; more than the whole range of lambda would have no further effect."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """How an agent is connected to the solver. Hashable; stored in a policy's file."""
+
+    observation: Observation = "scale-free"
+    """`scale-free`: decreases, gain ratios and lambdas of the last steps as ratios and logarithms. `paper`: the last
+    errors. `duration`: minus the duration of each of the last iterations, which is one for every iteration by the
+    game's deterministic clock (the paper's reversed roles of state and reward)."""
+
+    history: int = 5
+    """Number of past steps in an observation. Source of the default: the paper's state size."""
+
+    low: float = -9.0
+    """log10 of the smallest lambda."""
+
+    high: float = 2.0
+    """log10 of the largest lambda."""
+
+    first_low: float = -5.0
+    """log10 of the smallest lambda of the first iteration, when nothing is known about the problem yet."""
+
+    descent: float = 1.5
+    """Decades by which lambda may fall from one iteration to the next. Without this limit and `first_low` a policy
+    alternated between 10 and 1e-7 and ended 6% above the best cost of Ladybug-49. With a floor of 1e-6 instead, flat
+    valleys of the held-out scenes were never crossed."""
+
+    min_gain: float = 0.25
+    """Gain ratio that a candidate must exceed; otherwise the step is shortened and tried again. Source: the sufficient
+    decrease of trust regions (Nocedal, Wright 2006, algorithm 4.1)."""
+
+    guard: GuardMode = "hand-over"
+    """`off`: the agent's lambdas are used as they are. `hand-over`: they are limited (`damping/guard.py`), and after
+    `patience` rejections in a row Ceres' rule chooses lambda to the end of the solve."""
+
+    patience: int = 2
+    """Rejections in a row after which Ceres' rule takes over."""
+
+    max_rejections: int = 8
+    """Rejections in all after which Ceres' rule takes over."""
+
+    escalate: float = 0.5
+    """Decades by which lambda rises at least after a rejection, and after an accepted step for each time that it was
+    shortened. Without effect if it is 0 or the guard is off."""
+
+    refine_points: int = 3
+    """Embedded point iterations of the step, see `StepOptions`."""
+
+    trials: int = 4
+    """Trials of the step, see `StepOptions`."""
+
+    camera_rounds: int = 3
+    """Camera rounds of the step, see `StepOptions`."""
+
+    pattern_moves: int = 1
+    """Pattern moves of the step, see `StepOptions`."""
+
+    camera_damping: float = 1.0
+    """Damping of the cameras relative to that of the points, see `StepOptions`."""
+
+    lens_step: LensStep = "pixels"
+    """How a step is added to focal length and distortion, see `StepOptions`."""
+
+    point_starts: PointStarts = "rays"
+    """Where embedded point iterations start, see `StepOptions`."""
+
+    remembered_steps: int = 3
+    """Earlier steps that are combined with the new one, if the method supports it; see `StepOptions`."""
+
+    effort: EffortMode = "fixed"
+    """What an action decides besides lambda. `fixed`: nothing. `points`: its second number, the embedded point
+    iterations of the step. `points+forcing`: also, its third number, the forcing term of conjugate gradients. Once the
+    guard has handed over, a step has all point iterations and the smallest forcing term."""
+
+    def __post_init__(self) -> None:
+        for name, known in (("observation", Observation), ("guard", GuardMode), ("effort", EffortMode)):
+            if getattr(self, name) not in get_args(known):
+                raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
+        if not 1 <= self.history <= 20:
+            raise ValueError(f"history must be 1 to 20, is {self.history}")
+        if not -15 <= self.low < self.high <= 10:
+            raise ValueError(f"lambda must range over decades within -15 to 10, not {self.low} to {self.high}")
+        if self.patience < 1 or self.max_rejections < 1:
+            raise ValueError("patience and max_rejections must be at least 1")
+        if not 0 <= self.min_gain < 1:
+            raise ValueError(f"min_gain must be at least 0 and below 1, is {self.min_gain}")
+        if not self.first_low <= self.high:
+            raise ValueError(f"first_low must be at most high, {self.high}, is {self.first_low}")
+        if not self.descent > 0:
+            raise ValueError(f"descent must be positive, is {self.descent}")
+        if not 0 <= self.escalate <= LARGEST_ESCALATION:
+            raise ValueError(f"escalate must be 0 to {LARGEST_ESCALATION:g}, is {self.escalate}")
+        if self.effort != "fixed" and not self.refine_points:
+            raise ValueError(f"effort {self.effort!r} needs embedded point iterations to choose from: refine_points")
+        self.step_options(StepOptions())
+
+    def step_options(self, options: StepOptions) -> StepOptions:
+        """The options with this configuration's embedded iterations, damping of cameras and lens coordinates."""
+        coordinates = replace(options.coordinates, camera_damping=self.camera_damping, lens_step=self.lens_step)
+        refinement = Refinement(
+            points=self.refine_points,
+            starts=self.point_starts,
+            trials=self.trials,
+            camera_rounds=self.camera_rounds,
+            pattern_moves=self.pattern_moves,
+            previous_steps=self.remembered_steps,
+        )
+        return replace(options, refinement=refinement, coordinates=coordinates)
+
+    @property
+    def guarded(self) -> bool:
+        """Whether the guard is on."""
+        return self.guard != "off"
+
+    @property
+    def action_size(self) -> int:
+        """Numbers of an action: lambda, and what `effort` adds."""
+        return 1 + get_args(EffortMode).index(self.effort)
+
+
+def config_from(values: dict[str, Any]) -> AgentConfig:
+    """The inverse of `dataclasses.asdict`.
+
+    Raises:
+        ValueError: unknown names or impossible values.
+    """
+    known = {field.name: field for field in fields(AgentConfig)}
+    for name, value in values.items():
+        if name not in known:
+            raise ValueError(f"unknown setting {name!r}")
+        kind = type(known[name].default)
+        if not isinstance(value, (int, float) if kind is float else kind) or isinstance(value, bool):
+            raise ValueError(f"{name} must be of type {kind.__name__}, is {value!r}")
+    return AgentConfig(**values)

@@ -1,0 +1,173 @@
+"""What an agent observes: features of the last steps and of the solve.
+
+The game and the policies share this, so that a policy observes the same in a solve as in training.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.guard import FIRST_DAMPING, GuardState, full_effort, initial_guard, update_guard
+from jaxba.damping.policy import ProblemInfo
+from jaxba.linear.step import Effort
+from jaxba.lm.records import StepInfo
+
+FLOOR = 1e-9
+"""Smallest relative decrease that a feature distinguishes from zero."""
+
+PAPER_LIMIT = 1000.0
+"""Upper end of the paper's observation range, (-inf, 1000]. Source: Belder et al. 2023."""
+
+FEATURE_LIMIT = 2.0
+"""Bound of the absolute value of every scale-free feature."""
+
+
+class StepFeatures(NamedTuple):
+    """Features of one step, all within [-2, 2]."""
+
+    present: Array  # 0 if there was no such step yet, else 1
+    decrease: Array  # log10 of cost before over cost after
+    small_decrease: Array  # log10 of the relative decrease, scaled
+    promised: Array  # log10 of the linear model's decrease relative to the cost, scaled
+    gain: Array  # gain ratio, squashed
+    candidate: Array  # log10 of the candidate's cost over the cost, for rejected steps
+    damping: Array  # log10 of lambda, scaled
+    accepted: Array  # 1 or -1
+    damping_share: Array  # damping's share of the step's curvature
+    shortened: Array  # how often the step was shortened
+
+
+SOLVE_FEATURES = (
+    "progress",  # log10 of the first cost over the current one
+    "error_angle",  # log10 of the rms error over the focal length
+    "tracks",  # observations per point
+    "redundancy",  # equations per unknown
+    "cameras",
+    "consecutive_rejections",
+    "rejections",  # in all
+    "remaining",  # fraction of the iteration budget that is left
+    "accepted_damping",  # log10 of the last accepted lambda
+    "smallest_accepted",  # log10 of the smallest accepted lambda
+    "largest_rejected",  # log10 of the largest lambda rejected since the last accepted step
+)
+"""Features of the solve, in order; what the action decided besides lambda follows."""
+
+
+class Memory(NamedTuple):
+    """State of an agent between iterations."""
+
+    info: ProblemInfo
+    steps: Float[Array, "history features"]  # `StepFeatures` of the last steps, newest first
+    errors: Float[Array, " history"]  # the observation itself, unless it is `scale-free`; newest first
+    cost: Float[Array, ""]
+    smallest_accepted: Float[Array, ""]
+    largest_rejected: Float[Array, ""]
+    guard: GuardState
+    effort: Effort | None  # of the last step, once it is chosen; None if it is fixed
+
+
+def observation_size(config: AgentConfig) -> int:
+    """Numbers in an observation."""
+    if config.observation == "scale-free":
+        return len(StepFeatures._fields) * config.history + len(SOLVE_FEATURES) + config.action_size - 1
+    return config.history
+
+
+def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
+    """Before the first iteration."""
+    dtype = info.cost.dtype
+    number = lambda x: jnp.asarray(x, dtype)
+    error = jnp.minimum(_rms_error(info, info.cost), PAPER_LIMIT) if config.observation == "paper" else number(0.0)
+    return Memory(
+        info=info,
+        steps=jnp.zeros((config.history, len(StepFeatures._fields)), dtype),
+        errors=jnp.zeros((config.history,), dtype).at[0].set(error),
+        cost=info.cost,
+        smallest_accepted=number(FIRST_DAMPING),
+        largest_rejected=number(config.low),
+        guard=initial_guard(dtype),
+        effort=full_effort(config, dtype),
+    )
+
+
+def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
+    """What the network sees, float32."""
+    if config.observation != "scale-free":
+        return memory.errors.astype(jnp.float32)
+    info, guard = memory.info, memory.guard
+    unknowns = 9.0 * info.cameras + 3.0 * info.points
+    solve = [
+        _log(info.cost / memory.cost) / 3,
+        _log(_rms_error(info, memory.cost) / info.focal) + 3,
+        _log(info.observations / info.points),
+        _log(2.0 * info.observations / unknowns),
+        _log(info.cameras) - 1,
+        guard.consecutive_rejections / 3.0,
+        guard.rejections / 5.0,
+        1 - guard.iteration / info.max_iterations,
+        _scaled_decades(guard.accepted_damping),
+        _scaled_decades(memory.smallest_accepted),
+        _scaled_decades(memory.largest_rejected),
+    ]
+    if memory.effort is not None:
+        points, forcing = memory.effort
+        solve += [points / config.refine_points, *([] if forcing is None else [_log(forcing) + 1])]
+    features = jnp.concatenate([memory.steps.reshape(-1), jnp.stack([jnp.asarray(x) for x in solve])])
+    return jnp.clip(jnp.nan_to_num(features), -FEATURE_LIMIT, FEATURE_LIMIT).astype(jnp.float32)
+
+
+def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
+    """After an iteration."""
+    dtype = memory.cost.dtype
+    guard = update_guard(config, memory.guard, step)
+    decrease = (step.previous_cost - step.cost) / step.previous_cost
+    scaled = lambda x: (_log(x + FLOOR) + 4.5) / 4.5
+    features = StepFeatures(
+        present=jnp.ones((), dtype),
+        decrease=_log(step.previous_cost / step.cost),
+        small_decrease=scaled(decrease),
+        promised=scaled(step.predicted / step.previous_cost),
+        gain=guard.gain / (1 + jnp.abs(guard.gain)),
+        candidate=jnp.where(step.accepted, 0.0, _log(step.candidate_cost / step.previous_cost)),
+        damping=_scaled_decades(guard.damping),
+        accepted=jnp.where(step.accepted, 1.0, -1.0),
+        damping_share=step.damping_share,
+        shortened=guard.shortened / 2,
+    )
+    row = jnp.nan_to_num(jnp.stack(features), nan=FEATURE_LIMIT)
+    row = jnp.clip(row, -FEATURE_LIMIT, FEATURE_LIMIT).astype(dtype)
+    error = {
+        "paper": lambda: jnp.minimum(_rms_error(memory.info, step.cost), PAPER_LIMIT),
+        "duration": lambda: -jnp.ones((), dtype),
+        "scale-free": lambda: jnp.zeros((), dtype),
+    }[config.observation]()
+    shifted = lambda old, new: jnp.concatenate([new[None].astype(dtype), old[:-1]])
+    pick = lambda if_accepted, if_rejected: jnp.where(step.accepted, if_accepted, if_rejected).astype(dtype)
+    return Memory(
+        info=memory.info,
+        steps=shifted(memory.steps, row),
+        errors=shifted(memory.errors, error),
+        cost=step.cost,
+        smallest_accepted=pick(jnp.minimum(guard.damping, memory.smallest_accepted), memory.smallest_accepted),
+        largest_rejected=pick(config.low, jnp.maximum(guard.damping, memory.largest_rejected)),
+        guard=guard,
+        effort=memory.effort,
+    )
+
+
+def _log(x: Any) -> Array:
+    return jnp.log10(jnp.maximum(x, 1e-30))
+
+
+def _scaled_decades(x: Array) -> Array:
+    return (x + 4) / 6
+
+
+def _rms_error(info: ProblemInfo, cost: Array) -> Array:
+    """Root mean square error of an observation in pixels."""
+    return jnp.sqrt(2 * cost / info.observations)

@@ -1,0 +1,118 @@
+"""Policy files: a trained agent in one `.safetensors` file.
+
+It holds the weights of the actor, and as metadata the configuration of the agent and the origin of the policy. Reading
+it does not need flax.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from jaxba.damping.agent_config import config_from
+from jaxba.damping.features import observation_size
+from jaxba.damping.learned import Layer, LearnedPolicy
+from jaxba.runtime.atomic import atomic_write
+
+FORMAT = "jaxba-policy-1"
+"""Kind and version of a policy file, in its metadata."""
+
+LARGEST_FILE = 1 << 20
+"""Largest size of a policy file in bytes."""
+
+
+class PolicyFileError(ValueError):
+    """A file that is not a usable policy. The message is one line for a person."""
+
+
+def save_policy(path: str | Path, policy: LearnedPolicy, metadata: dict[str, str] | None = None) -> None:
+    """Writes a policy file atomically.
+
+    Args:
+        path: of the file; solver names accept it if it ends in `.safetensors`.
+        policy: to write.
+        metadata: where the policy comes from, for people.
+
+    Raises:
+        PolicyFileError: the file would be larger than `LARGEST_FILE`.
+    """
+    from safetensors.numpy import save
+
+    tensors = {}
+    for k, layer in enumerate(policy.layers):
+        tensors[f"layer{k}.kernel"] = np.asarray(layer.kernel, np.float32)
+        tensors[f"layer{k}.bias"] = np.asarray(layer.bias, np.float32)
+    metadata = {**(metadata or {}), "format": FORMAT, "agent": json.dumps(asdict(policy.config))}
+    content = _with_sorted_metadata(save(tensors, metadata))
+    if len(content) > LARGEST_FILE:
+        raise PolicyFileError(
+            f"{path}: a policy of {len(content)} bytes, more than the {LARGEST_FILE} of a policy file"
+        )
+    with atomic_write(path) as file:
+        file.write(content)
+
+
+def _with_sorted_metadata(content: bytes) -> bytes:
+    """The same file with its metadata sorted. safetensors writes it in random order; sorted, equal policies are equal
+    files."""
+    size = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + size])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # tensors begin at a multiple of eight bytes
+    return len(text).to_bytes(8, "little") + text + content[8 + size :]
+
+
+def load_policy(path: str | Path) -> LearnedPolicy:
+    """Reads a policy file.
+
+    Raises:
+        PolicyFileError: the file cannot be read, is not a policy, or its weights do not fit its configuration.
+    """
+    tensors, metadata = _read(Path(path))
+    if metadata.get("format") != FORMAT:
+        raise PolicyFileError(f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})")
+    try:
+        config = config_from(json.loads(metadata["agent"]))
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise PolicyFileError(f"{path}: cannot be used by this version: {error}") from None
+    count = len(tensors) // 2
+    try:
+        layers = tuple(Layer(tensors[f"layer{k}.kernel"], tensors[f"layer{k}.bias"]) for k in range(count))
+    except KeyError as error:
+        raise PolicyFileError(f"{path}: {error} is missing") from None
+    size = observation_size(config)
+    for k, layer in enumerate(layers):
+        if layer.kernel.ndim != 2 or layer.kernel.shape[0] != size or layer.bias.shape != layer.kernel.shape[1:]:
+            raise PolicyFileError(
+                f"{path}: layer {k} has the shape {layer.kernel.shape}, which does not take {size} numbers "
+                f"(observation {config.observation!r}, history {config.history})"
+            )
+        if layer.kernel.dtype != np.float32 or layer.bias.dtype != np.float32:
+            raise PolicyFileError(f"{path}: layer {k} is not of type float32")
+        if not (np.isfinite(layer.kernel).all() and np.isfinite(layer.bias).all()):
+            raise PolicyFileError(f"{path}: layer {k} holds numbers that are not finite")
+        size = layer.kernel.shape[1]
+    if not layers or size != 2 * config.action_size:
+        raise PolicyFileError(f"{path}: the last layer must give {2 * config.action_size} numbers, not {size}")
+    return LearnedPolicy(tuple(layers), config)
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        if path.is_dir():
+            raise PolicyFileError(f"{path}: a directory, not a policy file")
+        if path.stat().st_size > LARGEST_FILE:
+            raise PolicyFileError(f"{path}: no policy file, it is larger than {LARGEST_FILE} bytes")
+        with safe_open(path, framework="numpy") as file:
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+            return tensors, dict(file.metadata() or {})
+    except OSError as error:
+        raise PolicyFileError(f"{path}: {error.strerror or 'no such file'}") from None
+    except SafetensorError:
+        raise PolicyFileError(f"{path}: not a safetensors file") from None

@@ -1,0 +1,131 @@
+"""Configuration files `configs/KIND/NAME.yaml`: how they are found by name, and how one extends another.
+
+An installed jaxba carries copies of them, which setup.py puts there; in a clone they lie beside the package. A file may
+begin with `extends: BASE`, the name of a configuration or a path relative to the file. It then states differences to
+its base: mappings are merged key by key, everything else, lists too, replaces what the base says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+from jaxba.io.files import display_name, reason
+
+Kind: TypeAlias = Literal["train", "paper", "bench"]
+"""Command that reads a configuration, and its folder's name."""
+
+BASE = "extends"
+"""Key of a file that names its base."""
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+class SettingsError(ValueError):
+    """Settings that cannot be used. The message is one line for a person."""
+
+
+def names(kind: Kind) -> list[str]:
+    """Names that `find` knows, sorted."""
+    return sorted(path.stem for path in _folder(kind).glob("*.yaml"))
+
+
+def find(kind: Kind, name: str, folder: Path = Path()) -> Path:
+    """Where a configuration lies.
+
+    Args:
+        kind: of the configuration.
+        name: one of `names`, or the path of a file: anything with a slash or an ending.
+        folder: what a path is relative to.
+
+    Raises:
+        SettingsError: there is no such name. Whether the file of a path exists is not looked at.
+    """
+    if len(Path(name).parts) != 1 or Path(name).suffix:
+        return folder / name
+    if name not in names(kind):
+        known = ", ".join(names(kind))
+        raise SettingsError(f"no configuration {name!r}; known: {known}, or the path of a file")
+    return _folder(kind) / f"{name}.yaml"
+
+
+def read(kind: Kind, name: str) -> dict[str, Any]:
+    """What a configuration says, its bases included; an empty file says nothing.
+
+    Args:
+        kind: of the configuration.
+        name: one of `names`, or the path of a file.
+
+    Returns:
+        Plain data, a new object with each call.
+
+    Raises:
+        SettingsError: no such configuration or base, no YAML, no mapping, or files that extend each other in a circle.
+    """
+    path = find(kind, name)
+    data = _read_file(path, name)
+    shown, visited, layers = [name], [path.resolve()], [data]
+    while BASE in data:
+        base = data.pop(BASE)
+        if not isinstance(base, str):
+            raise SettingsError(f"{shown[-1]}: {BASE} must be a name or the path of a file, is {base!r}")
+        try:
+            path = find(kind, base, path.parent)
+            data = _read_file(path, display_name(base))
+        except SettingsError as error:
+            raise SettingsError(f"{shown[-1]}: {BASE}: {error}") from None
+        shown.append(display_name(base))
+        if path.resolve() in visited:
+            raise SettingsError(f"{' extends '.join(shown)}: a circle")
+        visited.append(path.resolve())
+        layers.append(data)
+    merged: dict[str, Any] = {}
+    for layer in reversed(layers):
+        merged = _merge(merged, layer)
+    return merged
+
+
+def parse(text: str, name: str) -> Any:
+    """Plain data from YAML.
+
+    Raises:
+        SettingsError: not YAML; `name` says whose text it is.
+    """
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
+        raise SettingsError(f"{name}{where}: not YAML") from None
+
+
+def _folder(kind: Kind) -> Path:
+    """The copies inside an installed package; in a clone, what they would be copies of."""
+    installed = _PACKAGE / "configs" / kind
+    return installed if installed.is_dir() else _PACKAGE.parent / "configs" / kind
+
+
+def _read_file(path: Path, name: str) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise SettingsError(f"{name}: not text") from None
+    except (OSError, ValueError) as error:  # ValueError: a name with a null character
+        raise SettingsError(f"{name}: {reason(error)}") from None
+    data = parse(text, name)
+    if data is None:
+        return {}
+    if not isinstance(data, dict):
+        raise SettingsError(f"{name}: must be a mapping of settings to their values")
+    return data
+
+
+def _merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in top.items():
+        below = merged.get(key)
+        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged

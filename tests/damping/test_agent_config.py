@@ -1,0 +1,91 @@
+"""The configuration of an agent: what it accepts, and the step that it asks for."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxba import StepOptions
+from jaxba.damping.agent_config import AgentConfig, config_from
+
+
+def _config(effort: str, refine_points: int, **other) -> AgentConfig:
+    return AgentConfig(effort=effort, refine_points=max(refine_points, int(effort != "fixed")), **other)
+
+
+configs = st.builds(
+    _config,
+    effort=st.sampled_from(["fixed", "points", "points+forcing"]),
+    observation=st.sampled_from(["scale-free", "paper", "duration"]),
+    history=st.integers(1, 20),
+    low=st.floats(-15, -3),
+    high=st.floats(-2, 10),
+    guard=st.sampled_from(["off", "hand-over"]),
+    patience=st.integers(1, 9),
+    max_rejections=st.integers(1, 99),
+    escalate=st.floats(0, 3),
+    refine_points=st.integers(0, 5),
+    trials=st.integers(1, 6),
+    camera_rounds=st.integers(0, 4),
+    pattern_moves=st.integers(0, 4),
+    camera_damping=st.floats(1e-6, 1e6),
+    lens_step=st.sampled_from(["file", "pixels"]),
+    point_starts=st.sampled_from(["step", "rays"]),
+)
+
+
+@given(configs)
+def test_a_configuration_comes_back_from_its_numbers(config):
+    assert config_from(asdict(config)) == config
+    made = config.step_options(StepOptions(cg_forcing=0.2))
+    own = "refine_points", "trials", "camera_rounds", "pattern_moves", "camera_damping", "lens_step", "point_starts"
+    assert [getattr(made, name) for name in own] == [getattr(config, name) for name in own]
+    assert made.cg_forcing == 0.2
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"histroy": 3}, "histroy"),
+        ({"history": 3.0}, "history"),
+        ({"history": True}, "history"),
+        ({"history": "3"}, "history"),
+        ({"low": "-3"}, "low"),
+        ({"low": None}, "low"),
+        ({"guard": 1}, "guard"),
+        ({"guard": "none"}, "guard"),
+        ({"observation": "everything"}, "observation"),
+        ({"history": 0}, "history"),
+        ({"history": 21}, "history"),
+        ({"low": 3.0}, "lambda"),
+        ({"low": -16.0}, "lambda"),
+        ({"low": float("nan")}, "lambda"),
+        ({"high": float("inf")}, "lambda"),
+        ({"patience": 0}, "patience"),
+        ({"max_rejections": 0}, "max_rejections"),
+        ({"descent": 0.0}, "descent"),
+        ({"descent": float("nan")}, "descent"),
+        ({"first_low": 3.0}, "first_low"),
+        ({"first_low": float("nan")}, "first_low"),
+        ({"min_gain": 1.0}, "min_gain"),
+        ({"min_gain": float("nan")}, "min_gain"),
+        ({"escalate": -0.1}, "escalate"),
+        ({"escalate": float("nan")}, "escalate"),
+        ({"escalate": float("inf")}, "escalate"),
+        ({"refine_points": -1}, "refine_points"),
+        ({"trials": 0}, "trials"),
+        ({"camera_rounds": -1}, "camera_rounds"),
+        ({"camera_damping": 0.0}, "camera_damping"),
+        ({"lens_step": "zoom"}, "lens_step"),
+        ({"point_starts": True}, "point_starts"),
+        ({"camera_damping": float("inf")}, "camera_damping"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_impossible_configurations_are_refused_in_one_line(change, word):
+    with pytest.raises(ValueError, match=word) as caught:
+        config_from({**asdict(AgentConfig()), **change})
+    assert "\n" not in str(caught.value)
