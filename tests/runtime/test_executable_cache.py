@@ -19,7 +19,7 @@ from compilations import Compilations
 from jax.experimental.compilation_cache import compilation_cache
 from support import solve
 
-from jaxba import make_policy
+from jaxba import Loss, make_policy
 from jaxba.io import write_problem
 from jaxba.lm.step import try_step
 from jaxba.problem.options import Refinement, StepOptions
@@ -220,12 +220,13 @@ def test_everything_that_changes_a_program_changes_its_file(folder, monkeypatch)
         (double, {"power": lambda: 0}, 1.0),
         (double, {"power": Choice()}, 1.0),
         (double, {"power": (1, Choice())}, 1.0),
+        (double, {"power": StepOptions(loss=Loss(abs))}, 1.0),
         (double, {"power": 1}, Rule(1.0)),
         (double, {"power": 1}, [Rule(1.0)]),
         (call, {"power": 1}, 1.0),
         (lambda x: x, {}, 1.0),
     ],
-    ids=["builtin", "lambda", "class", "inside", "tree", "in a tree", "function", "nameless"],
+    ids=["builtin", "lambda", "class", "inside", "loss", "tree", "in a tree", "function", "nameless"],
 )
 def test_programs_with_code_of_other_packages_are_not_stored(function, static, argument, folder):
     assert executable_cache.ExecutableCache(folder).path_for(function, static, (argument,)) is None
