@@ -16,6 +16,7 @@ from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemErro
 from jaxba.problem.options import LinearSolver, LinearSolverChoice, StepOptions
 from jaxba.structure.camera_ordering import camera_order, is_banded
 from jaxba.structure.density import has_dense_shape, has_small_capacitance
+from jaxba.structure.observation_order import ObservationOrder
 
 
 class Work(NamedTuple):
@@ -114,58 +115,57 @@ class SolverCosts(NamedTuple):
     implicit: float
 
 
-def work(problem: BundleProblem, products: float = ASSUMED_PRODUCTS) -> dict[str, Work]:
+def work(
+    problem: BundleProblem, products: float = ASSUMED_PRODUCTS, observations: ObservationOrder | None = None
+) -> dict[str, Work]:
     """Work of one iteration with each linear solver that has the memory for it.
 
     Args:
         problem: gives the numbers of cameras, observations, pairs and co-visible blocks.
         products: of conjugate gradients, where they are used.
+        observations: of the problem, where they are sorted already.
     """
-    counts, observations = count_pairs(problem), problem.num_observations
-    every = Work(step=1.0, observation=observations)
+    sorted_ = observations or ObservationOrder.of(problem)
+    counts, observed = count_pairs(problem, sorted_), problem.num_observations
+    every = Work(step=1.0, observation=observed)
     blocks = _bytes_of_blocks(counts)
-    solvers = {"implicit": every._replace(coarse=observations, implicit=products * observations)}
+    solvers = {"implicit": every._replace(coarse=observed, implicit=products * observed)}
     if blocks <= MAX_BYTES:
-        solvers["sparse"] = every._replace(coarse=observations, block=products * counts.blocks, pair=counts.pairs)
-    explicit, needed = _factoring(problem, counts, blocks)
+        solvers["sparse"] = every._replace(coarse=observed, block=products * counts.blocks, pair=counts.pairs)
+    explicit, needed = _factoring(sorted_, counts, blocks)
     if needed <= MAX_BYTES:
-        solvers["explicit"] = explicit._replace(step=1.0, observation=observations)
+        solvers["explicit"] = explicit._replace(step=1.0, observation=observed)
     return solvers
 
 
-def _factoring(problem: BundleProblem, counts: PairCounts, blocks: float) -> tuple[Work, float]:
+def _factoring(observations: ObservationOrder, counts: PairCounts, blocks: float) -> tuple[Work, float]:
     """Work of forming and factoring the system, and the bytes that it takes."""
-    unknowns, band, points = 9.0 * problem.num_cameras, 9.0 * counts.reach, _observed_points(problem)
-    if _is_dense(problem):
-        if has_small_capacitance(points + 1, problem.num_cameras):
+    unknowns, band, points = 9.0 * observations.num_cameras, 9.0 * counts.reach, observations.num_observed_points
+    if _is_dense(observations):
+        if has_small_capacitance(points + 1, observations.num_cameras):
             side, inner = 3.0 * (points + 1), unknowns
         else:
             side, inner = unknowns, 3.0 * points
         forming = Work(dense_product=side**2 * inner, square=side**2, cube=side**3)
         return forming, 3 * 8 * side * inner
     forming = Work(pair=counts.pairs)
-    if is_banded(problem.num_cameras, counts.reach):
+    if is_banded(observations.num_cameras, counts.reach):
         return forming._replace(band=unknowns * band**2), blocks + 3 * 8 * unknowns * band
     return forming._replace(square=unknowns**2, cube=unknowns**3), blocks + DENSE_COPIES * 8 * unknowns**2
 
 
-def predict(problem: BundleProblem) -> SolverCosts:
+def predict(problem: BundleProblem, observations: ObservationOrder | None = None) -> SolverCosts:
     """Costs of one iteration with each linear solver."""
-    solvers = work(problem)
+    solvers = work(problem, observations=observations)
     return SolverCosts(*(solvers[name].seconds if name in solvers else np.inf for name in SolverCosts._fields))
 
 
-def _observed_points(problem: BundleProblem) -> int:
-    return int(np.count_nonzero(np.bincount(problem.point_index, minlength=1)))
-
-
-def _is_dense(problem: BundleProblem) -> bool:
+def _is_dense(observations: ObservationOrder) -> bool:
     """Whether the explicit solver will form the system as one dense product, or a matrix of the points' size."""
-    tracks, cameras = np.bincount(problem.point_index, minlength=1), problem.num_cameras
-    if not has_dense_shape(tracks, cameras, _observed_points(problem) + 1):
+    columns = observations.num_observed_points + 1
+    if not has_dense_shape(observations.tracks, observations.num_cameras, columns):
         return False
-    views = np.asarray(problem.point_index, np.int64) * cameras + problem.camera_index
-    return len(np.unique(views)) == len(views)
+    return not observations.num_repeated_pairs
 
 
 class PairCounts(NamedTuple):
@@ -176,22 +176,13 @@ class PairCounts(NamedTuple):
     reach: int  # in the better order of cameras, the largest distance of two that share a point
 
 
-def num_pairs(problem: BundleProblem) -> int:
-    """Pairs of observations of one point; an observation pairs with itself."""
-    tracks = np.bincount(problem.point_index, minlength=1)
-    return int(np.sum(tracks * (tracks + 1) // 2))
-
-
-def count_pairs(problem: BundleProblem) -> PairCounts:
+def count_pairs(problem: BundleProblem, observations: ObservationOrder | None = None) -> PairCounts:
     """Counts pairs; blocks and reach are exact up to `MAX_COUNTED_PAIRS` pairs, else upper bounds."""
-    point, cameras = np.asarray(problem.point_index), problem.num_cameras
-    tracks = np.bincount(point, minlength=problem.num_points)
-    pairs = num_pairs(problem)
+    observations = observations or ObservationOrder.of(problem)
+    pairs, cameras, tracks = observations.num_pairs, observations.num_cameras, observations.tracks
     if pairs > MAX_COUNTED_PAIRS or cameras > MAX_COUNTED_CAMERAS:
         return PairCounts(pairs, min(pairs, cameras * (cameras + 1) // 2), cameras)
-    order = np.argsort(point.astype(np.int64) * cameras + problem.camera_index, kind="stable")
-    camera = np.asarray(problem.camera_index)[order]
-    start = np.cumsum(tracks) - tracks
+    camera, start = observations.camera, observations.start[:-1]
     shared = np.zeros((cameras, cameras), bool)
     for length in np.unique(tracks[tracks > 0]):
         first = start[tracks == length][:, None]
@@ -201,16 +192,21 @@ def count_pairs(problem: BundleProblem) -> PairCounts:
     return PairCounts(pairs, len(rows), camera_order(rows, columns, cameras)[1])
 
 
-def choose(problem: BundleProblem) -> LinearSolver:
+def choose(problem: BundleProblem, observations: ObservationOrder | None = None) -> LinearSolver:
     """The solver with the lowest predicted time to the end; a tie goes to the more exact one."""
     times = {
         name: time if name == "explicit" else INEXACT_ITERATIONS * time
-        for name, time in predict(problem)._asdict().items()
+        for name, time in predict(problem, observations)._asdict().items()
     }
     return min(times, key=lambda name: times[name])  # type: ignore[return-value]
 
 
-def choose_linear_solver(problem: BundleProblem, options: StepOptions, asked: LinearSolverChoice) -> StepOptions:
+def choose_linear_solver(
+    problem: BundleProblem,
+    options: StepOptions,
+    asked: LinearSolverChoice,
+    observations: ObservationOrder | None = None,
+) -> StepOptions:
     """Options with the linear solver that was asked for.
 
     Args:
@@ -218,6 +214,7 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, asked: Li
         options: of the step.
         asked: `auto` or a name. A method in the place of plain LM has its own solver and leaves no choice. Fixed
             intrinsics leave the explicit one.
+        observations: of the problem, where they are sorted already.
 
     Raises:
         ValueError: a method, and a solver asked for by name.
@@ -234,14 +231,14 @@ def choose_linear_solver(problem: BundleProblem, options: StepOptions, asked: Li
     if options.method is not None:
         return options
     if asked == "auto" and options.intrinsics == "free":
-        return replace(options, linear_solver=choose(problem))  # it looks at memory itself
+        return replace(options, linear_solver=choose(problem, observations))  # it looks at memory itself
     asked = "explicit" if asked == "auto" else asked
     if asked == "explicit":
-        _check_memory(problem)
+        _check_memory(problem, observations)
     return replace(options, linear_solver=asked)
 
 
-def _check_memory(problem: BundleProblem) -> None:
+def _check_memory(problem: BundleProblem, observations: ObservationOrder | None) -> None:
     """Refuses what takes more memory to factor than the machine has. Shared lenses break bands and blocks."""
     try:
         there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -251,11 +248,12 @@ def _check_memory(problem: BundleProblem) -> None:
     copies = TIED_COPIES if shared else DENSE_COPIES
     needed = copies * 8.0 * (CAMERA_SIZE * problem.num_cameras) ** 2
     if not shared:
-        most = num_pairs(problem)
+        observations = observations or ObservationOrder.of(problem)
+        most = observations.num_pairs
         needed += _bytes_of_blocks(PairCounts(most, min(most, problem.num_cameras**2), 0))
         if needed > there:  # so it is without counting: there may be a band
-            counts = count_pairs(problem)
-            needed = _factoring(problem, counts, _bytes_of_blocks(counts))[1]
+            counts = count_pairs(problem, observations)
+            needed = _factoring(observations, counts, _bytes_of_blocks(counts))[1]
     if needed > there:
         of, way = (" with shared lenses", "; with fixed intrinsics they may take less") if shared else ("", "")
         raise ProblemError(

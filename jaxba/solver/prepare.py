@@ -23,6 +23,7 @@ from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.names import fitting_policy
 from jaxba.solver.options import SolveOptions
 from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 
 DEFAULT_POLICY = "learned"
@@ -94,9 +95,10 @@ def prepare(
     if getattr(policy, "step_options", None) is not None and scaling != trained_step(policy).coordinates.scaling:
         raise ProblemError(f"this policy knows lambda as a factor on the diagonal, not with scaling {scaling!r}")
     capacity, asked = None, options.linear_solver
+    observations = ObservationOrder.of(problem)
     if options.pad:
-        capacity, asked = with_padded_solver(capacity_of(problem), step, asked)
-    step = choose_linear_solver(problem, step, asked)
+        capacity, asked = with_padded_solver(capacity_of(problem, observations), step, asked)
+    step = choose_linear_solver(problem, step, asked, observations)
     if step.mixed_precision and step.method is not None:
         raise ProblemError("mixed types are for plain LM; methods have float64 or float32")
     dtype = jnp.dtype("float32" if options.dtype == "float32" else "float64")
@@ -105,7 +107,7 @@ def prepare(
         offset = far_middle(problem)
         here = problem if offset is None else shift(problem, -offset)
         with CompileClock() as clock:
-            layout = jax.device_put(layout_for(problem, step, capacity))
+            layout = jax.device_put(layout_for(here, step, capacity, observations))
             initial = program(initial_state, "options", "dtype", level="quick")
             begin = here if capacity is None else padded_parameters(here, capacity)
             state = jax.block_until_ready(compile_and_run(initial, layout, begin, step, dtype))

@@ -22,6 +22,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.structure.camera_clusters import ClusterLayout, cluster_layout
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.density import is_dense
+from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.random_partitions import Partition, partition_layout
 from jaxba.structure.shared_intrinsics import LensTies, lens_ties
@@ -109,6 +110,7 @@ def build_layout(
     partitions: int | None = None,
     capacity: Capacity | None = None,
     lenses: bool = True,
+    observations: ObservationOrder | None = None,
 ) -> Layout:
     """Sorts a problem's observations into slots.
 
@@ -124,6 +126,7 @@ def build_layout(
         capacity: pads all sizes, for a system that is factored: no clusters, no partitions. Where the system is a band,
             it is factored dense all the same.
         lenses: whether the problem's lenses count; not where intrinsics are fixed.
+        observations: of the problem, where they are sorted already.
 
     Returns:
         A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths. Those of a padded
@@ -137,14 +140,10 @@ def build_layout(
         raise ValueError("only layouts for a factored system are padded: no clusters, no partitions, factor=True")
     if capacity is not None and not capacity.holds(problem):
         raise ValueError(f"the problem is larger than the capacity: {capacity}")
-    camera = np.asarray(problem.camera_index)
-    point = np.asarray(problem.point_index)
     cameras = problem.num_cameras if capacity is None else capacity.cameras
-    tracks = np.bincount(point, minlength=problem.num_points)
-    # by point, then by camera: pairs of a track then come with sorted cameras
-    order = np.argsort(point.astype(np.int64) * problem.num_cameras + camera, kind="stable")
-    camera, point = camera[order], point[order]
-    start = np.concatenate([[0], np.cumsum(tracks)])
+    observations = observations or ObservationOrder.of(problem)
+    camera, point, tracks = observations.camera, observations.point, observations.tracks
+    order, start = observations.order, observations.start
     seen = np.bincount(camera, minlength=cameras)
 
     made = bucket_slots(tracks) if capacity is None else padded_slots(tracks, point, capacity)
@@ -205,7 +204,12 @@ def build_layout(
     )
 
 
-def layout_for(problem: BundleProblem, options: StepOptions, capacity: Capacity | None = None) -> Layout:
+def layout_for(
+    problem: BundleProblem,
+    options: StepOptions,
+    capacity: Capacity | None = None,
+    observations: ObservationOrder | None = None,
+) -> Layout:
     """The layout that a step with these options needs, and nothing more; padded where there is a capacity."""
     return build_layout(
         problem,
@@ -215,6 +219,7 @@ def layout_for(problem: BundleProblem, options: StepOptions, capacity: Capacity 
         partitions=options.cluster_cameras,
         capacity=capacity,
         lenses=options.intrinsics == "free",
+        observations=observations,
     )
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Int
 
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem
 from jaxba.problem.options import LinearSolverChoice, StepOptions
+from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
 LEAST_CAMERAS = 8
@@ -66,7 +67,7 @@ class Capacity:
         return f"{self.cameras} cameras, {self.points} points, {self.observations} observations, {self.pairs} pairs"
 
 
-def capacity_of(problem: BundleProblem) -> Capacity | None:
+def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = None) -> Capacity | None:
     """The grid cell of a problem.
 
     Cameras are rounded up to 8, 12, 16, 24, ..., observations to a power of two. Points and pairs mostly follow from
@@ -81,11 +82,9 @@ def capacity_of(problem: BundleProblem) -> Capacity | None:
         return None
     if max(problem.num_points, problem.num_observations + 1) > MAX_OBSERVATIONS:
         return None
-    camera, point = np.asarray(problem.camera_index, np.int64), np.asarray(problem.point_index)
-    tracks = np.bincount(point).astype(np.int64)
-    # a camera that sees a point twice: both orders of the two are listed (structure/covisibility.py)
-    _, times = np.unique(point * problem.num_cameras + camera, return_counts=True)
-    pairs = int(np.sum(tracks * (tracks + 1) // 2) + np.sum(times * (times - 1) // 2))
+    observations = observations or ObservationOrder.of(problem)
+    # of a camera that sees a point twice both orders are listed (covisibility.py)
+    pairs = observations.num_pairs + observations.num_repeated_pairs
     if pairs > MAX_PAIRS:
         return None
     cameras = max(LEAST_CAMERAS, _power(problem.num_cameras))

@@ -1,0 +1,65 @@
+"""Observations sorted by point, then by camera: made once for a solve, for its cost model, padding and layout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.structure.sum_trees import sorted_by
+
+
+@dataclass(frozen=True)
+class ObservationOrder:
+    """The observations of a problem by point, those of a point by camera."""
+
+    order: Int[np.ndarray, " observations"]
+    """Problem index of each sorted observation."""
+
+    camera: Int[np.ndarray, " observations"]
+    """Camera of each sorted observation."""
+
+    point: Int[np.ndarray, " observations"]
+    """Point of each sorted observation."""
+
+    tracks: Int[np.ndarray, " points"]
+    """Observations of each point."""
+
+    num_cameras: int
+    """Cameras, observed or not."""
+
+    @classmethod
+    def of(cls, problem: BundleProblem) -> ObservationOrder:
+        """Sorts the observations of a problem in linear time; ties keep the order of the problem."""
+        camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
+        order = sorted_by(camera, problem.num_cameras)
+        order = order[sorted_by(point[order], problem.num_points)]
+        tracks = np.bincount(point, minlength=problem.num_points)
+        return cls(order, camera[order], point[order], tracks, problem.num_cameras)
+
+    @cached_property
+    def start(self) -> Int[np.ndarray, " points_and_one"]:
+        """Sorted observation at which each point begins; the last entry is their number."""
+        return np.concatenate([[0], np.cumsum(self.tracks)])
+
+    @cached_property
+    def num_pairs(self) -> int:
+        """Pairs of observations of one point; an observation pairs with itself."""
+        tracks = self.tracks.astype(np.int64)
+        return int(np.sum(tracks * (tracks + 1) // 2))
+
+    @cached_property
+    def num_repeated_pairs(self) -> int:
+        """Pairs of different observations of one point by one camera."""
+        new = np.ones(len(self.order), bool)
+        new[1:] = (np.diff(self.point) != 0) | (np.diff(self.camera) != 0)
+        times = np.diff(np.append(np.flatnonzero(new), len(new)))
+        return int(np.sum(times * (times - 1) // 2))
+
+    @cached_property
+    def num_observed_points(self) -> int:
+        """Points with at least one observation."""
+        return int(np.count_nonzero(self.tracks))
