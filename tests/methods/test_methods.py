@@ -55,11 +55,11 @@ def pieces(problem: BundleProblem, label: np.ndarray) -> BundleProblem:
     return BundleProblem.create(problem.cameras, points, problem.observations, problem.camera_index, index)
 
 
-def systems(problem: BundleProblem, options: StepOptions, damping: float, turn: int = 0):
+def systems(problem: BundleProblem, options: StepOptions, damping: float, iteration: int = 0):
     """Everything that a clustered step is made of."""
     layout, state = start(problem, options)
     layout = jax.tree.map(jnp.asarray, layout)
-    return layout, *_systems(layout, state, jnp.asarray(damping), options), partition_of(layout).at(turn)
+    return layout, *_systems(layout, state, jnp.asarray(damping), options), partition_of(layout).at(iteration)
 
 
 @functools.partial(jax.jit, static_argnames=("options",))
@@ -210,9 +210,9 @@ def test_ddlm_with_one_block_is_plain_lm(embedded):
     one = replace(whole, method=DomainDecomposition(cluster_cameras=100))
     layout, state = start(problem, one)
     plain, _ = start(problem, whole)
-    for turn, damping in enumerate([1e-4, 1e-2, 1e-6, 1.0]):
+    for iteration, damping in enumerate([1e-4, 1e-2, 1e-6, 1.0]):
         before = state
-        state, ours = step(layout, before, damping, one, iteration=turn)
+        state, ours = step(layout, before, damping, one, iteration=iteration)
         same, theirs = step(plain, before, damping, whole)
         assert ours.accepted
         assert theirs.accepted
@@ -228,9 +228,9 @@ def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, embe
     problem, options = support.odd(), replace(DECOMPOSED, refinement=embedded)
     layout, first = start(problem, options)
     state = first
-    for turn in range(6):
+    for iteration in range(6):
         before = state
-        state, info = step(layout, state, damping, options, iteration=turn)
+        state, info = step(layout, state, damping, options, iteration=iteration)
         assert state.cost <= before.cost
         assert bool(info.accepted) == (state.cost < before.cost)
         np.testing.assert_allclose(state.cost, support.cost(support.back(problem, first, state), options), rtol=1e-9)
@@ -292,8 +292,8 @@ def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
     _, good = step(layout, state, 1e-2, options)
     assert good.share == 1
     decreases = []
-    for turn in range(8):
-        state, info = step(layout, state, 1e-2, options, 1e9, turn)  # no gain is enough
+    for iteration in range(8):
+        state, info = step(layout, state, 1e-2, options, 1e9, iteration)  # no gain is enough
         decreases.append(float(info.previous_cost - info.cost) / float(info.cost))
         assert info.share == LEAST_SHARE
         assert not converged_in_cost(info, 1e-6)
@@ -450,8 +450,8 @@ def test_random_clusters_are_one_program_for_all_turns(method):
     assert len(np.unique(label, axis=0)) > 10
     state, _ = step(layout, state, 1e-3, options, iteration=0)
     with CompileClock() as clock:
-        for turn in range(1, 4):
-            state, info = step(layout, state, 1e-3, options, iteration=turn)
+        for iteration in range(1, 4):
+            state, info = step(layout, state, 1e-3, options, iteration=iteration)
             assert float(info.cost) <= float(info.previous_cost)  # of arrays it would be a program
     assert clock.seconds == 0
 
