@@ -53,7 +53,7 @@ class RunSettings:
     """Relative decrease of an accepted step that ends a solve."""
 
     linear_solver: str = "auto"
-    """`auto`, `explicit`, `sparse`, `implicit` or `power`, of plain LM steps; other methods have their own."""
+    """`auto`, `explicit`, `sparse` or `implicit`, of plain LM steps; other methods have their own."""
 
 
 @dataclass(frozen=True)

@@ -137,11 +137,12 @@ def _write_policy(folder: Path, config: Any, work: Any, best: Any) -> None:
 def _finish(folder: Path, work: Any, best: Any, console: Any, progress: _Progress) -> int:
     """Policy file, curve and table."""
     from jaxba.bench.plots import save_figure
-    from jaxba.training import log, plots
+    from jaxba.cli.training_curve import plot_curve
+    from jaxba.training import log
 
     _write_policy(folder, work.config, work, best)
     rules = {name: {**score._asdict(), "score": score.mean} for name, score in work.rules.items()}
-    figure = plots.plot_curve(log.read(folder), rules, work.config.game.tolerance)
+    figure = plot_curve(log.read(folder), rules, work.config.game.tolerance)
     files = [folder / POLICY, *save_figure(figure, folder / CURVE)]
     progress.stage("comparing with the rules")
     scores = work.compare(best.actor)

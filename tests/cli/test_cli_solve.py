@@ -90,7 +90,7 @@ def test_a_search_for_points_is_told_and_rows_count_through(tmp_path, capsys):
     points, center = np.array(problem.points), geometry.camera_centers(problem.cameras)[problem.camera_index[0]]
     points[0] = center - 3 * (points[0] - center)
     write_bal(problem.replace(points=points), tmp_path / "strayed.txt")
-    stranding = ["--damping", "ceres", "--refine-points", "3"]
+    stranding = ["--policy", "ceres", "--refine-points", "3"]
     assert run([str(tmp_path / "strayed.txt"), *stranding, "--retriangulate", "--log", str(log)]) == 0
     printed, record = capsys.readouterr().out, json.loads(log.read_text())
     searches = re.findall(
@@ -116,7 +116,7 @@ def test_the_rms_is_that_of_the_residuals_whatever_the_loss(loss, tiny, tmp_path
 
 
 def test_padded_sizes_are_said_and_so_is_why_there_are_none(tiny, capsys):
-    fast = [str(tiny), "--max-iterations", "1", "--damping", "ceres", "--pad"]
+    fast = [str(tiny), "--max-iterations", "1", "--policy", "ceres", "--pad"]
     assert run(fast) == 0
     assert "padded to 8 cameras, 512 points, 1024 observations, 4096 pairs\n" in capsys.readouterr().out
     assert run([*fast, "--linear-solver", "implicit"]) == 0
@@ -133,7 +133,7 @@ def test_the_iteration_limit_is_no_error_and_is_said(tiny, tmp_path, capsys):
 
 
 def test_a_rejected_step_is_marked(tiny, capsys):
-    assert run([str(tiny), "--damping", "constant:1e30", "--compilation", "full"]) == 0
+    assert run([str(tiny), "--policy", "constant:1e30", "--compilation", "full"]) == 0
     printed = capsys.readouterr().out
     assert rows(printed)[1][-1] == "rejected"
     assert "not converged: " in printed
@@ -153,12 +153,12 @@ def test_the_point_cloud_has_every_point_and_camera(tiny, tmp_path, capsys):
 @pytest.mark.slow
 def test_options_reach_the_solver(tiny, tmp_path, capsys):
     log = tmp_path / "log.json"
-    options = ["--damping", "classic:0.03", "--refine-points", "3", "--max-iterations", "3", "--log", str(log)]
+    options = ["--policy", "classic:0.03", "--refine-points", "3", "--max-iterations", "3", "--log", str(log)]
     assert run([str(tiny), *options]) == 0
     record = json.loads(log.read_text())
     assert record["solver"] == "classic:0.03+refine3"
     assert [point["lambda"] for point in record["trace"]][:2] == [None, 0.03]
-    assert "damping classic:0.03 + 3 point iterations, float64" in capsys.readouterr().out
+    assert "policy classic:0.03 + 3 point iterations, float64" in capsys.readouterr().out
     assert run([str(tiny), "--dtype", "float32", "--max-iterations", "2", "--log", str(log)]) == 0
     record = json.loads(log.read_text())
     assert (record["solver"], record["dtype"]) == ("learned@float32", "float32")
@@ -166,7 +166,7 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     record = json.loads(log.read_text())
     assert record["cg_iterations"] > 0
     assert record["backend"].endswith("(implicit)")
-    assert run([str(tiny), "--method", "stba:3", "--damping", "stba", "--max-iterations", "2", "--log", str(log)]) == 0
+    assert run([str(tiny), "--method", "stba:3", "--policy", "stba", "--max-iterations", "2", "--log", str(log)]) == 0
     assert json.loads(log.read_text())["solver"] == "stba:3+stba"
     assert "method stba:3" in capsys.readouterr().out
 
@@ -323,7 +323,7 @@ def test_not_enough_memory_is_one_line(tiny, capsys, monkeypatch):
     def solve(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr(sys.modules["jaxba.solver.solve"], "solve", solve)
+    monkeypatch.setattr("jaxba.cli.solve.solve", solve)
     assert run([str(tiny)]) == 2
     assert capsys.readouterr().err == "error: not enough memory\n"
 
@@ -383,25 +383,28 @@ BAD = {
     "directory": (lambda tiny: [str(tiny.parent)], "directory"),
     "truncated file": (lambda tiny: [str(cut_short(tiny, 0.5))], "tiny.txt"),
     "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),
-    "unknown damping": (lambda tiny: [str(tiny), "--damping", "cerse"], "unknown damping policy 'cerse'"),
-    "lambda that is no number": (lambda tiny: [str(tiny), "--damping", "constant:x"], "positive number"),
-    "missing policy": (lambda tiny: [str(tiny), "--damping", "no.safetensors"], "no.safetensors: No such file"),
-    "policy that is none": (lambda tiny: [str(tiny), "--damping", str(garbage(tiny))], "not a safetensors file"),
+    "unknown policy": (lambda tiny: [str(tiny), "--policy", "cerse"], "unknown damping policy 'cerse'"),
+    "lambda that is no number": (lambda tiny: [str(tiny), "--policy", "constant:x"], "positive number"),
+    "missing policy": (lambda tiny: [str(tiny), "--policy", "no.safetensors"], "no.safetensors: No such file"),
+    "policy that is none": (lambda tiny: [str(tiny), "--policy", str(garbage(tiny))], "not a safetensors file"),
     "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm, ddlm, poba"),
     "size of no clusters": (lambda tiny: [str(tiny), "--method", "poba:3"], "no clusters"),
     "solver of a method": (lambda tiny: [str(tiny), "--method", "poba", "--linear-solver", "sparse"], "has its own"),
     "fixed intrinsics of a method": (
         lambda tiny: [str(tiny), "--intrinsics", "fixed", "--method", "ddlm"],
-        "--intrinsics",
+        "--intrinsics 'fixed' need the explicit solver, not ddlm",
     ),
-    "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must not be negative"),
+    "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must be at least 0"),
     "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "not with scaling 'identity'"),
-    "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be positive"),
-    "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be positive"),
+    "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be at least 1"),
+    "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be at least 1"),
     "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
     "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
     "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
-    "loss without scale": (lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"], "--loss-scale"),
+    "loss without scale": (
+        lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"],
+        "--loss-scale must be positive",
+    ),
     "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
     "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "--output"),
     "output named as a directory": (
@@ -448,6 +451,6 @@ def test_what_the_parser_refuses_is_status_2_and_nothing_on_stdout(argv, capsys)
 
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])
 def test_the_heading_says_where_cameras_are_damped_otherwise_than_points(factor, said):
-    args = SimpleNamespace(damping="mine.safetensors", dtype="float64", method="lm", linear_solver="auto")
+    args = SimpleNamespace(policy="mine.safetensors", dtype="float64", method="lm", linear_solver="auto")
     text = table.heading("scene", support.tiny(), args, StepOptions(coordinates=Coordinates(camera_damping=factor)))
     assert ("cameras damped by 0.01 lambda" in text) == said

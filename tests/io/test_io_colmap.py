@@ -17,7 +17,8 @@ from support import DATA, needs_data
 from jaxba import (
     BundleProblem,
     ProblemError,
-    StepOptions,
+    Refinement,
+    SolveOptions,
     read_colmap,
     read_problem,
     solve,
@@ -30,7 +31,6 @@ from jaxba.cli.solve import run
 from jaxba.io import colmap
 from jaxba.io.colmap import MODELS
 from jaxba.problem import geometry
-from jaxba.problem.options import Refinement
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
 
@@ -320,7 +320,7 @@ def test_a_problem_of_another_model_is_not_written(tmp_path):
     for other in (support.tiny(), fewer):
         with pytest.raises(ProblemError, match="the problem is not one of"):
             write_colmap(other, tmp_path / "out", like=folder)
-    apart = solve(problem.replace(lenses=None), "ceres", max_iterations=2).problem
+    apart = solve(problem.replace(lenses=None), "ceres", SolveOptions(max_iterations=2)).problem
     with pytest.raises(ProblemError, match="images of camera 9 have different f, k1 or k2"):
         write_colmap(apart, tmp_path / "out", like=folder)
     assert not (tmp_path / "out").exists()
@@ -436,5 +436,5 @@ def test_a_start_far_from_the_end_is_solved_with_a_shared_lens(tmp_path):
     rng = np.random.default_rng(2)
     far: BundleProblem = problem.replace(points=problem.points + rng.normal(scale=0.3, size=problem.points.shape))
     near = solve(problem, "learned").final_cost
-    options = StepOptions(refinement=Refinement(points=3))
+    options = SolveOptions(refinement=Refinement(points=3))
     np.testing.assert_allclose(solve(far, "ceres", options).final_cost, near, rtol=1e-4)

@@ -15,11 +15,12 @@ import jax
 import numpy as np
 import pytest
 import support
-from support import DATA, needs_data, same_bits
+from support import DATA, needs_data, same_bits, solve
 
 from jaxba import (
     BundleProblem,
     Classic,
+    DampingPolicy,
     ProblemError,
     Schedule,
     StepOptions,
@@ -27,7 +28,6 @@ from jaxba import (
     Tolerances,
     make_policy,
     read_problem,
-    solve,
 )
 from jaxba.bench import report
 from jaxba.bench.records import read_records
@@ -70,6 +70,17 @@ def scattered(seed: int, far: float = 3) -> BundleProblem:
     """`tiny` with its points thrown some units; three are a third of the way to the cameras."""
     problem = support.tiny()
     return problem.replace(points=problem.points + far * np.random.default_rng(seed).normal(size=problem.points.shape))
+
+
+def built(name: str) -> tuple[DampingPolicy, StepOptions]:
+    """The policy and the step of a solver's name."""
+    policy, options = parse_solver(name).build()
+    return policy, options.step_options(policy)
+
+
+def on_the_manifold(options: StepOptions) -> StepOptions:
+    """The same step in the coordinates that Ceres' rotations have."""
+    return replace(options, coordinates=replace(options.coordinates, rotation="manifold"))
 
 
 # The problem
@@ -289,7 +300,7 @@ def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
         monkeypatch.setattr(Run, "start", lambda run: (before.append(clock.seconds), start(run)))
         solver = parse_solver(f"pyceres:dense+{name}")
         policy, options = solver.build()
-        drive_ceres(support.tiny(), "dense", policy, embedded=options if solver.embeds else None)
+        drive_ceres(support.tiny(), "dense", policy, embedded=options.step_options(policy) if solver.embeds else None)
         assert clock.seconds == before[0] > 0
 
 
@@ -303,14 +314,9 @@ def test_every_lambda_is_possible(damping):
 @pytest.mark.parametrize("name", ["learned", "ceres+embedded", "classic+refine2"])
 @pytest.mark.parametrize("make", [support.tiny, lambda: scattered(7)])
 def test_with_embedded_iterations_ceres_does_what_our_step_does(name, make):
-    policy, options = parse_solver(f"pyceres:dense+{name}").build()
+    policy, options = built(f"pyceres:dense+{name}")
     found = drive_ceres(make(), "dense", policy, embedded=options, max_iterations=12)
-    ours = solve(
-        make(),
-        policy,
-        replace(options, coordinates=replace(options.coordinates, rotation="manifold")),
-        max_iterations=12,
-    )
+    ours = solve(make(), policy, on_the_manifold(options), max_iterations=12)
     assert (found.iterations, found.termination) == (ours.iterations, ours.termination)
     np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
     np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-3)
@@ -320,8 +326,9 @@ def test_with_embedded_iterations_ceres_does_what_our_step_does(name, make):
 
 def test_ceres_makes_the_same_step_when_it_is_not_to_judge_it():
     """With nothing embedded, steps as long as Ceres makes them."""
-    bare = StepOptions(coordinates=Coordinates(rotation="manifold"))
-    found, plain = (drive_ceres(support.tiny(), "dense", SOME, max_iterations=6, embedded=it) for it in (bare, None))
+    found, plain = (
+        drive_ceres(support.tiny(), "dense", SOME, max_iterations=6, embedded=it) for it in (MANIFOLD, None)
+    )
     np.testing.assert_allclose(found.history.cost, plain.history.cost, rtol=1e-10)
     np.testing.assert_allclose(found.history.gain_ratio, plain.history.gain_ratio, rtol=1e-6)
     np.testing.assert_allclose(found.history.gradient_max, plain.history.gradient_max, rtol=1e-6)
@@ -344,7 +351,7 @@ def test_a_step_that_ceres_would_refuse_is_judged_and_then_leaves_every_bit():
 
 @pytest.mark.parametrize("mode", ["sparse", "iterative"])
 def test_other_modes_embed_as_well_and_tell_what_conjugate_gradients_took(mode):
-    policy, options = parse_solver(f"pyceres:{mode}+learned").build()
+    policy, options = built(f"pyceres:{mode}+learned")
     terms = []
     note = lambda record: terms.append(float(record.step.forcing))
     found = drive_ceres(support.tiny(), mode, policy, embedded=options, callback=note)
@@ -486,9 +493,9 @@ def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*IN_FRONT[:2], LADYBUG])
 def test_real_problems_end_as_with_our_step_where_iterations_are_embedded(name):
-    policy, options = parse_solver("pyceres:dense+learned").build()
+    policy, options = built("pyceres:dense+learned")
     found = drive_ceres(real(name), "dense", policy, embedded=options)
-    ours = solve(real(name), policy, replace(options, coordinates=replace(options.coordinates, rotation="manifold")))
+    ours = solve(real(name), policy, on_the_manifold(options))
     assert found.termination.converged
     assert abs(found.iterations - ours.iterations) <= 1  # the network turns rounding into differences of lambda
     np.testing.assert_allclose(found.final_cost, ours.final_cost, rtol=1e-5)

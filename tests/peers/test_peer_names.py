@@ -70,7 +70,7 @@ def test_without_embedded_iterations_a_policy_for_lambda_alone_drives_a_peer():
     policy, options = parse_solver("pyceres:dense+learned+refine0").build()
     assert isinstance(policy, LearnedPolicy)
     assert (policy.config.refine_points, policy.config.trials, policy.config.camera_rounds) == (0, 1, 0)
-    assert options == StepOptions()
+    assert options.step_options(policy) == StepOptions()
 
 
 def test_a_learned_policy_brings_its_embedded_iterations_to_a_peer():

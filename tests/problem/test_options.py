@@ -15,7 +15,11 @@ from jaxba import ConjugateGradients, Coordinates, Loss, Refinement, StepOptions
         (StepOptions, {"linear_solver": "dense"}, "linear_solver must be one of explicit"),
         (StepOptions, {"linear_solver": "auto"}, "linear_solver must be one of explicit"),
         (StepOptions, {"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
-        (StepOptions, {"intrinsics": "fixed", "linear_solver": "implicit"}, "the explicit solver, not implicit"),
+        (
+            StepOptions,
+            {"intrinsics": "fixed", "linear_solver": "implicit"},
+            "intrinsics 'fixed' need the explicit solver, not implicit",
+        ),
         (StepOptions, {"intrinsics": "fixed", "method": make_method("poba")}, "explicit solver, not poba"),
         (Coordinates, {"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
         (Coordinates, {"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),

@@ -20,7 +20,7 @@ from jaxba import (
     make_policy,
     prepare,
 )
-from jaxba.cli.solve import Arguments, run
+from jaxba.cli.solve import Arguments, run, solve_options
 from jaxba.damping.policy import trained_step
 from jaxba.io import read_problem, write_problem
 
@@ -36,10 +36,14 @@ def test_every_default_of_the_command_is_that_of_the_options():
     assert (command.loss, command.loss_scale) == (options.loss.name, options.loss.scale)
     assert (command.ftol, command.xtol, command.gtol) == options.tolerances[:3]
     assert options.refinement is command.refine_points is None
-    assert options.coordinates is None
-    assert (command.scaling, command.rotation) == (Coordinates().scaling, Coordinates().rotation)
+    assert options.coordinates is command.scaling is command.rotation is None
     grouped = {"conjugate_gradients", "loss", "tolerances", "refinement", "coordinates"}
     assert {field.name for field in fields(SolveOptions)} == plain | grouped
+
+
+def test_the_command_asks_for_the_same_step():
+    policy, options = solve_options(Arguments())
+    assert options.step_options(policy) == SolveOptions().step_options(make_policy("learned"))
 
 
 @pytest.mark.parametrize("function", [jaxba.solve, jaxba.solve_and_retriangulate, jaxba.prepare])

@@ -1,0 +1,156 @@
+"""The documents: their code runs, their commands exist, their links lead somewhere, and they stay short."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import pytest
+import tyro
+
+import jaxba
+from jaxba.damping.registry import SUFFIX
+from jaxba.solver.names import parse_solver
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+NOTEBOOK = DOCS / "notebook"
+
+MOST_WORDS = 15_000
+
+FENCE = re.compile(r"(?:^<!-- (no test)[^\n]*-->\n)?^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#[^)]*)?\)")
+FILE = re.compile(r"`((?:jaxba|tests|benchmarks|configs|docs|examples)/[\w/.-]+\.\w+)`")
+COMMAND = re.compile(r"(?:.*/)?jaxba-(\w+)")
+
+spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
+assert spec is not None
+assert spec.loader is not None
+generate = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(generate)
+
+PAGES = [ROOT / "README.md", *(DOCS / page for page in generate.navigation())]
+"""What speaks of today; the notebook does not."""
+
+TEXTS = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(NOTEBOOK.glob("*.md"))]
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def blocks(page: Path, language: str) -> list[tuple[str, bool]]:
+    """The code of a page in one language, and whether it says that it cannot be run in a test."""
+    found = FENCE.findall(page.read_text(encoding="utf-8"))
+    return [(code, bool(unfit)) for unfit, kind, code in found if kind == language]
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """The calls of jaxba's commands in the shell blocks of a page, and in its text where they have options."""
+    lines = [line for code, _ in blocks(page, "sh") for line in code.splitlines()]
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    lines += [" ".join(code.split()) for code in re.findall(r"`(jaxba-\w+(?: [^`]*)? --[^`]*)`", text)]
+    for line in lines:
+        splitter = shlex.shlex(line, posix=True, punctuation_chars=";&|")
+        splitter.whitespace_split = True
+        call: list[str] = []
+        for word in [*splitter, ";"]:
+            if not set(word) <= set(";&|"):
+                call.append(word)
+                continue
+            if call and COMMAND.fullmatch(call[0]):
+                yield call
+            call = []
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch) -> Path:
+    """A folder with small files under the names that the documents use."""
+    scene = jaxba.random_scene(jaxba.SceneConfig(cameras=6, points=30), seed=0)
+    jaxba.write_problem(scene, tmp_path / "problem-49-7776-pre.txt.bz2")
+    (tmp_path / "runs/fast").mkdir(parents=True)
+    shutil.copy(ROOT / "jaxba/policies/default.safetensors", tmp_path / "runs/fast/policy.safetensors")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name_of)
+def test_the_code_of_a_page_runs_from_top_to_bottom(page, workplace):
+    names: dict[str, object] = {"__name__": "__main__"}
+    try:
+        for number, (code, unfit) in enumerate(blocks(page, "python"), 1):
+            program = compile(code, f"{name_of(page)}, block {number}", "exec", dont_inherit=True)
+            if not unfit:
+                exec(program, names)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+        if "plt" in names:
+            names["plt"].close("all")  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_the_commands_of_a_page_have_the_options_that_it_names(page):
+    for program, *words in commands(page):
+        match = COMMAND.fullmatch(program)
+        assert match
+        module = importlib.import_module(f"jaxba.cli.{match[1]}")
+        arguments = module.Arguments
+        if match[1] == "kitti" and words[0] == module.EVALUATE:
+            arguments, words = module.EvaluateArguments, words[1:]
+        try:
+            parsed = tyro.cli(arguments, args=words)
+        except SystemExit:
+            pytest.fail(f"{name_of(page)}: {shlex.join([program, *words])}")
+        if solvers := getattr(parsed, "solvers", None):
+            for name in solvers.split(","):
+                if not name.endswith(SUFFIX):  # of a file that the page has the reader make
+                    parse_solver(name)
+
+
+def test_the_documents_name_commands_at_all():
+    assert sum(len(list(commands(page))) for page in PAGES) > 30
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_and_benchmarks_that_a_page_names_are_in_the_repository(page):
+    text = page.read_text(encoding="utf-8")
+    missing = [path for path in FILE.findall(text) if not (ROOT / path).exists()]
+    for name in re.findall(r"python -m (benchmarks\.\w+)", text):
+        place = ROOT / name.replace(".", "/")
+        missing += [] if place.is_dir() or place.with_suffix(".py").exists() else [name]
+    assert not missing
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=name_of)
+def test_links_lead_to_files_of_the_repository(page):
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    assert not [link for link in LINK.findall(text) if not (page.parent / link).exists()]
+
+
+def test_every_page_is_in_the_navigation_once_or_in_the_notebook():
+    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md") if NOTEBOOK not in page.parents}
+    navigation = generate.navigation()
+    assert sorted(navigation) == sorted(pages)
+
+
+def test_the_notebook_names_its_pages():
+    index = (NOTEBOOK / "index.md").read_text(encoding="utf-8")
+    assert set(LINK.findall(index)) == {page.name for page in NOTEBOOK.glob("*.md")} - {"index.md"}
+
+
+def test_the_documents_are_short():
+    assert sum(generate.count_words().values()) <= MOST_WORDS
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
+
+
+def test_every_public_name_stands_on_a_page_of_the_reference():
+    text = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "reference/api").glob("*.md"))
+    assert set(re.findall(r"^::: jaxba\.(\w+)$", text, re.MULTILINE)) == set(jaxba.__all__)
