@@ -1,6 +1,6 @@
 """What the cost model of `solver/cost_model.py` predicts, beside what the linear solvers take.
 
-    python -m benchmarks.choice [PROBLEM ...] [--damping ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
+    python -m benchmarks.choice [PROBLEM ...] [--solver ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
 
 A problem is a file or a random scene (`scene:random-150`); without any, all of `JAXBA_DATA` and two random scenes.
 The loop of so many iterations is one compiled program for every linear solver, timed in turns. `loss` is the time of
@@ -35,13 +35,13 @@ class Timed(NamedTuple):
     products: float  # of conjugate gradients, an iteration
 
 
-def measure(problem: BundleProblem, damping: str, iterations: int, repeats: int) -> dict[str, Timed]:
+def measure(problem: BundleProblem, solver: str, iterations: int, repeats: int) -> dict[str, Timed]:
     """Time of an iteration with each linear solver that has the memory, in turns; the first round compiles."""
     seconds: dict[str, list[float]] = {name: [] for name in work(problem)}
     products = {}
     for repeat in range(repeats + 1):
         for name, times in seconds.items():
-            policy, options = parse_solver(damping).build()
+            policy, options = parse_solver(solver).build()
             end = jaxba.solve(
                 problem,
                 policy,
@@ -66,7 +66,7 @@ def main() -> None:
     """Prints a line for every problem, and the fit."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("problem", nargs="*")
-    parser.add_argument("--damping", default="ceres+refine3")
+    parser.add_argument("--solver", default="ceres+refine3")
     parser.add_argument("--iterations", type=int, default=6)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--fit", action="store_true")
@@ -77,7 +77,7 @@ def main() -> None:
     print("problem: solver measured ms (predicted, with the products counted) ...: loss of auto")
     for source in sources(args.problem or [*real_problems(), *LARGE_SCENES]):
         problem = source.read()
-        times = measure(problem, args.damping, args.iterations, args.repeats)
+        times = measure(problem, args.solver, args.iterations, args.repeats)
         taken = choose(problem)
         losses.append(times[taken].seconds / min(time.seconds for time in times.values()))
         cells = []

@@ -1,6 +1,6 @@
 """Sliding windows over a sequence, each solved once, with sizes as they are and with padded sizes.
 
-    python -m benchmarks.padding [PROBLEM] [--windows 20] [--cameras 20] [--damping learned] [--repeats 5]
+    python -m benchmarks.padding [PROBLEM] [--windows 20] [--cameras 20] [--policy learned] [--repeats 5]
 
 PROBLEM is a file; without it windows are cut from a random sequence. Each kind starts without compiled programs. The
 time of an iteration is that of compiled programs, of both kinds in turns, on five of the windows.
@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("problem", nargs="?")
     parser.add_argument("--windows", type=int, default=20)
     parser.add_argument("--cameras", type=int, default=20)
-    parser.add_argument("--damping", default="learned")
+    parser.add_argument("--policy", default="learned")
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
     process.keep_memory()
@@ -91,7 +91,7 @@ def main() -> None:
         print(f"{name}: {min(sizes)} to {max(sizes)}")
     plain, pad = (
         lambda problem, pad=pad: jaxba.solve(
-            problem, args.damping, jaxba.SolveOptions(linear_solver="explicit", pad=pad, compilation="full")
+            problem, args.policy, jaxba.SolveOptions(linear_solver="explicit", pad=pad, compilation="full")
         )
         for pad in (False, True)
     )
