@@ -11,17 +11,6 @@ import pytest
 import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxba.refinement.trial import (
-    FORESEEN,
-    FREE,
-    GOOD_GAIN,
-    HOPELESS,
-    NEGLIGIBLE,
-    ROUNDS_OF_OTHERS,
-    SHORTER,
-    WITHIN_REACH,
-    best_trial,
-)
 from scipy.optimize import least_squares
 from support import same_bits, solve, start, step
 
