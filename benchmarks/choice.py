@@ -1,11 +1,11 @@
-"""What the cost model of `solver/cost_model.py` predicts, beside what the linear solvers take.
+"""Times of the linear solvers, compared with the predictions of the cost model (`solver/cost_model.py`).
 
     python -m benchmarks.choice [PROBLEM ...] [--damping ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
 
-A problem is a file or a random scene (`scene:random-150`); without any, all of `JAXBA_DATA` and two random scenes.
-The loop of so many iterations is one compiled program for every linear solver, timed in turns. `loss` is the time of
-the solver that `auto` takes over that of the fastest. `--fit` prints the constants that fit these times best, given
-the products of conjugate gradients that were counted.
+A problem is a file or a random scene (`scene:random-150`). Default: those in `JAXBA_DATA` and two random scenes. For
+each linear solver, the whole loop is one compiled program; the solvers are timed alternately. `loss` is the time of the
+solver that `auto` chooses over that of the fastest. `--fit` prints the constants of the cost model that fit these times
+best, with the counted number of products in conjugate gradients.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ from jaxba.solver.names import parse_solver
 
 
 class Timed(NamedTuple):
-    """One linear solver on one problem."""
+    """Measurement of a linear solver on a problem."""
 
-    seconds: float  # of an iteration
-    products: float  # of conjugate gradients, an iteration
+    seconds: float  # per iteration
+    products: float  # matrix-vector products of conjugate gradients per iteration
 
 
 def measure(problem: BundleProblem, damping: str, iterations: int, repeats: int) -> dict[str, Timed]:
-    """Time of an iteration with each linear solver that has the memory, in turns; the first round compiles."""
+    """Median time of an iteration with each linear solver that fits into memory, timed alternately. The first round
+    compiles and is not counted."""
     seconds: dict[str, list[float]] = {name: [] for name in work(problem)}
     products = {}
     for repeat in range(repeats + 1):
@@ -54,7 +55,7 @@ def measure(problem: BundleProblem, damping: str, iterations: int, repeats: int)
 
 
 def fit(done: list[tuple[Work, float]]) -> Work:
-    """Constants, none negative, with the least sum of squared relative errors."""
+    """The non-negative constants with the least sum of squared relative errors."""
     seconds = np.array([each for _, each in done])
     unit = np.array(SECONDS)
     amounts = np.array([amounts for amounts, _ in done]) * unit / seconds[:, None]
@@ -63,7 +64,7 @@ def fit(done: list[tuple[Work, float]]) -> Work:
 
 
 def main() -> None:
-    """Prints a line for every problem, and the fit."""
+    """Prints a line for each problem, and the fit."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("problem", nargs="*")
     parser.add_argument("--damping", default="ceres+refine3")

@@ -1,23 +1,23 @@
-"""What random clusters cost on the host, beside an iteration of the methods that use them.
+"""Time of a random clustering of the cameras on the host, compared with an iteration of the methods that use it.
 
     python -m benchmarks.clustering PROBLEM ... [--methods stba,stba:16,ddlm]
 
-A problem draws its clusterings once, when it is loaded, and uses them in turn. So an iteration costs a clustering only
-where there are fewer iterations than clusterings; here the whole price of one, drawn anew for every iteration, is set
-against an iteration. Median of all iterations of a solve under Ceres' rule, which excludes compilation.
+A solve draws a fixed number of clusterings once, with the layout, and uses them in turn. The table shows what it would
+cost to draw a new one for every iteration. The time of an iteration is the median over a solve under Ceres' rule,
+without compilation.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import statistics
 import time
 
 import jax
 import numpy as np
 
-from jaxba import SolveOptions, StepOptions, make_method, solve
+from benchmarks.suite import iteration_seconds
+from jaxba import StepOptions, make_method
 from jaxba.bench.sources import sources
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
@@ -29,7 +29,7 @@ ITERATIONS = 8
 
 
 def main() -> None:
-    """Prints a Markdown row for every problem and method."""
+    """Prints a Markdown row for each pair of problem and method."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("problem", nargs="+", help="as for jaxba-bench")
     parser.add_argument("--methods", default="stba,stba:16,ddlm")
@@ -44,17 +44,17 @@ def main() -> None:
             options = make_method(name).options(StepOptions())
             graph, drawing = _clustering_seconds(problem, options.cluster_cameras or 0)
             with process.single_blas_thread():
-                iteration = _iteration_seconds(problem, name)
+                iteration, _ = iteration_seconds(problem, repeats=1, method=name)
             started = time.perf_counter()
             layout_for(problem, options)
             layout = time.perf_counter() - started
             cells = (f"{1e3 * graph:.1f}", f"{1e3 * drawing:.1f}", f"{1e3 * iteration:.0f}")
-            share = f"{drawing / iteration:.3f}"
-            print(f"| {source.name}, `{name}` |", " | ".join((*cells, share, f"{1e3 * layout:.0f}")), "|", flush=True)
+            ratio = f"{drawing / iteration:.3f}"
+            print(f"| {source.name}, `{name}` |", " | ".join((*cells, ratio, f"{1e3 * layout:.0f}")), "|", flush=True)
 
 
 def _clustering_seconds(problem: BundleProblem, largest: int) -> tuple[float, float]:
-    """Seconds for the camera graph, and for one clustering of it."""
+    """Seconds to build the camera graph, and to draw one clustering of it."""
     camera, point = np.asarray(problem.camera_index), np.asarray(problem.point_index)
     order = np.lexsort((camera, point))
     camera, point = camera[order], point[order]
@@ -63,17 +63,6 @@ def _clustering_seconds(problem: BundleProblem, largest: int) -> tuple[float, fl
     made = time.perf_counter()
     drawn = list(itertools.islice(clusterings(graph, largest, np.random.default_rng(SEED)), PARTITIONS))
     return made - started, (time.perf_counter() - made) / len(drawn)
-
-
-def _iteration_seconds(problem: BundleProblem, method: str) -> float:
-    stamps = [0.0]
-    solve(
-        problem,
-        "ceres",
-        SolveOptions(method=method, max_iterations=ITERATIONS, compilation="full"),
-        callback=lambda record: stamps.append(record.time_s) and False,
-    )
-    return statistics.median(after - before for before, after in itertools.pairwise(stamps))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""Seconds to compile the parts of a step and seconds that they take, at each level of optimisation.
+"""Time to compile the parts of a step and time to run them, at each level of optimisation.
 
     python -m benchmarks.compilation PROBLEM ... [--solver learned] [--linear-solver auto] [--repeats 15]
     python -m benchmarks.compilation PROBLEM ... --whole
 
-PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The constants of
-`jaxba/runtime/compilation.py` follow from the last columns: after how many observations times iterations, in millions,
-the longer compilation of the better level has paid. All levels in turns, in one process, without a compilation cache,
-at the start with lambda 1e-4. `--whole` takes the time of `jaxba-solve FILE` from start to end, with
-`--compilation auto` and `full` in turns.
+PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The last columns show after
+how many runs, times the observations of the problem and in millions, the faster programs of a better level have repaid
+its longer compilation; the constants of `jaxba/runtime/compilation.py` come from them. The levels are timed alternately
+in one process, without a compilation cache, at the start of the problem with lambda 1e-4. `--whole` times calls of
+`jaxba-solve FILE` alternately with `--compilation auto` and `full`.
 """
 
 from __future__ import annotations
@@ -39,11 +39,13 @@ from jaxba.solver.names import parse_solver
 from jaxba.structure.layout import layout_for
 
 LONGEST = 10.0
-"""Seconds of repeats of one program."""
+"""Limit in seconds of all repeats of one program."""
 
 LEVELS: tuple[Level, ...] = ("quick", "medium", "full")
+"""Levels of optimisation, by increasing time of compilation and decreasing time of a run."""
 
 REPAID = (("quick", "medium"), ("quick", "full"), ("medium", "full"))
+"""Pairs of levels in the last columns, the better one second."""
 
 HEADING = (
     f"{'problem':28s} {'linear solver':13s} {'part':7s}"
@@ -53,7 +55,7 @@ HEADING = (
 
 
 def measure(step: Any, arguments: tuple[Any, ...], level: Level, repeats: int) -> tuple[float, float]:
-    """Seconds of compilation, tracing included, and median seconds of a step."""
+    """Seconds of compilation including tracing, and median seconds of a run."""
     options: Any = compiler_options(level)
     started = time.perf_counter()
     with fast_compilation(options is not None):
@@ -70,12 +72,12 @@ def measure(step: Any, arguments: tuple[Any, ...], level: Level, repeats: int) -
 
 
 def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats: int) -> Iterator[str]:
-    """All levels for every part of a problem's step, as lines of the table."""
+    """Lines of the table for the parts of a step on a problem."""
     source = sources([location])[0]
     problem, name = source.read(), parse_solver(solver)
-    policy, asked = name.build()
-    asked_solver = linear_solver if name.method == DEFAULT_METHOD else "auto"
-    options = choose_linear_solver(problem, asked.step_options(policy), asked_solver)
+    policy, solve_options = name.build()
+    choice = linear_solver if name.method == DEFAULT_METHOD else "auto"
+    options = choose_linear_solver(problem, solve_options.step_options(policy), choice)
     with jax.enable_x64(name.dtype == "float64"):
         dtype = jnp.dtype(name.dtype)
         layout = jax.device_put(layout_for(problem, options))
@@ -86,7 +88,7 @@ def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats:
         }
         if options.single_solve:
             propose = lambda la, s, d: step.propose(la, s, d, options)
-            proposal = jax.jit(lambda *given: propose(*given))(*given)  # not the program that is timed
+            proposal = jax.jit(lambda *given: propose(*given))(*given)  # a separate program, not the one that is timed
             parts = {
                 "propose": (propose, given),
                 "try_step": (lambda la, s, d, p: step.try_step(la, s, d, p, options), (*given, proposal)),
@@ -110,7 +112,8 @@ WHOLE = (
 
 
 def whole(location: str) -> tuple[str, float]:
-    """One uncached call of `jaxba-solve` with each `--compilation`, as a line of the table; and the ratio of times."""
+    """Calls of `jaxba-solve` with `--compilation auto` and `full` without a cache: the line of the table, and the ratio
+    of their times."""
     cells, costs, seconds = f"{Path(location).name[:28]:28s}", [], []
     with tempfile.TemporaryDirectory() as folder:
         for compilation in ("auto", "full"):
@@ -134,7 +137,7 @@ def main() -> None:
     parser.add_argument("--solver", default="learned")
     parser.add_argument("--linear-solver", default="auto")
     parser.add_argument("--repeats", type=int, default=15)
-    parser.add_argument("--whole", action="store_true", help="whole calls of jaxba-solve")
+    parser.add_argument("--whole", action="store_true", help="time calls of jaxba-solve")
     args = parser.parse_args()
     if args.whole:
         print(WHOLE)

@@ -1,12 +1,13 @@
-"""More real problems than there are files: windows of long ones, and starts that are far away.
+"""Iterations on more problems than there are files: windows of long sequences, and distant starts.
 
     python -m benchmarks.far [--solvers learned,ceres+embedded,ceres] [--seeds 2]
 
-Fifteen problems are few: two valleys among them move a mean by a tenth. Here are windows of neighbouring cameras of
-three sequences, and the others perturbed by the scale of their cameras and points (a start at hundreds to thousands of
-times the best cost). All with the explicit solver and sizes rounded up, so that programs are shared. Iterations to 1e-3
-of the lowest cost of the run, to convergence (a failure counts as 100), and how many end more than 1e-4 and 1e-3 above
-that cost. Solvers are named as in `jaxba-bench`.
+Means over the few real problems change by a tenth if two of them converge to other local minima. This benchmark has
+windows of neighbouring cameras of three sequences, and the other problems with large perturbations of cameras and
+points (initial costs of hundreds to thousands of times the best cost). All use the explicit solver and padded sizes, so
+that they share compiled programs. The tables show the iterations until the cost is within 1e-3 of the lowest cost, the
+iterations to convergence (100 for a failure), and how many solves end more than 1e-4 and 1e-3 above that cost. Solvers
+are named as in `jaxba-bench`.
 """
 
 from __future__ import annotations
@@ -31,14 +32,15 @@ from jaxba.solver.names import parse_solver
 from jaxba.solver.options import MAX_ITERATIONS, SolveOptions
 
 WINDOWS = (("kitti00vo", 14, 16), ("kittistereo00s", 6, 16), ("bulani1", 6, 14))
-"""A part of a problem's name, how many windows it is cut into, and how many cameras a window has."""
+"""Part of the name of a problem, number of its windows, and number of cameras of a window."""
 
 ROTATION, TRANSLATION, POINT = 0.01, 1.0, 1.0
-"""Perturbation: radians, and shares of the scale of a normalised problem (`jaxba.perturb`)."""
+"""Standard deviations of the perturbation: radians, and relative to the scale of a normalised problem
+(`jaxba.perturb`)."""
 
 
 class Case(NamedTuple):
-    """A problem and the group it is counted in."""
+    """A problem and its group in the means."""
 
     group: str
     name: str
@@ -46,7 +48,7 @@ class Case(NamedTuple):
 
 
 def cases(seeds: int) -> Iterator[Case]:
-    """Windows first, then perturbed problems."""
+    """The windows, then the perturbed problems, each with `seeds` random seeds."""
     for source in sources(real_problems()):
         problem = source.read()
         for part, count, cameras in WINDOWS:
@@ -63,10 +65,10 @@ def cases(seeds: int) -> Iterator[Case]:
 
 
 def main() -> None:
-    """Prints a Markdown row for every problem, then one for every group."""
+    """Prints a Markdown row for each problem, then one for each group."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--solvers", default="learned,ceres+embedded,ceres")
-    parser.add_argument("--seeds", type=int, default=2, help="of the perturbed problems")
+    parser.add_argument("--seeds", type=int, default=2, help="perturbations of each problem")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     process.keep_memory()
@@ -94,19 +96,19 @@ def main() -> None:
 
 
 class Run(NamedTuple):
-    """A solve."""
+    """Result of a solve."""
 
-    costs: np.ndarray  # after each iteration, the start first
+    costs: np.ndarray  # at the start and after each iteration, pixels squared
     converged: int  # iterations to convergence
 
     def to(self, best: float) -> int:
-        """Iterations to 1e-3 of a cost, at least one."""
+        """Iterations until the cost is within 1e-3 of `best`, at least 1; `MAX_ITERATIONS` if that never happens."""
         near = self.costs <= best * (1 + 1e-3)
         return max(1, int(np.argmax(near))) if near[-1] else MAX_ITERATIONS
 
 
 def run(problem: BundleProblem, policy: DampingPolicy, options: SolveOptions) -> Run:
-    """One solve with the explicit solver."""
+    """Solves a problem with the explicit linear solver and padded sizes."""
     found = solve(problem, policy, replace(options, linear_solver="explicit", pad=True, compilation="full"))
     costs = np.append(found.initial_cost, found.history.cost)
     return Run(costs, found.iterations if found.termination.converged else MAX_ITERATIONS)

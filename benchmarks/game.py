@@ -1,10 +1,10 @@
-"""Policies, rules and the look-ahead oracle on the held-out scenes of a training run.
+"""Iterations of policies, rules and the look-ahead oracle on the held-out scenes of a training run.
 
     python -m benchmarks.game runs/default --policy learned --policy learned+refine0 --scenes 200
 
-Every rule, every constant of a grid, a random policy, the virtual best of these per scene, beam search over lambda and
-its greedy cousin, each with plain steps, with three point iterations, and with all embedded iterations; and learned
-policies, each with its own step.
+The rules, a grid of constant lambdas, random lambdas, the virtual best of the rules and constants, and the oracle (beam
+search and greedy search over lambda) are run with plain steps, with three point iterations, and with all embedded
+iterations. Learned policies are run with the step that they were trained with.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import numpy as np
 from jaxba.cli.common import prepare_process
 from jaxba.damping import DampingPolicy, Schedule, make_policy
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.game.evaluate import Score, score
+from jaxba.game.evaluate import Score, score, virtual_best
 from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.rollout import Trajectories, play
-from jaxba.game.scene_bank import sieve
+from jaxba.game.scene_bank import select
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.names import parse_solver
@@ -31,21 +31,23 @@ from jaxba.training.task import BANK, read_banks
 RULES = ("classic", "ceres", "gtsam", "nielsen", "theseus", "gauss-newton", "schedule")
 CONSTANTS = tuple(f"constant:1e{decade}" for decade in (-8, -6, -5, -4, -3, -2))
 LIMIT = 40
+"""Limit of linear solves of a scene."""
+
 STEPS = {
     "": StepOptions(),
     "+refine3": StepOptions(refinement=Refinement(points=3)),
     "+embedded": AgentConfig().step_options(StepOptions()),
 }
-"""Plain, with point iterations, and with all embedded ones."""
+"""Steps by the suffix of their name: plain, with point iterations, with all embedded iterations."""
 
 
 def main() -> None:
-    """Prints a Markdown table per tolerance."""
+    """Prints a Markdown table for each tolerance."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="folder of jaxba-train")
     parser.add_argument("--policy", action="append", default=[], help="learned solver, or file; may be repeated")
-    parser.add_argument("--scenes", type=int, default=200, help="held-out scenes of each class")
-    parser.add_argument("--oracle", type=int, default=48, help="scenes of them that the oracle plays; 0: none")
+    parser.add_argument("--scenes", type=int, default=200, help="number of held-out scenes of each class")
+    parser.add_argument("--oracle", type=int, default=48, help="number of scenes for the oracle; 0: none")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     prepare_process()
@@ -54,9 +56,9 @@ def main() -> None:
     with process.single_blas_thread():
         for kind, split in zip(config.bank.classes, splits, strict=True):
             count = min(args.scenes, len(split.held_out.initial_cost))
-            bank = sieve(split.held_out, np.arange(count))
+            bank = select(split.held_out, np.arange(count))
             runs = _runs(kind, bank, args.policy)
-            some = sieve(bank, np.arange(min(args.oracle, count)))
+            some = select(bank, np.arange(min(args.oracle, count)))
             beams = {}
             for suffix, options in STEPS.items() if args.oracle else ():
                 for name, width in ((f"beam search, width {WIDTH}", WIDTH), ("greedy", 1)):
@@ -75,11 +77,11 @@ def _runs(kind, bank, policies: list[str]) -> dict[str, Trajectories]:
             runs[name + suffix] = play(kind, bank, policy, options, LIMIT)
             print(f"played {name}{suffix}", flush=True)
     for name in policies:
-        runs[name] = _played(kind, bank, name)
+        runs[name] = _play_solver(kind, bank, name)
     return runs
 
 
-def _played(kind, bank, name: str) -> Trajectories:
+def _play_solver(kind, bank, name: str) -> Trajectories:
     policy, options = parse_solver(name).build()
     return play(kind, bank, policy, options.step_options(policy), LIMIT)
 
@@ -95,12 +97,7 @@ def _report(bank, runs: dict[str, Trajectories], beams: dict[str, Trajectories],
         print("| --- | --: | --: | --: | --: | --: | --: |")
         rows = {name: score([run], [best], tolerance, LIMIT) for name, run in runs.items()}
         for suffix in STEPS:
-            members = [runs[n + suffix] for n in (*RULES, *CONSTANTS)]
-            lowest = members[0]._replace(
-                costs=np.min([m.costs for m in members], axis=0),
-                iterations=np.min([np.where(m.converged, m.iterations, LIMIT) for m in members], axis=0),
-                converged=np.any([m.converged for m in members], axis=0),
-            )
+            lowest = virtual_best([runs[name + suffix] for name in (*RULES, *CONSTANTS)], LIMIT)
             rows[f"virtual best{suffix}"] = score([lowest], [best], tolerance, LIMIT)
         for name, beam in beams.items():
             size = len(beam.costs)

@@ -1,10 +1,10 @@
-"""Time and memory of reading and writing BAL files, of a real file or of a synthetic one.
+"""Time and memory of reading and writing a BAL file, a given one or a random one.
 
     python benchmarks/io_speed.py problem.txt.bz2
     python benchmarks/io_speed.py --observations 10000000 --points 1500000 --cameras 10000 [--suffix .gz]
 
-A study, not a test: it prints figures and asserts none. Every measurement has its own process, so that the peak
-memory is its own; "base" is the peak of a process that only imports the package.
+Each measurement runs in its own process, so that the peak memory is that of this measurement. `base` is the peak of a
+process that only imports the package.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 
 
 def synthetic(cameras: int, points: int, observations: int) -> BundleProblem:
-    """A problem of full-length random numbers, in the order of a BAL file (point by point)."""
+    """A problem of random numbers with all digits, ordered by point as in a BAL file."""
     rng = np.random.default_rng(0)
     return BundleProblem.create(
         rng.normal(size=(cameras, 9)),
@@ -52,7 +52,7 @@ def measure(what: str, path: str, sizes: tuple[int, int, int]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("path", nargs="?", help="a file to read; without it a synthetic one is written and read")
+    parser.add_argument("path", nargs="?", help="file to read; default: write and read a random one")
     parser.add_argument("--cameras", type=int, default=1_000)
     parser.add_argument("--points", type=int, default=150_000)
     parser.add_argument("--observations", type=int, default=1_000_000)

@@ -11,10 +11,10 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Metric:
-    """One measured number."""
+    """A measured number."""
 
     key: str
-    """Name, stable over time."""
+    """Name, which should not change."""
 
     value: float
     """Median over repeats."""
@@ -23,17 +23,17 @@ class Metric:
     """`s`, `ratio`, `1/s`, `bytes` ..."""
 
     direction: Literal["lower", "higher"]
-    """Which way is better."""
+    """Whether lower or higher values are better."""
 
     tolerance: float = 0.0
-    """Relative change for the worse that the gate forgives. Only ratios are gated: seconds depend on the machine."""
+    """Relative change for the worse that the gate accepts."""
 
     target: float | None = None
-    """What the project wants."""
+    """Value that the project aims at."""
 
     @property
     def gated(self) -> bool:
-        """Whether the baseline keeps it."""
+        """Whether it is compared with the baseline. Only ratios are, since seconds depend on the machine."""
         return self.unit == "ratio"
 
     @property
@@ -45,7 +45,7 @@ class Metric:
 
 
 def regressions(metrics: Iterable[Metric], baseline: dict[str, float]) -> list[str]:
-    """One line for every ratio that is worse than the baseline by more than its tolerance."""
+    """A line of text for each ratio that is worse than the baseline by more than its tolerance."""
     found = []
     for metric in metrics:
         before = baseline.get(metric.key)
@@ -58,23 +58,23 @@ def regressions(metrics: Iterable[Metric], baseline: dict[str, float]) -> list[s
 
 
 def read_baseline(path: Path) -> dict[str, float]:
-    """Committed ratios by key; empty where there is no file yet."""
+    """The ratios of the baseline by key; empty if there is no file."""
     return json.loads(path.read_text()) if path.exists() else {}
 
 
 def write_baseline(path: Path, metrics: Iterable[Metric]) -> None:
-    """Keeps the ratios of this run, beside those of metrics that did not run."""
+    """Replaces the ratios in the baseline by those of this run, and keeps those that were not measured."""
     ratios = {m.key: round(m.value, 4) for m in metrics if m.gated}
     path.write_text(json.dumps(dict(sorted({**read_baseline(path), **ratios}.items())), indent=1) + "\n")
 
 
-def to_json(metrics: Iterable[Metric], facts: dict[str, str]) -> str:
-    """The run as one JSON document."""
-    return json.dumps({"facts": facts, "metrics": [asdict(m) for m in metrics]}, indent=1) + "\n"
+def to_json(metrics: Iterable[Metric], machine: dict[str, str]) -> str:
+    """The metrics and a description of the machine as a JSON document."""
+    return json.dumps({"facts": machine, "metrics": [asdict(m) for m in metrics]}, indent=1) + "\n"
 
 
 def to_text(metrics: Iterable[Metric]) -> str:
-    """A table for people."""
+    """The metrics as a table of text."""
     lines = [f"{'metric':58s} {'value':>10s} {'unit':8s} {'target':>8s}"]
     for m in metrics:
         target = "" if m.target is None else f"{m.target:.3g}"

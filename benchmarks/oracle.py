@@ -1,15 +1,15 @@
-"""The look-ahead oracle on real problems: how many iterations the damping alone could save.
+"""The look-ahead oracle on real problems: how many iterations a better choice of lambda could save.
 
     python -m benchmarks.oracle [PROBLEM ...] [--solver learned+refine0] [--iterations 40]
 
-Beam search over lambda, its greedy cousin, a learned solver and Ceres' rule, all with the learned solver's step, and
-`classic` and `ceres` as published, with plain steps. Iterations until the cost is within 1e-3, 1e-4 and 1e-6 of the
-lowest that any of them, or a file of costs given with `--best`, reached, and until a stop rule fired; never counts as
-100, also where the search was given fewer. The search stops where no state of its beam becomes better by a millionth.
-An iteration of the search takes `width x grid` linear solves and counts as one.
+Compares beam search over lambda, greedy search, a learned solver and Ceres' rule, all with the step of the learned
+solver, and `classic` and `ceres` with plain steps. The tables show the iterations until the cost is within 1e-3, 1e-4
+and 1e-6 of the lowest cost of any of them (or of the file `--best`), and the iterations to convergence. Never counts as
+100, also if the search had fewer iterations. The search ends when no state of its beam improves by 1e-6, relatively. An
+iteration of the search takes `width x grid` linear solves and counts as one.
 
-`jaxba/game/oracle.py` does it for scenes, all states of a beam at once in one program. A real problem is too large for
-36 copies side by side, so here they take turns in the solver's own compiled step.
+`jaxba/game/oracle.py` does the same for small scenes, with all states of a beam in one batched program. Real problems
+are too large for that, so here the states are stepped one after the other.
 """
 
 from __future__ import annotations
@@ -43,24 +43,24 @@ _step = jax.jit(lm_step, static_argnames=("options",))
 
 
 def main() -> None:
-    """Prints one Markdown row a problem, and the geometric means."""
+    """Prints a Markdown row for each problem, and the geometric means."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("problem", nargs="*", help="as for jaxba-bench; all real problems without any")
-    parser.add_argument("--solver", default="learned", help="a learned one, whose step is taken")
-    parser.add_argument("--iterations", type=int, default=40, help="of the search")
-    parser.add_argument("--best", type=Path, help="best known costs, one `NAME COST` a line")
+    parser.add_argument("problem", nargs="*", help="as for jaxba-bench; default: all real problems")
+    parser.add_argument("--solver", default="learned", help="a learned solver, whose step is used")
+    parser.add_argument("--iterations", type=int, default=40, help="limit of the iterations of the search")
+    parser.add_argument("--best", type=Path, help="file of best known costs, lines of `NAME COST`")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     prepare_process()
-    policy, asked = parse_solver(args.solver).build()
-    options = asked.step_options(policy)
+    policy, solve_options = parse_solver(args.solver).build()
+    options = solve_options.step_options(policy)
     if not isinstance(policy, LearnedPolicy):
-        parser.error(f"--solver {args.solver}: not a learned one")
+        parser.error(f"--solver {args.solver}: not a learned solver")
     known = dict(line.split() for line in args.best.read_text().splitlines()) if args.best else {}
     rules = {
-        args.solver: (policy, asked),
-        "ceres, same step": (make_policy("ceres"), asked),
-        **{name: (make_policy(name), StepOptions()) for name in ("ceres", "classic")},
+        args.solver: (policy, solve_options),
+        "ceres, same step": (make_policy("ceres"), solve_options),
+        **{name: (make_policy(name), SolveOptions()) for name in ("ceres", "classic")},
     }
     names = (f"beam of {WIDTH}", "greedy", *rules)
     print("| problem |" + "".join(f" {name} |" for name in names) + "\n| --- |" + " --- |" * len(names))
@@ -79,17 +79,25 @@ def main() -> None:
 
 
 class Run(NamedTuple):
-    """A solve, or a search."""
+    """Result of a solve or a search."""
 
     costs: np.ndarray
-    """Lowest accepted cost after each number of iterations, the start first; pixels squared."""
+    """Lowest cost at the start and after each iteration, pixels squared."""
 
     stopped: int
-    """Iterations until a stop rule fired; the limit where none did."""
+    """Iterations to convergence; the limit if it did not converge."""
 
 
 def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterations: int, width: int) -> Run:
-    """Beam search; it ends early where no state of the beam became better by a millionth."""
+    """Beam search over lambda. It ends early when no state of the beam improves by 1e-6, relatively.
+
+    Args:
+        problem: the problem.
+        options: the step.
+        min_gain: gain ratio that an accepted step exceeds.
+        iterations: limit of iterations.
+        width: number of states that are kept; 1 is greedy search.
+    """
     options = choose_linear_solver(problem, options, "auto")
     layout = jax.device_put(layout_for(problem, options))
     start = jax.jit(initial_state, static_argnums=(2, 3))(layout, problem, options, jnp.dtype("float64"))
@@ -100,7 +108,7 @@ def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterat
     beam, costs = [start], [float(start.cost)]
     for turn in range(iterations):
         after = [take(state, damping, turn) for state in beam for damping in GRID]
-        distinct = {float(state.cost): state for state in (*after, *beam)}  # a refused step is its own start
+        distinct = {float(state.cost): state for state in (*after, *beam)}  # a rejected step leaves the state as it was
         before, beam = beam, [distinct[cost] for cost in sorted(distinct)[:width]]
         costs.append(float(beam[0].cost))
         pairs = zip(before, beam, strict=False)
@@ -116,7 +124,7 @@ def _play(problem: BundleProblem, policy: DampingPolicy, options: SolveOptions) 
 
 
 def _reached(costs: np.ndarray, target: float) -> int:
-    """Iterations to a cost, at least one; a failure counts as the limit."""
+    """Iterations until the cost is at most `target`, at least 1; the limit if that never happens."""
     return max(1, int(np.argmax(costs <= target))) if costs[-1] <= target else LIMIT
 
 

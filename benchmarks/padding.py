@@ -1,9 +1,10 @@
-"""Sliding windows over a sequence, each solved once, with sizes as they are and with padded sizes.
+"""Solves of sliding windows over a sequence, without and with padding of their sizes.
 
     python -m benchmarks.padding [PROBLEM] [--windows 20] [--cameras 20] [--damping learned] [--repeats 5]
 
-PROBLEM is a file; without it windows are cut from a random sequence. Each kind starts without compiled programs. The
-time of an iteration is that of compiled programs, of both kinds in turns, on five of the windows.
+PROBLEM is a file; by default the windows are parts of a random sequence. All windows are solved once without and once
+with padding, each time starting without compiled programs. The time of an iteration is then measured without
+compilation on five of the windows.
 """
 
 from __future__ import annotations
@@ -23,26 +24,26 @@ from jaxba.runtime import process
 from jaxba.scenes import SceneConfig
 
 PROGRAM = "/jax/core/compile/backend_compile_duration"
-"""What JAX reports once for each program that it compiles."""
+"""JAX's monitoring event for the compilation of a program."""
 
 
 class FirstSolves(NamedTuple):
-    """What it took to solve all windows once."""
+    """Measurements of solving all windows once."""
 
-    programs: int
+    programs: int  # number of compiled programs
     wall_s: float
-    costs: np.ndarray
-    cells: int  # of the grid; one where nothing is padded
+    costs: np.ndarray  # final costs, pixels squared
+    cells: int  # number of different padded sizes; 1 without padding
 
 
 def windows(problem: BundleProblem, count: int, cameras: int) -> list[BundleProblem]:
-    """Runs of neighbouring cameras, evenly spaced, and the points that two of them see."""
+    """Sub-problems of consecutive cameras, evenly spaced, with the points that two of their cameras observe."""
     starts = np.linspace(0, problem.num_cameras - cameras, count).astype(int)
     return [sub_problem(problem, np.arange(first, first + cameras)) for first in starts]
 
 
 def solve_all(problems: list[BundleProblem], solve: Callable[[BundleProblem], jaxba.Solution]) -> FirstSolves:
-    """Solves every window once, beginning without compiled programs."""
+    """Solves every window once, starting without compiled programs."""
     programs: list[str] = []
     listen = lambda event, duration_secs, **_: programs.append(event) if event == PROGRAM else None
     jax.clear_caches()
@@ -58,7 +59,7 @@ def solve_all(problems: list[BundleProblem], solve: Callable[[BundleProblem], ja
 
 
 def step_seconds(problem: BundleProblem, solves: list[Callable[[BundleProblem], jaxba.Solution]], repeats: int):
-    """Least seconds of an iteration and of the set-up under each kind of solve, in turns; shape (kinds, 2)."""
+    """Least seconds of an iteration and of the set-up for each kind of solve, timed alternately; shape (kinds, 2)."""
     jax.clear_caches()
     times = np.full((repeats + 1, len(solves), 2), np.inf)
     for repeat in range(repeats + 1):
@@ -101,7 +102,7 @@ def main() -> None:
     for kind, name in enumerate(("as given", "padded")):
         step, setup = 1e3 * np.median(timed[:, kind], axis=0)
         print(f"{name:>8} {first[kind].programs:9d} {first[kind].wall_s:8.1f} {step:13.2f} {setup:10.1f}")
-    print(f"cells of the grid: {first[1].cells}")
+    print(f"different padded sizes: {first[1].cells}")
     print(f"wall time, padded over as given: {first[1].wall_s / first[0].wall_s:.2f}")
     ratios = timed[:, 1, 0] / timed[:, 0, 0]
     print(f"iteration, padded over as given: median {np.median(ratios):.2f}, {ratios.min():.2f} to {ratios.max():.2f}")

@@ -1,9 +1,9 @@
-"""Time of every phase of one LM step, beside the bytes it must move.
+"""Time of each phase of an LM step, compared with the limit by memory bandwidth.
 
     python -m benchmarks.phases PROBLEM [--solver explicit|sparse|implicit] [--refine 3] [--repeats 30]
 
-PROBLEM is a file or a random scene (`scene:random-150`). `least` is the time that the measured copy bandwidth needs
-for the phase's inputs and outputs, each moved once; `share` is that over the measured time.
+PROBLEM is a file or a random scene (`scene:random-150`). `bound` is the time to move the inputs and outputs of a phase
+once with the measured bandwidth of a copy; `bound/min` is that over the shortest measured time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from jaxba.structure.layout import Layout, layout_for
 
 
 def timed(function: Any, *arguments: Any, repeats: int) -> tuple[Any, float, float, float]:
-    """Result, least and median seconds, and seconds of compilation."""
+    """Result of a function, least and median seconds of a call, and seconds of its compilation."""
     started = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
     compile_s = time.perf_counter() - started
@@ -48,48 +48,49 @@ def timed(function: Any, *arguments: Any, repeats: int) -> tuple[Any, float, flo
 
 
 def size(tree: Any) -> int:
-    """Bytes of all arrays in a pytree."""
+    """Size of all arrays in a pytree, bytes."""
     return sum(x.nbytes for x in jax.tree.leaves(tree) if hasattr(x, "nbytes"))
 
 
 def bandwidth() -> float:
-    """Bytes per second of a large copy, read and write counted."""
+    """Bandwidth of a large copy, bytes per second; reads and writes count."""
     x = jnp.ones(1 << 23, jnp.float64)
     _, least, _, _ = timed(lambda x: x + 1.0, x, repeats=20)
     return 2 * x.nbytes / least
 
 
 class Phase(NamedTuple):
-    """One row of the table."""
+    """A row of the table."""
 
     name: str
     least_s: float
     median_s: float
-    floor_s: float  # time that the copy bandwidth needs for inputs and outputs, each moved once, without index arrays
+    bound_s: float  # time to move inputs and outputs once, without index arrays
     compile_s: float
 
     def __str__(self) -> str:
-        times = f"{1e3 * self.least_s:8.2f} {1e3 * self.median_s:8.2f} {1e3 * self.floor_s:9.2f}"
-        return f"{self.name:14s} {times} {self.floor_s / self.least_s:6.0%} {self.compile_s:9.2f}"
+        times = f"{1e3 * self.least_s:8.2f} {1e3 * self.median_s:8.2f} {1e3 * self.bound_s:9.2f}"
+        return f"{self.name:14s} {times} {self.bound_s / self.least_s:9.0%} {self.compile_s:9.2f}"
 
 
-HEADING = f"{'phase':14s} {'min ms':>8s} {'median':>8s} {'least ms':>9s} {'share':>6s} {'compile s':>9s}"
+HEADING = f"{'phase':14s} {'min ms':>8s} {'median':>8s} {'bound ms':>9s} {'bound/min':>9s} {'compile s':>9s}"
 
 
 def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: float, repeats: int) -> Iterator[Phase]:
-    """Times every phase of a step, one compiled program each, then whole steps.
+    """Times each phase of a step as a separately compiled program, then complete steps.
 
     Args:
-        layout: made for these options, on the device.
+        layout: layout of the problem for these options, on the device.
         problem: the problem.
-        options: of the step; `refinement` only matters where refinement is timed.
-        rate: copy bandwidth, bytes per second.
+        options: the step; `refinement` only matters where refinement is timed.
+        rate: bandwidth of a copy, bytes per second.
         repeats: runs of each phase.
     """
     done: dict[str, Any] = {}
 
     def phase(name: str, function: Any, *arguments: Any) -> Phase:
-        """The layout is the first argument, as in a step: index arrays that XLA knows make other programs."""
+        """Times a function of the layout and other arguments. The layout must be an argument, as in a step, since XLA
+        would compile its index arrays differently as constants."""
         done[name], least, median, compile_s = timed(function, layout, *arguments, repeats=repeats)
         return Phase(name, least, median, (size(arguments) + size(done[name])) / rate, compile_s)
 
@@ -100,9 +101,9 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     linear = done["linearise"]
     yield phase("eliminate", lambda la, li, d: schur.eliminate_points(la, li, d, plain), linear, damping)
     points = done["eliminate"]
-    turn = schur.RotationCoordinates.of(state.cameras, plain)
+    rotation = schur.RotationCoordinates.of(state.cameras, plain)
     by_camera = lambda la, li, po, tu: schur.camera_system(la, li, po, tu, damping, plain)
-    yield phase("camera sums", by_camera, linear, points, turn)
+    yield phase("camera sums", by_camera, linear, points, rotation)
     system = done["camera sums"]
     if layout.grid is not None:
         yield phase(

@@ -1,11 +1,11 @@
-"""Gradient updates a second of jaxba's training loop, beside sbx's SAC on the same task.
+"""Gradient updates per second of jaxba's training loop, compared with SAC of sbx on the same task.
 
     python -m benchmarks.sac [--repeats 5] [--envs 64] [--out FILE]
 
-Pendulum, two hidden layers, batch 256, one update per vector step; width 256, which is also sbx's, and 64, jaxba's
-preset. sbx (the package `sbx-rl`) runs under the interpreter that `JAXBA_SBX` names; without one it is left out, and
-said. Compilation and warm-up are excluded on both sides. The two take turns, and the least time of each counts, because
-other work on the machine can only add to it.
+The task is Pendulum with two hidden layers, batches of 256, and one update per vector step. The width is 256, as in
+sbx, and 64, as in jaxba's preset. sbx (the package `sbx-rl`) runs with the Python interpreter that `JAXBA_SBX` names;
+without it, sbx is left out with a message. Compilation and warm-up are not counted. The two are timed alternately, and
+the least time of each is used, since other work on the machine can only add to it.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig, run_chunk, start
 
 VARIABLE = "JAXBA_SBX"
-"""Environment variable with the path of a Python that has sbx-rl."""
+"""Environment variable with the path of a Python interpreter that has sbx-rl."""
 
 TARGET = 250.0
-"""Updates a second that the project wants at width 256, batch 256 on two cores."""
+"""Updates per second that the project aims at, with width 256 and batches of 256 on two cores."""
 
 TOLERANCE = 0.25
-"""As in benchmarks/suite.py."""
+"""Relative change of a ratio that the gate accepts, as in benchmarks/suite.py."""
 
 LIMIT = 200
-"""Steps of an episode. Source: Gymnasium's Pendulum-v1, as all its constants below."""
+"""Steps of an episode. Source: Gymnasium's Pendulum-v1, as all constants of `Pendulum`."""
 
 
 class _Swing(NamedTuple):
@@ -58,7 +58,7 @@ class Pendulum:
     """Gymnasium's Pendulum-v1: mass 1 kg, length 1 m, gravity 10 m/s^2, torque at most 2 Nm, steps of 0.05 s."""
 
     num_envs: int = dataclasses.field(metadata={"static": True})
-    """Pendulums."""
+    """Number of pendulums."""
 
     observation_size = 3
     action_size = 1
@@ -113,7 +113,7 @@ for _ in sys.stdin:
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     print(json.dumps([model._n_updates - before, wall, cpu]), flush=True)
 """
-"""What runs under `JAXBA_SBX`: a measurement for each line that it is sent."""
+"""Program for the interpreter `JAXBA_SBX`: makes a measurement for each line on its standard input."""
 
 
 class Sample(NamedTuple):
@@ -125,7 +125,7 @@ class Sample(NamedTuple):
 
 
 def ours(config: SacConfig, envs: int, updates: int) -> Callable[[], Sample]:
-    """A measurement of jaxba's loop, one update per vector step; compiled, and warm."""
+    """A function that measures jaxba's loop with one update per vector step, after compilation and warm-up."""
     env, loop = jax.device_put(Pendulum(envs)), LoopConfig(100_000, 1000, 1, updates)
     state, _ = run_chunk(config, loop, env, start(config, loop, env, jax.random.key(0)))
     held = [jax.block_until_ready(state)]
@@ -139,7 +139,7 @@ def ours(config: SacConfig, envs: int, updates: int) -> Callable[[], Sample]:
 
 
 class Sbx:
-    """sbx in a process of its own, asleep between measurements."""
+    """sbx in a separate process, which waits between measurements."""
 
     def __init__(self, python: str, updates: int, together: int) -> None:
         self._process = subprocess.Popen(
@@ -159,7 +159,7 @@ class Sbx:
         return line.strip()
 
     def __call__(self) -> Sample:
-        """A measurement."""
+        """Makes a measurement."""
         if self._process.stdin:
             self._process.stdin.write("go\n")
             self._process.stdin.flush()
@@ -172,7 +172,7 @@ class Sbx:
 
 
 def run(repeats: int, envs: int, updates: int) -> list[Metric]:
-    """Everything, in turns."""
+    """Measures all programs alternately."""
     peer_like = SacConfig(width=256, layer_norm=False)
     programs: dict[str, Callable[[], Sample]] = {
         "jaxba, width 256": ours(peer_like, envs, updates),
@@ -210,8 +210,8 @@ def _metrics(samples: dict[str, list[Sample]]) -> Iterator[Metric]:
         target = TARGET if name == "jaxba, width 256" else None
         yield Metric(f"sac/{name}", speed[name], "1/s", "higher", target=target)
         yield Metric(f"sac/{name}: cores used", best.cpu_s / best.wall_s, "cores", "higher")
-        thrift = max(s.updates / s.cpu_s for s in taken)
-        yield Metric(f"sac/{name}: of one core", thrift, "1/s", "higher")
+        per_core = max(s.updates / s.cpu_s for s in taken)
+        yield Metric(f"sac/{name}: of one core", per_core, "1/s", "higher")
     for name in speed:
         if name.startswith("sbx"):
             ratio = speed["jaxba, width 256"] / speed[name]
@@ -220,11 +220,11 @@ def _metrics(samples: dict[str, list[Sample]]) -> Iterator[Metric]:
 
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description="Gradient updates a second, beside sbx.")
+    parser = argparse.ArgumentParser(description="Gradient updates per second, compared with sbx.")
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--envs", type=int, default=64, help="pendulums that step together")
-    parser.add_argument("--updates", type=int, default=512, help="gradient updates in a measurement")
-    parser.add_argument("--out", default="", help="write the metrics as JSON here")
+    parser.add_argument("--envs", type=int, default=64, help="number of pendulums")
+    parser.add_argument("--updates", type=int, default=512, help="number of gradient updates in a measurement")
+    parser.add_argument("--out", default="", help="output file of the metrics as JSON")
     args = parser.parse_args()
     metrics = run(args.repeats, args.envs, args.updates)
     print(to_text(metrics))

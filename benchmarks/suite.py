@@ -1,10 +1,11 @@
-"""Speed of jaxba beside its peers, in one run.
+"""Speed of jaxba compared with Ceres, in one run.
 
     python -m benchmarks.suite [--only iteration,scenes,cold,tolerance,large,layout] [--solvers ...] [--repeats 3]
         [--gate] [--update-baseline]
 
-Real problems come from the folder `JAXBA_DATA`; the C++ Ceres peer from `JAXBA_CERES` (benchmarks/README.md). What is
-missing is left out, and said. Ratios are compared with benchmarks/baseline.json by `--gate`.
+`JAXBA_DATA` names the folder of real problems, and `JAXBA_CERES` the program with C++ Ceres (benchmarks/README.md).
+Parts whose data or program are missing are left out with a message. `--gate` compares ratios with
+benchmarks/baseline.json.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent
 BASELINE = HERE / "baseline.json"
 GATE_TOLERANCE = 0.25
-"""Ratios of short runs on a shared machine vary by some 10%; see benchmarks/README.md."""
+"""Relative change of a ratio that `--gate` accepts: ratios of short runs on a shared machine vary by up to 15%."""
 
 ITERATION_PROBLEMS = (
     "bal/problem-49-7776-pre.txt.bz2",
@@ -42,7 +43,7 @@ ITERATION_PROBLEMS = (
     "scene:ladybug-1197",
 )
 ITERATIONS = 8
-"""Iterations that are timed; later ones cost the same."""
+"""Number of iterations that are timed; later ones take the same time."""
 
 TOLERANCE_SOLVERS = (
     "ceres+refine3",
@@ -53,31 +54,32 @@ TOLERANCE_SOLVERS = (
     "nielsen+refine3@float32",
     "learned@float32",
 )
-"""Hand-written policies with point iterations, and the one that ships; in float32 too, which is enough for 1e-3."""
+"""Rules with point iterations, and the shipped policy; also in float32, which is accurate enough for 1e-3."""
 
 ROUNDING = 2e-5
-"""Relative error of a cost in float32, which may end a solve so far above its goal: a fiftieth of the tolerance."""
+"""Relative error of a cost in float32, by which a solve may end above its target: a fiftieth of the tolerance."""
 
-LEAST_SOLVES = 5
-"""Solves that are timed to a tolerance; compiled once, they cost little."""
+MIN_SOLVES = 5
+"""Smallest number of timed solves to a tolerance."""
 
 LARGE_SCENES = ("scene:random-150", "scene:ladybug-1197")
-"""Random scenes larger than the real problems at hand; the second has the counts of a BAL file."""
+"""Random scenes larger than the real problems; the second has the size of the BAL problem Ladybug-1197."""
 
 SMALL_SCENES = ("scene:tiny", "scene:paper")
-"""Scenes in which the fixed cost of a layout shows."""
+"""Scenes so small that the fixed cost of a layout matters."""
 
 LARGE_ITERATIONS = 30
-"""Limit of Ceres' iterations on them. Under its rule our step took 17 to f*(1 + 1e-3) (docs/game-tried.md)."""
+"""Limit of Ceres' iterations on the large scenes. jaxba's step under Ceres' rule takes 17 to f*(1 + 1e-3)."""
 
-MANY_CAMERAS = 500
-"""With more, Ceres' dense mode takes minutes an iteration and is left out."""
+MAX_DENSE_CAMERAS = 500
+"""With more cameras, Ceres' dense mode takes minutes per iteration and is left out."""
 
 COLD_PROBLEM = "bal/problem-49-7776-pre.txt.bz2"
+"""Problem for the time of a first call."""
 
 
 def locate(name: str) -> str | None:
-    """A source's location, or None where the file is not at hand."""
+    """Path of a problem, or the scene itself; None if the file does not exist."""
     if name.startswith("scene:"):
         return name
     folder = os.environ.get("JAXBA_DATA", "")
@@ -86,14 +88,14 @@ def locate(name: str) -> str | None:
 
 
 def real_problems() -> list[str]:
-    """Every real problem at hand but the hand-cut miniatures, which end at rounding noise."""
+    """Paths of the real problems in `JAXBA_DATA`, without the very small ones in other folders."""
     folder = Path(os.environ.get("JAXBA_DATA", ""))
     files = [*folder.glob("bal/problem-*.bz2"), *folder.glob("bal-converted/*.bz2")]
     return sorted(map(str, files)) if folder.name else []
 
 
 def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
-    """Seconds per LM iteration, jaxba's `auto` against the best of Ceres' modes."""
+    """Seconds per LM iteration, of jaxba's linear solver `auto` and of Ceres' modes, and the ratio to the best mode."""
     from jaxba.bench.sources import sources
     from jaxba.io import write_problem
 
@@ -105,11 +107,11 @@ def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
             continue
         source = sources([location])[0]
         problem = source.read()
-        ours, linear_solver = _our_iteration(problem, repeats)
+        ours, linear_solver = iteration_seconds(problem, repeats)
         label = f"iteration/{source.name}"
         yield Metric(f"{label}/jaxba ({linear_solver})", ours, "s", "lower")
-        process = _layout_seconds(problem, repeats)
-        yield Metric(f"{label}/layout over an iteration", process / ours, "ratio", "lower", GATE_TOLERANCE, target=1.0)
+        ratio = _layout_seconds(problem, repeats) / ours
+        yield Metric(f"{label}/layout over an iteration", ratio, "ratio", "lower", GATE_TOLERANCE, target=1.0)
         if binary is None:
             continue
         with tempfile.TemporaryDirectory() as folder:
@@ -126,20 +128,27 @@ def iteration_times(repeats: int, threads: int) -> Iterator[Metric]:
 
 
 def layout_times(repeats: int) -> Iterator[Metric]:
-    """Layout over an iteration on every real problem, and on the smallest built-in scenes."""
+    """Time of the layout relative to an iteration, on every real problem and on the smallest random scenes."""
     from jaxba.bench.sources import sources
 
     for source in sources([*real_problems(), *SMALL_SCENES]):
         problem = source.read()
-        ours, process = _our_iteration(problem, repeats)[0], _layout_seconds(problem, repeats)
-        yield Metric(f"layout/{source.name}, over an iteration", process / ours, "ratio", "lower", GATE_TOLERANCE, 1.0)
+        ratio = _layout_seconds(problem, repeats) / iteration_seconds(problem, repeats)[0]
+        yield Metric(f"layout/{source.name}, over an iteration", ratio, "ratio", "lower", GATE_TOLERANCE, 1.0)
 
 
 def _modes(problem: BundleProblem) -> list[str]:
-    return [mode for mode in peers.MODES if mode != "DENSE_SCHUR" or problem.num_cameras <= MANY_CAMERAS]
+    return [mode for mode in peers.MODES if mode != "DENSE_SCHUR" or problem.num_cameras <= MAX_DENSE_CAMERAS]
 
 
-def _our_iteration(problem, repeats: int) -> tuple[float, str]:
+def iteration_seconds(problem: BundleProblem, repeats: int, method: str = "lm") -> tuple[float, str]:
+    """Median seconds of an iteration under Ceres' rule without compilation, and the linear solver.
+
+    Args:
+        problem: the problem.
+        repeats: number of solves with `ITERATIONS` iterations each.
+        method: name of the method that computes the step.
+    """
     import jaxba
 
     times, solver = [], ""
@@ -148,7 +157,7 @@ def _our_iteration(problem, repeats: int) -> tuple[float, str]:
         solution = jaxba.solve(
             problem,
             "ceres",
-            jaxba.SolveOptions(max_iterations=ITERATIONS, compilation="full"),
+            jaxba.SolveOptions(method=method, max_iterations=ITERATIONS, compilation="full"),
             callback=lambda record, stamps=stamps: stamps.append(record.time_s) and False,
         )
         solver = solution.linear_solver
@@ -157,7 +166,7 @@ def _our_iteration(problem, repeats: int) -> tuple[float, str]:
 
 
 def _layout_seconds(problem: BundleProblem, repeats: int) -> float:
-    """Median time on the host to sort the observations for the solver that `auto` takes."""
+    """Median seconds on the host to make the layout for the linear solver that `auto` chooses."""
     from jaxba import StepOptions
     from jaxba.solver.cost_model import choose_linear_solver
     from jaxba.structure.layout import layout_for
@@ -172,35 +181,42 @@ def _layout_seconds(problem: BundleProblem, repeats: int) -> float:
 
 
 def time_to_tolerance(
-    part: str, places: list[str], solvers: list[str], limit: int, repeats: int, threads: int
+    part: str, problems: list[str], solvers: list[str], limit: int, repeats: int, threads: int
 ) -> Iterator[Metric]:
-    """Time to f*(1 + 1e-3): rules with point iterations and the shipped policy against Ceres.
+    """Time to the cost f*(1 + 1e-3), of jaxba's solvers and of Ceres.
 
-    f* is the lowest cost of all runs of the problem. Ours are timed as a library's user runs them: the whole loop as
-    one program that ends at that cost. Ceres solves under its own rule, at most `limit` iterations, and its fastest
-    mode counts, by its own clock.
+    f* is the lowest cost of all runs on the problem. jaxba is timed as one compiled program that ends at that cost.
+    Ceres is timed under its own rule, with its own clock, in its fastest mode.
+
+    Args:
+        part: name of this part of the suite, for the metrics.
+        problems: paths or random scenes.
+        solvers: names of jaxba's solvers.
+        limit: limit of Ceres' iterations.
+        repeats: runs of Ceres in each mode.
+        threads: threads of Ceres.
     """
     from jaxba.bench.sources import sources
     from jaxba.io import write_problem
 
     binary = peers.program()
-    if binary is None or not places:
+    if binary is None or not problems:
         print(f"left out: {part} (needs JAXBA_CERES; for real problems JAXBA_DATA)", file=sys.stderr)
         return
     ratios: dict[str, list[float]] = {name: [] for name in solvers}
-    for source in sources(places):
+    for source in sources(problems):
         problem = source.read()
-        ends = [_solved(problem, name)[0] for name in solvers]
+        final_costs = [_cost_and_seconds(problem, name)[0] for name in solvers]
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "problem.txt"
             write_problem(problem, file)
             runs = [[peers.run(binary, file, m, threads, limit) for _ in range(repeats)] for m in _modes(problem)]
-        best = min(ends + [run.final_cost for mode in runs for run in mode])
-        goal = best * (1 + 1e-3)
-        theirs = min(statistics.median(run.seconds_to(goal) for run in mode) for mode in runs)
+        best = min(final_costs + [run.final_cost for mode in runs for run in mode])
+        target = best * (1 + 1e-3)
+        theirs = min(statistics.median(run.seconds_to(target) for run in mode) for mode in runs)
         yield Metric(f"{part}/{source.name}/ceres best mode", theirs, "s", "lower")
-        for name, end in zip(solvers, ends, strict=True):
-            ours = _seconds_to(problem, name, goal, max(repeats, LEAST_SOLVES)) if end <= goal else math.inf
+        for name, cost in zip(solvers, final_costs, strict=True):
+            ours = _seconds_to(problem, name, target, max(repeats, MIN_SOLVES)) if cost <= target else math.inf
             yield Metric(f"{part}/{source.name}/jaxba {name}", ours, "s", "lower")
             if math.isfinite(ours) and math.isfinite(theirs):
                 ratios[name].append(ours / max(theirs, 1e-6))
@@ -210,8 +226,8 @@ def time_to_tolerance(
         yield Metric(f"{part}/problems that {name} and ceres reached", len(both), "count", "higher")
 
 
-def _solved(problem: BundleProblem, name: str, goal: float = -math.inf) -> tuple[float, float]:
-    """Final cost, in float64 by NumPy, and seconds of a solve in one program that ends at the goal."""
+def _cost_and_seconds(problem: BundleProblem, name: str, target: float = -math.inf) -> tuple[float, float]:
+    """Final cost, evaluated in float64, and seconds of a solve in one program that ends at the target cost."""
     import jaxba
     from jaxba.problem import geometry
     from jaxba.solver.names import parse_solver
@@ -221,22 +237,22 @@ def _solved(problem: BundleProblem, name: str, goal: float = -math.inf) -> tuple
     solution = jaxba.solve(
         problem,
         policy,
-        dataclasses.replace(options, tolerances=jaxba.Tolerances(target=goal), compilation="full"),
+        dataclasses.replace(options, tolerances=jaxba.Tolerances(target=target), compilation="full"),
     )
     return geometry.cost(solution.problem), solution.total_s
 
 
-def _seconds_to(problem: BundleProblem, name: str, goal: float, repeats: int) -> float:
-    """Median time of the compiled loop of a solver until its cost is at most `goal`."""
-    solves = [_solved(problem, name, goal) for _ in range(repeats)]
-    if max(cost for cost, _ in solves) > (1 + ROUNDING) * goal:
-        print(f"{name} did not reach the goal again", file=sys.stderr)
+def _seconds_to(problem: BundleProblem, name: str, target: float, repeats: int) -> float:
+    """Median seconds of a solve in one program until its cost is at most `target`."""
+    solves = [_cost_and_seconds(problem, name, target) for _ in range(repeats)]
+    if max(cost for cost, _ in solves) > (1 + ROUNDING) * target:
+        print(f"{name} did not reach the target again", file=sys.stderr)
         return math.inf
     return statistics.median(seconds for _, seconds in solves)
 
 
 def scene_throughput(repeats: int) -> Iterator[Metric]:
-    """LM environment steps a second on 10 x 10 scenes, all in one vmapped program."""
+    """LM steps per second on scenes of 10 cameras and 10 points, all in one vmapped program."""
     import jax
     import jax.numpy as jnp
 
@@ -262,7 +278,8 @@ def scene_throughput(repeats: int) -> Iterator[Metric]:
 
 
 def cold_start() -> Iterator[Metric]:
-    """Wall time of `jaxba-solve`, import and compilation included, without and with a warm cache, and optimised."""
+    """Wall time of a call of `jaxba-solve`: with an empty compilation cache, with a filled one, and with
+    `--compilation full`."""
     location = locate(COLD_PROBLEM)
     if location is None:
         print("left out: cold start (JAXBA_DATA)", file=sys.stderr)
@@ -277,23 +294,23 @@ def cold_start() -> Iterator[Metric]:
             subprocess.run([*command, *more], env=environment, check=True, capture_output=True)
             measured[name] = time.perf_counter() - started
             yield Metric(f"start/jaxba-solve on ladybug-49, {name}", measured[name], "s", "lower", target=target)
-        share = measured["cold"] / measured["cold, full"]
-        yield Metric("start/cold over cold with full compilation", share, "ratio", "lower", GATE_TOLERANCE, target=1.0)
+        ratio = measured["cold"] / measured["cold, full"]
+        yield Metric("start/cold over cold with full compilation", ratio, "ratio", "lower", GATE_TOLERANCE, target=1.0)
 
 
 def main() -> int:
-    """Runs the parts asked for; status 1 when the gate finds a regression."""
-    parser = argparse.ArgumentParser(description="Speed of jaxba beside its peers.")
+    """Runs the requested parts; returns 1 if the gate finds a regression."""
+    parser = argparse.ArgumentParser(description="Speed of jaxba compared with Ceres.")
     parser.add_argument(
         "--only",
         default="iteration,scenes,cold,tolerance,large",
-        help="comma-separated parts; layout, on all problems, only if named",
+        help="comma-separated parts; also: layout, on all problems",
     )
-    parser.add_argument("--solvers", default=",".join(TOLERANCE_SOLVERS), help="of the parts tolerance and large")
+    parser.add_argument("--solvers", default=",".join(TOLERANCE_SOLVERS), help="solvers of the parts tolerance, large")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--gate", action="store_true", help="fail when a ratio is worse than the baseline")
+    parser.add_argument("--gate", action="store_true", help="fail if a ratio is worse than the baseline")
     parser.add_argument("--update-baseline", action="store_true")
-    parser.add_argument("--out", default="", help="write the metrics as JSON here")
+    parser.add_argument("--out", default="", help="output file of the metrics as JSON")
     args = parser.parse_args()
     from jaxba.bench.run import machine, threads
     from jaxba.runtime import process

@@ -95,7 +95,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--seconds", type=float, default=60.0, help="of training, compilation included")
     parser.add_argument("--envs", type=int, default=32, help="scenes in play")
-    parser.add_argument("--scenes", type=int, default=400, help="scenes drawn; about a third of them are of use")
+    parser.add_argument("--scenes", type=int, default=400, help="scenes drawn; about a third of them are usable")
     arguments = parser.parse_args()
 
     kind = SceneClass(5, 20)

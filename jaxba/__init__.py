@@ -8,8 +8,11 @@ from jaxba.damping import (
     Geometric,
     ProblemInfo,
     Schedule,
+    load_policy,
     make_policy,
+    save_policy,
 )
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.io import (
     read_bal,
     read_bundler,
@@ -44,6 +47,7 @@ __version__ = "0.1.0"
 __all__ = [
     "METHODS",
     "POLICIES",
+    "AgentConfig",
     "BundleProblem",
     "Ceres",
     "Classic",
@@ -76,6 +80,7 @@ __all__ = [
     "initial_state",
     "like",
     "lm_step",
+    "load_policy",
     "make_method",
     "make_policy",
     "normalize",
@@ -89,6 +94,7 @@ __all__ = [
     "read_colmap",
     "read_problem",
     "retriangulate",
+    "save_policy",
     "solve",
     "solve_and_retriangulate",
     "solve_loop",

@@ -9,6 +9,7 @@ import inspect
 import itertools
 import os
 import pkgutil
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,6 +19,9 @@ import pytest
 import jaxba
 from jaxba.damping import registry as policies
 from jaxba.methods import registry as methods
+
+PACKAGE = Path(jaxba.__file__).resolve().parent
+REFERENCE = PACKAGE.parent / "docs" / "reference" / "api"
 
 
 @pytest.mark.parametrize("name", jaxba.__all__)
@@ -57,6 +61,19 @@ def test_the_public_list_is_sorted_and_has_no_name_twice():
     assert jaxba.__all__ == sorted(upper) + sorted(classes) + sorted(functions)
 
 
+@pytest.mark.skipif(not REFERENCE.is_dir(), reason="the documents are not beside the package")
+def test_the_reference_describes_every_public_name_and_no_other():
+    pages = "\n".join(page.read_text(encoding="utf-8") for page in REFERENCE.glob("*.md"))
+    assert sorted(re.findall(r"^::: jaxba\.(\w+)$", pages, re.MULTILINE)) == sorted(jaxba.__all__)
+
+
+def test_no_public_function_hides_a_module():
+    modules = {module.name for module in pkgutil.iter_modules(jaxba.__path__)}
+    assert not {name for name in modules if inspect.isfunction(getattr(jaxba, name, None))}
+    # where no room has the name of a function, and every other module stands in a room, there is none to hide
+    assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == {"__init__.py", "typing.py", "py.typed"}
+
+
 @pytest.mark.extra
 @pytest.mark.parametrize("module", [m.name for m in pkgutil.walk_packages(jaxba.__path__, "jaxba.")])
 def test_every_module_can_be_imported_and_says_what_it_is_for(module):
@@ -75,8 +92,7 @@ def test_the_version_is_that_of_the_installed_package():
 
 
 def in_a_new_process(code: str, **environment: str) -> subprocess.CompletedProcess:
-    root = Path(jaxba.__file__).resolve().parent.parent
-    path = os.pathsep.join([str(root), *filter(None, [os.environ.get("PYTHONPATH")])])
+    path = os.pathsep.join([str(PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     env = {**os.environ, "PYTHONPATH": path, **environment}
     command = [sys.executable, "-W", "error::DeprecationWarning:jaxba", "-c", code]
     return subprocess.run(command, env=env, capture_output=True, text=True, timeout=120)
@@ -85,7 +101,7 @@ def in_a_new_process(code: str, **environment: str) -> subprocess.CompletedProce
 def test_importing_starts_no_backend_and_does_not_switch_to_64_bits():
     """A platform that does not exist is noticed only when a backend is started."""
     code = (
-        "import jaxba, jaxba.solve, jaxba.cli.solve, jaxba.cli.bench, jax\n"
+        "import jaxba, jaxba.cli.solve, jaxba.cli.bench, jax\n"
         "assert not jax.config.jax_enable_x64\n"
         "try:\n"
         "    jax.devices()\n"
@@ -102,7 +118,7 @@ def test_solving_in_float64_leaves_the_rest_of_the_process_in_32_bits():
     code = (
         "import jax, jax.numpy as jnp, numpy as np, jaxba\n"
         "problem = jaxba.random_scene(jaxba.like('paper'), 0)\n"
-        "solution = jaxba.solve(problem, max_iterations=1)\n"
+        "solution = jaxba.solve(problem, options=jaxba.SolveOptions(max_iterations=1))\n"
         "assert not jax.config.jax_enable_x64\n"
         "assert jnp.asarray(1.0).dtype == jnp.float32\n"
         "assert solution.problem.cameras.dtype == np.float64\n"
@@ -123,5 +139,5 @@ def test_help_starts_no_backend():
     )
     done = in_a_new_process(code, JAX_PLATFORMS="none_such")
     assert done.returncode == 0, done.stderr
-    assert "--damping" in done.stdout
+    assert "--policy" in done.stdout
     assert "--refine-points" in done.stdout

@@ -11,7 +11,7 @@ from jaxba import BundleProblem, StepOptions
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.env import Game, GameConfig, make_game
 from jaxba.game.random_scenes import SceneClass, Scenes
-from jaxba.game.scene_bank import Bank, draft, sieve
+from jaxba.game.scene_bank import Bank, draft, select
 
 KIND = SceneClass(4, 12)
 AGENT = AgentConfig(
@@ -32,7 +32,7 @@ RULES = GameConfig(agent=AGENT, max_iterations=4, limit_is_failure=False)
 def tiny_bank() -> Bank:
     """A dozen scenes or more, with the best costs that Ceres' and GTSAM's rules find."""
     made = draft(KIND, jax.random.key(5), 120, StepOptions(), 40, rules=("ceres",))
-    return sieve(made.bank, made.useful)
+    return select(made.bank, made.usable)
 
 
 def tiny_game(config: GameConfig = RULES, envs: int = 6) -> Game:

@@ -1,8 +1,8 @@
-"""One LM step on a GPU: every phase, types of arithmetic, throughput of small scenes, memory.
+"""An LM step on a GPU: phases, floating point types, throughput of small scenes, memory.
 
     python -m benchmarks.gpu [--problems scene:ladybug-1197,...] [--out benchmarks/gpu/results.json] [--any-device]
 
-Without a GPU it says so and measures nothing, unless `--any-device` asks for a trial run.
+Without a GPU it prints a message and measures nothing, unless `--any-device` is given.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from jaxba.solver.options import SolveOptions
 from jaxba.structure.layout import layout_for
 
 PROBLEMS = "scene:ladybug-49,scene:random-150,scene:ladybug-1197,scene:venice-1778"
-"""Built-in scenes, since the machine with the GPU need not have any data."""
+"""Random scenes, which need no files on the machine with the GPU."""
 
 BATCHES = (256, 4096, 16384)
-"""Numbers of small scenes stepped at once."""
+"""Numbers of small scenes in a batch."""
 
 
 def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, Any]]:
-    """Seconds per iteration of whole solves, for every type of arithmetic."""
+    """Seconds per iteration of complete solves, for each floating point type, without and with point iterations."""
     for dtype in ("float64", "mixed", "float32"):
         for refine in (0, 3):
             options = SolveOptions(
@@ -56,7 +56,7 @@ def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, A
 
 
 def scene_throughput(count: int, dtype: Any) -> float:
-    """LM steps a second on `count` scenes of 10 cameras and 10 points in one program."""
+    """LM steps per second on `count` scenes of 10 cameras and 10 points in one program."""
     options = StepOptions()
     problems = [jaxba.random_scene(jaxba.like("paper"), seed) for seed in range(min(count, 256))]
     layouts = [jaxba.build_layout(problem) for problem in problems]
@@ -70,20 +70,20 @@ def scene_throughput(count: int, dtype: Any) -> float:
 
 
 def peak_bytes() -> int | None:
-    """Most memory in use so far, where the device tells."""
+    """Peak memory in use so far; None if the device does not report it."""
     stats = jax.devices()[0].memory_stats()
     return None if stats is None else int(stats.get("peak_bytes_in_use", 0))
 
 
 def main() -> int:
-    """Prints and writes the results; status 3 without a GPU."""
-    parser = argparse.ArgumentParser(description="One LM step on a GPU.")
+    """Prints and writes the results; returns 3 without a GPU."""
+    parser = argparse.ArgumentParser(description="An LM step on a GPU.")
     parser.add_argument("--problems", default=PROBLEMS)
     parser.add_argument("--batches", default=",".join(map(str, BATCHES)))
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--iterations", type=int, default=10)
     parser.add_argument("--out", default="")
-    parser.add_argument("--any-device", action="store_true", help="run on whatever JAX has")
+    parser.add_argument("--any-device", action="store_true", help="run on the default device of JAX")
     args = parser.parse_args()
     device = jax.devices()[0]
     if device.platform != "gpu" and not args.any_device:

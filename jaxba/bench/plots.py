@@ -1,7 +1,7 @@
 """Figures from records: performance profiles, convergence, damping. Each function returns a matplotlib `Figure`.
 
-No pyplot, so no global state and no display. A solver keeps its colour, line style and marker in every figure
-made from the same records, and legends stand outside the axes.
+pyplot is not used, so that there is no global state and no display is needed. A solver has the same colour, line style
+and marker in all figures made from the same records.
 """
 
 from __future__ import annotations
@@ -30,36 +30,36 @@ COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#5
 """Okabe and Ito's palette, safe for colour-blind readers; grey for its yellow, which is too light for lines."""
 
 LINES = ("-", (0, (6, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (1.5, 1.2)))
-"""Line styles, changing with every solver, so that curves differ in black and white too."""
+"""Line styles, a different one for each next solver, so that curves can be told apart in black and white."""
 
 MARKERS = "osD^vP*X"
 """Markers, one per colour."""
 
 RESERVED = ("classic", "ceres", "learned")
-"""Solvers with the first styles in every benchmark, so that reports can be laid side by side."""
+"""Solvers that always get the first styles, so that different reports can be compared."""
 
 ZOOM_ITERATIONS = 10
-"""Length of the zoom of the damping chart. Source: the paper's figure."""
+"""Iterations in the zoomed part of the damping chart. Source: the paper's figure."""
 
 DENSE_TICKS = 200.0
-"""Largest ratio of the ends of a logarithmic axis that also has ticks at 2 and 5; below 5, ticks are even."""
+"""A logarithmic axis has ticks at 1, 2 and 5 up to this ratio of its limits; up to a ratio of 5, ticks are linear."""
 
 LOG_TIME_SPREAD = 20.0
-"""Ratio of the longest to the shortest solve time from which the time axis is logarithmic."""
+"""The time axis is logarithmic if the longest solve takes more than this times the shortest."""
 
 CLIPPING = 1e3
-"""How far below the lowest tolerance line a convergence plot reaches."""
+"""A convergence plot reaches below the lowest tolerance line by this factor."""
 
-TAG_DISTANCE = 0.06
-"""Share of the axis height below which the names of two dashed lines would overlap."""
+LABEL_DISTANCE = 0.06
+"""Fraction of the axis height below which the labels of two dashed lines would overlap."""
 
 PAPER_TOLERANCES = (0.1, 0.001)
-"""Tolerances with dashed lines in the convergence plot. Source: the paper's figure."""
+"""Values of tau with dashed lines in the convergence plot. Source: the paper's figure."""
 
 
 @dataclass(frozen=True)
 class Style:
-    """How a solver is drawn."""
+    """Colour, line style and marker of a solver."""
 
     color: str
     linestyle: Any
@@ -71,7 +71,7 @@ class Style:
 
 
 def solver_styles(solvers: Iterable[str]) -> dict[str, Style]:
-    """One style per solver: the first for `RESERVED`, the following ones in the order given."""
+    """A style for each solver: the first ones for `RESERVED`, then in the given order."""
     names = list(dict.fromkeys(solvers))
     ranked = [*RESERVED, *(name for name in names if name not in RESERVED)]
     n = len(COLOURS)
@@ -84,13 +84,12 @@ def solver_styles(solvers: Iterable[str]) -> dict[str, Style]:
 def plot_profiles(
     records: Sequence[Record], targets: Sequence[Target], known_best: Mapping[str, float] | None = None
 ) -> Figure:
-    """Performance profiles by time and by iterations; x is log alpha.
+    """Performance profiles by time and by iterations, over alpha on a logarithmic axis.
 
     Args:
         records: of at least one solver.
-        targets: e.g. the relative tolerances, one column each with time above and iterations below; a single
-            target has them side by side.
-        known_best: see `profile.best_cost`.
+        targets: one column for each, with time above and iterations below. A single target has them side by side.
+        known_best: best known costs, see `profile.best_cost`.
     """
     styles = solver_styles(profile.solver_names(records))
     count = len(profile.problem_names(records))
@@ -109,7 +108,7 @@ def plot_profiles(
         for one in axes[:1, column] if len(targets) > 1 else axes[:, column]:
             one.set_title(target.label, parse_math=False, fontsize="medium")
     for one in axes[:, 0] if len(targets) > 1 else axes[:1, 0]:
-        one.set_ylabel(f"share of all problems (%, n = {count})")
+        one.set_ylabel(f"fraction of all problems (%, n = {count})")
     _legend(figure, styles, marker=False)
     return figure
 
@@ -118,8 +117,8 @@ def _profile_axes(axes: Axes, curves: Mapping[str, profile.Curve], styles: Mappi
     last = max((alpha for curve in curves.values() for alpha in curve.alphas), default=1.0)
     limit = max(2.0, 1.3 * last)
     for rank, (solver, curve) in enumerate(curves.items()):
-        x, y = [*curve.alphas, limit], [100 * share for share in (*curve.shares, curve.shares[-1])]
-        width = 1.3 + 1.3 * (len(curves) - 1 - rank) / max(len(curves) - 1, 1)  # ties: later curves are thinner, on top
+        x, y = [*curve.alphas, limit], [100 * value for value in (*curve.fractions, curve.fractions[-1])]
+        width = 1.3 + 1.3 * (len(curves) - 1 - rank) / max(len(curves) - 1, 1)  # equal curves stay visible
         axes.step(x, y, where="post", zorder=3, clip_on=False, **styles[solver].line(width))
     axes.set_xscale("log")
     axes.set_xlim(1.0, limit)
@@ -133,9 +132,9 @@ def plot_convergence(
 ) -> Figure:
     """Accepted cost of every solver on one problem, over time (left) and iterations (right).
 
-    Above: cost, dashed lines at `f* + tau (f0 - f*)` for the paper's tolerances and the given one. Below: distance
-    to f* relative to f* (to f0 on zero-residual problems), dashed lines at the relative tolerances; distances far
-    below the lowest line are drawn at the bottom. Of several repeats the one of median time is drawn.
+    Upper row: the cost, with dashed lines at `f* + tau (f0 - f*)` for the paper's tolerances and the given one.
+    Lower row: `f - f*` relative to f* (to f0 for zero-residual problems), with dashed lines at the relative tolerances.
+    Distances far below the lowest line are drawn at the bottom. The repeat of median time is drawn.
     """
     styles = solver_styles(profile.solver_names(records))
     runs = _representatives(records, problem)
@@ -169,9 +168,9 @@ def plot_convergence(
         axes[1][column].set_xlabel("solve time (s)" if measure == "time_s" else "iteration")
     for one in axes[:, 0]:
         _log_ticks(one.yaxis)  # shared with the right column
-    ends = {e: "zero-residual floor" if e in floored else f"f*(1+{e:g})" for e in gaps}
+    labels = {e: "zero-residual floor" if e in floored else f"f*(1+{e:g})" for e in gaps}
     _dashed(axes[0], [(f"τ = {tau:g}", cost) for tau, cost in taus.items()])
-    _dashed(axes[1], [(ends[e], gap / unit) for e, gap in gaps.items()])
+    _dashed(axes[1], [(labels[e], gap / unit) for e, gap in gaps.items()])
     axes[0][0].set_ylabel("cost (pixels²)")
     axes[1][0].set_ylabel(rf"$(f - f^*)\,/\,{name}$")
     _legend(figure, {solver: styles[solver] for solver in runs})
@@ -179,11 +178,11 @@ def plot_convergence(
 
 
 def plot_lambda(records: Sequence[Record], problem: str) -> Figure:
-    """Damping of each iteration on one problem, rejected iterations hollow, with a zoom.
+    """Lambda of each iteration on one problem, with hollow markers for rejected steps, and a zoomed part.
 
-    The zoom shows the last ten iterations of "classic", as in the paper's figure; without a converged "classic",
-    those of the longest converged solve, else of the longest solve; there is none if no solve has more iterations.
-    lambda = 0 is drawn at the lower edge. Of several repeats the one of median time is drawn.
+    As in the paper's figure, the zoomed part shows the last ten iterations of the solver `classic`. If that did not
+    converge, it shows those of the longest converged solve, else of the longest solve. It is left out if no solve has
+    more than ten iterations. lambda = 0 is drawn at the lower edge. The repeat of median time is drawn.
     """
     styles = solver_styles(profile.solver_names(records))
     runs = _representatives(records, problem)
@@ -227,9 +226,9 @@ def _zoom(main: Axes, zoom: Axes, lines: Mapping[str, Sequence[TracePoint]], spa
 
 
 def _log_ticks(axis: Axis) -> None:
-    """Few ticks with plain labels (1e-5) on a logarithmic axis whose limits are set.
+    """Sets few ticks with plain labels such as 1e-5 on a logarithmic axis whose limits are set.
 
-    Not matplotlib's own labels, because typesetting their powers of ten takes half of the time of a figure.
+    matplotlib's own labels are not used, since rendering their powers of ten takes half of the time of a figure.
     """
     low, high = axis.get_view_interval()
     dense = LogLocator(subs=(1.0, 2.0, 5.0)) if high < DENSE_TICKS * low else LogLocator()
@@ -245,7 +244,7 @@ def _whole_ticks() -> MaxNLocator:
 
 
 def _zoom_range(runs: Mapping[str, Record]) -> tuple[int, int]:
-    """First and last iteration of the zoom of `plot_lambda`."""
+    """First and last iteration of the zoomed part of `plot_lambda`."""
     finished = {solver: r for solver, r in runs.items() if profile.converged(r)}
     chosen = [finished["classic"]] if "classic" in finished else list((finished or runs).values())
     end = max((r.trace[-1].iteration for r in chosen), default=1)
@@ -262,7 +261,7 @@ def _damping_line(axes: Axes, line: Sequence[TracePoint], style: Style, low: flo
 
 
 def _representatives(records: Sequence[Record], problem: str) -> dict[str, Record]:
-    """One run per solver: of its repeats the one whose solve time is the (lower) median."""
+    """For each solver, the repeat with the (lower) median solve time."""
     runs: dict[str, list[Record]] = {}
     for r in records:
         if r.problem == problem:
@@ -275,7 +274,7 @@ def _end(record: Record) -> float:
 
 
 def _spread(runs: Iterable[Record]) -> float:
-    """Longest over shortest solve time: decides whether the time axis is logarithmic."""
+    """Longest over shortest solve time."""
     ends = [end for end in map(_end, runs) if 0 < end < math.inf]
     return max(ends) / min(ends) if ends else 1.0
 
@@ -289,26 +288,26 @@ def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Figur
 
 
 def _dashed(row: Iterable[Axes], lines: Sequence[tuple[str, float]]) -> None:
-    """Horizontal dashed lines in axes that share y, named right of the last; lines too close share a name tag."""
+    """Draws horizontal dashed lines in axes that share y, labelled at the right. Lines too close share a label."""
     *_, last = row = list(row)
     found = sorted((y, label) for label, y in dict(lines).items() if math.isfinite(y) and y > 0)
     for axes in row:
         for y, _ in found:
             axes.axhline(y, color="0.35", linestyle=(0, (4, 3)), linewidth=0.8, zorder=1)
     bottom, top = map(math.log, last.get_ylim())
-    tags: list[tuple[float, list[str]]] = []
+    groups: list[tuple[float, list[str]]] = []
     for y, label in found:
-        if tags and math.log(y / tags[-1][0]) < TAG_DISTANCE * (top - bottom):
-            tags[-1][1].append(label)
+        if groups and math.log(y / groups[-1][0]) < LABEL_DISTANCE * (top - bottom):
+            groups[-1][1].append(label)
         else:
-            tags.append((y, [label]))
-    for y, labels in tags:
-        place: dict[str, Any] = {"xy": (1.0, y), "xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
-        last.annotate("\n".join(labels[::-1]), **place, xytext=(4, 0), va="center", fontsize="small", color="0.25")
+            groups.append((y, [label]))
+    for y, labels in groups:
+        where: dict[str, Any] = {"xy": (1.0, y), "xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+        last.annotate("\n".join(labels[::-1]), **where, xytext=(4, 0), va="center", fontsize="small", color="0.25")
 
 
 def _legend(figure: Figure, styles: Mapping[str, Style], marker: bool = True) -> None:
-    """One legend below all axes."""
+    """Adds one legend below all axes."""
     if not styles:
         return
     handles = [Line2D([], [], **s.line(), marker=s.marker if marker else "", markersize=5) for s in styles.values()]
@@ -320,18 +319,18 @@ def _legend(figure: Figure, styles: Mapping[str, Style], marker: bool = True) ->
 
 
 def _safe(name: str, longest: int = 48) -> str:
-    """A name as a label: no mathematics mode, no leading underscore (matplotlib hides those), not too long."""
+    """A name as a label: shortened, without mathematics mode, and without a leading underscore, which would hide it."""
     short = name if len(name) <= longest else f"{name[: longest // 2 - 1]}…{name[-(longest // 2) :]}"
     return (" " + short if short.startswith("_") else short).replace("$", r"\$")
 
 
 def save_figure(figure: Figure, stem: str | os.PathLike[str]) -> list[Path]:
-    """Writes `stem.png` (150 dpi) and `stem.svg`, the same bytes for the same figure. Raises OSError."""
+    """Writes `stem.png` (150 dpi) and `stem.svg`, reproducibly to the byte. Raises OSError."""
     paths = [Path(f"{os.fspath(stem)}.{kind}") for kind in ("png", "svg")]
     with warnings.catch_warnings(), matplotlib.rc_context({"svg.hashsalt": "jaxba"}):
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # names in other scripts
         figure.draw_without_rendering()
-        figure.set_layout_engine("none")  # the layout is found; finding it again for each file costs most of the time
+        figure.set_layout_engine("none")  # keeps the layout, since computing it again for each file is slow
         figure.savefig(paths[0], dpi=150)
         figure.savefig(paths[1], metadata={"Date": None})
     return paths

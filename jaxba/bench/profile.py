@@ -1,11 +1,11 @@
-"""What "solved to a tolerance" means, and performance profiles. Pure functions over records.
+"""Time and iterations to a tolerance, and performance profiles. Pure functions of records.
 
-Costs are accepted costs in pixels squared, times are seconds without compilation, iterations are linear
-solves, accepted or rejected. "Never" is infinity everywhere. Repeats of one solver on one problem enter by
-their median, so a solver that fails in half of its repeats or more counts as failed there.
+Costs are accepted costs in pixels squared. Times are seconds without compilation. Iterations are linear solves,
+accepted or rejected. A target that is never reached has infinite time and iterations. Repeats are combined by their
+median, so that a solver that fails in at least half of its repeats counts as failed.
 
-Source: rootba's performance profiles (Demmel et al. 2021, after Dolan and More 2002), with one change:
-problems that no solver finishes stay in the denominator.
+Source: performance profiles of rootba (Demmel et al. 2021, after Dolan and Moré 2002), with one change: problems that
+no solver finishes stay in the denominator.
 """
 
 from __future__ import annotations
@@ -22,34 +22,35 @@ ITERATION_LIMIT = 100
 """A solve that has not converged within this many iterations is a failure. Source: the paper."""
 
 RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)
-"""The epsilons of `f <= f*(1 + epsilon)`. Source: design contract."""
+"""Values of epsilon in the target `f <= f*(1 + epsilon)`."""
 
 OWN_END_TOLERANCE = 1e-3
-"""Distance from a solver's own final cost at which it counts as arrived. Source: design contract."""
+"""Value of epsilon in the target `f <= f_end (1 + epsilon)`, where f_end is the solver's own final cost."""
 
 ZERO_RESIDUAL_FLOOR = 1e-12
-"""Share of f0 above f* that always counts as reached by the relative tolerances. Without it a problem whose best
-cost is rounding noise (f* ~ 1e-26) would ask every solver for the same noise."""
+"""Costs up to f* plus this times f0 satisfy every relative tolerance. Without it, a problem whose best cost is rounding
+error (f* ~ 1e-26) would demand the same rounding error of every solver."""
 
 INITIAL_COST_TOLERANCE = 1e-2
-"""Relative difference of initial costs above which two solvers did not start alike. Source: rootba."""
+"""Relative difference of initial costs above which two solvers had different starts. Source: rootba."""
 
 COST_DEFINITION_TOLERANCE = 1e-5
-"""Relative difference of initial costs that rounding does not explain: COLMAP's zeroing of the 31 points behind
-cameras of Ladybug-49 makes 1.3e-4, float32 about 1e-6."""
+"""Relative difference of initial costs above which rounding cannot be the reason. float32 makes about 1e-6; ignoring
+the 31 observations of Ladybug-49 whose points are behind their cameras, as COLMAP does, makes 1.3e-4."""
 
 CONVERGED = frozenset({"cost", "step", "gradient", "rounding", "converged", "convergence", "ftol", "xtol", "gtol"})
-"""Words in `Record.termination` that mean converged, in lower case; every other word is a failure. The first four
-are the names of `jaxba.solve.Termination`; peers write "converged" or Ceres' "CONVERGENCE"."""
+"""Values of `Record.termination`, in lower case, that mean converged; all others mean failed. The first four are
+members of `Termination`; other libraries write "converged" or "CONVERGENCE"."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A point of a solve that is timed."""
+    """A cost threshold, or convergence, at which the time and iterations of a solve are measured."""
 
     kind: Literal["tau", "relative", "own_end", "converged"]
-    """`tau`: f* + tau (f0 - f*). `relative`: f*(1 + e). `own_end`: the solver's own final cost (1 + e), for solves
-    that converged. `converged`: the end of a solve that converged within `ITERATION_LIMIT` iterations."""
+    """`tau`: cost at most f* + tau (f0 - f*). `relative`: cost at most f*(1 + epsilon). `own_end`: cost at most
+    (1 + epsilon) times the solver's own final cost, if it converged. `converged`: the end of a solve that converged
+    within `ITERATION_LIMIT` iterations."""
 
     value: float = 0.0
     """tau or epsilon; unused for `converged`."""
@@ -70,24 +71,24 @@ class Target:
 
 
 def standard_targets(tolerance: float) -> tuple[Target, ...]:
-    """Every target that tables show: the tau tolerance given, the relative ones, own end, converged."""
+    """The targets in tables: tau with the given tolerance, the relative ones, own end, converged."""
     relative = (Target("relative", epsilon) for epsilon in RELATIVE_TOLERANCES)
     return (Target("tau", tolerance), *relative, Target("own_end", OWN_END_TOLERANCE), Target("converged"))
 
 
 @dataclass(frozen=True)
 class Reach:
-    """When a target was reached; both infinite if never."""
+    """Iterations and time to a target; both are infinite if it is never reached."""
 
     iterations: float
-    """Linear solves until then; 0 if the start already satisfies it."""
+    """Linear solves to the target; 0 if the start satisfies it."""
 
     seconds: float
-    """Solve time until then."""
+    """Solve time to the target, without compilation."""
 
 
 NEVER = Reach(math.inf, math.inf)
-"""A target that was not reached."""
+"""The value for a target that is never reached."""
 
 
 def problem_names(records: Iterable[Record]) -> list[str]:
@@ -106,11 +107,12 @@ def initial_costs(records: Iterable[Record]) -> dict[str, float]:
 
 
 def best_cost(records: Iterable[Record], known_best: Mapping[str, float] | None = None) -> dict[str, float]:
-    """f* of each problem: the lowest accepted cost that any solver reached, NaN if none is finite.
+    """f* of each problem: the lowest accepted cost of any solver, NaN if none is finite.
 
     Args:
-        records: every solver counts, converged or not; of float32 only the ends, which were computed in float64.
-        known_best: costs known from elsewhere (pixels squared) for some problems; the lower one is used.
+        records: of all solvers, converged or not. Of float32 solvers only the initial and final costs count, which were
+            computed in float64.
+        known_best: costs of some problems known from other runs, pixels squared; used where lower.
     """
     costs = [(r.problem, [r.initial_cost, lowest_cost(r)]) for r in records]
     known = [(name, [(known_best or {}).get(name, math.nan)]) for name in dict.fromkeys(name for name, _ in costs)]
@@ -118,7 +120,8 @@ def best_cost(records: Iterable[Record], known_best: Mapping[str, float] | None 
 
 
 def lowest_cost(record: Record) -> float:
-    """The lowest cost that a run may be said to have reached, NaN if none is finite."""
+    """The lowest finite accepted cost of a run, NaN if there is none. The trace of a float32 run is ignored, since its
+    rounding errors are too large."""
     trace = [] if record.dtype == "float32" else [point.cost for point in record.trace]
     return min((cost for cost in (record.final_cost, *trace) if math.isfinite(cost)), default=math.nan)
 
@@ -132,7 +135,7 @@ def _extreme(costs: Iterable[tuple[str, Sequence[float]]], choose) -> dict[str, 
 
 
 def threshold(f0: float, f_star: float, tolerance: float) -> float:
-    """`f* + tau (f0 - f*)`, the cost that counts as solved for tolerance tau."""
+    """`f* + tau (f0 - f*)`, the largest cost that counts as solved for tolerance tau."""
     return f_star + tolerance * (f0 - f_star)
 
 
@@ -147,9 +150,9 @@ def converged(record: Record) -> bool:
 
 
 def own_end_threshold(record: Record) -> float:
-    """The cost at which a solve is within 1e-3 of its own final cost; NaN (never reached) if it did not converge.
+    """The largest cost within `OWN_END_TOLERANCE` of the final cost of a solve; NaN if the solve did not converge.
 
-    A solve that stalls at its start is within 1e-3 of its end from iteration 0; only a converged end is an end.
+    Without that exception, a solve that stalls at its start would satisfy the target at iteration 0.
     """
     if not converged(record):
         return math.nan
@@ -157,12 +160,12 @@ def own_end_threshold(record: Record) -> float:
 
 
 def first_time(record: Record, cost: float) -> float:
-    """Seconds until the accepted cost is first <= `cost`; infinity if never (NaN costs never are)."""
+    """Seconds until the accepted cost is at most `cost`; infinity if that never happens."""
     return next((_time(p.time_s) for p in record.trace if p.cost <= cost), math.inf)
 
 
 def first_iteration(record: Record, cost: float) -> float:
-    """Iterations until the accepted cost is first <= `cost`; infinity if never."""
+    """Iterations until the accepted cost is at most `cost`; infinity if that never happens."""
     return next((float(p.iteration) for p in record.trace if p.cost <= cost), math.inf)
 
 
@@ -171,7 +174,7 @@ def _time(seconds: float) -> float:
 
 
 def reach(record: Record, target: Target, f0: float, f_star: float) -> Reach:
-    """When one solve reached a target, given the problem's initial and best cost."""
+    """Iterations and time of one solve to a target, given the problem's initial cost f0 and best cost f*."""
     if target.kind == "converged":
         if not converged(record):
             return NEVER
@@ -188,7 +191,8 @@ def reach(record: Record, target: Target, f0: float, f_star: float) -> Reach:
 def reach_table(
     records: Sequence[Record], target: Target, known_best: Mapping[str, float] | None = None
 ) -> dict[str, dict[str, Reach]]:
-    """`table[solver][problem]`, the median over repeats; pairs that were not run are absent."""
+    """Iterations and time to a target as `table[solver][problem]`, medians over repeats. Pairs that were not run are
+    absent."""
     starts, bests = initial_costs(records), best_cost(records, known_best)
     found: dict[str, dict[str, list[Reach]]] = {}
     for r in records:
@@ -204,28 +208,31 @@ def _median_reach(items: Sequence[Reach]) -> Reach:
 
 @dataclass(frozen=True)
 class Curve:
-    """A solver's step function: the share of all problems solved within alpha times the fastest solver's time."""
+    """Performance profile of a solver: the fraction of all problems solved within alpha times the fastest solver's
+    time, a step function of alpha."""
 
     alphas: tuple[float, ...]
-    """Where the curve steps, ascending, dimensionless; the first is 1."""
+    """Positions of the steps, ascending; the first is 1."""
 
-    shares: tuple[float, ...]
-    """Value from each alpha on, in [0, 1]."""
+    fractions: tuple[float, ...]
+    """Value of the function from each position on, in [0, 1]."""
 
-    def share_at(self, alpha: float) -> float:
-        """The share at `alpha`; 0 below 1."""
-        return max((share for step, share in zip(self.alphas, self.shares, strict=True) if step <= alpha), default=0.0)
+    def fraction_at(self, alpha: float) -> float:
+        """Value of the function at `alpha`; 0 below 1."""
+        return max(
+            (value for step, value in zip(self.alphas, self.fractions, strict=True) if step <= alpha), default=0.0
+        )
 
 
 def performance_profile(times: Mapping[str, Mapping[str, float]]) -> dict[str, Curve]:
     """Performance profile of each solver.
 
     Args:
-        times: `times[solver][problem]`, any positive measure; infinite, NaN or absent means not solved.
+        times: `times[solver][problem]`, time or another positive cost; infinite, NaN or absent means not solved.
 
     Returns:
-        One curve per solver. The denominator is every problem that any solver has an entry for, also those that
-        nobody solved. Where the best time is 0 (solved at the start), only times of 0 are within any factor.
+        A curve for each solver. The denominator is the number of problems that have an entry for any solver, solved or
+        not. If the best time of a problem is 0 (solved at the start), only times of 0 count as within any factor.
     """
     names = list(dict.fromkeys(name for row in times.values() for name in row))
     best = {
@@ -250,7 +257,8 @@ def _ratio(time: float, best: float) -> float:
 
 
 def cost_warnings(records: Sequence[Record]) -> list[str]:
-    """One line for each problem whose solvers disagree about the initial cost: they minimised different things."""
+    """A warning for each problem on which solvers have different initial costs, and so did not minimise the same
+    function from the same start."""
     lines = []
     for name in problem_names(records):
         costs = {r.solver: r.initial_cost for r in records if r.problem == name and math.isfinite(r.initial_cost)}

@@ -1,8 +1,8 @@
 """Lines of `results.jsonl`: one record per problem, solver and repeat.
 
-The keys are a contract (docs, other tools and old result files rely on them): they are the field names
-below, except that `TracePoint.damping` is written as `"lambda"`, a reserved word in Python. JSON has no NaN
-and no infinity, so a non-finite number is written as null, and null is read as NaN.
+The JSON keys are the field names below, except that `TracePoint.damping` is written as `"lambda"`, a reserved word in
+Python. The keys must not change, since other tools and old result files rely on them. JSON has no NaN and no infinity,
+so a non-finite number is written as null, and null is read as NaN.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TracePoint:
-    """State after one iteration, accepted or rejected; the first point of a trace is the start."""
+    """State after one iteration, accepted or rejected. The first point of a trace is the start."""
 
     iteration: int
-    """0 is the start; then one per linear solve."""
+    """Number of linear solves so far; 0 is the start."""
 
     time_s: float
-    """Seconds since the start of the solve, cumulative, without compilation."""
+    """Seconds since the start of the solve, without compilation."""
 
     cost: float
-    """Accepted cost after this iteration, `1/2 sum rho` in pixels squared; a rejection repeats the last one."""
+    """Accepted cost after this iteration, `1/2 sum rho` in pixels squared; unchanged by a rejected step."""
 
     damping: float
-    """The damping (lambda) that this iteration used, dimensionless; written as `"lambda"`. NaN where unknown."""
+    """Lambda of this iteration, dimensionless; written as `"lambda"`. NaN where unknown."""
 
     accepted: bool
-    """Whether the step was taken."""
+    """Whether the step was accepted."""
 
     cg_iterations: int
-    """Conjugate gradient iterations inside this one; 0 for a direct solver."""
+    """Conjugate gradient iterations of this linear solve; 0 for a direct solver."""
 
     gain_ratio: float
-    """Real over predicted decrease. NaN where there was no step, e.g. after a failed factorisation."""
+    """Actual over predicted decrease of the cost. NaN where there was no step, e.g. after a failed factorisation."""
 
 
 @dataclass(frozen=True)
@@ -67,31 +67,31 @@ class Record:
     """Number of observations."""
 
     solver: str
-    """Name, `[method+]policy[+refineK][@dtype]`, or a peer's."""
+    """Name, `[method+]policy[+refineK|+embedded][@dtype]`, or that of another library, e.g. `pyceres:dense`."""
 
     backend: str
-    """Library that ran, e.g. jax or ceres, with what is worth saying about it."""
+    """Library that ran, with its version and linear solver."""
 
     device: str
-    """Processor or accelerator."""
+    """Platform and device kind, e.g. `cpu: cpu`."""
 
     dtype: str
-    """Precision, e.g. float64."""
+    """Floating point type, e.g. float64."""
 
     threads: int
-    """Threads that the run could use."""
+    """Number of threads available to the run."""
 
     repeat: int
-    """Counts from 0."""
+    """Number of the repeat, from 0."""
 
     setup_s: float
-    """Seconds to build layout, problem objects and the like."""
+    """Seconds to build the layout or the problem of another library."""
 
     compile_s: float
-    """Seconds of compilation, in no other field but perhaps `total_s`."""
+    """Seconds of compilation; not part of the other times, except perhaps of `total_s`."""
 
     total_s: float
-    """Seconds from problem in memory to solution."""
+    """Seconds from the problem in memory to the solution."""
 
     initial_cost: float
     """Cost at the start, pixels squared."""
@@ -103,13 +103,13 @@ class Record:
     """Linear solves, accepted or rejected."""
 
     accepted: int
-    """Iterations whose step was taken."""
+    """Number of iterations whose step was accepted."""
 
     cg_iterations: int
-    """Sum over the iterations."""
+    """Conjugate gradient iterations, summed over the linear solves."""
 
     termination: str
-    """Why the solve stopped; `jaxba.bench.profile.CONVERGED` lists the words that count as converged."""
+    """Why the solve stopped; `jaxba.bench.profile.CONVERGED` lists the reasons that count as converged."""
 
     trace: tuple[TracePoint, ...]
     """The start and every iteration."""
@@ -161,7 +161,7 @@ def _key(name: str) -> str:
 
 
 def _values(kind: type, data: Any, where: str = "") -> dict[str, Any]:
-    """Checked constructor arguments of `kind` from a JSON object; keys that it does not know are ignored."""
+    """Constructor arguments of `kind` from a JSON object, with checked types. Unknown keys are ignored."""
     if not isinstance(data, Mapping):
         raise ProblemError(f"{where.rstrip('.') or 'the record'} is no object")
     values = {}
@@ -181,16 +181,16 @@ def _finite(value: Any) -> Any:
 
 
 def record_from_json(data: Mapping[str, Any]) -> Record:
-    """A record from one parsed line. Unknown keys are ignored; null stands for NaN.
+    """A record from one parsed line. Unknown keys are ignored, and null is read as NaN.
 
     Raises:
-        ProblemError: a key is missing or has the wrong type; the message names it.
+        ProblemError: a key is missing or its value has the wrong type; the message names the key.
     """
     return Record(**_values(Record, data))
 
 
 def record_to_json(record: Record) -> dict[str, Any]:
-    """The object to write as one line: keys in the contract's order, non-finite numbers as None."""
+    """The JSON object of a record, with keys in the order of the fields and non-finite numbers as None."""
     data: dict[str, Any] = {field.name: _finite(getattr(record, field.name)) for field in fields(record)}
     data["trace"] = [{_key(f.name): _finite(getattr(p, f.name)) for f in fields(p)} for p in record.trace]
     return data
@@ -199,11 +199,10 @@ def record_to_json(record: Record) -> dict[str, Any]:
 def read_records(path: str | os.PathLike[str]) -> list[Record]:
     """All records of a `results.jsonl`, in the order of the file. Empty lines are skipped.
 
-    A last line without its newline that is no complete JSON is what a killed run leaves behind: it is
-    dropped, with one warning in the log (`jaxba.bench.records`).
+    An interrupted run can leave an incomplete last line without a newline. It is ignored with a warning in the log.
 
     Raises:
-        ProblemError: the file cannot be read, or any other line is malformed; one line that names file and line.
+        ProblemError: the file cannot be read, or another line is malformed; the message names the file and the line.
     """
     try:
         lines = Path(path).read_bytes().split(b"\n")
@@ -225,10 +224,10 @@ def read_records(path: str | os.PathLike[str]) -> list[Record]:
 
 
 def append_record(path: str | os.PathLike[str], record: Record) -> None:
-    """Adds one line in a single write and has it on the disk (fsync) when it returns.
+    """Appends one line to a file in a single write, followed by fsync.
 
-    If the file ends in a half-written line, that line is removed first, so that the file stays readable; if
-    only the newline of a complete line is missing, the newline is added. One process may write at a time.
+    If the file ends in an incomplete line, that line is removed first. If only the newline after a complete line is
+    missing, it is added. Only one process may write at a time.
 
     Raises:
         OSError: the file cannot be written.
@@ -249,7 +248,8 @@ def append_record(path: str | os.PathLike[str], record: Record) -> None:
 
 
 def _unterminated_tail(file: Any, block: int = 1 << 16) -> tuple[int, bytes]:
-    """Offset and bytes of what follows the last newline; reads from the end so that appending stays cheap."""
+    """Offset and bytes of what follows the last newline. Reads backwards from the end, so that the size of the file
+    does not matter."""
     start, tail = file.seek(0, os.SEEK_END), b""
     while start > 0 and b"\n" not in tail:
         step = min(block, start)

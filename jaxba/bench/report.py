@@ -1,4 +1,4 @@
-"""Writes what a benchmark leaves behind: `summary.json`, figures and one self-contained `report.html`."""
+"""Writes the results of a benchmark: `summary.json`, figures and a self-contained `report.html`."""
 
 from __future__ import annotations
 
@@ -47,23 +47,23 @@ def write_all(
     out_dir: str | os.PathLike[str],
     tolerance: float = 1e-3,
     *,
-    facts: Mapping[str, Any] | None = None,
+    metadata: Mapping[str, Any] | None = None,
     known_best: Mapping[str, float] | None = None,
 ) -> list[Path]:
-    """Writes every result file of a benchmark into `out_dir` (made if absent) and returns their paths.
+    """Writes all result files of a benchmark into a folder and returns their paths.
 
-    `summary.json`, `profile_tau_<tau>`, `profile_relative`, `convergence_<problem>`, `lambda_<problem>` (each .png
-    and .svg) and `report.html`. Existing files of these names are replaced.
+    These are `summary.json`, `profile_tau_<tau>`, `profile_relative`, `convergence_<problem>`, `lambda_<problem>` (each
+    as .png and .svg) and `report.html`. Existing files of these names are replaced.
 
     Args:
         records: at least one.
-        out_dir: folder.
-        tolerance: tau of the tolerance profile, in (0, 1).
-        facts: device, threads, versions and the like, shown as a table.
-        known_best: costs of some problems known from elsewhere, see `profile.best_cost`.
+        out_dir: folder; created if it does not exist.
+        tolerance: tau of the performance profile, in (0, 1).
+        metadata: device, threads, versions and the like, shown as a table; from the records by default.
+        known_best: best known costs of some problems, see `profile.best_cost`.
 
     Raises:
-        ProblemError: no records, or a tolerance outside (0, 1).
+        ProblemError: there are no records, or the tolerance is outside (0, 1).
         OSError: a file cannot be written.
     """
     if not records:
@@ -72,7 +72,7 @@ def write_all(
         raise ProblemError(f"the tolerance must lie between 0 and 1, not {tolerance:g}")
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    summary = summarize(records, tolerance, known_best, facts or run_facts(records))
+    summary = summarize(records, tolerance, known_best, metadata or run_metadata(records))
     files = [folder / "summary.json"]
     write_summary(files[0], summary)
     figures = []
@@ -85,8 +85,8 @@ def write_all(
     return [*files, report]
 
 
-def run_facts(records: Iterable[Record]) -> dict[str, str]:
-    """What the records themselves say about the run: devices, backends, precisions, threads, repeats."""
+def run_metadata(records: Iterable[Record]) -> dict[str, str]:
+    """Devices, libraries, floating point types, threads and repeats that occur in the records."""
     records = list(records)
     named = {
         "device": (r.device for r in records),
@@ -94,17 +94,17 @@ def run_facts(records: Iterable[Record]) -> dict[str, str]:
         "dtype": (r.dtype for r in records),
         "threads": (str(r.threads) for r in records),
     }
-    facts = {name: ", ".join(dict.fromkeys(values)) for name, values in named.items()}
-    return facts | {"repeats": str(max((r.repeat for r in records), default=-1) + 1)}
+    metadata = {name: ", ".join(dict.fromkeys(values)) for name, values in named.items()}
+    return metadata | {"repeats": str(max((r.repeat for r in records), default=-1) + 1)}
 
 
 def file_names(problems: Iterable[str]) -> dict[str, str]:
-    """A part of a file name for each problem: letters, digits, `.`, `_` and `-` only, all different."""
+    """A unique part of a file name for each problem, of letters, digits, `.`, `_` and `-` only."""
     names: dict[str, str] = {}
     for problem in problems:
         plain = re.sub(r"[^A-Za-z0-9._-]+", "_", problem).strip("._")[:100] or "problem"
         taken, name, count = {n.lower() for n in names.values()}, plain, 1
-        while name.lower() in taken:  # lower case: some file systems do not tell a from A
+        while name.lower() in taken:  # some file systems ignore case
             count += 1
             name = f"{plain}-{count}"
         names[problem] = name
@@ -112,10 +112,10 @@ def file_names(problems: Iterable[str]) -> dict[str, str]:
 
 
 def _figures(records: Sequence[Record], tolerance: float, known_best: Mapping[str, float] | None):
-    """Yields (file stem, title, caption, figure) one by one, so that only one figure is alive."""
+    """Yields (file stem, title, caption, figure). A generator, so that only one figure is in memory."""
     caption = (
-        "Share of all problems, also those that nobody solved, that a solver solves within a factor (x axis) of the "
-        "time or iterations of the best solver on that problem."
+        "Fraction of all problems, including those that no solver solved, that a solver solves within a factor (x "
+        "axis) of the time or iterations of the best solver on that problem."
     )
     single, relative = [Target("tau", tolerance)], [Target("relative", epsilon) for epsilon in RELATIVE_TOLERANCES]
     figure = plots.plot_profiles(records, single, known_best)
@@ -126,15 +126,15 @@ def _figures(records: Sequence[Record], tolerance: float, known_best: Mapping[st
         text = "Accepted cost over solve time and iterations; dashed: tolerances. Below: distance to the best cost."
         figure = plots.plot_convergence(records, problem, tolerance, known_best)
         yield f"convergence_{name}", f"Convergence: {problem}", text, figure
-        text = "Damping of every iteration, hollow where the step was rejected; on the right a zoom into the last ones."
+        text = "Lambda of every iteration, hollow where the step was rejected. Right: the last iterations, enlarged."
         yield f"lambda_{name}", f"Damping: {problem}", text, plots.plot_lambda(records, problem)
 
 
 def to_html(summary: Summary, figures: Sequence[ReportFigure] = ()) -> str:
-    """The report as one HTML document that loads nothing from anywhere; all names are escaped."""
+    """The report as one HTML document without external resources. All names are escaped."""
     profiles, others = figures[:2], figures[2:]
     parts = [f'<p class="warning">{html.escape(warning)}</p>' for warning in summary.warnings]
-    parts.append(_table(_facts_table(summary)))
+    parts.append(_table(_metadata_table(summary)))
     parts.append(_table(_problem_table(summary)))
     *main, details = tables(summary)
     parts += [_table(table) for table in main]
@@ -150,9 +150,9 @@ def to_html(summary: Summary, figures: Sequence[ReportFigure] = ()) -> str:
     )
 
 
-def _facts_table(summary: Summary) -> Table:
-    rows = [(str(name), str(value)) for name, value in summary.facts.items()]
-    return Table("Run", ("fact", "value"), rows, "", text_columns=2)
+def _metadata_table(summary: Summary) -> Table:
+    rows = [(str(name), str(value)) for name, value in summary.metadata.items()]
+    return Table("Run", ("property", "value"), rows, "", text_columns=2)
 
 
 def _problem_table(summary: Summary) -> Table:
@@ -161,7 +161,13 @@ def _problem_table(summary: Summary) -> Table:
     for p in summary.problems:
         sizes = (str(p.cameras), str(p.points), str(p.observations))
         rows.append((p.problem, p.family, *sizes, f"{p.initial_cost:.7g}", f"{p.best_cost:.7g}", p.best_solver))
-    return Table("Scenes", header, rows, "Costs are half the sum of squared residuals, pixels².", text_columns=2)
+    return Table(
+        "Problems and their sizes",
+        header,
+        rows,
+        "Costs are half the sum of squared residuals, pixels².",
+        text_columns=2,
+    )
 
 
 def _table(table: Table) -> str:

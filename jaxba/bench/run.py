@@ -1,4 +1,4 @@
-"""Runs solvers on problems, one record a run, and keeps what is done."""
+"""Runs solvers on problems and appends a record of each run to a results file, so that a run can be continued."""
 
 from __future__ import annotations
 
@@ -36,24 +36,24 @@ except ImportError:  # Windows
     fcntl = None
 
 RESULTS = "results.jsonl"
-"""One line a run."""
+"""File of the records, one line per run."""
 
 SETTINGS = "settings.json"
-"""What the runs of a folder have in common; a run with other settings may not continue there."""
+"""File of the settings that all runs in a folder share; other settings are refused there."""
 
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What every run of a benchmark shares."""
+    """Settings shared by all runs of a benchmark."""
 
     max_iterations: int = MAX_ITERATIONS
-    """Linear solves after which a solver has failed."""
+    """Limit of linear solves."""
 
     ftol: float = Tolerances().ftol
-    """Relative decrease of an accepted step that ends a solve."""
+    """A solve has converged when an accepted step decreases the cost by less than this, relatively."""
 
     linear_solver: str = "auto"
-    """`auto`, `explicit`, `sparse`, `implicit` or `power`, of plain LM steps; other methods have their own."""
+    """`auto`, `explicit`, `sparse` or `implicit`. Applies to the method `lm`; others have their own solver."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,16 @@ def run_solver(
     settings: RunSettings,
     on_iteration: Callable[[IterationRecord], Any] | None = None,
 ) -> Record:
-    """Solves one problem once, step by step, with real time stamps."""
+    """Solves one problem once, with a Python callback after each iteration, and so with measured times.
+
+    Args:
+        problem: the problem.
+        source: where it comes from; its name and family go into the record.
+        solver: what solves it.
+        repeat: number of the repeat, from 0, for the record.
+        settings: shared settings.
+        on_iteration: called after every iteration.
+    """
     steps: list[IterationRecord] = []
 
     def watch(step: IterationRecord) -> None:
@@ -93,7 +102,7 @@ def run_solver(
     )
     solution = solve(problem, policy, options, callback=watch)
     record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
-    if solver.dtype == "float32":  # whose own sums are wrong by more than solvers differ
+    if solver.dtype == "float32":  # rounding errors of its own sums are larger than the differences between solvers
         record = replace(record, initial_cost=geometry.cost(problem), final_cost=geometry.cost(solution.problem))
     return record
 
@@ -107,7 +116,7 @@ def _run_peer(
     steps: list[IterationRecord],
     watch: Callable[[IterationRecord], Any],
 ) -> Record:
-    """The same by another library, which computes on the host."""
+    """`run_solver` for another library, which computes on the host."""
     from jaxba.peers.ceres import solve_by_ceres
     from jaxba.peers.colmap import backend
     from jaxba.peers.driven import drive_ceres
@@ -133,7 +142,7 @@ def _run_peer(
 def record_of(
     solution: Solution, steps: Sequence[IterationRecord], *, name: str, family: str, solver: SolverName, repeat: int = 0
 ) -> Record:
-    """A solution as a line of `results.jsonl`."""
+    """The record of a solution and its iterations."""
     trace = [TracePoint(0, 0.0, solution.initial_cost, float("nan"), True, 0, float("nan"))]
     for item in steps:
         step = item.step
@@ -175,12 +184,12 @@ def record_of(
 
 
 def threads() -> int:
-    """Processor cores this process may use."""
+    """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
 
 
 def machine() -> dict[str, str]:
-    """The machine in words, for a report."""
+    """Device, processor and versions, for a report."""
     device = jax.devices()[0]
     return {
         "device": f"{device.platform}: {device.device_kind}",
@@ -192,10 +201,10 @@ def machine() -> dict[str, str]:
 
 
 def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> list[Job]:
-    """All runs, problem by problem.
+    """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count once.
 
     Raises:
-        SolverNameError, UnknownPolicyError: a name that is no solver, or a peer that is not installed.
+        SolverNameError, UnknownPolicyError: an unknown solver, or one whose library is not installed.
     """
     names = list(dict.fromkeys(str(parse_solver(name)) for name in solvers))
     parsed = [parse_solver(name) for name in names]
@@ -206,10 +215,10 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
 
 @contextmanager
 def only_writer(folder: Path) -> Iterator[None]:
-    """Makes the folder and keeps other processes from writing results there, where the system can lock folders.
+    """Creates the folder and locks it against other writers, where the file system supports locks.
 
     Raises:
-        ProblemError: another process has it.
+        ProblemError: another process has locked it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     if fcntl is None:
@@ -222,56 +231,60 @@ def only_writer(folder: Path) -> Iterator[None]:
         except BlockingIOError:
             raise ProblemError(f"{folder}: another jaxba-bench is writing here") from None
         except OSError:
-            pass  # some network file systems lock no folders
+            pass  # some network file systems cannot lock folders
         yield
     finally:
         os.close(handle)
 
 
 def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:
-    """Makes the folder, or finds what an earlier run left there: of each run one record.
+    """Creates the folder, or continues a benchmark in it. Writes the settings.
+
+    Returns:
+        The records that the folder already has, one for each run.
 
     Raises:
-        ProblemError: the folder holds runs with other settings, or results of other problems or policies under the
-            same names.
+        ProblemError: the folder has runs with other settings, or results of other problems or policies under the same
+            names. Files are compared by checksum.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / SETTINGS
     sources = dict.fromkeys(job.source for job in jobs)
-    places = {s.name: s.location for s in sources if not s.location.startswith(SCENE_PREFIX)}
-    places |= {job.solver.policy: job.solver.policy for job in jobs if job.solver.policy.endswith(SUFFIX)}
-    files = {name: digest for name, place in places.items() if (digest := _digest(Path(place)))}
-    mine: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}, "files": files}
+    paths = {s.name: s.location for s in sources if not s.location.startswith(SCENE_PREFIX)}
+    paths |= {job.solver.policy: job.solver.policy for job in jobs if job.solver.policy.endswith(SUFFIX)}
+    files = {name: digest for name, file in paths.items() if (digest := _digest(Path(file)))}
+    current: dict[str, Any] = {**asdict(settings), "problems": {s.name: s.location for s in sources}, "files": files}
     done = _results(folder / RESULTS)
-    tried = {record.problem for record in done}
-    used = lambda name: name in tried or (name.endswith(SUFFIX) and any(name in record.solver for record in done))
+    solved = {record.problem for record in done}
+    used = lambda name: name in solved or (name.endswith(SUFFIX) and any(name in record.solver for record in done))
     if path.exists():
         try:
-            before = json.loads(path.read_text())
-            known = dict(before.pop("problems"))
-            known_files = dict(before.pop("files", {}))  # folders of earlier versions have none
+            previous = json.loads(path.read_text())
+            known = dict(previous.pop("problems"))
+            known_files = dict(previous.pop("files", {}))  # absent in folders of older versions
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ProblemError(f"{path}: not the settings of a benchmark ({type(error).__name__})") from None
-        other = [key for key, value in asdict(settings).items() if before.get(key) != value]
-        other += [name for name, place in mine["problems"].items() if used(name) and known.get(name, place) != place]
-        other += [name for name, digest in files.items() if used(name) and known_files.get(name, digest) != digest]
-        if other:
-            raise ProblemError(f"{folder} holds a run with another {other[0]}; give another --out, or remove it")
-        mine["problems"] = {**known, **mine["problems"]}
-        mine["files"] = {**known_files, **files}
-    write_text(path, json.dumps(mine, indent=1) + "\n")
+        changed = [key for key, value in asdict(settings).items() if previous.get(key) != value]
+        changed += [name for name, file in current["problems"].items() if used(name) and known.get(name, file) != file]
+        changed += [name for name, digest in files.items() if used(name) and known_files.get(name, digest) != digest]
+        if changed:
+            raise ProblemError(f"{folder} holds a run with another {changed[0]}; give another --out, or remove it")
+        current["problems"] = {**known, **current["problems"]}
+        current["files"] = {**known_files, **files}
+    write_text(path, json.dumps(current, indent=1) + "\n")
     return done
 
 
 def _results(path: Path) -> list[Record]:
     first: dict[tuple[str, str, int], Record] = {}
     for record in read_records(path) if path.exists() else []:
-        first.setdefault((record.problem, record.solver, record.repeat), record)  # two processes may have done the same
+        first.setdefault((record.problem, record.solver, record.repeat), record)  # a run may have been done twice
     return list(first.values())
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a COLMAP model; empty where they cannot be read, which is said later."""
+    """SHA-256 of a file, or of all files of a COLMAP model. Empty if a file cannot be read; reading the problem or the
+    policy reports that later."""
     total = hashlib.sha256()
     try:
         parts = sorted(p for p in path.iterdir() if p.suffix in (".bin", ".txt")) if path.is_dir() else [path]
@@ -292,9 +305,19 @@ def execute(
     on_iteration: Callable[[IterationRecord], Any],
     on_error: Callable[[Job, ProblemError], Any],
 ) -> Iterator[Record]:
-    """Does the jobs that have no record yet, appending each result as soon as it is there.
+    """Runs the jobs that have no record yet. Appends each record to the results file, then yields it.
 
-    A problem that cannot be read is reported once and skipped, and so is a solver that refuses one.
+    A problem that cannot be read is reported once and skipped. A solver that refuses a problem, or runs out of memory
+    on it, is reported and skipped for this problem.
+
+    Args:
+        jobs: all runs.
+        done: records of earlier runs.
+        folder: where the results file is.
+        settings: shared settings.
+        on_start: called before each job.
+        on_iteration: called after every iteration.
+        on_error: called for what is skipped.
 
     Raises:
         OSError: a result cannot be written.
@@ -315,7 +338,7 @@ def execute(
         assert problem is not None
         try:
             record = run_solver(problem, job.source, job.solver, job.repeat, settings, on_iteration)
-        except ProblemError as error:  # what this solver cannot do, others may
+        except ProblemError as error:  # another solver may be able to solve it
             on_error(job, ProblemError(f"{job.source.name}, {job.solver}: {error}"))
             continue
         except Exception as error:

@@ -1,4 +1,4 @@
-"""Where a benchmark's problems come from: files, COLMAP models, downloaded problems and random scenes by name."""
+"""Problems of a benchmark by name or path: files, COLMAP models, downloaded BAL problems and random scenes."""
 
 from __future__ import annotations
 
@@ -13,63 +13,65 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, like, random_scene
 
 SCENE_PREFIX = "scene:"
-"""`scene:NAME` or `scene:NAME:SEED` stands for a random scene."""
+"""Prefix of a random scene: `scene:NAME` or `scene:NAME:SEED`."""
 
-_SAYS_NOTHING = re.compile(r"sparse|model|\d+", re.IGNORECASE)
+_GENERIC_FOLDER = re.compile(r"sparse|model|\d+", re.IGNORECASE)
+"""Folder names that do not identify a COLMAP model."""
 
-EMBEDDED: dict[str, SceneConfig] = {
+DEFAULT_SCENES: dict[str, SceneConfig] = {
     "street-30": SceneConfig(cameras=30, points=1500, mean_track=4.5),
     "street-12-drift": SceneConfig(cameras=12, points=600, mean_track=4.5, start_drift=0.003),
     "photos-14": SceneConfig(cameras=14, points=1200, mean_track=4.0, trajectory="photos"),
     "orbit-10-noisy": SceneConfig(cameras=10, points=400, mean_track=5.0, trajectory="orbit", noise=2.0),
 }
-"""Scenes of the suite that runs where no problems are named."""
+"""Random scenes of the benchmark that runs if no problem is given."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A problem that has a name and can be read when its turn comes."""
+    """A named problem that has not been read yet."""
 
     name: str
-    """Unique in a run."""
+    """Unique within a benchmark."""
 
     family: str
-    """Folder of a file, `scene` for a random one."""
+    """Name of the folder of a file; `scene` for a random scene."""
 
     location: str
     """Path, or `scene:NAME:SEED`."""
 
     def read(self) -> BundleProblem:
-        """Reads or makes the problem.
+        """Reads or generates the problem.
 
         Raises:
-            ProblemError: bad input, in one line.
+            ProblemError: the input is invalid; the message is one line.
         """
         if not self.location.startswith(SCENE_PREFIX):
             return read_problem(self.location)
         name, seed = _scene(self.location)
-        return random_scene(EMBEDDED.get(name) or like(name), seed)
+        return random_scene(DEFAULT_SCENES.get(name) or like(name), seed)
 
 
-def embedded_sources() -> list[Source]:
-    """The synthetic suite."""
-    return sources([f"{SCENE_PREFIX}{name}" for name in EMBEDDED])
+def default_sources() -> list[Source]:
+    """The sources of `DEFAULT_SCENES`."""
+    return sources([f"{SCENE_PREFIX}{name}" for name in DEFAULT_SCENES])
 
 
 def sources(locations: list[str]) -> list[Source]:
-    """Names for locations, all different; missing files and unknown scenes are refused at once. What is named twice is
-    one problem.
+    """Checks that problems exist, and gives each a unique name.
 
-    A location such as ladybug-49, where no file is called so, is a downloaded problem of BAL.
+    Args:
+        locations: paths, random scenes (`scene:NAME:SEED`), or names of downloaded BAL problems such as ladybug-49, if
+            there is no file of that name. Duplicates count once.
 
     Raises:
-        ProblemError: in one line.
+        ProblemError: a missing file or an unknown scene; the message is one line.
     """
     found: list[Source] = []
     for location in locations:
         if location.startswith(SCENE_PREFIX):
             name, seed = _scene(location)
-            if name not in EMBEDDED:
+            if name not in DEFAULT_SCENES:
                 like(name)
             label, family = (f"{name}-{seed}" if seed else name), "scene"
         else:
@@ -82,7 +84,7 @@ def sources(locations: list[str]) -> list[Source]:
             label = re.sub(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$", "", Path(name).name) or path.name
             if path.is_dir():
                 label = _model_name(path)
-            # stray bytes of a name have no place in reports and pictures
+            # reports and figures cannot show bytes that are not valid text
             label, family = display_name(label), display_name(path.resolve().parent.name)
         if any(_same(source.location, location) for source in found):
             continue
@@ -104,9 +106,10 @@ def _same(one: str, other: str) -> bool:
 
 
 def _model_name(folder: Path) -> str:
-    """Name of a COLMAP model: its folder's, with those above it as long as that says nothing: `garden-sparse-0`."""
+    """Name of a COLMAP model: the name of its folder, preceded by those above it up to the first that is not generic,
+    e.g. `garden-sparse-0`."""
     parts = list(folder.resolve().parts[1:]) or ["model"]
-    count = next((k for k, part in enumerate(reversed(parts), 1) if not _SAYS_NOTHING.fullmatch(part)), len(parts))
+    count = next((k for k, part in enumerate(reversed(parts), 1) if not _GENERIC_FOLDER.fullmatch(part)), len(parts))
     return "-".join(parts[-count:])
 
 

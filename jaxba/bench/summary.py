@@ -1,8 +1,8 @@
-"""Tables from records: one row per solver, one per problem and solver (data and JSON).
+"""Statistics of records, for each solver and for each pair of problem and solver, and `summary.json`.
 
-How unreached targets enter the means: every mean over reached problems stands beside "reached k of n", n being
-all problems of the benchmark, run or not. Iterations also have a capped mean over all n, in which an unreached
-target counts as `ITERATION_LIMIT`; there a solver cannot look good by failing on the hard problems.
+A mean over the problems on which a target was reached is always given with the number k of these problems, out of all n
+problems of the benchmark. Iterations also have a capped mean over all n problems, in which a target that was not
+reached counts as `ITERATION_LIMIT`, so that a solver cannot improve its mean by failing on hard problems.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from jaxba.bench.virtual import best_reach, rules_of_one_step
 from jaxba.runtime.atomic import write_text
 
 YARDSTICKS = ("classic", "ceres")
-"""Solvers that every other one is compared with: the paper's yardstick and what people use. Source: design."""
+"""Solvers that all others are compared with: the baseline of the paper, and the rule of the most used library."""
 
 SHORTEST_TIME = 1e-6
-"""Seconds; a shorter time (0 where the start already satisfies a target) enters geometric means as this."""
+"""Lower limit in seconds of times in geometric means; a time is 0 where the start satisfies a target."""
 
 FORMAT = 1
 """Version of `summary.json`; it changes when a key changes its meaning."""
@@ -39,13 +39,13 @@ class Cell:
     solver: str
     repeats: int
     converged: bool
-    """In more than half of the repeats, each within `ITERATION_LIMIT` iterations."""
+    """Whether more than half of the repeats converged within `ITERATION_LIMIT` iterations."""
     termination: str
-    """Reasons of the repeats, each once, joined by a slash."""
+    """Distinct reasons of the repeats to stop, joined by a slash."""
     final_cost: float
     """Pixels squared; infinite if not finite."""
     final_ratio: float
-    """(final + floor) / (f* + floor), floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best."""
+    """(final cost + floor) / (f* + floor) with floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best."""
     iterations: float
     rejected: float
     seconds: float
@@ -60,29 +60,34 @@ class Cell:
 
 @dataclass(frozen=True)
 class TargetSummary:
-    """How a solver does on one target over all problems."""
+    """Statistics of a solver on one target over all problems."""
 
     reached: int
+    """Number of problems on which the target was reached."""
     total: int
-    """All problems, also those that the solver was not run on."""
+    """Number of all problems, including those that the solver was not run on."""
     iterations: float
-    """Geometric mean over the reached problems; a count of 0 enters as 1. NaN if none."""
+    """Geometric mean over the reached problems, with a count of 0 taken as 1. NaN if there are none."""
     iterations_capped: float
-    """Geometric mean over all problems with counts capped at `ITERATION_LIMIT`, unreached ones included."""
+    """Geometric mean over all problems, with counts capped at `ITERATION_LIMIT`."""
     seconds: float
     """Geometric mean over the reached problems. NaN if none."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A solver against a yardstick on one target; ratios are solver / yardstick, so below 1 is better."""
+    """A solver compared with a yardstick on one target. Ratios are solver / yardstick, so that below 1 is better."""
 
     both: int
-    """Problems that both reached; the ratios are geometric means over these only."""
+    """Number of problems on which both reached the target; the ratios are geometric means over these."""
     only_solver: int
+    """Number of problems on which only the solver reached it."""
     only_yardstick: int
+    """Number of problems on which only the yardstick reached it."""
     iterations: float
+    """Ratio of iterations."""
     seconds: float
+    """Ratio of times."""
 
 
 @dataclass(frozen=True)
@@ -91,21 +96,22 @@ class SolverSummary:
 
     solver: str
     run: int
-    """Problems that it was run on."""
+    """Number of problems that it was run on."""
     total: int
-    """Problems of the benchmark."""
+    """Number of problems of the benchmark."""
     targets: dict[str, TargetSummary]
     """By `Target.key`."""
     against: dict[str, dict[str, Comparison]]
-    """By yardstick, then by `Target.key`; without the solver itself."""
+    """By yardstick, then by `Target.key`; a yardstick is not compared with itself."""
     final_ratio_worst: float
+    """Largest `Cell.final_ratio` over the problems that it was run on."""
     final_ratio_mean: float
-    """Geometric mean; both over the problems it was run on."""
+    """Geometric mean of `Cell.final_ratio` over the problems that it was run on."""
     rejected_share: float
     """Rejected iterations / iterations, over all runs."""
     linear_failure_share: float
-    """Rejected iterations without a finite gain ratio (failed factorisation, non-finite cost) / iterations;
-    NaN where the trace has no gain ratios at all."""
+    """Rejected iterations without a finite gain ratio (failed factorisation, non-finite cost) / iterations. NaN if the
+    traces have no gain ratios at all."""
     seconds_per_iteration: float
     """Median over problems."""
     setup_s: float
@@ -127,12 +133,12 @@ class ProblemSummary:
     best_cost: float
     """f*, pixels squared."""
     best_solver: str
-    """Who reached f*; "known" if it was given."""
+    """First solver that reached f*; "known" if f* comes from `known_best`."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Everything that tables show."""
+    """The content of `summary.json` and of all tables."""
 
     targets: tuple[Target, ...]
     problems: list[ProblemSummary]
@@ -140,27 +146,24 @@ class Summary:
     cells: list[Cell]
     warnings: list[str]
     virtual: dict[str, dict[str, TargetSummary]] = field(default_factory=dict)
-    """The virtual best of hand-written rules with one and the same step (virtual.py): by name, then by `Target.key`."""
-    facts: dict[str, Any] = field(default_factory=dict)
-
-    def cell(self, problem: str, solver: str) -> Cell | None:
-        """The cell of a pair, None if it was not run."""
-        return next((c for c in self.cells if c.problem == problem and c.solver == solver), None)
+    """Virtual best of the hand-written rules with the same step (`virtual.py`): by name, then by `Target.key`."""
+    metadata: dict[str, Any] = field(default_factory=dict)
+    """Device, threads, versions and the like; written to `summary.json` as `facts`."""
 
 
 def summarize(
     records: Sequence[Record],
     tolerance: float = 1e-3,
     known_best: Mapping[str, float] | None = None,
-    facts: Mapping[str, Any] | None = None,
+    metadata: Mapping[str, Any] | None = None,
 ) -> Summary:
-    """Condenses records into tables.
+    """Computes the statistics of all tables.
 
     Args:
         records: any number, also none.
-        tolerance: tau of the tolerance target.
-        known_best: costs (pixels squared) of some problems known from elsewhere, see `profile.best_cost`.
-        facts: what to say about the run (device, threads, versions); copied into the result.
+        tolerance: tau of the target `tau`.
+        known_best: best known costs of some problems, pixels squared; see `profile.best_cost`.
+        metadata: device, threads, versions and the like; copied into the result.
     """
     targets = profile.standard_targets(tolerance)
     starts, bests = profile.initial_costs(records), profile.best_cost(records, known_best)
@@ -180,7 +183,7 @@ def summarize(
         cells=cells,
         warnings=profile.cost_warnings(records) + _coverage_warnings(cells, solvers, names),
         virtual={best: _virtual(rules, tables, names) for best, rules in rules_of_one_step(solvers).items()},
-        facts=dict(facts or {}),
+        metadata=dict(metadata or {}),
     )
 
 
@@ -293,8 +296,9 @@ def _coverage_warnings(cells: Sequence[Cell], solvers: Sequence[str], names: Seq
 
 
 def to_json(summary: Summary) -> dict[str, Any]:
-    """The object written to `summary.json`; non-finite numbers (never reached, unknown) become None."""
+    """The JSON object of `summary.json`. Non-finite numbers (never reached, unknown) become None."""
     body = asdict(summary)
+    body["facts"] = body.pop("metadata")
     body["targets"] = [{"key": t.key, "label": t.label, "kind": t.kind, "value": t.value} for t in summary.targets]
     rules = {
         "iteration_limit": profile.ITERATION_LIMIT,
@@ -315,5 +319,5 @@ def _clean(value: Any) -> Any:
 
 
 def write_summary(path: str | os.PathLike[str], summary: Summary) -> None:
-    """Writes `summary.json` atomically: readers see the old file or the whole new one. Raises OSError."""
+    """Writes `summary.json` atomically: a reader sees the old file or the complete new one. Raises OSError."""
     write_text(path, json.dumps(to_json(summary), indent=1, allow_nan=False, ensure_ascii=False) + "\n")

@@ -1,4 +1,4 @@
-"""A summary as tables: for a console, Markdown or HTML."""
+"""Tables of a summary, for the console, Markdown or HTML."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Table:
-    """A table ready to be drawn: plain text, first column(s) left, numbers right."""
+    """A table of text cells: the first columns are aligned left, the others right."""
 
     title: str
     header: tuple[str, ...]
     rows: list[tuple[str, ...]]
     note: str
-    """What the numbers mean, one or two sentences."""
+    """Explains the numbers in one or two sentences."""
     text_columns: int = 1
-    """Columns from the left that hold names."""
+    """Number of columns that are aligned left."""
 
 
-_VIRTUAL = " Best of the rules: on every problem the hand-written rule with this step that does best there."
+_VIRTUAL = (
+    " Best of the rules: for each problem, the result of the hand-written rule with this step that is best on it."
+)
 
 
 def number(value: float, digits: int = 3) -> str:
-    """A number for people: `digits` significant ones, an infinity as its sign, NaN as a dash."""
+    """A number with `digits` significant digits, infinity as ∞, NaN as a dash."""
     if math.isnan(value):
         return "-"
     if math.isinf(value):
@@ -40,16 +42,16 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
 
 
-def _percent(share: float) -> str:
-    return "-" if math.isnan(share) else f"{100 * share:.0f} %"
+def _percent(fraction: float) -> str:
+    return "-" if math.isnan(fraction) else f"{100 * fraction:.0f} %"
 
 
 def tables(summary: Summary, details: bool = True) -> list[Table]:
-    """The tables of every rendering.
+    """All tables of a summary.
 
     Args:
         summary: from `summarize`.
-        details: also the table of every problem and solver.
+        details: whether to include the table with a row for each pair of problem and solver.
     """
     found = [_overview(summary), *_reach_tables(summary)]
     found += [
@@ -65,10 +67,10 @@ def _overview(summary: Summary) -> Table:
     for s in summary.solvers:
         end = s.targets["converged"]
         means = (end.iterations, end.iterations_capped, end.seconds, s.seconds_per_iteration)
-        shares = (_percent(s.rejected_share), _percent(s.linear_failure_share))
+        fractions = (_percent(s.rejected_share), _percent(s.linear_failure_share))
         ratios = (number(s.final_ratio_worst, 6), number(s.final_ratio_mean, 6))
         rows.append(
-            (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *shares, number(s.compile_s))
+            (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *fractions, number(s.compile_s))
         )
     for name, targets in summary.virtual.items():
         end = targets["converged"]
@@ -77,7 +79,7 @@ def _overview(summary: Summary) -> Table:
     note = (
         f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
         "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
-        f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): shares of all iterations. "
+        f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): fractions of all iterations. "
         f"Seconds per iteration and compilation: medians over problems.{virtual}"
     )
     return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
@@ -98,10 +100,10 @@ def _reach_tables(summary: Summary) -> list[Table]:
         iterations.append((name, *capped))
         seconds.append((name, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
     note = (
-        "Geometric mean over the k of n problems reached (k/n). f*: lowest accepted cost of any solver; "
+        "Geometric mean over the problems reached, k of n (k/n). f*: lowest accepted cost of any solver; "
         f"τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged.{virtual}"
     )
-    capped_note = f" In brackets: over all n, unreached ones counting as {profile.ITERATION_LIMIT}."
+    capped_note = f" In brackets: over all n, with {profile.ITERATION_LIMIT} for those not reached."
     return [
         Table("Iterations to tolerance", header, iterations, note + capped_note),
         Table("Time to tolerance (s, without compilation)", header, seconds, note),
@@ -114,9 +116,9 @@ def _against(summary: Summary, yardstick: str) -> Table:
         if yardstick in s.against:
             rows.append((s.solver, *(_ratio_text(s.against[yardstick][target.key]) for target in summary.targets)))
     note = (
-        f"Iterations / time as a share of {yardstick}'s (below 1 is better), geometric means over the problems that "
-        "both reached; their number in brackets, then + those that only this solver and - those that only "
-        f"{yardstick} reached."
+        f"Iterations / time relative to {yardstick} (below 1 is better), geometric means over the problems on which "
+        "both reached the target. In brackets their number, then + the number of those that only this solver and - of "
+        f"those that only {yardstick} reached."
     )
     return Table(f"Against {yardstick}", ("solver", *(target.label for target in summary.targets)), rows, note)
 

@@ -1,7 +1,7 @@
-"""The virtual best: on every problem the hand-written rule that does best there, which nobody knows beforehand.
+"""The virtual best rule: for each problem, the result of the hand-written damping rule that is best on it.
 
-A yardstick that no single rule reaches (SATzilla's "virtual best solver", Xu et al. 2008): what is left to win by
-choosing lambda, with one and the same step.
+No single rule reaches it, since the best rule is not known beforehand. It bounds what can be gained by choosing lambda
+with the same step. Source: "virtual best solver" of SATzilla (Xu et al. 2008).
 """
 
 from __future__ import annotations
@@ -12,30 +12,38 @@ from jaxba.bench.profile import NEVER, Reach
 from jaxba.damping import is_learned
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, parse_solver
+from jaxba.solver.options import SolveOptions
 
-FEWEST = 3
-"""Rules that make a virtual best: of the two yardsticks, which most tables have, one is nearly always the better."""
+MIN_RULES = 3
+"""Fewest rules of a virtual best. With the two baselines alone, one is nearly always the better, so that it would
+repeat that row."""
 
 
 def rules_of_one_step(solvers: Iterable[str]) -> dict[str, list[str]]:
-    """Hand-written rules that differ in lambda alone, under the name of their virtual best.
+    """Groups hand-written rules that use the same step and differ in lambda only.
 
     Args:
-        solvers: names; learned policies, peers, other methods than plain LM and unknown names are left out.
+        solvers: names. Learned policies, other libraries, methods other than plain LM and unknown names are ignored.
 
     Returns:
-        `FEWEST` rules or more each.
+        By the name of the virtual best, the rules of each group that has at least `MIN_RULES`.
     """
-    groups: dict[str, list[str]] = {}
+    groups: dict[SolveOptions, dict[str, str]] = {}
     for name in solvers:
         rule = _rule(name)
         if rule is not None:
-            groups.setdefault(str(rule).removeprefix(rule.policy), []).append(name)
-    return {f"best of {len(rules)} rules{step}": rules for step, rules in groups.items() if len(rules) >= FEWEST}
+            ending = str(rule).removeprefix(rule.policy)
+            groups.setdefault(rule.build()[1], {})[name] = ending
+    # `bold` has the embedded iterations without the ending that the other rules of its group have
+    return {
+        f"best of {len(group)} rules{max(group.values(), key=len)}": list(group)
+        for group in groups.values()
+        if len(group) >= MIN_RULES
+    }
 
 
 def best_reach(reaches: Sequence[Reach]) -> Reach:
-    """The fewest iterations and the least time, each of whoever has it."""
+    """The fewest iterations and the least time, which may be those of different solvers."""
     counts, times = [r.iterations for r in reaches], [r.seconds for r in reaches]
     return Reach(min(counts), min(times)) if reaches else NEVER
 

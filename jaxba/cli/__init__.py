@@ -1,1 +1,1 @@
-"""Command-line programs. Each module imports what it needs when it runs, so that errors come fast."""
+"""Command-line programs. Modules import JAX and other slow packages only after the arguments have been checked."""

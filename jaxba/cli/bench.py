@@ -1,4 +1,4 @@
-"""`jaxba-bench`: solvers side by side on many problems."""
+"""`jaxba-bench`: compares solvers on many problems."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from jaxba.cli import common
 from jaxba.problem.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "learned,classic,ceres,ceres+refine3,ceres+embedded"
-"""The shipped policy, both yardsticks, and the better of them with the policy's embedded iterations."""
+"""The shipped policy, the paper's baseline, Ceres' rule, and Ceres' rule with embedded iterations."""
 
 FILE_WIDTH = 180
-"""Columns of the tables where the output is no terminal."""
+"""Width of the tables in characters if the output is not a terminal."""
 
 DETAILS_WIDTH = 120
-"""A narrower terminal gets no table of every problem; the report has it."""
+"""On a narrower terminal the table of every problem is left out; the report has it."""
 
 _VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)
-"""What `os.path.expandvars` fills in."""
+"""A variable that `os.path.expandvars` expands."""
 
 
 @dataclass(frozen=True)
@@ -33,33 +33,32 @@ class Arguments:
     """Options of `jaxba-bench`."""
 
     problems: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Files, downloaded problems of BAL such as ladybug-49 (see jaxba-data), or random scenes such as
-    scene:ladybug-49 or scene:tiny:7. Without them (and without a suite) an embedded suite of four random scenes
-    runs."""
+    """Files, downloaded BAL problems such as ladybug-49 (see jaxba-data), or random scenes such as scene:ladybug-49 or
+    scene:tiny:7. Default: the problems of the suite, or four random scenes."""
 
     suite: str | None = None
-    """A suite (methods, real, rules, synthetic), or the path of a YAML file with any of: problems (names, globs and
-    $VARIABLES allowed), solvers, tolerance, repeats, max_iterations."""
+    """A suite (methods, real, rules, synthetic), or the path of a YAML file with any of: problems (names or paths, in
+    which wildcards and $VARIABLES are expanded), solvers, tolerance, repeats, max_iterations."""
 
     solvers: str | None = None
-    """Comma-separated names, [method+]policy[+refineK|+embedded][@dtype], or with the extra `ceres`
-    pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]], pyceres:dense-inner|sparse-inner. Default:
+    """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], or, with the extra `ceres`,
+    pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default:
     learned,classic,ceres,ceres+refine3,ceres+embedded."""
 
     tolerance: float | None = None
-    """tau of the performance profile: cost <= f* + tau (f0 - f*). Default 1e-3."""
+    """tau of the performance profile: cost <= f* + tau (f0 - f*). Default: 1e-3."""
 
     repeats: int | None = None
-    """Runs of each solver on each problem; times are medians. Default 3."""
+    """Runs of each solver on each problem; times are medians. Default: 3."""
 
     max_iterations: int | None = None
-    """Linear solves at most; the tables count more than 100 as a failure. Default 100."""
+    """Limit of linear solves. The tables count more than 100 as a failure. Default: 100."""
 
     linear_solver: LinearSolverChoice = "auto"
-    """For solvers of plain LM; other methods have their own."""
+    """Linear solver of the method lm; other methods have their own."""
 
     out: str = "runs/bench"
-    """Folder of the results. A second run into the same folder does only what is missing."""
+    """Folder of the results. A second run with the same folder does only what is missing."""
 
 
 def main() -> None:
@@ -68,8 +67,8 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; status 0 when all is done, 2 for bad input, 130 after Ctrl-C (results are kept)."""
-    return common.run_command(Arguments, _bench, "Solvers side by side: table, profiles, plots.", argv)
+    """Runs the command. Exit status: 0 if all runs are done, 2 for bad input, 130 after Ctrl-C (results are kept)."""
+    return common.run_command(Arguments, _bench, "Compares solvers: tables, performance profiles, plots.", argv)
 
 
 def _bench(args: Arguments) -> int:
@@ -84,20 +83,21 @@ def _bench(args: Arguments) -> int:
     if not solvers:
         raise common.UsageError("--solvers names no solver")
     from jaxba.bench import run
-    from jaxba.bench.sources import embedded_sources, sources
+    from jaxba.bench.sources import default_sources, sources
 
-    places = sources(list(args.problems)) if args.problems else embedded_sources()
-    jobs = run.plan(places, solvers, repeats)
+    problems = sources(list(args.problems)) if args.problems else default_sources()
+    jobs = run.plan(problems, solvers, repeats)
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
     try:
         with run.only_writer(Path(args.out)):
-            return _fill(Path(args.out), jobs, settings, tolerance)
+            return _run_missing(Path(args.out), jobs, settings, tolerance)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
 
 
-def _fill(folder: Path, jobs: Any, settings: Any, tolerance: float) -> int:
-    """Runs what is missing in the folder and draws. Raises OSError where it cannot be written, as on a full disk."""
+def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float) -> int:
+    """Runs the jobs that the folder has no record of, and writes the report. Raises OSError if a file cannot be
+    written."""
     from rich.console import Console
 
     from jaxba.bench import report, run
@@ -107,7 +107,7 @@ def _fill(folder: Path, jobs: Any, settings: Any, tolerance: float) -> int:
 
     done = run.open_folder(folder, settings, jobs)
     common.prepare_process()
-    console = Console(markup=False, emoji=False)  # names are printed as they are
+    console = Console(markup=False, emoji=False)  # prints names without interpreting brackets and colons
     if not console.is_terminal:
         console = Console(width=FILE_WIDTH, markup=False, emoji=False)
     wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
@@ -122,7 +122,7 @@ def _fill(folder: Path, jobs: Any, settings: Any, tolerance: float) -> int:
         status = common.INTERRUPTED
     if records:
         console.print("drawing", highlight=False)
-        files = report.write_all(records, folder, tolerance, facts={**report.run_facts(records), **run.machine()})
+        files = report.write_all(records, folder, tolerance, metadata={**report.run_metadata(records), **run.machine()})
         print_summary(summarize(records, tolerance), console, details=console.width >= DETAILS_WIDTH)
         console.print(f"wrote {len(files)} files; see {folder / 'report.html'}", highlight=False)
     return status
@@ -153,7 +153,7 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
 
         def fail(job: Any, error: Exception) -> None:
             failures.append(job)
-            common.complain(str(error))
+            common.print_error(str(error))
 
         for record in run.execute(jobs, done, folder, settings, start, iterate, fail):
             records.append(record)
@@ -168,51 +168,52 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
     return common.BAD_INPUT if failures else 0
 
 
-def _number(text: str) -> float | str:
-    """A number where the text is one."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
+@dataclass(frozen=True)
+class Suite:
+    """Content of a suite file; the command line replaces what it gives."""
+
+    problems: tuple[str, ...] = ()
+    """Names or paths, in which $VARIABLES and wildcards are expanded."""
+
+    solvers: tuple[str, ...] | None = None
+    """Names of solvers."""
+
+    tolerance: float | None = None
+    """As `Arguments.tolerance`."""
+
+    repeats: int | None = None
+    """As `Arguments.repeats`."""
+
+    max_iterations: int | None = None
+    """As `Arguments.max_iterations`."""
 
 
 def _with_suite(args: Arguments) -> Arguments:
-    """Fills what the command line leaves open from the suite."""
+    """The arguments, completed by those of the suite."""
     if args.suite is None:
         return args
     from jaxba.io import configurations
+    from jaxba.training import settings
 
     try:
-        suite = configurations.read("bench", args.suite)
+        data = configurations.read("bench", args.suite)
     except configurations.SettingsError as error:
         raise common.UsageError(f"--suite: {error}") from None
-    kinds: dict[str, tuple[type, ...]] = {
-        "problems": (list,),
-        "solvers": (list,),
-        "tolerance": (float, int),
-        "repeats": (int,),
-        "max_iterations": (int,),
-    }
-    if not suite:
-        raise common.UsageError(f"--suite {args.suite}: says nothing; known: {', '.join(kinds)}")
-    for key, value in suite.items():
-        if key not in kinds:
-            raise common.UsageError(f"--suite {args.suite}: unknown key {key!r}; known: {', '.join(kinds)}")
-        if key == "tolerance" and isinstance(value, str):  # YAML takes 1e-3, without a point, for text
-            value = _number(value)
-        if not isinstance(value, kinds[key]) or isinstance(value, bool):
-            raise common.UsageError(f"--suite {args.suite}: {key} is {value!r}, not a {kinds[key][0].__name__}")
-        suite[key] = float(value) if key == "tolerance" else value
-    problems = args.problems or tuple(
-        place for entry in suite.get("problems", ()) for place in _expand(args, str(entry))
-    )
-    solvers = args.solvers or (",".join(map(str, suite["solvers"])) if "solvers" in suite else None)
-    rest = {k: suite.get(k) for k in ("tolerance", "repeats", "max_iterations") if getattr(args, k) is None}
+    if not data:
+        known = ", ".join(settings.field_types(Suite))
+        raise common.UsageError(f"--suite {args.suite}: is empty; known: {known}")
+    try:
+        suite = settings.read(Suite, data)
+    except configurations.SettingsError as error:
+        raise common.UsageError(f"--suite {args.suite}: {error}") from None
+    problems = args.problems or tuple(path for entry in suite.problems for path in _expand(args, entry))
+    solvers = args.solvers or (None if suite.solvers is None else ",".join(suite.solvers))
+    rest = {k: getattr(suite, k) for k in ("tolerance", "repeats", "max_iterations") if getattr(args, k) is None}
     return replace(args, problems=problems, solvers=solvers, **rest)
 
 
 def _expand(args: Arguments, entry: str) -> list[str]:
-    """What an entry of a suite's problems stands for: its variables and its wildcards are filled in."""
+    """The names or paths for an entry of a suite's problems, with variables and wildcards expanded."""
     for name in _VARIABLE.findall(entry):
         if not os.environ.get(name):
             raise common.UsageError(

@@ -1,4 +1,4 @@
-"""What the commands share: arguments, errors in one line, the compilation cache."""
+"""Code shared by the commands: errors of one line, output, the compilation cache, checks of arguments."""
 
 from __future__ import annotations
 
@@ -13,31 +13,42 @@ from typing import Any, NoReturn, TypeVar
 Arguments = TypeVar("Arguments")
 
 BAD_INPUT = 2
-"""Exit status for input that cannot be used."""
+"""Exit status for invalid input."""
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells define it."""
 
 CACHE_VARIABLE = "JAXBA_CACHE"
-"""Environment variable: folder of compiled programs; `off` switches the cache off."""
+"""Environment variable with the folder of compiled programs; `off` disables the cache."""
 
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
-"""Bits of a mode; root may write without any."""
+"""Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
 
 
 class UsageError(ValueError):
-    """Arguments that make no sense. The message is one line for a person."""
+    """Invalid arguments. The message is one line for the user."""
 
 
 def run_command(
     arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
 ) -> int:
-    """Parses the command line and runs `main`; every expected error becomes one line on stderr and status 2, and so
-    does Ctrl-C, with status 130, where `main` does not deal with it."""
+    """Parses the command line and runs `main`.
+
+    Expected errors are printed as one line to stderr, and so is a Ctrl-C that `main` does not handle.
+
+    Args:
+        arguments: dataclass of the arguments, from which tyro makes the parser.
+        main: gets the parsed arguments and returns the exit status.
+        description: first line of the help.
+        argv: the command line; `sys.argv[1:]` if None.
+
+    Returns:
+        The exit status: that of `main`, 2 after an error, or 130 after Ctrl-C.
+    """
     import tyro
 
-    print_all_names()
+    escape_unencodable_output()
     try:
         parsed = tyro.cli(arguments, args=argv, description=description)
         from jaxba.damping.policy_file import PolicyFileError
@@ -50,59 +61,60 @@ def run_command(
         try:
             return main(parsed)
         except (ProblemError, UsageError, PolicyFileError, *names) as error:
-            return complain(str(error))
+            return print_error(str(error))
         except Exception as error:
             from jaxba.runtime.process import out_of_memory
 
             if not out_of_memory(error):
                 raise
-            return complain("not enough memory")
+            return print_error("not enough memory")
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
 
 
-def print_all_names() -> None:
-    """Escapes what the encoding of stdout or stderr lacks, such as stray bytes in a file's name, instead of failing."""
+def escape_unencodable_output() -> None:
+    """Lets stdout and stderr escape characters that their encoding lacks, instead of raising an error. File names may
+    have such characters."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
-def complain(message: str) -> int:
-    """Prints an error line and returns the exit status for bad input."""
+def print_error(message: str) -> int:
+    """Prints an error as one line to stderr and returns the exit status for invalid input."""
     print(f"error: {message}", file=sys.stderr)
     return BAD_INPUT
 
 
-def say(text: str) -> None:
-    """Prints to stdout at once; where its reader has gone the work goes on, and what is said is lost."""
+def print_line(text: str) -> None:
+    """Prints a line to stdout and flushes. If the reader of stdout has closed it, this and later output is
+    discarded."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
-        close_pipe()
+        discard_stdout()
 
 
 def exit_with(status: int) -> NoReturn:
-    """Ends the process after flushing; a closed pipe on stdout is no error."""
+    """Flushes stdout and ends the process. A closed pipe on stdout is not an error."""
     try:
         sys.stdout.flush()
     except BrokenPipeError:
-        close_pipe()
+        discard_stdout()
     sys.exit(status)
 
 
-def close_pipe() -> None:
-    """Stdout, and what waits in its buffer, goes nowhere."""
+def discard_stdout() -> None:
+    """Redirects stdout, including its buffer, to the null device."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def prepare_process(*, untraced: bool = False) -> None:
-    """Settings for speed: memory is kept, compiled programs are cached.
+    """Makes the process keep freed memory, and enables the cache of compiled programs.
 
     Args:
-        untraced: whether cached programs are found without tracing them (`jaxba.runtime.executable_cache`), for a
-            command that runs few programs, all of them through `ParallelCompilation`; else JAX's cache is used.
+        untraced: which cache; see `use_compilation_cache`.
     """
     from jaxba.runtime import process
 
@@ -111,9 +123,12 @@ def prepare_process(*, untraced: bool = False) -> None:
 
 
 def use_compilation_cache(untraced: bool = False) -> None:
-    """Keeps compiled programs in the user's cache folder, so that the next run starts at once.
+    """Keeps compiled programs in the user's cache folder, so that the next run starts faster.
 
-    One way or the other: what JAX has read from its cache cannot be written again.
+    Args:
+        untraced: whether to use the cache of `jaxba/runtime/executable_cache.py`, which finds programs without tracing
+            them, but only those that jaxba compiles itself. Otherwise JAX's own cache is used. Both cannot be used
+            together, since a program that JAX has read from its cache cannot be serialised again.
     """
     import jax
 
@@ -127,7 +142,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
-        return  # a home that cannot be written costs time, nothing else
+        return  # without a writable cache folder the command only takes longer
     if untraced:
         compilation.use_cache(folder)
         return
@@ -136,22 +151,25 @@ def use_compilation_cache(untraced: bool = False) -> None:
 
 
 def check_writable(option: str, path: str | None) -> None:
-    """Refuses an output file that could not be written later, before any work is done.
+    """Checks that an output file can be written, before any work is done.
+
+    Args:
+        option: name of the option, for the message.
+        path: the file; None and the names of streams are accepted.
 
     Raises:
-        UsageError: the folder is missing or not writable, the file is read-only, or the path is a folder or ends as
-            that of one.
+        UsageError: the folder is missing or not writable, the file is read-only, or the path is that of a folder.
     """
     from jaxba.io.files import STREAMS
 
     if path is None or path.startswith(STREAMS):
         return
-    target = Path(os.path.realpath(path))  # a link stays: what it points to is written
+    target = Path(os.path.realpath(path))  # a symbolic link is kept, and its target is written
     if target.is_dir():
         raise UsageError(f"{option} {path}: is a directory")
     if path.endswith(tuple(filter(None, (os.sep, os.altsep)))):
         raise UsageError(f"{option} {path}: is the name of a directory, not of a file")
-    if os.path.exists(path) and not os.path.isfile(path):  # a pipe or device is written itself
+    if os.path.exists(path) and not os.path.isfile(path):  # a pipe or device is written directly
         if not os.access(path, os.W_OK):
             raise UsageError(f"{option} {path}: cannot be written")
         return
@@ -165,25 +183,29 @@ def check_writable(option: str, path: str | None) -> None:
 
 
 def check_folder(option: str, path: str) -> None:
-    """Refuses a folder that could not be made or written to later, before any work is done.
+    """Checks that an output folder can be created or written, before any work is done.
 
     Raises:
-        UsageError: it cannot be written or is a file, or the one that would hold it is missing or cannot be written.
+        UsageError: it is a file or not writable, or it does not exist and its parent is missing or not writable.
     """
     target = Path(path).absolute()
     if target.exists() and not target.is_dir():
         raise UsageError(f"{option} {path}: is a file, not a folder")
     if not target.exists():
-        check_writable(option, str(Path(path)))  # without a separator at its end
+        check_writable(option, str(Path(path)))  # without a trailing separator
     elif not os.access(target, os.W_OK):
         raise UsageError(f"{option} {path}: folder cannot be written")
 
 
 def check_positive(**values: Any) -> None:
-    """Refuses numbers that are not positive (or, for tolerances, negative), and counts that programs cannot hold.
+    """Checks that numbers are positive, that tolerances (names ending in `tol`) are not negative, and that integers are
+    not too large for 32 bits.
+
+    Args:
+        values: values by argument name.
 
     Raises:
-        UsageError: naming the option.
+        UsageError: a value is invalid; the message names the option.
     """
     from jaxba.typing import LARGEST_COUNT
 

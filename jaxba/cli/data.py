@@ -1,4 +1,4 @@
-"""`jaxba-data`: problems of the BAL data set, downloaded once and then known by their names."""
+"""`jaxba-data`: downloads problems of the BAL data set, which other commands then find by name."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ import tyro
 from jaxba.cli import common
 
 FILE_WIDTH = 120
-"""Columns of the list where the output is no terminal."""
+"""Width of the list in characters if the output is not a terminal."""
 
 
 @dataclass(frozen=True)
 class Download:
-    """Downloads problems into the cache folder. What broke off is continued; what is there is not asked for again."""
+    """Downloads problems into the cache folder. Continues interrupted downloads, and skips files that are there."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Such as ladybug-1197; a family (trafalgar) stands for all of its problems."""
+    """Names such as ladybug-1197, or families such as trafalgar for all of their problems."""
 
     base_url: str | None = None
-    """Folder of the families on another server. Default: the data set's own."""
+    """URL of the folder with the families. Default: that of the data set."""
 
     checksum: bool = True
-    """Refuse files with another checksum than the known one. --no-checksum: unpack a file and compare its header
-    with its name instead, as for files without a known checksum."""
+    """Compare the checksum. --no-checksum: unpack a file and compare its header with its name instead, as for files
+    without a known checksum."""
 
 
 @dataclass(frozen=True)
 class List:
-    """Lists the problems: name, size, file, and whether it is in the cache folder."""
+    """Lists the problems: name, size, file, and whether they are in the cache folder."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """Names or families; all if left out."""
+    """Names or families. Default: all."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class PathOf:
     """Prints the path of a downloaded problem."""
 
     name: Annotated[str, tyro.conf.Positional]
-    """Such as ladybug-1197."""
+    """Name such as ladybug-1197."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; status 0 when all is there, 2 for bad input or a failed download, 130 after Ctrl-C."""
-    text = "Problems of BAL (Bundle Adjustment in the Large). JAXBA_BAL names another folder than the user's cache."
+    """Runs the command. Exit status: 0 for success, 2 for bad input or a failed download, 130 after Ctrl-C."""
+    text = "Problems of BAL (Bundle Adjustment in the Large). The variable JAXBA_BAL names another cache folder."
     return common.run_command(Arguments, _data, text, argv)
 
 
@@ -129,13 +129,13 @@ def _download(args: Download) -> int:
             try:
                 path, new = download.fetch(entry, folder, show, args.base_url or download.BASE_URL, args.checksum)
             except KeyboardInterrupt:
-                console.print("interrupted; what has come is kept, run the same command again to continue")
+                console.print("interrupted; what was downloaded is kept, run the same command again to continue")
                 return common.INTERRUPTED
             except download.DownloadError as error:
                 progress.remove_task(task)
-                status = common.complain(str(error))
+                status = common.print_error(str(error))
                 if isinstance(error, download.UnreachableError):
-                    break  # the others would not come either
+                    break  # the others would fail too
                 continue
             progress.remove_task(task)
             state = _state(new, args.checksum and bool(entry.sha256))

@@ -1,4 +1,4 @@
-"""Ctrl-C as a question: the work under way ends where nothing is lost."""
+"""Handles Ctrl-C so that the work under way is finished first and nothing is lost."""
 
 from __future__ import annotations
 
@@ -11,77 +11,85 @@ import time
 
 from jaxba.cli.common import INTERRUPTED
 
-PATIENCE_S = 1.0
-"""Seconds after which a second Ctrl-C ends the process, where Python has not come to hear of it. It hears nothing while
-a compiled program runs."""
+EXIT_DELAY_S = 1.0
+"""Seconds after a second Ctrl-C until the process is ended, if Python has not handled the signal by then. Python
+handles no signals while a compiled program runs."""
 
-_HEARD = 0
-"""What Python tells the thread once a Ctrl-C became an exception; no signal has this number."""
+_HANDLED = 0
+"""Byte that the signal handler sends to the thread when it raises KeyboardInterrupt; no signal has this number."""
 
 
 class Interrupt:
-    """While `gentle`, the first Ctrl-C only sets `asked`, and the second is real; otherwise every one is real.
+    """Context manager. While `graceful`, the first Ctrl-C only sets `requested`, and the second raises
+    KeyboardInterrupt; otherwise each one raises it.
 
-    Signals are told to a thread as they come (`signal.set_wakeup_fd`), so that the first is answered, and the second
-    ends the process, in the middle of a long program too. What commands write is a whole file or none.
+    A thread receives the signals as they arrive (`signal.set_wakeup_fd`). So even during a long compiled program the
+    first Ctrl-C prints a message, and the second ends the process. Ending it is safe, since commands write files
+    atomically.
     """
 
-    def __init__(self, unit: str, *, gentle: bool) -> None:
-        """`unit`: what is finished first, in a word for the person who pressed the keys."""
-        self.unit, self.gentle, self.asked = unit, gentle, False
-        self._came, self._heard = 0, 0  # signals: told to the thread, and to Python, which takes several for one
-        self._untold = [True]
+    def __init__(self, unit: str, *, graceful: bool) -> None:
+        """Does nothing yet.
+
+        Args:
+            unit: what is finished after the first Ctrl-C, for the message, e.g. `iteration`.
+            graceful: initial value of the attribute, which can be changed later.
+        """
+        self.unit, self.graceful, self.requested = unit, graceful, False
+        # signals that the thread and the handler have seen; Python calls the handler once for several signals
+        self._received, self._handled = 0, 0
+        self._message = [True]  # empty when the message has been printed
 
     def __enter__(self) -> Interrupt:
-        self._ear, mouth = socket.socketpair()
-        mouth.setblocking(False)
-        self._mouth = mouth
-        self._before = signal.signal(signal.SIGINT, self._handle)
-        self._mouth_before = signal.set_wakeup_fd(mouth.fileno(), warn_on_full_buffer=False)
+        self._receiver, sender = socket.socketpair()
+        sender.setblocking(False)
+        self._sender = sender
+        self._previous_handler = signal.signal(signal.SIGINT, self._handle)
+        self._previous_wakeup = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        signal.set_wakeup_fd(self._mouth_before)
-        signal.signal(signal.SIGINT, self._before)
-        self._mouth.close()
+        signal.set_wakeup_fd(self._previous_wakeup)
+        signal.signal(signal.SIGINT, self._previous_handler)
+        self._sender.close()
         self._thread.join()
-        self._ear.close()
+        self._receiver.close()
 
     def _listen(self) -> None:
-        """In the thread: counts signals until the other end is closed."""
+        """Runs in the thread: receives signals until the socket is closed."""
         deadline = None
         while True:
-            self._ear.settimeout(None if deadline is None else max(1e-3, deadline - time.monotonic()))
+            self._receiver.settimeout(None if deadline is None else max(1e-3, deadline - time.monotonic()))
             try:
-                numbers = self._ear.recv(1)
+                numbers = self._receiver.recv(1)
             except TimeoutError:
                 print("interrupted", file=sys.stderr, flush=True)
                 os._exit(INTERRUPTED)
             if not numbers:
                 return
-            if numbers[0] == _HEARD:
+            if numbers[0] == _HANDLED:
                 deadline = None
             elif numbers[0] == signal.SIGINT:
-                self._came += 1
-                if self._came > 1:
-                    deadline = deadline or time.monotonic() + PATIENCE_S
-                elif self.gentle:
-                    self._ask()
+                self._received += 1
+                if self._received > 1:
+                    deadline = deadline or time.monotonic() + EXIT_DELAY_S
+                elif self.graceful:
+                    self._request()
 
     def _handle(self, *_: object) -> None:
-        """In Python's own time; once for several signals that came meanwhile."""
-        self._heard += 1
-        if not self.gentle or max(self._heard, self._came) > 1:
-            self._mouth.send(bytes([_HEARD]))
+        """The signal handler, which Python calls in the main thread between two instructions."""
+        self._handled += 1
+        if not self.graceful or max(self._handled, self._received) > 1:
+            self._sender.send(bytes([_HANDLED]))
             raise KeyboardInterrupt
-        self._ask()
+        self._request()
 
-    def _ask(self) -> None:
-        self.asked = True
+    def _request(self) -> None:
+        self.requested = True
         try:
-            self._untold.pop()  # one thread gets it
+            self._message.pop()  # succeeds in one of the two threads only
         except IndexError:
             return
         print(f"stopping after this {self.unit}; Ctrl-C again stops at once", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""`jaxba-kitti`: from the images of a KITTI odometry sequence to a problem, and from solutions to trajectory errors."""
+"""`jaxba-kitti`: makes a problem from the images of a KITTI odometry sequence, and computes trajectory errors."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import tyro
 from jaxba.cli import common
 
 FILE_WIDTH = 120
-"""Columns of tables where the output is no terminal."""
+"""Width of tables in characters if the output is not a terminal."""
 
 EVALUATE = "evaluate"
-"""First argument of the second form of the command; a folder of that name can be given as ./evaluate."""
+"""First argument of the subcommand; a folder of this name can be given as ./evaluate."""
 
 
 @dataclass(frozen=True)
@@ -29,66 +29,68 @@ class Arguments:
     """Folder of a KITTI odometry sequence: image_0/000000.png ..., calib.txt."""
 
     out: str = "kitti.txt.bz2"
-    """The problem, a BAL file, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json, written beside it, says
-    which frame every camera is."""
+    """Output file of the problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json, written
+    beside it, has the frame of each camera."""
 
     frames: str = ":"
-    """first:end or first:end:step by frame number, the end not included, such as 0:200."""
+    """Range of frame numbers, first:end or first:end:step, without the end, such as 0:200."""
 
     features: Literal["sift", "orb", "klt"] = "sift"
-    """Key-points that are matched (sift, orb), or corners that are followed from frame to frame (klt)."""
+    """sift, orb: match key-points. klt: track corners from frame to frame."""
 
     keypoints: int = 2000
-    """Most key-points of a frame."""
+    """Largest number of key-points of a frame."""
 
     reach: int = 3
-    """Match every frame with this many frames before it."""
+    """Match every frame with this many previous frames."""
 
     min_matches: int = 40
-    """Verified matches that two frames need."""
+    """Smallest number of verified matches between two frames."""
 
     keyframes: str = "auto"
-    """auto: by parallax and by the share of tracks left. all, or N for every N-th frame."""
+    """auto: choose by parallax and by the fraction of tracks left. all: every frame. N: every N-th frame."""
 
     start: Literal["vo", "poses", "noisy-poses"] = "vo"
-    """Poses from monocular visual odometry, from --poses, or from --poses with errors that accumulate."""
+    """vo: start from the poses of monocular visual odometry. poses: from --poses. noisy-poses: from --poses with
+    accumulating errors."""
 
     poses: str | None = None
-    """True poses, 12 numbers a line, a line for every frame of the sequence from frame 0 on. With --start vo they only
-    serve to print the error of the start."""
+    """File of the true poses, 12 numbers per line, a line for every frame of the sequence from frame 0. With --start vo
+    they are only used to print the error of the start."""
 
     rotation_sigma: float = 0.1
-    """Error of noisy-poses: degrees on each axis a key-frame."""
+    """Error of noisy-poses: standard deviation of the rotation on each axis per key-frame, degrees."""
 
     translation_sigma: float = 0.05
-    """Error of noisy-poses: on each axis, as a share of the way from the key-frame before."""
+    """Error of noisy-poses: standard deviation of the translation on each axis per key-frame, relative to the distance
+    from the previous key-frame."""
 
     min_angle: float = 1.0
-    """A point needs two rays that meet at this angle, degrees."""
+    """Smallest triangulation angle of a point, degrees."""
 
     max_error: float = 3.0
-    """Largest reprojection error of a point's observation, pixels; before the noise of noisy-poses."""
+    """Largest reprojection error of an observation, pixels; before the noise of noisy-poses."""
 
     min_views: int = 2
-    """Key-frames that must see a point."""
+    """Smallest number of key-frames that observe a point."""
 
     window: int | None = None
-    """Write several problems of this many key-frames each, named NAME-FIRST-LAST by their frames."""
+    """Write several problems with this many key-frames each, named NAME-FIRST-LAST by their frames."""
 
     stride: int | None = None
-    """Key-frames from the start of one window to that of the next; half a window if left out."""
+    """Number of key-frames from the start of one window to the next. Default: half a window."""
 
     camera: int = 0
-    """Which camera: image_0 and P0, or 1 to 3."""
+    """Number of the camera, 0 (image_0 and P0) to 3."""
 
     calibration: str | None = None
-    """File of the camera's matrix, lines as in calib.txt or 3 x 3 numbers; that of the sequence if left out."""
+    """File of the camera matrix, lines as in calib.txt or 3 x 3 numbers. Default: that of the sequence."""
 
     work: str | None = None
-    """Folder in which results of single frames are kept, so that a run goes on where it was; NAME.work if left out."""
+    """Folder of intermediate results, with which an interrupted run continues. Default: NAME.work."""
 
     seed: int = 0
-    """Of every random sample and error."""
+    """Seed of all random numbers."""
 
 
 @dataclass(frozen=True)
@@ -96,19 +98,19 @@ class EvaluateArguments:
     """Options of `jaxba-kitti evaluate`."""
 
     problem: Annotated[str, tyro.conf.Positional]
-    """A problem of jaxba-kitti, with its NAME.frames.json beside it."""
+    """Problem written by jaxba-kitti, with its NAME.frames.json beside it."""
 
     solutions: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """What jaxba-solve made of it, BAL files."""
+    """Solutions of the problem by jaxba-solve, BAL files."""
 
     poses: str | None = None
-    """True poses of the whole sequence, 12 numbers a line. Without them there is only the picture."""
+    """File of the true poses of the whole sequence, 12 numbers per line. Without it no errors are computed."""
 
     lengths: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-    """Metres of the segments over which relative errors are taken."""
+    """Lengths of the segments for relative errors, metres."""
 
     out: str = "runs/kitti"
-    """Folder of top-view.png and .svg, evaluation.json and the aligned trajectories."""
+    """Output folder of top-view.png and .svg, evaluation.json and the aligned trajectories."""
 
 
 def main() -> None:
@@ -117,12 +119,12 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; status 0 when all is written, 2 for bad input, 130 after Ctrl-C (a new run goes on)."""
+    """Runs the command. Exit status: 0 for success, 2 for bad input, 130 after Ctrl-C (a new run continues)."""
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv[:1] == [EVALUATE]:
-        text = "Trajectory errors, and the scene from above."
+        text = "Computes trajectory errors and draws the scene from above."
         return common.run_command(EvaluateArguments, _evaluate, text, argv[1:])
-    text = "From KITTI images to a problem. 'jaxba-kitti evaluate --help': solutions compared with true poses."
+    text = "Makes a problem from KITTI images. 'jaxba-kitti evaluate --help': compares solutions with true poses."
     return common.run_command(Arguments, _build, text, argv)
 
 
@@ -151,7 +153,7 @@ def _build(args: Arguments) -> int:
     if stem.suffix.lower() in (".ply", ".out"):
         raise common.UsageError(f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
     try:
-        from jaxba.datasets.kitti import opencv  # noqa: F401 - says what to install
+        from jaxba.datasets.kitti import opencv  # noqa: F401 - the error names the package to install
     except ImportError as error:
         raise common.UsageError(str(error)) from None
     from jaxba.datasets.kitti.build import BuildOptions, build
@@ -164,7 +166,7 @@ def _build(args: Arguments) -> int:
     poses = None
     if args.poses is not None:
         table, name = read_poses(args.poses), args.poses
-        poses_of(table, sequence.numbers, sequence.calibration, name)  # complains before any work
+        poses_of(table, sequence.numbers, sequence.calibration, name)  # raises errors before any work is done
         poses = lambda frames: poses_of(table, frames, sequence.calibration, name)
     front = FrontEndOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
     options = BuildOptions(
@@ -198,7 +200,7 @@ def _build(args: Arguments) -> int:
 
 
 def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
-    """Problems to be written, and where."""
+    """The problems to write, and their files."""
     from jaxba.datasets.kitti.assemble import windows
     from jaxba.io.files import strip_compression
 
@@ -212,7 +214,7 @@ def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
 
 
 def _write(part: Any, path: str, sequence: Any, args: Arguments) -> str:
-    """Writes the sidecar file, then the problem, so that no problem is without its frames."""
+    """Writes the file of frames first, then the problem, so that there is never a problem without its frames."""
     from jaxba import __version__
     from jaxba.datasets.kitti.assemble import sidecar_contents
     from jaxba.datasets.kitti.evaluate import write_sidecar
@@ -220,14 +222,14 @@ def _write(part: Any, path: str, sequence: Any, args: Arguments) -> str:
     from jaxba.io import write_problem
 
     times = None if sequence.times is None else dict(zip(sequence.numbers, sequence.times.tolist(), strict=True))
-    facts = sidecar_contents(
+    metadata = sidecar_contents(
         part,
         sequence.calibration,
         times=None if times is None else [times[number] for number in part.frames],
         options=asdict(args),
         versions={"jaxba": __version__, "opencv": cv2.__version__},
     )
-    write_sidecar(path, facts)
+    write_sidecar(path, metadata)
     write_problem(part.problem, path)
     return path
 
@@ -333,7 +335,7 @@ def _console() -> Any:
 
 
 class _Progress:
-    """A live line on a terminal, a line for every stage elsewhere."""
+    """A progress bar on a terminal; otherwise a line for every stage."""
 
     def __init__(self, console: Any) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -352,7 +354,7 @@ class _Progress:
         self._bar.stop()
 
     def report(self, stage: str, done: int, total: int) -> None:
-        """So much of a stage is done."""
+        """Updates the progress: `done` of `total` units of a stage."""
         if stage != self._stage:
             self._stage = stage
             self._bar.reset(self._task, description=stage)

@@ -1,4 +1,4 @@
-"""`jaxba-paper`: every table and figure of the seed paper."""
+"""`jaxba-paper`: reproduces the tables and figures of the paper."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from typing import Any
 from jaxba.cli import common
 
 FULL, FAST = "full", "fast"
-"""Presets."""
+"""Names of the presets."""
 
 TIMES = "times.json"
+"""File of the times spent on each table or figure."""
+
 REPORT = "paper.md"
+"""File of the report, unless `--report` names another."""
 
 
 @dataclass(frozen=True)
@@ -29,17 +32,17 @@ class Arguments:
     """A preset (full, fast) or the path of a YAML file."""
 
     only: tuple[str, ...] = ()
-    """Tables and figures to work on, by name; all if left out. The report shows the others as far as they are there."""
+    """Names of the tables and figures to compute; default: all. The report has the others from earlier results."""
 
     list: bool = False
-    """Names all tables and figures, and does nothing."""
+    """List all tables and figures and exit."""
 
     out: str | None = None
-    """Folder of records, agents and pictures; runs/paper or runs/paper-NAME of the configuration if left out. A second
-    run into the same folder does only what is missing."""
+    """Folder of results, agents and figures. Default: runs/paper, or runs/paper-NAME for the configuration NAME. A
+    second run with the same folder computes only what is missing."""
 
     report: str | None = None
-    """The Markdown file; pictures go into a folder beside it that is called like it. OUT/paper.md if left out."""
+    """Markdown file of the report; figures go into a folder of the same name beside it. Default: OUT/paper.md."""
 
 
 def main() -> None:
@@ -48,27 +51,28 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; status 0 when the report is written, 2 for bad input, 130 after Ctrl-C (work is kept)."""
-    return common.run_command(Arguments, _paper, "Every table and figure of the paper, from one command.", argv)
+    """Runs the command. Exit status: 0 if the report was written, 2 for bad input, 130 after Ctrl-C (results are
+    kept)."""
+    return common.run_command(Arguments, _paper, "Reproduces the tables and figures of the paper.", argv)
 
 
 def _paper(args: Arguments) -> int:
     from rich.console import Console
 
     from jaxba.paper import config as configs
-    from jaxba.paper.pieces import PIECES
+    from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
     from jaxba.training.settings import SettingsError
 
     console = Console(soft_wrap=True, highlight=False)
     if args.list:
-        for piece in PIECES.values():
-            console.print(f"{piece.name:12} {piece.title}")
+        for entry in TABLES_AND_FIGURES.values():
+            console.print(f"{entry.name:12} {entry.title}")
         return 0
     if args.fast and args.config:
         raise common.UsageError("--fast is --config fast; give one of them")
     for name in args.only:
-        if name not in PIECES:
-            raise common.UsageError(f"--only {name}: unknown; known: {', '.join(PIECES)}")
+        if name not in TABLES_AND_FIGURES:
+            raise common.UsageError(f"--only {name}: unknown; known: {', '.join(TABLES_AND_FIGURES)}")
     name = args.config or (FAST if args.fast else FULL)
     try:
         config = configs.load(name)
@@ -84,10 +88,10 @@ def _paper(args: Arguments) -> int:
 
 
 def _open(folder: Path, config: Any) -> None:
-    """Makes the folder, or finds the same run in it.
+    """Creates the folder and writes the configuration there, or checks that the folder has the same configuration.
 
     Raises:
-        UsageError: it holds a run with other settings, or cannot be written.
+        UsageError: the folder has another configuration, or cannot be written.
     """
     from jaxba.paper import config as configs
     from jaxba.runtime.atomic import write_text
@@ -112,51 +116,52 @@ def _open(folder: Path, config: Any) -> None:
 def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any) -> int:
     import jax
 
-    from jaxba.paper.pieces import PIECES
     from jaxba.paper.report import write
-    from jaxba.paper.workshop import Workshop
+    from jaxba.paper.runner import Runner
+    from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
     from jaxba.runtime import process
 
     jax.config.update("jax_enable_x64", True)  # the game counts in float64, the networks in float32
     status = 0
     with process.single_blas_thread():
-        shop = Workshop(config, folder, lambda words: console.print(f"  {words}"))
+        runner = Runner(config, folder, lambda line: console.print(f"  {line}"))
         seconds = _read_times(folder)
-        wanted = [piece for name, piece in PIECES.items() if not args.only or name in args.only]
+        wanted = [entry for name, entry in TABLES_AND_FIGURES.items() if not args.only or name in args.only]
         try:
-            for number, piece in enumerate(wanted, start=1):
-                console.print(f"{number} of {len(wanted)}: {piece.title}")
-                started, cpu, before = time.perf_counter(), time.process_time(), shop.done
+            for number, entry in enumerate(wanted, start=1):
+                console.print(f"{number} of {len(wanted)}: {entry.title}")
+                started, cpu, before = time.perf_counter(), time.process_time(), runner.done
                 try:
-                    piece.work(shop)
+                    entry.run(runner)
                 finally:
                     spent, cpu = time.perf_counter() - started, time.process_time() - cpu
-                    if shop.done > before:
-                        wall, busy = seconds.get(piece.name, (0.0, 0.0))
-                        seconds[piece.name] = wall + spent, busy + cpu
+                    if runner.done > before:
+                        wall, busy = seconds.get(entry.name, (0.0, 0.0))
+                        seconds[entry.name] = wall + spent, busy + cpu
                         _write_times(folder, seconds)
-                console.print(f"  {shop.done - before} runs, {spent:.1f} s")
+                console.print(f"  {runner.done - before} runs, {spent:.1f} s")
         except KeyboardInterrupt:
             console.print("interrupted; what is done is kept, run the same command again to continue")
             status = common.INTERRUPTED
         console.print("drawing")
-        sections = [piece.section(shop) for piece in PIECES.values()]
-        files = write(shop, sections, report, _command(args), {n: seconds[n] for n in PIECES if n in seconds})
+        sections = [entry.section(runner) for entry in TABLES_AND_FIGURES.values()]
+        listed = {name: seconds[name] for name in TABLES_AND_FIGURES if name in seconds}
+        files = write(runner, sections, report, _command(args), listed)
     console.print(
-        f"wrote {report} and {len(files) - 1} pictures; {sum(wall for wall, _ in seconds.values()):.0f} s of work in "
+        f"wrote {report} and {len(files) - 1} figures; {sum(wall for wall, _ in seconds.values()):.0f} s of work in "
         f"{folder}"
     )
     return status
 
 
 def _command(args: Arguments) -> str:
-    """The command as a reader would repeat it; paths of the writer's machine are left out."""
+    """The command line without paths of this machine, for the report."""
     chosen = " --fast" if args.fast else f" --config {Path(args.config).name}" if args.config else ""
     return f"jaxba-paper{chosen}"
 
 
 def _read_times(folder: Path) -> dict[str, tuple[float, float]]:
-    """Seconds on the wall clock and of the processor by piece."""
+    """Wall-clock time and processor time in seconds for each table or figure."""
     try:
         found = json.loads((folder / TIMES).read_text(encoding="utf-8"))
         return {str(name): (float(wall), float(cpu)) for name, (wall, cpu) in found.items()}

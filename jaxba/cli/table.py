@@ -1,4 +1,4 @@
-"""Text of a solve: a table in the manner of Ceres, and a summary."""
+"""Text that `jaxba-solve` prints: a table of the iterations like that of Ceres, and a summary."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      la
 
 
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
-    """What is about to be solved, and how."""
+    """Size of the problem, and the policy and options of the solve."""
     refine = f" + {options.refinement.points} point iterations" if options.refinement.points else ""
     if refine and options.refinement.starts == "rays":
         refine += " from the better of step and rays"
@@ -47,12 +47,12 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
 
 
 def header(initial_cost: float) -> str:
-    """Column names and the row of the start."""
+    """Column names and the row of the initial cost."""
     return f"{_COLUMNS}\n{0:4d}  {initial_cost:.6e}"
 
 
 def row(record: IterationRecord, time_before: float) -> str:
-    """One iteration; the cost is the accepted one, the change that of the proposed step."""
+    """The row of an iteration, with the accepted cost, and the change of the cost by the candidate."""
     step = record.step
     cells = (
         f"{record.iteration:4d}  {step.cost:.6e}  {step.previous_cost - step.candidate_cost: .2e}   "
@@ -63,7 +63,7 @@ def row(record: IterationRecord, time_before: float) -> str:
 
 
 def retriangulated(found: Retriangulation, ftol: float) -> str:
-    """What a search for points at other depths brought, between two rows."""
+    """The result of a search for points at other depths, as a line between two rows."""
     count = f"{found.moved} of {found.problem.num_points} points moved"
     costs = f"cost {found.cost_before:.6e} -> {found.cost_after:.6e}"
     if not found.moved:
@@ -73,9 +73,9 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
 
 
 def summary(problem: BundleProblem, solution: Solution) -> str:
-    """How it ended, in lines for a person."""
+    """The result of a solve in a few lines."""
     state = "converged" if solution.converged else "not converged"
-    # of the residuals themselves: the cost may be that of a robust loss
+    # from the residuals, since the cost may be that of a robust loss
     rms = [np.sqrt(2 * geometry.cost(p) / p.num_observations) for p in (problem, solution.problem)]
     lines = [
         f"{state}: {solution.termination.reason}",
@@ -88,7 +88,7 @@ def summary(problem: BundleProblem, solution: Solution) -> str:
 
 
 def _how_compiled(solution: Solution) -> str:
-    """That iterations were slow by design."""
+    """A note on iterations with quickly compiled programs, which are slower; empty if there were none."""
     quick = solution.quick_iterations
     if not quick:
         return ""
@@ -97,7 +97,7 @@ def _how_compiled(solution: Solution) -> str:
 
 
 def lost_in_bal(problem: BundleProblem) -> str:
-    """What BAL cannot say of a problem, for a person; empty where it can say all of it."""
+    """Properties of a problem that a BAL file cannot store, as text; empty if there are none."""
     lenses = problem.lenses
     lost = [
         (lenses is not None and lenses.shared, "which images share a lens"),
@@ -108,7 +108,7 @@ def lost_in_bal(problem: BundleProblem) -> str:
 
 
 def padding(problem: BundleProblem, solution: Solution) -> str:
-    """Sizes of the program where they were asked to be rounded up, or why they were not."""
+    """The sizes to which a problem was padded, or why it was not."""
     if solution.capacity is not None:
         return f"padded to {solution.capacity}"
     if problem.lenses is not None:
@@ -121,7 +121,7 @@ def padding(problem: BundleProblem, solution: Solution) -> str:
 
 
 def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
-    """What a user should know about the data: unobserved, seen once, behind a camera."""
+    """Notes on the data: cameras and points without observations, points with one, points behind cameras."""
     cameras = np.bincount(np.asarray(problem.camera_index), minlength=problem.num_cameras)
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
     before, after = (int(np.sum(geometry.depths(p) <= 0)) for p in (problem, solution.problem))

@@ -1,4 +1,4 @@
-"""`jaxba-train`: from a configuration to a policy file."""
+"""`jaxba-train`: trains a damping policy."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from jaxba.cli import common
 from jaxba.cli.interrupt import Interrupt
 
 DEFAULT_CONFIG = "default"
-"""Preset of a new run where none is named."""
+"""Default preset of a new run."""
 
 POLICY = "policy.safetensors"
+"""File of the best policy."""
+
 CURVE = "curve"
+"""Stem of the files with the learning curve."""
 
 FILE_WIDTH = 120
-"""Columns of the table where the output is no terminal."""
+"""Width of the table in characters if the output is not a terminal."""
 
 
 @dataclass(frozen=True)
@@ -27,19 +30,19 @@ class Arguments:
     """Options of `jaxba-train`."""
 
     config: str | None = None
-    """A preset (default, plain, driver, fast, paper) or the path of a YAML file. A resumed run takes that of its
-    folder."""
+    """A preset (default, plain, driver, fast, paper) or the path of a YAML file. A resumed run has its configuration in
+    its folder."""
 
     overrides: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="KEY=VALUE ...")
     ] = ()
-    """Settings that win over the file, such as sac.width=128 seed=3; values are YAML."""
+    """Settings that replace those of the configuration, such as sac.width=128 seed=3; values are YAML."""
 
     out: str | None = None
-    """Folder of the run; runs/NAME of the configuration if left out."""
+    """Folder of the run. Default: runs/NAME for the configuration NAME."""
 
     resume: bool = False
-    """Go on with the run in the folder, from its last checkpoint, with the same numbers as if it had never stopped."""
+    """Continue the run in the folder from its last checkpoint, with the same results as without the interruption."""
 
 
 def main() -> None:
@@ -48,7 +51,8 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command; status 0 when the policy is written, 2 for bad input, 130 after Ctrl-C (the run is saved)."""
+    """Runs the command. Exit status: 0 if the policy was written, 2 for bad input, 130 after Ctrl-C (the run is
+    saved)."""
     return common.run_command(Arguments, _train, "Trains a damping policy on random scenes.", argv)
 
 
@@ -60,7 +64,7 @@ def _train(args: Arguments) -> int:
     from jaxba.training import config as configs
     from jaxba.training import driver, task
 
-    jax.config.update("jax_enable_x64", True)  # the game counts in float64, the agent's networks in float32
+    jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
     overrides = tuple(item for group in args.overrides for item in group)
     name = args.config or DEFAULT_CONFIG
     folder = Path(args.out or Path("runs") / Path(name).stem)
@@ -73,21 +77,21 @@ def _train(args: Arguments) -> int:
     console = _console()
     with (
         process.single_blas_thread(),
-        Interrupt("chunk", gentle=False) as interrupt,
+        Interrupt("chunk", graceful=False) as interrupt,
         _Progress(console, config) as progress,
     ):
         try:
             work = task.build(config, folder, progress.stage)
             progress.rules = work.rules
-            interrupt.gentle = True
+            interrupt.graceful = True
 
             def keep(best: driver.Best) -> None:
                 _write_policy(folder, config, work, best)
                 progress.best = best
 
-            hooks = driver.Hooks(progress.stage, progress.row, keep, lambda: interrupt.asked)
+            hooks = driver.Hooks(progress.stage, progress.row, keep, lambda: interrupt.requested)
             outcome = driver.train(config, work.game, work.evaluate, folder, hooks)
-            interrupt.gentle = False
+            interrupt.graceful = False
         except KeyboardInterrupt:
             console.print(f"interrupted; go on from the last checkpoint with {_again(folder)}")
             return common.INTERRUPTED
@@ -104,15 +108,17 @@ def _train(args: Arguments) -> int:
 
 
 def _console() -> Any:
-    """Where progress goes; if its reader has gone the training goes on, and brackets in names are no markup."""
+    """A console for the progress. The training continues if the reader of stdout closes it, and brackets in names are
+    not interpreted as markup."""
     from rich.console import Console
 
-    class Kept(Console):
+    class PipeTolerantConsole(Console):
         def on_broken_pipe(self) -> None:
-            common.close_pipe()
+            common.discard_stdout()
 
-    console = Kept(soft_wrap=True, highlight=False, markup=False)
-    return console if console.is_terminal else Kept(soft_wrap=True, highlight=False, markup=False, width=FILE_WIDTH)
+    options: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
+    console = PipeTolerantConsole(**options)
+    return console if console.is_terminal else PipeTolerantConsole(**options, width=FILE_WIDTH)
 
 
 def _again(folder: Path) -> str:
@@ -124,24 +130,25 @@ def _write_policy(folder: Path, config: Any, work: Any, best: Any) -> None:
     from jaxba.damping.policy_file import save_policy
     from jaxba.training.config import to_yaml
 
-    facts = {
+    metadata = {
         "jaxba": __version__,
         "config": to_yaml(config),
         "agent_number": str(best.seed),
         "chunk": str(best.chunk),
         "held_out_iterations": f"{best.score:.4f}",
     }
-    save_policy(folder / POLICY, work.policy(best.actor), facts)
+    save_policy(folder / POLICY, work.policy(best.actor), metadata)
 
 
 def _finish(folder: Path, work: Any, best: Any, console: Any, progress: _Progress) -> int:
-    """Policy file, curve and table."""
+    """Writes the policy and the learning curve, and prints the comparison with the rules."""
     from jaxba.bench.plots import save_figure
-    from jaxba.training import log, plots
+    from jaxba.cli.training_curve import plot_curve
+    from jaxba.training import log
 
     _write_policy(folder, work.config, work, best)
     rules = {name: {**score._asdict(), "score": score.mean} for name, score in work.rules.items()}
-    figure = plots.plot_curve(log.read(folder), rules, work.config.game.tolerance)
+    figure = plot_curve(log.read(folder), rules, work.config.game.tolerance)
     files = [folder / POLICY, *save_figure(figure, folder / CURVE)]
     progress.stage("comparing with the rules")
     scores = work.compare(best.actor)
@@ -173,14 +180,14 @@ def _table(scores: Mapping[str, Any], tolerance: float, count: int) -> Any:
 
 
 class _Progress:
-    """A live line on a terminal, plain lines elsewhere."""
+    """A progress bar on a terminal; otherwise lines of text."""
 
     def __init__(self, console: Any, config: Any) -> None:
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
         self.console, self.config = console, config
         self.rules: Mapping[str, Any] = {}
-        self.best: Any = None  # the best policy that this process has found
+        self.best: Any = None  # the best policy that this process has trained
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=20),
@@ -203,14 +210,14 @@ class _Progress:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def stage(self, words: str) -> None:
-        """Something begins that takes a while."""
-        self._bar.update(self._task, description=words, now="")
+    def stage(self, description: str) -> None:
+        """Reports the start of a stage."""
+        self._bar.update(self._task, description=description, now="")
         if not self.console.is_terminal:
-            self.console.print(words)
+            self.console.print(description)
 
     def row(self, row: Mapping[str, Any]) -> None:
-        """A chunk is done."""
+        """Reports a finished chunk, by its row of the training log."""
         config = self.config
         done = row["seed"] * config.chunks + row["chunk"]
         total = config.seeds * config.chunks

@@ -1,17 +1,27 @@
 """Damping policies: who chooses lambda."""
 
-from jaxba.damping.learned import LearnedPolicy
+from jaxba.damping.learned import AgentPolicy, ConstantAction, LearnedPolicy
 from jaxba.damping.policy import DampingPolicy, ProblemInfo, decides_effort, effort_of
 from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
-from jaxba.damping.registry import LEARNED, LEARNED_PLAIN, POLICIES, UnknownPolicyError, is_learned, make_policy
+from jaxba.damping.registry import (
+    LEARNED,
+    LEARNED_PLAIN,
+    POLICIES,
+    UnknownPolicyError,
+    brings_embedded,
+    is_learned,
+    make_policy,
+)
 from jaxba.damping.rules import Ceres, Classic, Geometric, Schedule
 
 __all__ = [
     "LEARNED",
     "LEARNED_PLAIN",
     "POLICIES",
+    "AgentPolicy",
     "Ceres",
     "Classic",
+    "ConstantAction",
     "DampingPolicy",
     "Geometric",
     "LearnedPolicy",
@@ -19,6 +29,7 @@ __all__ = [
     "ProblemInfo",
     "Schedule",
     "UnknownPolicyError",
+    "brings_embedded",
     "decides_effort",
     "effort_of",
     "is_learned",

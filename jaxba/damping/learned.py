@@ -1,4 +1,4 @@
-"""A trained agent as a damping policy."""
+"""Policies that act as an agent does, through the guard: a trained network, and one and the same action always."""
 
 from __future__ import annotations
 
@@ -20,39 +20,20 @@ from jaxba.problem.options import StepOptions
 from jaxba.typing import AnyArray
 
 
-class Layer(NamedTuple):
-    """`x W + b`."""
+class AgentPolicy:
+    """What policies of an agent share: they observe, choose an action, and get the lambda that the guard allows."""
 
-    kernel: Float[AnyArray, "inputs outputs"]
-    bias: Float[AnyArray, " outputs"]
+    config: AgentConfig
+    """What is observed, what an action means, and the step that the policy is made for."""
 
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class LearnedPolicy:
-    """The mean action of a trained actor, limited by the guard.
-
-    The weights are traced: another policy of the same shape never recompiles.
-    """
-
-    layers: tuple[Layer, ...]
-    """Hidden layers with ReLU, then mean and log standard deviation of the action before its tanh."""
-
-    config: AgentConfig = field(metadata={"static": True})
-    """What is observed and what an action means."""
+    def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
+        """The action in [-1, 1] for an observation."""
+        raise NotImplementedError
 
     @property
     def min_gain(self) -> float:
         """Gain ratio that a step must exceed."""
         return self.config.min_gain
-
-    def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
-        """The action in [-1, 1] for an observation."""
-        x = observation
-        for layer in self.layers[:-1]:
-            x = jax.nn.relu(x @ layer.kernel + layer.bias)
-        outputs = x @ self.layers[-1].kernel + self.layers[-1].bias
-        return jnp.tanh(outputs[: outputs.shape[0] // 2])
 
     def effort(self, state: Memory) -> Effort | None:
         """See `policy.effort_of`."""
@@ -74,6 +55,60 @@ class LearnedPolicy:
         action = self.act(observe(self.config, memory))
         effort = effort_for(self.config, memory.guard, action)
         return memory._replace(effort=effort), damping_of(self.config, memory.guard, action[0])
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ConstantAction(AgentPolicy):
+    """The same action in every iteration: what the guard alone achieves, without a network.
+
+    The best constant action of a game is the baseline that training has to beat.
+    """
+
+    action: tuple[float, ...]
+    """Numbers in [-1, 1], as many as `AgentConfig.action_size`."""
+
+    config: AgentConfig = field(metadata={"static": True})
+    """What the action means."""
+
+    def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
+        """The action, whatever the observation."""
+        return jnp.asarray(self.action, jnp.float32)
+
+
+def boldest(config: AgentConfig) -> ConstantAction:
+    """The policy that always asks for the smallest lambda and the least effort."""
+    return ConstantAction((-1.0,) * config.action_size, config)
+
+
+class Layer(NamedTuple):
+    """`x W + b`."""
+
+    kernel: Float[AnyArray, "inputs outputs"]
+    bias: Float[AnyArray, " outputs"]
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class LearnedPolicy(AgentPolicy):
+    """The mean action of a trained actor, limited by the guard.
+
+    The weights are traced: another policy of the same shape never recompiles.
+    """
+
+    layers: tuple[Layer, ...]
+    """Hidden layers with ReLU, then mean and log standard deviation of the action before its tanh."""
+
+    config: AgentConfig = field(metadata={"static": True})
+    """What is observed and what an action means."""
+
+    def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
+        """The action in [-1, 1] for an observation."""
+        x = observation
+        for layer in self.layers[:-1]:
+            x = jax.nn.relu(x @ layer.kernel + layer.bias)
+        outputs = x @ self.layers[-1].kernel + self.layers[-1].bias
+        return jnp.tanh(outputs[: outputs.shape[0] // 2])
 
 
 def learned_from(config: AgentConfig, actor: Any) -> LearnedPolicy:

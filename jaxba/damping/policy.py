@@ -13,7 +13,7 @@ from jaxba.problem.options import StepOptions
 
 
 class ProblemInfo(NamedTuple):
-    """What a policy may know before the first iteration."""
+    """What a policy knows before the first iteration."""
 
     cost: Float[Array, ""]  # at the start, pixels^2
     observations: Int[Array, ""]
@@ -29,8 +29,8 @@ class DampingPolicy(Protocol):
     """Chooses lambda for every iteration.
 
     A policy is a frozen dataclass and a pytree: its numbers are traced, so that changing one never
-    recompiles, and its class selects the code. Both functions are pure and jittable. A policy may have two more,
-    `effort(state)`, see `effort_of`, and `step_options(base)`, see `trained_step`.
+    recompiles, and its class selects the code. Both functions are pure and jittable. A policy may have two more
+    functions: `effort(state)`, see `effort_of`, and `step_options(base)`, see `trained_step`.
     """
 
     @property
@@ -48,12 +48,12 @@ class DampingPolicy(Protocol):
 
 
 def decides_effort(policy: DampingPolicy) -> bool:
-    """Whether the policy says what an iteration may cost; otherwise `StepOptions` do."""
+    """Whether the policy has a function for the effort of an iteration; otherwise `StepOptions` decide it."""
     return getattr(policy, "effort", None) is not None
 
 
 def effort_of(policy: DampingPolicy, state: Any) -> Effort | None:
-    """What the iteration that follows may cost, if the policy decides that; None where `StepOptions` do."""
+    """Point iterations and forcing term of the next iteration; None if `StepOptions` decide them."""
     return policy.effort(state) if decides_effort(policy) else None  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -7,9 +7,38 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from jaxba.damping.learned import ConstantAction, LearnedPolicy, boldest
 from jaxba.damping.policy import DampingPolicy
 from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
+
+LEARNED, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-plain", "learned-driver"
+"""The shipped policies: for a step with embedded iterations; for lambda alone (`learned+refine0`); and for lambda alone
+if another library makes the step and damps cameras and points alike. In the name of a solver, `learned` means the one
+that fits the step (solver/names.py)."""
+
+SHIPPED = {
+    LEARNED: "default.safetensors",
+    LEARNED_PLAIN: "plain.safetensors",
+    LEARNED_DRIVER: "driver.safetensors",
+}
+"""Their files in `jaxba/policies`, each trained with the preset of `jaxba-train` that has the file's name."""
+
+BOLD, BOLD_PLAIN, BOLD_DRIVER = "bold", "bold-plain", "bold-driver"
+"""No network, but the guard and the step of the shipped policies, in the same order. In the name of a solver, `bold`
+means the one that fits the step."""
+
+_GUARD_OF = {BOLD: LEARNED, BOLD_PLAIN: LEARNED_PLAIN, BOLD_DRIVER: LEARNED_DRIVER}
+
+
+def bold(guard_of: str = LEARNED) -> ConstantAction:
+    """The smallest lambda that the guard of a shipped policy allows, in every iteration.
+
+    Args:
+        guard_of: the shipped policy; its file says how it is guarded.
+    """
+    return boldest(_shipped(guard_of).config)
+
 
 POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
     "ceres": (Ceres, "Ceres' trust-region rule: x1/3 to x2 by gain ratio, x2, x4, ... after rejections"),
@@ -20,21 +49,9 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
     "theseus": (theseus, "Theseus' adaptive rule: 1e-3, then x1/9 or x11"),
     "schedule": (Schedule, "the paper's cycle 1e-15, 1e-15, 0.194, 0.551"),
     "gauss-newton": (gauss_newton, "next to no damping: 1e-10 throughout"),
+    BOLD: (bold, "the smallest lambda that the guard of `learned` allows: 1e-5, then /32 down to 1e-9"),
 }
 """Factory and one line of description by name."""
-
-LEARNED, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-plain", "learned-driver"
-"""The shipped policies, each where it is the best: for a step with embedded iterations; for lambda alone
-(`learned+refine0`); and for lambda alone where another library makes the step and damps all variables alike. In the
-name of a solver `learned` means the one that fits (solver/names.py)."""
-
-SHIPPED = {
-    LEARNED: "default.safetensors",
-    LEARNED_PLAIN: "plain.safetensors",
-    LEARNED_DRIVER: "driver.safetensors",
-}
-"""Their files in `jaxba/policies`, each made by the preset of `jaxba-train` that has its name, `driver` before a rescue
-of the guard changed (docs/game-tried.md)."""
 
 SUFFIX = ".safetensors"
 """Ending by which a name is the path of a policy file."""
@@ -44,24 +61,26 @@ CONSTANT = "constant"
 
 
 class UnknownPolicyError(ValueError):
-    """A name that is no policy. The message is one line for a person."""
+    """A name that is not a policy. The message is one line for a person."""
 
 
 def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
     Args:
-        name: `learned`, here that for plain LM, another of `SHIPPED`, the path of a policy file, a key of `POLICIES`,
-            optionally `name:FIRST_LAMBDA` for the rules that have one, or `constant:LAMBDA`.
+        name: `learned` (here the policy for plain LM) or another key of `SHIPPED`; the path of a policy file; a key of
+            `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; `bold-plain`, `bold-driver`; or `constant:LAMBDA`.
 
     Raises:
         UnknownPolicyError: no such policy, or a lambda that is not a positive number.
         PolicyFileError: a path, but not of a policy file.
     """
     if name in SHIPPED:
-        return load_policy(Path(__file__).parent.parent / "policies" / SHIPPED[name])
+        return _shipped(name)
     if is_learned(name):
         return load_policy(name)
+    if name in _GUARD_OF:
+        return bold(_GUARD_OF[name])
     base, colon, number = name.partition(":")
     if base == CONSTANT:
         return Schedule(values=(_damping(name, number),))
@@ -71,14 +90,23 @@ def make_policy(name: str) -> DampingPolicy:
     policy = POLICIES[base][0]()
     if not colon:
         return policy
-    if isinstance(policy, Schedule):
+    if isinstance(policy, Schedule | ConstantAction):
         raise UnknownPolicyError(f"{base!r} has no first lambda to set; use constant:LAMBDA")
     return replace(policy, initial=_damping(name, number))  # type: ignore[type-var]
 
 
 def is_learned(name: str) -> bool:
-    """Whether a policy of this name has a network and brings its own embedded iterations."""
+    """Whether a policy of this name has a network."""
     return name in SHIPPED or name.endswith(SUFFIX)
+
+
+def brings_embedded(name: str) -> bool:
+    """Whether a policy of this name has a configuration with embedded iterations of its own."""
+    return is_learned(name) or name in _GUARD_OF
+
+
+def _shipped(name: str) -> LearnedPolicy:
+    return load_policy(Path(__file__).parent.parent / "policies" / SHIPPED[name])
 
 
 def _damping(name: str, number: str) -> float:

@@ -1,6 +1,6 @@
 """Hand-written damping rules. All lambdas multiply what `StepOptions.scaling` says.
 
-Formulas and sources: the docstring of each class; collected in docs/definitions.md.
+Formulas and sources are in the docstring of each class.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ LARGEST = 1e32
 """Upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32."""
 
 SMALLEST = 1e-30
-"""Lower bound of rules whose source has none or zero: no factor brings a lambda of exactly zero back."""
+"""Lower bound of rules whose source has none, or zero: a lambda of exactly zero could never grow again."""
 
 
 def _scalar(value: Any, info: ProblemInfo) -> Array:

@@ -1,1 +1,1 @@
-"""The game of bundle adjustment: a vectorised environment over the LM step, and agents that learn to play it."""
+"""The game of bundle adjustment: a vectorised environment over the LM step, its scenes, and the scores of policies."""

@@ -2,14 +2,14 @@
 
 | | |
 | --- | --- |
-| state | a scene of the bank, its cameras and points, the agent's memory of the episode |
+| state | a scene of the bank, its current cameras and points, the agent's memory of the episode |
 | observation | `damping.features.observe` |
-| action | numbers in (-1, 1): lambda by `damping.guard.damping_of`; the effort if the agent has it |
-| terminated | accepted cost within `tolerance` of the scene's best known; or the limit, where that counts as failure |
-| truncated | the limit, where it does not |
+| action | numbers in (-1, 1): lambda by `damping.guard.damping_of`, effort by `damping.guard.effort_for` |
+| terminated | accepted cost within `tolerance` of the best known cost, or the limit if `limit_is_failure` |
+| truncated | the limit otherwise |
 | reward | `GameConfig.reward` |
 
-Everything is traced once. Episodes that end are followed by another scene of the bank, gathered by number.
+Everything is traced once. An episode that ends is followed by one on a random scene of the bank.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ Reward = Literal["duration", "constant", "reduction", "reversed"]
 
 POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
-Ladybug-49: three take 3.9 of 12.6 ms (docs/optimisations.md)."""
+Ladybug-49: three take 3.9 of 12.6 ms."""
 
 CG_ITERATION_COST = 0.06
-"""The same for an iteration of conjugate gradients, charged where the agent chooses their number. An estimate: one
-product of the reduced system takes 20 to 25 of an implicit step's 351 ms on a scene of Ladybug-1197's size
-(docs/performance.md); those of method `deeplm`, on all variables, were not measured."""
+"""The same for an iteration of conjugate gradients, charged if the agent chooses the forcing term. An estimate: one
+product with the reduced system takes 20 to 25 of an implicit step's 351 ms on a scene of Ladybug-1197's size. Products
+of method `deeplm`, with all variables, were not measured."""
 
 BONUS_DECAY = 0.01
-"""Share of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023, ablation."""
+"""Fraction of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023."""
 
 
 @dataclass(frozen=True)
@@ -56,26 +56,27 @@ class GameConfig:
     """Rules of the game. Hashable: static in compiled programs."""
 
     agent: AgentConfig = field(default_factory=AgentConfig)
-    """What the agent sees and does."""
+    """What the agent observes and decides."""
 
     reward: Reward = "duration"
-    """`duration`: minus a deterministic cost of the iteration. `constant`: -1. `reduction`: nothing, and a bonus that
-    shrinks. `reversed`: the error as reward (the paper's ablation)."""
+    """Of an iteration. `duration`: minus a deterministic cost of the iteration. `constant`: -1. `reduction`: zero, and
+    the bonus shrinks with every iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's
+    reversed roles of state and reward)."""
 
     bonus: float = 10.0
-    """Added where the episode ends in success. Source: Belder et al. 2023."""
+    """Added if the episode ends in success. Source: Belder et al. 2023."""
 
     scale: float = 0.1
     """Factor on every reward, so that returns stay within a few units."""
 
     tolerance: float = 1e-3
-    """Success: accepted cost at most (1 + tolerance) times the best known."""
+    """Success: accepted cost at most (1 + tolerance) times the best known cost."""
 
     max_iterations: int = 40
-    """Limit of an episode."""
+    """Limit of an episode's length."""
 
     limit_is_failure: bool = True
-    """Whether the limit ends an episode for good, as the paper counts it, or cuts it off."""
+    """Whether an episode that reaches the limit is terminated, as in the paper, or truncated."""
 
     def __post_init__(self) -> None:
         if self.reward not in get_args(Reward):
@@ -106,7 +107,7 @@ class GameState(NamedTuple):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Game:
-    """Satisfies `protocol.Environment`."""
+    """A batch of environments; satisfies `protocol.Environment`."""
 
     banks: tuple[Bank, ...]
     """Scenes to play, a bank per class."""
@@ -121,7 +122,7 @@ class Game:
     """Rules."""
 
     options: StepOptions = field(metadata={"static": True})
-    """Of the LM step, with what the agent's configuration says of it (`AgentConfig.step_options`)."""
+    """Of the LM step, those of the agent's configuration included (`AgentConfig.step_options`)."""
 
     @property
     def num_envs(self) -> int:
@@ -148,8 +149,8 @@ class Game:
         return GameState(episodes, key), self._observe(episodes)
 
     def _observe(self, episodes: tuple[Episode, ...]) -> Array:
-        see = jax.vmap(lambda episode: observe(self.config.agent, episode.memory))
-        return jnp.concatenate([see(part) for part in episodes])
+        observe_all = jax.vmap(lambda episode: observe(self.config.agent, episode.memory))
+        return jnp.concatenate([observe_all(part) for part in episodes])
 
     def _fresh(self, bank: Bank, key: Array) -> Episode:
         count = bank.initial_cost.shape[0]
@@ -168,10 +169,10 @@ class Game:
         """One LM iteration of one scene."""
         agent = self.config.agent
         layout = class_layout(kind, self.options)
-        own = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
+        layout = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
         guard = episode.memory.guard
         damping, effort = damping_of(agent, guard, action[0]), effort_for(agent, guard, action)
-        state, step = lm_step(own, episode.state, damping, self.options, agent.min_gain, guard.iteration, effort)
+        state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, guard.iteration, effort)
         memory = record(agent, episode.memory._replace(effort=effort), step)
         return Episode(episode.scene, state, memory), step
 
@@ -180,12 +181,12 @@ class Game:
         key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
         parts, after, start = [], [], 0
         for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
-            own, start = action[start : start + count], start + count
+            part, start = action[start : start + count], start + count
 
             def one(episode: Episode, action: Array, key: Array, kind=kind, bank=bank) -> tuple[Episode, Step]:
                 return self._play(kind, bank, episode, action, key)
 
-            episodes, step = step_groups(one, episodes, own, jax.random.split(k, count))
+            episodes, step = step_groups(one, episodes, part, jax.random.split(k, count))
             parts.append(step)
             after.append(episodes)
         return GameState(tuple(after), key), jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
@@ -208,8 +209,8 @@ class Game:
             "rejections": single(after.memory.guard.rejections),
             "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
         }
-        see = lambda episode: observe(rules.agent, episode.memory)
-        return following, Step(see(following), single(reward), terminated, truncated, see(after), metrics)
+        observed = lambda episode: observe(rules.agent, episode.memory)
+        return following, Step(observed(following), single(reward), terminated, truncated, observed(after), metrics)
 
     def _reward(self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]) -> Array:
         rules = self.config
@@ -227,11 +228,8 @@ class Game:
         return rules.scale * reward
 
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
-        """Uniform actions on half of the environments; on the others Ceres' rule, on half of those two decades
-        bolder.
-
-        What else there is in an action is uniform on all of them.
-        """
+        """Uniform actions in half of the environments, Ceres' rule in a quarter, and a hundredth of its lambda in the
+        last quarter. Numbers of an action other than lambda are uniform in all of them."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
         guard = jax.tree.map(lambda *x: jnp.concatenate(x), *(part.memory.guard for part in state.episodes))
@@ -262,9 +260,9 @@ def make_game(
         kinds: classes of the banks.
         banks: scenes.
         envs: environments of each class.
-        options: of the LM step; the agent has the last word (`AgentConfig.step_options`).
+        options: of the LM step; the agent's configuration overrides them (`AgentConfig.step_options`).
     """
     options = config.agent.step_options(options or StepOptions())
     for kind in kinds:
-        class_layout(kind, options)  # on the host, before anything is traced
+        class_layout(kind, options)  # cached on the host before anything is traced
     return Game(tuple(banks), tuple(kinds), tuple(envs), config, options)

@@ -1,4 +1,4 @@
-"""How good a policy is on a bank: iterations, their tail, failures and final costs."""
+"""Scores of policies on a bank of scenes: iterations, failures and final costs."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ class Score(NamedTuple):
     median: float
     p90: float
     failures: float
-    """Share of the scenes that never get there."""
+    """Fraction of the scenes that never reach the tolerance."""
 
     to_convergence: float
-    """Mean iterations until the solver's own stop rule, the limit where it never fires."""
+    """Mean iterations until the solver's own convergence test, the limit if it never holds."""
 
     end: float
     """Median of the final cost over the best known, less one."""
 
 
 def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int) -> Score:
-    """Of runs on several banks, all scenes alike."""
-    there = np.concatenate([reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)])
-    counted = np.minimum(np.maximum(there, 1), limit)
+    """The score of a policy's runs on several banks; every scene has the same weight."""
+    iterations = np.concatenate([reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)])
+    counted = np.minimum(np.maximum(iterations, 1), limit)
     ends = np.concatenate([run.costs[:, -1] / b - 1 for run, b in zip(runs, best, strict=True)])
     length = np.concatenate([np.where(run.converged, run.iterations, limit) for run in runs])
     return Score(
@@ -43,7 +43,7 @@ def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]],
         geometric_mean=float(np.exp(np.log(counted).mean())),
         median=float(np.median(counted)),
         p90=float(np.percentile(counted, 90)),
-        failures=float(np.mean(~(there <= limit))),
+        failures=float(np.mean(~(iterations <= limit))),
         to_convergence=float(length.mean()),
         end=float(np.median(ends)),
     )
@@ -62,17 +62,17 @@ def evaluate(
     Args:
         kinds: classes of the banks.
         banks: scenes.
-        policy: what chooses lambda.
-        options: of the step; embedded iterations are the caller's choice.
+        policy: chooses lambda.
+        options: of the step.
         tolerance: relative to the best known cost.
-        limit: linear solves of a scene at most.
+        limit: largest number of linear solves of a scene.
     """
     runs = [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
     return score(runs, [np.asarray(bank.best_cost) for bank in banks], tolerance, limit)
 
 
 Runs = list[Trajectories]
-"""Of one policy, on each bank."""
+"""Trajectories of one policy on each bank."""
 
 
 def play_all(
@@ -81,29 +81,35 @@ def play_all(
     policies: Mapping[str, tuple[DampingPolicy, StepOptions]],
     limit: int = 40,
 ) -> dict[str, Runs]:
-    """What every policy does on every scene, by the policy's name."""
+    """Trajectories of every policy on every scene, by the policy's name."""
     return {
         name: [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
         for name, (policy, options) in policies.items()
     }
 
 
+def virtual_best(runs: Sequence[Trajectories], limit: int) -> Trajectories:
+    """The virtual best of several policies on a bank: for each scene the lowest cost after each iteration, and the
+    fewest iterations to convergence, each of the policy that has it. Its dampings are those of the first policy."""
+    return Trajectories(
+        costs=np.min([run.costs for run in runs], axis=0),
+        dampings=runs[0].dampings,
+        iterations=np.min([np.where(run.converged, run.iterations, limit) for run in runs], axis=0),
+        converged=np.any([run.converged for run in runs], axis=0),
+    )
+
+
 def scores(
     policies: Mapping[str, Runs], rules: Mapping[str, Runs], banks: Sequence[Bank], tolerance: float, limit: int
 ) -> dict[str, Score]:
-    """The score of all policies and rules, and under `virtual best` that of the best rule of each scene.
+    """Scores of all policies and rules, and as `virtual best` that of the best rule for each scene.
 
-    Best costs are the lowest that the bank knew or any of all these runs found, the same for all.
+    The best cost of a scene is the lowest one of the bank and of all these runs, the same for all scores.
     """
     runs = {**policies, **rules}
     best = [
         np.min([np.asarray(bank.best_cost), *(run[k].costs[:, -1] for run in runs.values())], axis=0)
         for k, bank in enumerate(banks)
     ]
-    lowest = []
-    for k in range(len(banks)):
-        together = [run[k] for run in rules.values()]
-        pick = lambda name, choose, together=together: choose([getattr(run, name) for run in together], axis=0)
-        ended = np.min([np.where(run.converged, run.iterations, limit) for run in together], axis=0)
-        lowest.append(Trajectories(pick("costs", np.min), together[0].dampings, ended, pick("converged", np.any)))
+    lowest = [virtual_best([run[k] for run in rules.values()], limit) for k in range(len(banks))]
     return {name: score(run, best, tolerance, limit) for name, run in {**runs, "virtual best": lowest}.items()}

@@ -25,19 +25,20 @@ except ModuleNotFoundError:
 
 
 def observation_space(game: Game) -> spaces.Box:
-    """What one scene's observation may be."""
+    """Bounds of one scene's observation."""
     agent = game.config.agent
     limit = FEATURE_LIMIT if agent.observation == "scale-free" else np.inf
     return spaces.Box(-limit, limit, (game.observation_size,), np.float32)
 
 
 def action_space(game: Game) -> spaces.Box:
-    """What one scene's action may be."""
+    """Bounds of one scene's action."""
     return spaces.Box(-1.0, 1.0, (game.action_size,), np.float32)
 
 
 class _Compiled:
-    """The two functions of a game, from and to NumPy. The game is their argument, its banks no constants of them."""
+    """`reset` and `step` of a game with NumPy arrays. The game is an argument of the compiled functions, so that its
+    banks are not constants in them."""
 
     def __init__(self, game: Game) -> None:
         self.game = game
@@ -54,7 +55,7 @@ class _Compiled:
         """One iteration of every scene: a `Step` of NumPy arrays."""
         with jax.enable_x64(self.x64):
             self.state, step = _step(self.game, self.state, jnp.asarray(action, jnp.float32))
-            return jax.tree.map(np.array, step)  # copies: a user may keep them, and write to them
+            return jax.tree.map(np.array, step)  # copies, which callers may keep and write to
 
 
 _reset = jax.jit(lambda game, key: game.reset(key))
@@ -62,14 +63,14 @@ _step = jax.jit(lambda game, state, action: game.step(state, action))
 
 
 class GymVectorGame(gymnasium.vector.VectorEnv):
-    """All scenes of a game. Episodes that end are followed by others in the same step.
+    """All scenes of a game. An episode that ends is followed by another one in the same step.
 
-    Where one ended, `infos` says in `final_obs` what was seen last and in `final_info` the facts about the episode:
-    `length`, `success`, `rejections`, and `ceres`, the iterations that Ceres' rule would have taken.
+    For each episode that ended, `infos` has the last observation in `final_obs` and the metrics of the episode in
+    `final_info`: `length`, `success`, `rejections`, and `ceres`, the iterations that Ceres' rule takes.
     """
 
     def __init__(self, game: Game) -> None:
-        """The game's random numbers start at a seed of the operating system until `reset` is given one."""
+        """Random numbers are seeded by the operating system until `reset` is given a seed."""
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self.num_envs = game.num_envs
         self.single_observation_space, self.single_action_space = observation_space(game), action_space(game)
@@ -84,8 +85,8 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
         """New episodes everywhere.
 
         Args:
-            seed: of all that follows; without one the present random numbers go on.
-            options: there are none.
+            seed: of all random numbers from now on; if None, the current sequence continues.
+            options: not used.
         """
         super().reset(seed=seed)
         observation = self._game().reset(self.np_random)
@@ -96,7 +97,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
         """One iteration of every scene.
 
         Args:
-            actions: a row a scene; numbers beyond -1 or 1 are taken as these.
+            actions: one row per scene; numbers outside of [-1, 1] are clipped.
         """
         if not self._started:
             raise gymnasium.error.ResetNeeded("call reset before step")
@@ -105,7 +106,7 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
         return step.observation, step.reward.astype(np.float64), step.terminated, step.truncated, _infos(step, done)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Lets go of the scenes."""
+        """Releases the memory of the scenes."""
         self._compiled = None
 
     def _game(self) -> _Compiled:
@@ -115,10 +116,10 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
 class GymGame(gymnasium.Env):
     """A game of one scene at a time, a random one of the bank in every episode.
 
-    Where an episode ends, `info` has what `GymVectorGame` has in `final_info`.
+    When an episode ends, `info` has the metrics that `GymVectorGame` has in `final_info`.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - gymnasium's own way
+    metadata = {"render_modes": []}  # noqa: RUF012 - as gymnasium declares it
 
     def __init__(self, game: Game) -> None:
         """
@@ -137,8 +138,8 @@ class GymGame(gymnasium.Env):
         """A new episode.
 
         Args:
-            seed: of all that follows; without one the present random numbers go on.
-            options: there are none.
+            seed: of all random numbers from now on; if None, the current sequence continues.
+            options: not used.
         """
         super().reset(seed=seed)
         observation = self._game().reset(self.np_random)[0]
@@ -149,7 +150,7 @@ class GymGame(gymnasium.Env):
         """One iteration.
 
         Args:
-            action: one number; beyond -1 or 1 it is taken as these.
+            action: numbers outside of [-1, 1] are clipped.
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("call reset before step: no episode is under way")
@@ -160,7 +161,7 @@ class GymGame(gymnasium.Env):
         return step.final_observation[0], float(step.reward[0]), terminated, truncated, info
 
     def close(self) -> None:
-        """Lets go of the scenes."""
+        """Releases the memory of the scenes."""
         self._compiled = None
 
     def _game(self) -> _Compiled:
@@ -183,13 +184,13 @@ def _actions(action: Any, shape: tuple[int, ...] | None) -> np.ndarray:
 
 
 def _infos(step: Any, done: np.ndarray) -> dict[str, Any]:
-    """As gymnasium's own vector environments have it: an array for each name, and under `_name` where it is valid."""
+    """In the form of gymnasium's own vector environments: an array per name, and the mask of its entries as `_name`."""
     if not done.any():
         return {}
     last = np.full(len(done), None, dtype=object)
-    facts: dict[str, np.ndarray] = {}
+    metrics: dict[str, np.ndarray] = {}
     for k in np.flatnonzero(done):
         last[k] = step.final_observation[k].copy()
     for name, values in step.metrics.items():
-        facts[name], facts[f"_{name}"] = np.where(done, values, 0), done.copy()
-    return {"final_obs": last, "_final_obs": done.copy(), "final_info": facts, "_final_info": done.copy()}
+        metrics[name], metrics[f"_{name}"] = np.where(done, values, 0), done.copy()
+    return {"final_obs": last, "_final_obs": done.copy(), "final_info": metrics, "_final_info": done.copy()}

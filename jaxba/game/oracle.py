@@ -1,9 +1,8 @@
-"""A look-ahead oracle: beam search over lambda, the floor that no policy of one lambda an iteration should be expected
-to beat.
+"""A look-ahead oracle: beam search over lambda, an estimate of the fewest iterations that any choice of lambda needs.
 
-It plays every lambda of a grid from every state of the beam and keeps the best, which takes `width x grid` times the
-work of a solve. With a beam of one it is the greedy choice, which loses: the best next cost is not the way to the best
-end.
+It tries every lambda of a grid from every state of the beam and keeps the states of lowest cost, which takes
+`width x grid` times the work of a solve. With a beam of one it is the greedy choice, which needs more iterations: the
+lowest next cost does not lead to the lowest final cost.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 
 GRID = tuple(10.0**decade for decade in (-8, -7, -6, -5, -4, -3, -2, -1, 0))
-"""Lambdas that are tried in every state."""
+"""Lambdas tried from every state."""
 
 WIDTH = 4
-"""States that are kept (issue 3)."""
+"""States kept."""
 
 
 def beam_search(
@@ -45,7 +44,7 @@ def beam_search(
         step: one LM iteration from a state with a lambda; pure.
         start: first state.
         iterations: linear solves in a row.
-        width: states kept after each, those of equal cost last: they are mostly one state under two lambdas.
+        width: states kept after each iteration. States of equal cost come last, since they are mostly the same state.
         grid: lambdas.
     """
     pairs = [(state, damping) for state in range(width) for damping in range(len(grid))]
@@ -60,10 +59,10 @@ def beam_search(
         alive = info.accepted & jnp.isfinite(origin.cost)
         costs = jnp.concatenate([jnp.where(alive, after.cost, jnp.inf), beam.cost])
         order = jnp.argsort(costs)
-        twin = jnp.concatenate([jnp.zeros(1, bool), jnp.diff(costs[order]) <= 0])
-        best = order[jnp.argsort(jnp.where(twin, jnp.inf, costs[order]))[:width]]
-        together = jax.tree.map(lambda new, old: jnp.concatenate([new, old])[best], after, beam)
-        beam = together._replace(cost=costs[best])
+        duplicate = jnp.concatenate([jnp.zeros(1, bool), jnp.diff(costs[order]) <= 0])
+        best = order[jnp.argsort(jnp.where(duplicate, jnp.inf, costs[order]))[:width]]
+        kept = jax.tree.map(lambda new, old: jnp.concatenate([new, old])[best], after, beam)
+        beam = kept._replace(cost=costs[best])
         return beam, beam.cost[0]
 
     costs = lax.scan(body, beam, None, length=iterations)[1]
@@ -77,9 +76,10 @@ def _search(
     layout = class_layout(kind, options)
 
     def one(scene: Bank) -> Array:
-        own = with_scene(layout, scene.scenes.pixels, scene.scenes.mask)
+        seen = with_scene(layout, scene.scenes.pixels, scene.scenes.mask)
         start = state_at(scene.scenes.cameras, scene.scenes.points, scene.initial_cost, options)
-        return beam_search(lambda state, damping: lm_step(own, state, damping, options), start, iterations, width, grid)
+        step = lambda state, damping: lm_step(seen, state, damping, options)
+        return beam_search(step, start, iterations, width, grid)
 
     return lax.map(one, bank)
 
@@ -92,7 +92,7 @@ def oracle(
     width: int = WIDTH,
     grid: tuple[float, ...] = GRID,
 ) -> Trajectories:
-    """The search on every scene of a bank; the lambdas of the winning line are not kept."""
+    """The search on every scene of a bank; the lambdas of the best sequence are not returned."""
     costs = np.asarray(_search(kind, bank, options, iterations, width, grid))
     count = len(costs)
     return Trajectories(costs, np.zeros_like(costs[:, 1:]), np.full(count, iterations), np.zeros(count, bool))

@@ -1,4 +1,4 @@
-"""What a trainer may rely on in a game: a batch of environments behind two pure functions."""
+"""The protocol between trainer and game: a batch of environments as pure functions."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from jaxtyping import Bool, Float
 
 
 class Step(NamedTuple):
-    """What one action of every environment led to."""
+    """Result of one action in every environment."""
 
-    observation: Float[Array, "envs features"]  # to act on next: of a new episode where this one ended
+    observation: Float[Array, "envs features"]  # for the next action; of a new episode if this one ended
     reward: Float[Array, " envs"]
-    terminated: Bool[Array, " envs"]  # the episode ended for good: its value is zero from here on
-    truncated: Bool[Array, " envs"]  # it was cut off: its value is that of `final_observation`
-    final_observation: Float[Array, "envs features"]  # true result of the action, before any reset
-    metrics: dict[str, Float[Array, " envs"]]  # facts about an episode, valid where it ended; the same keys always
+    terminated: Bool[Array, " envs"]  # the episode ended: the value of what follows is zero
+    truncated: Bool[Array, " envs"]  # it was cut off: the value of what follows is that of `final_observation`
+    final_observation: Float[Array, "envs features"]  # after the action, before any reset
+    metrics: dict[str, Float[Array, " envs"]]  # of an episode, valid if it ended; always the same keys
 
 
 @runtime_checkable
@@ -42,7 +42,7 @@ class Environment(Protocol):
         ...
 
     def reset(self, key: Array) -> tuple[Any, Float[Array, "envs features"]]:
-        """State and observations of new episodes. The state carries all further randomness."""
+        """State and observations of new episodes. The state holds the key of all further random numbers."""
         ...
 
     def step(self, state: Any, action: Float[Array, "envs actions"]) -> tuple[Any, Step]:
@@ -50,5 +50,5 @@ class Environment(Protocol):
         ...
 
     def demonstrate(self, state: Any, key: Array) -> Float[Array, "envs actions"]:
-        """Actions that fill the replay buffer before the agent acts: random ones, or those of a rule."""
+        """Actions that fill the replay buffer before training: random, or of a damping rule."""
         ...

@@ -1,8 +1,8 @@
 """Scenes for the game, made by one compiled program: thousands of small problems of equal shape.
 
-A *class* of scenes shares a shape: C cameras and P points at most, a slot for every pair of them, and a mask that says
-which pairs were observed. Smaller scenes leave cameras and points unobserved. What is random inside a class is in
-`SceneFamily`; sizes, motion, depth, noise, wrong matches and how far off the start is are all drawn per scene.
+Scenes of one *class* share a shape: at most C cameras and P points, an observation slot for every pair of a camera and
+a point, and a mask of the pairs that are observed. Smaller scenes leave cameras and points unobserved. Size, motion,
+depth, noise, wrong matches and the error of the start are drawn per scene; `SceneFamily` says from which distributions.
 """
 
 from __future__ import annotations
@@ -19,31 +19,32 @@ from jaxtyping import Bool, Float, Int
 from jaxba.model import camera
 
 SceneFamily = Literal["wide", "paper"]
-"""`wide`: every motion, depth, noise and start below. `paper`: 10 cameras that see 10 points, all of them."""
+"""`wide`: all motions, depths, noises and starts below. `paper`: every camera sees every point."""
 
-KINDS = ("forward", "lateral", "orbit", "photos")
+MOTIONS = ("forward", "lateral", "orbit", "photos")
 """Motions of the cameras of a wide scene, equally often."""
 
 MIN_VIEWS = 5
-"""Cameras with fewer observations are dropped: nine unknowns need five."""
+"""Cameras with fewer observations are removed: nine unknowns need five observations."""
 
 NOISE = (0.05, 3.0)
-"""Sigma of a measurement in pixels, log-uniform (issue 3)."""
+"""Sigma of a measurement in pixels, log-uniform per scene."""
 
 OUTLIERS = (0.4, 1e-3, 0.03)
-"""Share of the scenes with wrong matches, and the smallest and largest share of wrong matches in them."""
+"""Fraction of the scenes with wrong matches, and smallest and largest fraction of wrong matches in these scenes."""
 
-WRONG = (5.0, 100.0)
+OUTLIER_ERROR = (5.0, 100.0)
 """Largest error of a wrong match in pixels, log-uniform per scene."""
 
 FOCAL = (300.0, 4000.0)
-"""Focal length in pixels, log-uniform."""
+"""Focal length in pixels, log-uniform per scene."""
 
 CANDIDATES = 3
-"""Points drawn for each one kept, since many are seen only once."""
+"""Points drawn per point that is kept, since many are seen by one camera only."""
 
 START_ROTATION, START_CENTER, START_DEPTH = (1e-5, 0.03), (1e-3, 0.3), (1e-3, 0.25)
-"""Sigmas of the start, log-uniform: rotations in radians, centres in steps, depths of points relative to them."""
+"""Sigmas of the error of the start, log-uniform per scene: rotations in radians, centres in units of the distance of
+neighbouring cameras, depths of points relative to the true ones."""
 
 
 @dataclass(frozen=True)
@@ -51,13 +52,13 @@ class SceneClass:
     """Scenes of equal shape."""
 
     cameras: int = 10
-    """Largest number of cameras; a wide scene has a random number from 4 on."""
+    """Largest number of cameras; a wide scene has at least 4."""
 
     points: int = 40
-    """Largest number of points; a wide scene has a random number from a quarter of it on."""
+    """Largest number of points; a wide scene has at least a quarter of it."""
 
     family: SceneFamily = "wide"
-    """What is random in them."""
+    """Distributions that the scenes are drawn from."""
 
     def __post_init__(self) -> None:
         if self.cameras < 4 or self.points < 10 or 9 * self.cameras > 512:
@@ -67,7 +68,7 @@ class SceneClass:
 
 
 class Scenes(NamedTuple):
-    """A batch of scenes of one class, in the order of its layout (`slots.class_layout`)."""
+    """A batch of scenes of one class, in the order of its layout (`scene_layout.class_layout`)."""
 
     cameras: Float[Array, "scenes 9 cameras"]  # the start
     points: Float[Array, "scenes 3 points"]  # the last point is the layout's empty one
@@ -85,13 +86,13 @@ class _Rig(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("kind", "count", "dtype"))
 def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
-    """Random scenes; some are useless, which is for the bank to find out.
+    """Random scenes, the unusable ones included; see `scene_bank.draft`.
 
     Args:
         kind: shape and family.
         key: the same key gives the same scenes.
-        count: how many.
-        dtype: of everything.
+        count: number of scenes.
+        dtype: of all numbers.
     """
     one = _paper_scene if kind.family == "paper" else _wide_scene
     scenes = lax.map(lambda k: one(kind, k), jax.random.split(key, count), batch_size=256)
@@ -114,8 +115,8 @@ def _turns(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
     return jnp.moveaxis(camera.rotation_matrix(vectors.T), -1, 0)
 
 
-def _path(kind: Array, key: Array, cameras: int) -> tuple[Array, Array]:
-    """Centres and viewing directions of the four motions, chosen by number; a step is the unit of length."""
+def _path(motion: Array, key: Array, cameras: int) -> tuple[Array, Array]:
+    """Centres and viewing directions of a motion of `MOTIONS`; the distance of neighbours is the unit of length."""
     keys = iter(jax.random.split(key, 12))
     i = jnp.arange(cameras)
     bend = jax.random.uniform(next(keys), minval=-0.12, maxval=0.12)
@@ -135,34 +136,34 @@ def _path(kind: Array, key: Array, cameras: int) -> tuple[Array, Array]:
     height = 0.1 * radius * jax.random.normal(next(keys), (cameras,))
     crowd = jnp.stack([away * jnp.sin(side), height, away * jnp.cos(side)], axis=1)
     gaze = 0.15 * radius * jax.random.normal(next(keys), (cameras, 3))
-    center = jnp.stack([street, street, ring, crowd])[kind]
-    forward = jnp.stack([ahead, aside, -ring + 0.3 * gaze, gaze - crowd])[kind]
+    center = jnp.stack([street, street, ring, crowd])[motion]
+    forward = jnp.stack([ahead, aside, -ring + 0.3 * gaze, gaze - crowd])[motion]
     return center, forward / jnp.linalg.norm(forward, axis=1, keepdims=True)
 
 
 def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
     keys = iter(jax.random.split(key, 24))
     uniform = lambda low, high, shape=(): jax.random.uniform(next(keys), shape, minval=low, maxval=high)
-    number = jax.random.randint(next(keys), (), 0, len(KINDS))
+    motion = jax.random.randint(next(keys), (), 0, len(MOTIONS))
     cameras = jnp.floor(_log_uniform(next(keys), 4.0, kind.cameras + 1.0)).astype(int)
     points = jnp.floor(_log_uniform(next(keys), max(10.0, float(kind.points // 4)), kind.points + 1.0)).astype(int)
     used = jnp.arange(kind.cameras) < cameras
 
-    center, forward = _path(number, next(keys), kind.cameras)
+    center, forward = _path(motion, next(keys), kind.cameras)
     up = jnp.array([0.0, 1.0, 0.0]) + 0.05 * jax.random.normal(next(keys), (kind.cameras, 3))
     focal = _log_uniform(next(keys), *FOCAL) * jnp.exp(
-        jnp.where(number == 3, 0.25, 0.0) * jax.random.normal(next(keys), (kind.cameras,))
+        jnp.where(motion == 3, 0.25, 0.0) * jax.random.normal(next(keys), (kind.cameras,))
     )
     half = jax.random.uniform(next(keys), (2,), minval=0.15, maxval=0.9)  # tangents of half the angles of view
     square = jnp.sum(half**2)
-    bent = jax.random.bernoulli(next(keys), 0.7)
-    k1 = bent * uniform(-0.2, 0.1) / square
-    k2 = bent * uniform(-0.03, 0.03) / square**2
+    distorted = jax.random.bernoulli(next(keys), 0.7)
+    k1 = distorted * uniform(-0.2, 0.1) / square
+    k2 = distorted * uniform(-0.03, 0.03) / square**2
     lens = jnp.stack([focal, jnp.full_like(focal, k1), jnp.full_like(focal, k2)])
     rig = _Rig(_look_at(forward, up), center, lens)
 
-    reference, world = _points(kind, rig, number, cameras, half, next(keys))
-    seen = _visible(rig, world, half) & used[:, None] & _matched(kind, number, reference, next(keys))
+    reference, world = _points(kind, rig, motion, cameras, half, next(keys))
+    seen = _visible(rig, world, half) & used[:, None] & _matched(kind, motion, reference, next(keys))
     first = jnp.argsort(jnp.sum(seen, axis=0) < 2, stable=True)[: kind.points]  # tracks before single views
     reference, world = reference[first], world[first]
     seen = _enough(seen[:, first] & (jnp.arange(kind.points) < points))
@@ -174,9 +175,9 @@ def _wide_scene(kind: SceneClass, key: Array) -> Scenes:
 
 
 def _points(
-    kind: SceneClass, rig: _Rig, number: Array, cameras: Array, half: Array, key: Array
+    kind: SceneClass, rig: _Rig, motion: Array, cameras: Array, half: Array, key: Array
 ) -> tuple[Int[Array, " candidates"], Float[Array, "candidates 3"]]:
-    """Points on random rays of a random camera each; depths over up to two decades, or around an object."""
+    """Each point on a random ray of a random camera, at depths over up to two decades or around an object."""
     a, b, c, d, e = jax.random.split(key, 5)
     count = CANDIDATES * kind.points
     reference = jax.random.randint(a, (count,), 0, cameras)
@@ -186,7 +187,7 @@ def _points(
     along = jax.random.uniform(e, (count,))
     focus = jnp.linalg.norm(rig.center[reference], axis=1)
     around = focus * jnp.exp((along - 0.5) * jnp.minimum(jnp.log(spread), 1.5))
-    depth = jnp.where(number >= 2, around, near * spread**along)
+    depth = jnp.where(motion >= 2, around, near * spread**along)
     local = depth[:, None] * jnp.concatenate([ray, -jnp.ones((count, 1))], axis=1)
     return reference, rig.center[reference] + jnp.einsum("nji,nj->ni", rig.rotation[reference], local)
 
@@ -205,26 +206,26 @@ def _project(rig: _Rig, world: Float[Array, "points 3"]) -> Float[Array, "2 came
 
 
 def _visible(rig: _Rig, world: Float[Array, "points 3"], half: Array) -> Bool[Array, "cameras points"]:
-    """In front of the camera, not at its nose, and inside the image."""
+    """In front of the camera, not too close to it, and inside the image."""
     local = _local(rig, world)
     depth = -local[..., 2]
     inside = jnp.all(jnp.abs(local[..., :2]) <= half * depth[..., None], axis=-1)
     return (depth > 0.3) & inside
 
 
-def _matched(kind: SceneClass, number: Array, reference: Array, key: Array) -> Bool[Array, "cameras _"]:
-    """Which of the possible views were matched: tracks of random length along a path, random ones of photos."""
+def _matched(kind: SceneClass, motion: Array, reference: Array, key: Array) -> Bool[Array, "cameras _"]:
+    """Which of the possible views are matched: tracks of random length along a path, random views of photos."""
     a, b, c, d = jax.random.split(key, 4)
     window = _log_uniform(a, 1.0, float(kind.cameras))
     reach = jnp.maximum(1.0, window * _log_uniform(b, 0.5, 2.0, reference.shape))
     near = jnp.abs(jnp.arange(kind.cameras)[:, None] - reference) <= reach
     keep = jax.random.uniform(c, near.shape) < jax.random.uniform(d, minval=0.35, maxval=1.0)
     own = jnp.arange(kind.cameras)[:, None] == reference
-    return (near | (number >= 2)) & (keep | own)
+    return (near | (motion >= 2)) & (keep | own)
 
 
 def _enough(seen: Bool[Array, "cameras points"]) -> Bool[Array, "cameras points"]:
-    """Drops points that one camera sees and cameras that see too little, until nothing changes."""
+    """Repeatedly removes points that one camera sees and cameras with fewer than `MIN_VIEWS` observations."""
 
     def prune(_: Array, seen: Array) -> Array:
         seen = seen & (jnp.sum(seen, axis=0) >= 2)
@@ -238,15 +239,15 @@ def _measure(rig: _Rig, world: Array, noise: Array, wrong: Array, key: Array) ->
     a, b, c, d = jax.random.split(key, 4)
     pixels = _project(rig, world)
     pixels = pixels + noise * jax.random.normal(a, pixels.shape)
-    moved = _log_uniform(b, *WRONG) * jax.random.uniform(c, pixels.shape, minval=-1.0, maxval=1.0)
+    moved = _log_uniform(b, *OUTLIER_ERROR) * jax.random.uniform(c, pixels.shape, minval=-1.0, maxval=1.0)
     return pixels + moved * jax.random.bernoulli(d, wrong, pixels.shape[1:])
 
 
 def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[Array, Array]:
-    """Cameras and points off the truth: drift along the path, own errors, a wrong lens, wrong depths."""
+    """Start with errors: drift along the path, independent errors of cameras and points, wrong lens, wrong depths."""
     keys = iter(jax.random.split(key, 24))
     cameras = rig.center.shape[0]
-    sometimes = lambda share, low, high: jax.random.bernoulli(next(keys), share) * _log_uniform(next(keys), low, high)
+    sometimes = lambda chance, low, high: jax.random.bernoulli(next(keys), chance) * _log_uniform(next(keys), low, high)
     turn = jnp.cumsum(sometimes(0.5, 1e-5, 0.02) * jax.random.normal(next(keys), (cameras, 3)), axis=0)
     turns = _turns(turn)
     pace = jnp.exp(jnp.cumsum(sometimes(0.3, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras, 1)), axis=0))
@@ -267,10 +268,10 @@ def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[
     rotation = _turns(noise) @ rig.rotation @ jnp.swapaxes(turns, 1, 2)
     center = moved + _log_uniform(next(keys), *START_CENTER) * jax.random.normal(next(keys), moved.shape)
     common = sometimes(0.5, 0.01, 0.4) * jax.random.uniform(next(keys), minval=-1.0, maxval=1.0)
-    own = sometimes(0.5, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras,))
+    individual = sometimes(0.5, 1e-3, 0.1) * jax.random.normal(next(keys), (cameras,))
     flat = jax.random.bernoulli(next(keys), 0.6)
     focal, k1, k2 = rig.intrinsics
-    lens = jnp.stack([focal * jnp.exp(common + own), k1 * (1 - flat), k2 * (1 - flat)])
+    lens = jnp.stack([focal * jnp.exp(common + individual), k1 * (1 - flat), k2 * (1 - flat)])
     return _camera_columns(rotation, center, lens), points
 
 
@@ -280,7 +281,7 @@ def _camera_columns(rotation: Array, center: Array, lens: Array) -> Float[Array,
 
 
 def _angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
-    """Angle-axis vectors with angles in [0, pi], by way of the quaternion's largest entry (Shepperd 1978)."""
+    """Angle-axis vectors with angles in [0, pi], computed from the quaternion's largest entry (Shepperd 1978)."""
     m = rotation
     trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
     squares = jnp.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
@@ -307,11 +308,11 @@ def _angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
 
 
 def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
-    """Cameras on a line before a cloud of points, all seen by all; half a pixel of noise at 500 pixels of focal length.
+    """Cameras on a line, all of which see all points; focal length 500 pixels, noise of half a pixel.
 
     Source: the released code of Belder et al. 2023 (cameras on x in [-2, 2], identity rotation; errors of the start
-    0.005 on quaternions, 0.05 on centres, 0.01 on points), but unbiased, and with the Gaussian noise of the paper's
-    equation 1, without which the best cost is zero and no relative tolerance makes sense.
+    0.005 on quaternions, 0.05 on centres, 0.01 on points), but with errors of mean zero, and with the Gaussian noise of
+    the paper's equation 1, without which the best cost is zero and a relative tolerance is meaningless.
     """
     a, b, c, d, e, f = jax.random.split(key, 6)
     center = jnp.zeros((kind.cameras, 3)).at[:, 0].set(jax.random.uniform(a, (kind.cameras,), minval=-2, maxval=2))
@@ -328,7 +329,7 @@ def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
 
 
 def _assemble(start: tuple[Array, Array], pixels: Array, seen: Bool[Array, "cameras points"]) -> Scenes:
-    """Slot order: camera by camera, a column per point, the last one empty."""
+    """Observations in the order of the slots: camera by camera, the points of each, and an empty one at the end."""
     cameras, points = start
     pad = lambda x: jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, 1)])
     mask = pad(seen).reshape(-1)

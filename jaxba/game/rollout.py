@@ -1,6 +1,6 @@
 """Plays a damping policy on every scene of a bank, many at a time, each to its end.
 
-A compiled loop over lanes: where a scene ends, its lane takes the next one, so that no lane waits for the slowest
+A compiled loop over lanes: when a scene ends, its lane starts the next one, so that no lane waits for the slowest
 scene.
 """
 
@@ -27,11 +27,11 @@ from jaxba.problem.options import StepOptions
 T = TypeVar("T")
 
 LANES = 128
-"""Scenes in play at a time."""
+"""Scenes solved at a time."""
 
 GROUP = 8
-"""Scenes that step together. Trials and camera rounds last as long as the slowest scene of a group needs them, and
-arrays of this size stay in a core's cache: 8 scenes of 10 x 40 took no longer a scene than 64 did."""
+"""Scenes that step together on a CPU. Trials and camera rounds of a group last until its slowest scene is done, and
+arrays of this size stay in a core's cache: 8 scenes of 10 x 40 took no more time per scene than 64."""
 
 
 def step_groups(function: Callable[..., T], *arguments: Any) -> T:
@@ -41,15 +41,15 @@ def step_groups(function: Callable[..., T], *arguments: Any) -> T:
     count = jax.tree.leaves(arguments)[0].shape[0]
     if count <= GROUP:
         return jax.vmap(function)(*arguments)
-    # whole groups only: `lax.map` would run what is left over beside the others, and two batched factorisations at a
-    # time wait for each other for ever where XLA has two threads
+    # whole groups only: `lax.map` would run the remainder at the same time as the groups, and two batched
+    # factorisations at a time can deadlock if XLA has two threads
     rows = jnp.minimum(jnp.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
     found = lax.map(lambda a: jax.vmap(function)(*a), jax.tree.map(lambda x: x[rows], arguments))
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
 
 
 class Trajectories(NamedTuple):
-    """What a policy did on every scene; NumPy arrays."""
+    """Costs and lambdas of a policy on every scene; NumPy arrays."""
 
     costs: Float[np.ndarray, "scenes iterations"]
     """Accepted cost after each iteration, the start first; constant after the end."""
@@ -61,7 +61,7 @@ class Trajectories(NamedTuple):
     """Linear solves until the end."""
 
     converged: Bool[np.ndarray, " scenes"]
-    """Whether it ended by its own stop rule and not by the limit."""
+    """Whether the convergence test ended it, and not the limit."""
 
 
 class _Lane(NamedTuple):
@@ -91,8 +91,8 @@ def play(
         bank: scenes with their `ProblemInfo`.
         policy: chooses lambda; a pytree, so that policies of one class share a program.
         options: of the steps.
-        limit: linear solves a scene at most.
-        ftol: an accepted step that lowers the cost by less, and is not short for its damping, ends a scene.
+        limit: largest number of linear solves per scene.
+        ftol: relative decrease of an accepted step below which a scene has converged (`converged_in_cost`).
     """
     loop = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
     found = jax.tree.map(np.asarray, (loop.costs, loop.dampings, loop.iterations, loop.converged))
@@ -110,7 +110,7 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
     lanes = min(LANES, count)
 
     def fresh(scene: Int[Array, ""]) -> _Lane:
-        at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)
+        at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)  # idle lanes repeat the last
         start = at(bank.scenes)
         policy_state, damping = policy.init(at(bank.info))
         state = state_at(start.cameras, start.points, at(bank.initial_cost), options)
@@ -118,15 +118,15 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
 
     def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:
         row = jnp.minimum(lane.scene, count - 1)
-        own = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
+        seen = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
         effort = effort_of(policy, lane.policy)
-        state, step = lm_step(own, lane.state, lane.damping, options, policy.min_gain, lane.iteration, effort)
+        state, step = lm_step(seen, lane.state, lane.damping, options, policy.min_gain, lane.iteration, effort)
         policy_state, damping = policy.propose(lane.policy, step)
         return _Lane(lane.scene, state, policy_state, damping, lane.iteration + 1), step
 
     def body(loop: _Loop) -> _Loop:
         lane, step = step_groups(advance, loop.lane)
-        row = jnp.minimum(lane.scene, count)  # idle lanes write to a row that nobody reads
+        row = jnp.minimum(lane.scene, count)  # idle lanes write to an extra row that is dropped
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, ftol)
         done = converged | (lane.iteration >= limit)
         costs = loop.costs.at[row, lane.iteration - 1].set(step.cost)

@@ -1,8 +1,8 @@
-"""The bank of scenes that the game is played on, and the best cost known for each.
+"""The bank of scenes that the game is played on, and the best known cost of each.
 
-Scenes are made in one compiled program, solved by a portfolio of hand-written rules with embedded point iterations, run
-long, and sieved: what no rule brings to an end, what is solved at the start and what is numerically absurd teaches
-nothing. The best cost of a scene ends its episodes in training. Nothing that a policy sees depends on it.
+Scenes are made in one compiled program and solved by a portfolio of hand-written rules with embedded point iterations.
+Those that no rule solves, that are solved at the start or that are numerically meaningless are left out. Reaching the
+best known cost ends an episode in training. No observation of a policy depends on it.
 """
 
 from __future__ import annotations
@@ -28,44 +28,43 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, Refinement, StepOptions
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
-"""Rules whose best cost counts, each with point iterations."""
+"""Rules whose lowest cost is the best known one, each with point iterations."""
 
 PORTFOLIO_ITERATIONS = 50
-"""Linear solves of each rule."""
+"""Largest number of linear solves of each rule."""
 
 PORTFOLIO_FTOL = 1e-7
-"""Relative decrease of an accepted step that ends a rule's run, a decade below the solver's own."""
+"""Relative decrease of an accepted step that ends a rule's run, a tenth of the solver's default."""
 
 MIN_RATIO, MAX_RATIO = 1.01, 1e6
-"""Initial over best cost of a scene that is kept. Four of six models of COLMAP at hand begin between 1.04 and 1.1, so
-that the 1.1 first asked for would leave their like out."""
+"""Range of initial over best cost of a usable scene. The ratio of four of six COLMAP models is between 1.04 and 1.1."""
 
-SMALLEST_COST_SHARE = 1e-9
-"""... and its best cost over the cost of one pixel an observation: below, rounding decides."""
+SMALLEST_COST = 1e-9
+"""Smallest best cost per observation of a usable scene, pixels squared: below, rounding errors dominate."""
 
 MIN_OBSERVATIONS = 30
-"""Smaller scenes are not even tried ..."""
+"""Smallest number of observations of a scene that is solved at all."""
 
 MAX_ERROR_ANGLE = 0.2
-"""... nor those whose start is off by more, root mean square, relative to the focal length: points near the cameras'
-planes."""
+"""Largest root mean square error of a scene that is solved at all, relative to the focal length. It is larger if points
+are close to the plane of a camera."""
 
 EASY_ENOUGH = 40
-"""Iterations in which at least one rule must come within 1e-3 of the best cost."""
+"""Iterations in which at least one rule must come within 1e-3 of the best cost of a usable scene."""
 
 
 class Bank(NamedTuple):
-    """Scenes with what is known of them. A row is a scene."""
+    """Scenes and what is known about them. A row is a scene."""
 
     scenes: Scenes
     initial_cost: Float[Array, " scenes"]
     best_cost: Float[Array, " scenes"]
     info: ProblemInfo  # a field per scene
-    ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule, with the bank's steps, to the game's tolerance
+    ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule with the portfolio's steps, to the game's tolerance
 
 
 def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
-    """What a policy may know of each scene before the first iteration."""
+    """What a policy knows about each scene before the first iteration."""
     count = len(scenes.mask)
     grid = scenes.mask.reshape(count, kind.cameras, kind.points + 1)
     whole = lambda x: x.astype(jnp.int32)
@@ -101,23 +100,23 @@ class BankConfig:
     """Shapes of scenes; each is a program of its own."""
 
     scenes: tuple[int, ...] = (12000,)
-    """Scenes drawn in each class, before sieving."""
+    """Scenes drawn in each class; the usable ones are kept."""
 
     refine_points: int = 3
     """Embedded point iterations of the portfolio."""
 
     warm_share: float = 0.0
-    """Share of the scenes that begin where a few heavily damped iterations lead (`warm.py`)."""
+    """Fraction of the scenes that begin after a few heavily damped iterations (`warm_starts.py`)."""
 
     dtype: str = "float64"
-    """Arithmetic of the game's solves."""
+    """Floating point type of the game's solves."""
 
     intrinsics: Intrinsics = "free"
-    """Whether focal lengths and distortions are unknowns of the game's solves."""
+    """Whether focal lengths and distortions are optimised in the game's solves."""
 
     @property
     def options(self) -> StepOptions:
-        """Of the portfolio's steps; those of plain rules without the point iterations."""
+        """Of the portfolio's steps."""
         return StepOptions(refinement=Refinement(points=self.refine_points), intrinsics=self.intrinsics)
 
     def __post_init__(self) -> None:
@@ -127,19 +126,19 @@ class BankConfig:
             raise ValueError("every class needs at least one scene")
         if not 0 <= self.warm_share <= 1:
             raise ValueError(f"warm_share must be 0 to 1, is {self.warm_share}")
-        _ = self.options  # refuses what makes no step
+        _ = self.options  # raises ValueError if impossible
 
 
 class TooFewScenes(ValueError):
-    """Of those drawn. The message is one line for a person."""
+    """Too few of the scenes drawn are usable. The message is one line for a person."""
 
 
 class Draft(NamedTuple):
-    """Scenes of one class with the runs of the portfolio, before sieving."""
+    """All scenes of one class with the runs of the portfolio."""
 
     bank: Bank
     runs: dict[str, Trajectories]
-    useful: np.ndarray
+    usable: np.ndarray
 
 
 def draft(
@@ -162,11 +161,11 @@ def draft(
         count: scenes drawn.
         options: of the steps.
         limit: iterations of an episode, for the scenes' `ProblemInfo`.
-        dtype: arithmetic.
+        dtype: floating point type.
         rules: the portfolio.
-        on_rule: told when a rule begins.
-        warm_share: share of the scenes with a warm start.
-        tolerance: that the first rule's iterations are counted to.
+        on_rule: called with the name of a rule when it begins.
+        warm_share: fraction of the scenes with a warm start.
+        tolerance: to which the first rule's iterations are counted.
     """
     scenes = make_scenes(kind, key, count, dtype)
     initial = initial_costs(kind, scenes)
@@ -187,13 +186,13 @@ def draft(
     bank = bank._replace(best_cost=jnp.asarray(best), ceres_iterations=jnp.asarray(to_best))
     ratio = np.asarray(initial) / best
     soonest = np.min([reach(run.costs, best, 1e-3) for run in runs.values()], axis=0)
-    floor = SMALLEST_COST_SHARE * np.asarray(info.observations)
-    useful = (ratio > MIN_RATIO) & (ratio < MAX_RATIO) & (soonest <= EASY_ENOUGH) & (best > floor)
-    return Draft(bank, runs, useful)
+    floor = SMALLEST_COST * np.asarray(info.observations)
+    usable = (ratio > MIN_RATIO) & (ratio < MAX_RATIO) & (soonest <= EASY_ENOUGH) & (best > floor)
+    return Draft(bank, runs, usable)
 
 
 class Split(NamedTuple):
-    """Scenes to train on, and scenes that training never sees."""
+    """Scenes to train on, and held-out scenes."""
 
     train: Bank
     held_out: Bank
@@ -204,51 +203,53 @@ def make_banks(
     key: Array,
     options: StepOptions,
     limit: int,
-    on_progress: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
     tolerance: float = 1e-3,
 ) -> list[Split]:
-    """Draws, solves, sieves and splits the scenes of every class.
+    """Draws and solves scenes of every class, and splits the usable ones.
 
     Args:
-        config: which and how many.
+        config: classes and numbers of scenes.
         key: the same key gives the same banks.
         options: of the portfolio's steps.
         limit: iterations of an episode.
-        on_progress: told in words what begins.
-        tolerance: of the game; which scenes are of use does not depend on it.
+        report: called with a line of text when something begins that takes a while.
+        tolerance: of the game; it does not change which scenes are usable.
 
     Raises:
-        TooFewScenes: none of a class would be left to train on.
+        TooFewScenes: no scene of a class would be left to train on.
     """
     splits = []
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
         where = f"{kind.cameras} cameras x {kind.points} points"
-        say = lambda rule, where=where, count=count: on_progress(f"{count} scenes of {where}: {rule}")
-        own = jax.random.fold_in(key, number and MORE_CLASSES + number)
-        made = draft(kind, own, count, options, limit, config.dtype, PORTFOLIO, say, config.warm_share, tolerance)
-        rows = np.flatnonzero(made.useful)
+        on_rule = lambda rule, where=where, count=count: report(f"{count} scenes of {where}: {rule}")
+        class_key = jax.random.fold_in(key, number and MORE_CLASSES + number)
+        made = draft(
+            kind, class_key, count, options, limit, config.dtype, PORTFOLIO, on_rule, config.warm_share, tolerance
+        )
+        rows = np.flatnonzero(made.usable)
         held = max(1, round(HELD_OUT * len(rows)))
         if len(rows) <= held:
-            raise TooFewScenes(f"only {len(rows)} of {count} scenes of {where} are of use: draw more")
-        splits.append(Split(sieve(made.bank, rows[held:]), sieve(made.bank, rows[:held])))
+            raise TooFewScenes(f"only {len(rows)} of {count} scenes of {where} are usable: draw more")
+        splits.append(Split(select(made.bank, rows[held:]), select(made.bank, rows[:held])))
     return splits
 
 
 MORE_CLASSES = 2**30
-"""Offset of the random streams of all classes but the first from those of the agents, which begin at 1 (train.py)."""
+"""Offset of the random streams of all classes but the first from those of the agents, which begin at 1 (driver.py)."""
 
 HELD_OUT = 0.1
-"""Share of the useful scenes that training never sees."""
+"""Fraction of the usable scenes that is held out."""
 
 
 def reach(
-    costs: Float[np.ndarray, "scenes iterations"], best: Float[np.ndarray, " scenes"], share: float
+    costs: Float[np.ndarray, "scenes iterations"], best: Float[np.ndarray, " scenes"], tolerance: float
 ) -> np.ndarray:
-    """Iterations until the accepted cost is at most `best (1 + share)`; infinite where it never is."""
-    there = costs <= best[:, None] * (1 + share)
-    return np.where(there.any(axis=1), there.argmax(axis=1), np.inf)
+    """Iterations until the accepted cost is at most `best (1 + tolerance)`; infinite if it never is."""
+    reached = costs <= best[:, None] * (1 + tolerance)
+    return np.where(reached.any(axis=1), reached.argmax(axis=1), np.inf)
 
 
-def sieve(bank: Bank, rows: Int[np.ndarray, " kept"] | Bool[np.ndarray, " scenes"]) -> Bank:
-    """The scenes of some rows."""
+def select(bank: Bank, rows: Int[np.ndarray, " kept"] | Bool[np.ndarray, " scenes"]) -> Bank:
+    """The scenes of these rows."""
     return jax.tree.map(lambda x: x[jnp.asarray(rows)], bank)

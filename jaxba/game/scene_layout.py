@@ -1,4 +1,4 @@
-"""The layout that all scenes of a class share, and one scene's observations in it."""
+"""The layout that all scenes of a class share, and how a scene's observations are put into it."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from jaxba.typing import AnyArray
 
 
 def class_layout(kind: SceneClass, options: StepOptions) -> Layout:
-    """Slots for every pair of a camera and a point; scenes put their own pixels and mask in (`with_scene`).
+    """A layout with an observation slot for every pair of a camera and a point; see `with_scene`.
 
-    Random clusters, where the options ask for them, are those of a scene in which everybody sees everything, so that
+    Random clusters, if the options ask for them, are those of a scene in which every camera sees every point, so that
     all scenes of a class share them.
     """
     return _layout(kind, options.cluster_cameras)
@@ -40,7 +40,7 @@ def _layout(kind: SceneClass, partitions: int | None) -> Layout:
 
 
 def with_scene(layout: Layout, pixels: Float[AnyArray, "2 slots"], mask: Bool[AnyArray, " slots"]) -> Layout:
-    """The class's layout with one scene's observations."""
+    """The layout of the class with one scene's observations."""
     cameras = layout.num_cameras
     seen = jnp.any(mask.reshape(cameras, -1), axis=1)
     return replace(layout, pixels=pixels, slot_mask=mask, camera_seen=seen)

@@ -1,9 +1,9 @@
-"""Warm starts: scenes that somebody has already worked on.
+"""Warm starts: scenes that begin after a few heavily damped iterations.
 
 Real problems mostly begin where an incremental reconstruction ended: each camera and its points agree well with their
-neighbours, and what is left lies along the directions in which the whole bends easily. Errors drawn independently for
-cameras and points are nothing like it. So a share of the scenes begins where a few heavily damped iterations end: these
-remove what is stiff and leave what is weak.
+neighbours, and the remaining error lies along directions of small curvature. Errors drawn independently for cameras and
+points are different. So a fraction of the scenes begins after a few heavily damped iterations, which remove the error
+along directions of large curvature and leave the rest.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 
 ITERATIONS = 10
-"""Most iterations that a warm start has behind it; their number is uniform from one on."""
+"""Largest number of iterations before a warm start; the number is uniform from one on."""
 
 DAMPING = (1e-4, 1.0)
-"""Lambda of these iterations, log-uniform per scene: from Ceres' first one to one that holds most of a scene."""
+"""Lambda of these iterations, log-uniform per scene: from Ceres' first one to one at which damping dominates."""
 
 
 @functools.partial(jax.jit, static_argnames=("kind", "options"))
@@ -35,17 +35,17 @@ def warm_starts(
     scenes: Scenes,
     initial: Float[Array, " scenes"],
     key: Array,
-    share: Float[Array, ""] | float,
+    fraction: Float[Array, ""] | float,
     options: StepOptions,
 ) -> tuple[Scenes, Float[Array, " scenes"]]:
-    """Moves the start of a share of the scenes to where a few heavily damped iterations lead.
+    """Moves the start of a fraction of the scenes by a few heavily damped iterations.
 
     Args:
         kind: class of the scenes.
         scenes: with starts as drawn.
-        initial: their costs, pixels squared.
+        initial: costs of these starts, pixels squared.
         key: random key.
-        share: of the scenes that are moved, each chosen at random.
+        fraction: of the scenes that are moved, chosen at random.
         options: of the steps.
 
     Returns:
@@ -54,16 +54,16 @@ def warm_starts(
     layout = class_layout(kind, options)
     a, b, c = jax.random.split(key, 3)
     rows = (len(initial),)
-    count = jax.random.randint(a, rows, 1, ITERATIONS + 1) * jax.random.bernoulli(b, share, rows)
+    count = jax.random.randint(a, rows, 1, ITERATIONS + 1) * jax.random.bernoulli(b, fraction, rows)
     low, high = (jnp.log(jnp.asarray(x, initial.dtype)) for x in DAMPING)
     damping = jnp.exp(jax.random.uniform(c, rows, initial.dtype, low, high))
 
     def one(scene: Scenes, cost: Array, count: Array, damping: Array) -> LMState:
-        own = with_scene(layout, scene.pixels, scene.mask)
+        seen = with_scene(layout, scene.pixels, scene.mask)
 
-        def body(turn: Array, state: LMState) -> LMState:
-            after, _ = lm_step(own, state, damping, options, 0.0, turn)
-            return jax.tree.map(lambda new, old: jnp.where(turn < count, new, old), after, state)
+        def body(iteration: Array, state: LMState) -> LMState:
+            after, _ = lm_step(seen, state, damping, options, 0.0, iteration)
+            return jax.tree.map(lambda new, old: jnp.where(iteration < count, new, old), after, state)
 
         return lax.fori_loop(0, ITERATIONS, body, state_at(scene.cameras, scene.points, cost, options))
 

@@ -24,6 +24,7 @@ from jaxba.model import camera
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.fusion import compute_in_one_loop
+from jaxba.structure.conventions import components_first
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_each, take_rows, tree_sum
 from jaxba.structure.shared_intrinsics import LensTies
@@ -172,7 +173,7 @@ def project_to_points(
     layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras 9"]
 ) -> list[Array]:
     """`sum Y^T x` over each point's slots."""
-    at_slot = take(x.T, layout.slot_camera)
+    at_slot = take(components_first(x), layout.slot_camera)
 
     def inner(at_slot: Array, projected: list[list[Array]], jacobian: list[list[Array]]) -> list[Array]:
         over, under = (sum(row[a] * at_slot[a] for a in range(9)) for row in jacobian)
@@ -185,7 +186,7 @@ def jacobian_product(
     layout: Layout, linear: Linearization, cameras: Float[Array, "cameras 9"], points: Float[Array, "3 points"]
 ) -> list[Array]:
     """`J d` of every slot, two vectors, pixels."""
-    by_camera, by_point = take_each(cameras.T, layout.slot_camera), take_each(points, layout.slot_point)
+    by_camera, by_point = take_each(components_first(cameras), layout.slot_camera), take_each(points, layout.slot_point)
     rows = zip(linear.camera_jacobian, linear.point_jacobian, strict=True)
     dot = lambda a, b: functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
     return [dot(c, by_camera) + dot(p, by_point) for c, p in rows]

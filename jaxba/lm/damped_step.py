@@ -29,6 +29,7 @@ from jaxba.lm.method import DampedSystem, MethodStep, StepMethod
 from jaxba.model import camera
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
+from jaxba.structure.conventions import components_first
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 
@@ -85,7 +86,7 @@ def solve_step(
     if not found.residual_orthogonal:
         damped = slope - sum(jnp.sum(m * m) for m in jacobian_product(layout, linear, step, point_step))
     return Step(
-        camera_step.T,
+        components_first(camera_step),
         point_step,
         slope,
         damped,

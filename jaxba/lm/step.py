@@ -23,6 +23,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import Candidate
 from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.subproblems import Whole
+from jaxba.structure.conventions import components_first
 from jaxba.structure.layout import Layout
 from jaxba.typing import AnyArray
 
@@ -43,10 +44,10 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
         options: only the loss matters, for the cost.
         dtype: floating point type of the solve; the problem's own when None.
     """
-    cameras = jnp.asarray(problem.cameras, dtype).T
+    cameras = components_first(jnp.asarray(problem.cameras, dtype))
     order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
     # padding points name an index out of range; they rest at the origin
-    points = jnp.asarray(problem.points, dtype).at[order].get(mode="fill", fill_value=0).T
+    points = components_first(jnp.asarray(problem.points, dtype).at[order].get(mode="fill", fill_value=0))
     return state_at(cameras, points, cost(layout, cameras, points, options.loss), options)
 
 

@@ -40,6 +40,7 @@ from jaxba.refinement.acceptance import NEGLIGIBLE
 from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.points import PreviousPoints, refine_points
 from jaxba.refinement.subproblems import Clusters
+from jaxba.structure.conventions import components_first
 from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import take, total
@@ -177,7 +178,9 @@ def _cluster_steps(
     curvatures = parts.sums(moved[0] * moved[0] + moved[1] * moved[1])
     gradient_max = largest_gradient(eliminated, system, coordinates)
     none = jnp.zeros((), jnp.int32), jnp.zeros_like(gradient_max)
-    return Step(coordinates.given(moves).T, point_moves, slopes, slopes - curvatures, gradient_max, *none)
+    return Step(
+        components_first(coordinates.given(moves)), point_moves, slopes, slopes - curvatures, gradient_max, *none
+    )
 
 
 def _separators(

@@ -1,5 +1,2 @@
-"""Every table and figure of the seed paper (Belder, Vivanti, Tal, ICCV 2023) from one command, `jaxba-paper`.
-
-Part of the package and not of `benchmarks/`, since the command must work where only the package is installed, and since
-it brings data (presets) and code (the Zero-net) that are no measurements of this repository's speed.
-"""
+"""Reproduction of all tables and figures of Belder, Vivanti, Tal, "A Game of Bundle Adjustment - Learning Efficient
+Convergence", ICCV 2023, with the command `jaxba-paper`."""

@@ -1,6 +1,6 @@
-"""The agents that the tables compare: one preset, one thing changed in each, all on the same scenes.
+"""The trained agents that the tables compare: one configuration with one change in each, all on the same scenes.
 
-An agent is trained by `jaxba.game.train`, in a folder of its own inside the run's, and goes on there after a kill.
+Each agent is trained in its own folder inside the folder of the run. An interrupted training continues there.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxba.damping import LearnedPolicy, load_policy, save_policy
 from jaxba.game.env import Game, make_game
-from jaxba.game.scene_bank import Bank, Split, sieve
+from jaxba.game.scene_bank import Bank, Split, select
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions
@@ -24,11 +24,13 @@ from jaxba.training import driver, task
 from jaxba.training.config import TrainConfig
 
 POLICY = "policy.safetensors"
-SCENES = "scenes"
-"""Folder of the scenes that all agents share."""
+"""File of a trained policy."""
 
-YARDSTICKS = ("ceres",)
-"""Rules that training logs are measured against; the tables have their own."""
+SCENES = "scenes"
+"""Folder of the scenes, which all agents share."""
+
+BASELINES = ("ceres",)
+"""What training logs are compared with; the tables have baselines of their own."""
 
 
 @dataclass(frozen=True)
@@ -36,55 +38,55 @@ class Agent:
     """One kind of agent."""
 
     name: str
-    """In records and folders."""
+    """Name in records and folders."""
 
     overrides: tuple[str, ...] = ()
-    """What is changed about the paper's own agent."""
+    """Settings (`key=value`) that differ from the paper's agent."""
 
     few_scenes: bool = False
-    """Whether it is trained on as few scenes as the paper's."""
+    """Whether it is trained on as few scenes as the paper's agent."""
 
 
 OURS = Agent("agent")
-"""The paper's agent as the preset reads the paper."""
+"""The paper's agent, as the configuration interprets the paper."""
 
 FEW = Agent("agent-ten", few_scenes=True)
 REDUCTION = Agent("agent-reduction", ("game.reward=reduction",))
 REVERSED = Agent("agent-reversed", ("game.reward=reversed", "game.agent.observation=duration"))
 
 
-def of_state(size: int) -> Agent:
-    """The agent that sees so many last errors."""
+def with_state_size(size: int) -> Agent:
+    """The agent that observes the last `size` errors."""
     return OURS if size == PAPER_STATE else Agent(f"agent-state-{size}", (f"game.agent.history={size}",))
 
 
 def train_config(config: PaperConfig, agent: Agent, seed: int) -> TrainConfig:
-    """Of one training run: one agent, so that none is picked among several.
+    """Configuration of one training run, which trains one agent, so that no choice is made among several.
 
     Raises:
-        SettingsError: a wrong override.
+        SettingsError: an override is invalid.
     """
     found = train_configs.load(config.agents.preset, (*config.agents.overrides, *agent.overrides, "seeds=1"))
-    return replace(found, seed=config.seed + seed)  # the agent's: the scenes are those of the shared folder
+    return replace(found, seed=config.seed + seed)  # seed of the agent; the scenes are shared
 
 
 def trained(
-    config: PaperConfig, agent: Agent, seed: int, folder: Path, say: Callable[[str], None]
+    config: PaperConfig, agent: Agent, seed: int, folder: Path, report: Callable[[str], None]
 ) -> tuple[LearnedPolicy, bool]:
-    """The policy of an agent, trained now if that is not done.
+    """The policy of an agent. Trains it if the folder does not have it yet.
 
     Args:
-        config: of the reproduction run.
-        agent: which.
+        config: configuration of the reproduction run.
+        agent: the agent.
         seed: number of the training run, from 0.
-        folder: of the reproduction run.
-        say: told in words what begins.
+        folder: folder of the reproduction run.
+        report: called with a line of text when something starts.
 
     Returns:
-        The policy, and whether anything had to be done.
+        The policy, and whether it was trained by this call.
 
     Raises:
-        ProblemError: the training cannot start or go on; one line.
+        ProblemError: the training cannot start or continue; the message is one line.
     """
     own = folder / "agents" / f"{agent.name}-{seed}"
     if (own / POLICY).is_file():
@@ -93,10 +95,10 @@ def trained(
     begun = (own / driver.CONFIG).is_file()
     try:
         settings = driver.prepare_folder(own, wanted, resume=begun)
-        _share(config, folder, own, say)
+        _copy_shared_scenes(config, folder, own, report)
         work = task.build(settings, own)
-        played = game(config, agent, settings, scenes(config, folder, say)[0])
-        note = lambda row: say(f"{agent.name} {seed + 1}: {row['chunk']} of {settings.chunks} parts")
+        played = game(config, agent, settings, scenes(config, folder, report)[0])
+        note = lambda row: report(f"{agent.name} {seed + 1}: {row['chunk']} of {settings.chunks} parts")
         outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(row=note))
     except (driver.TrainError, train_configs.SettingsError) as error:
         raise ProblemError(str(error)) from None
@@ -108,40 +110,43 @@ def trained(
     return load_policy(own / POLICY), True
 
 
-def scenes(config: PaperConfig, folder: Path, say: Callable[[str], None]) -> tuple[Bank, Bank]:
-    """Scenes to train on, and the tables' own, which neither training nor the choice of a checkpoint sees.
+def scenes(config: PaperConfig, folder: Path, report: Callable[[str], None]) -> tuple[Bank, Bank]:
+    """Scenes for training, and scenes for the tables, which are used neither for training nor to choose a checkpoint.
 
-    The latter are the last ones of the shared bank, as many as there are to choose checkpoints by, so that one compiled
-    program plays both.
+    The second set is the last part of the shared bank. It is as large as the set by which checkpoints are chosen, so
+    that one compiled program serves both.
+
+    Raises:
+        ProblemError: there are too few scenes.
     """
-    split = _shared(config, folder, say)
+    split = _shared_scenes(config, folder, report)
     count = len(split.train.initial_cost)
     kept = len(split.held_out.initial_cost)
     if count <= kept:
         raise ProblemError(f"only {count} scenes to train on: draw more (bank.scenes)")
-    return sieve(split.train, np.arange(count - kept)), sieve(split.train, np.arange(count - kept, count))
+    return select(split.train, np.arange(count - kept)), select(split.train, np.arange(count - kept, count))
 
 
 def game(config: PaperConfig, agent: Agent, settings: TrainConfig, train_on: Bank) -> Game:
-    """What an agent plays."""
+    """The game in which an agent is trained."""
     if agent.few_scenes:
-        train_on = sieve(train_on, np.arange(min(config.agents.trajectories, len(train_on.initial_cost))))
+        train_on = select(train_on, np.arange(min(config.agents.trajectories, len(train_on.initial_cost))))
     options = StepOptions(intrinsics=settings.bank.intrinsics)
     return make_game(settings.game, settings.bank.classes, [train_on], settings.envs, options)
 
 
-def _shared(config: PaperConfig, folder: Path, say: Callable[[str], None]) -> Split:
-    """The run's one bank, made for the first who asks."""
+def _shared_scenes(config: PaperConfig, folder: Path, report: Callable[[str], None]) -> Split:
+    """The scenes of the run. Generates them if the folder does not have them yet."""
     shared = folder / SCENES
     if not all((shared / name).is_file() for name in (task.BANK, task.RULES)):
         shared.mkdir(parents=True, exist_ok=True)
-        task.build(train_config(config, OURS, 0), shared, say, YARDSTICKS)
+        task.build(train_config(config, OURS, 0), shared, report, BASELINES)
     return task.read_banks(shared / task.BANK)[0]
 
 
-def _share(config: PaperConfig, folder: Path, own: Path, say: Callable[[str], None]) -> None:
-    """Puts the run's bank into the folder of a training run."""
-    _shared(config, folder, say)
+def _copy_shared_scenes(config: PaperConfig, folder: Path, own: Path, report: Callable[[str], None]) -> None:
+    """Copies the scenes of the run into the folder of a training run."""
+    _shared_scenes(config, folder, report)
     for name in (task.BANK, task.RULES):
         if not (own / name).is_file():
             with open(folder / SCENES / name, "rb") as source, atomic_write(own / name) as file:

@@ -1,4 +1,4 @@
-"""What a reproduction run depends on, and the YAML files that say it.
+"""Configuration of a reproduction run, and its YAML files.
 
 A file in `configs/paper` states differences to the file that it extends, or to the defaults of the classes
 (jaxba/io/configurations.py).
@@ -18,63 +18,63 @@ CONFIG = "config.yaml"
 
 @dataclass(frozen=True)
 class AgentsConfig:
-    """The agents that the ablation tables train."""
+    """The agents that are trained for the ablation tables."""
 
     preset: str = "paper"
     """Of `jaxba-train`; what the tables vary is put on top."""
 
     overrides: tuple[str, ...] = ()
-    """`key=value` on the preset, for all agents; such as its length."""
+    """Changes of the preset for all agents as `key=value`, such as the length of the training."""
 
     seeds: int = 3
-    """Agents of each kind. All of them enter the tables, none is picked."""
+    """Training runs of each kind of agent. All of them enter the tables."""
 
     state_sizes: tuple[int, ...] = (1, 5, 10, 20)
-    """Last errors that the agents of the state-size table see. 5 is the paper's own agent and must be among them."""
+    """Numbers of last errors that the agents of the state-size table observe. They must include 5, the paper's."""
 
     trajectories: int = 10
-    """Training scenes of the agent that is trained on as few as the paper's. Source: the paper, synthetic data."""
+    """Number of training scenes of the agent that is trained on few. Source: the paper, synthetic data."""
 
 
 @dataclass(frozen=True)
 class ZeroNetConfig:
-    """The non-holistic network."""
+    """The Zero-net, which the paper calls non-holistic, and its training."""
 
     width: int = 1280
     """Units of each layer. Source: the paper."""
 
     layers: int = 3
-    """Hidden layers. Source: the paper."""
+    """Number of hidden layers. Source: the paper."""
 
     batch: int = 16
-    """Scenes that step together, and over whose next errors a gradient is averaged."""
+    """Number of scenes in a batch; the gradient is averaged over them."""
 
     updates: int = 4000
-    """Gradient updates: one after each step of the batch."""
+    """Number of gradient updates; there is one after each step of the batch."""
 
     max_iterations: int = 30
-    """Steps after which a scene that has not converged makes place for another."""
+    """Iterations after which a scene that has not converged is replaced by another."""
 
     learning_rate: float = 1e-4
-    """Adam's; not in the paper."""
+    """Learning rate of Adam; the paper does not give it."""
 
 
 @dataclass(frozen=True)
 class FamilyConfig:
-    """Real problems of one kind."""
+    """A family of real problems."""
 
     name: str
-    """For tables, and to find the paper's row."""
+    """Name in tables; the paper's numbers are found by it."""
 
     files: tuple[str, ...]
-    """Paths with $VARIABLES and wildcards, or names of downloaded problems of BAL. What is not there is left out, and
-    the report says so."""
+    """Paths, in which $VARIABLES and wildcards are expanded, or names of downloaded BAL problems. Missing ones are left
+    out and listed in the report."""
 
     cameras: tuple[int, ...] = ()
-    """Sizes of sub-problems that are cut from each file."""
+    """Numbers of cameras of the sub-problems that are made of each file."""
 
     whole: bool = True
-    """Whether the files enter whole too."""
+    """Whether the complete problems are used too."""
 
 
 @dataclass(frozen=True)
@@ -82,24 +82,24 @@ class RealConfig:
     """Real problems."""
 
     bal: tuple[FamilyConfig, ...] = ()
-    """Families of BAL."""
+    """Families of the BAL data set."""
 
     kitti: FamilyConfig = field(default_factory=lambda: FamilyConfig("KITTI", ()))
-    """Sequences, such as those that `jaxba-kitti` writes, and windows of the first of them."""
+    """KITTI sequences, such as those that `jaxba-kitti` writes, and sub-problems of them."""
 
     repeats: int = 1
-    """Runs of each solver on each problem; times are medians."""
+    """Solves of each problem with each solver; times are medians."""
 
 
 @dataclass(frozen=True)
 class FigureConfig:
-    """Problems of the figures."""
+    """Problems in the figures."""
 
     scene: str = "scene:ladybug-49"
-    """Of the lambda chart and the small convergence plot where there are no real problems."""
+    """Scene of the lambda chart and of the small convergence plot if there are no real problems."""
 
     large_scene: str = "scene:ladybug-1197"
-    """Stand-in for Ladybug-1197."""
+    """Scene of the large convergence plot, instead of the problem Ladybug-1197."""
 
     large_solvers: tuple[str, ...] = (
         "classic/implicit",
@@ -107,21 +107,21 @@ class FigureConfig:
         "learned/implicit",
         "learned-driver/implicit",
     )
-    """`solver/linear solver` on the large scene."""
+    """Solvers on the large scene, as `SOLVER/LINEAR_SOLVER`."""
 
     large_iterations: int = 100
-    """Linear solves of each there, at most."""
+    """Limit of linear solves on the large scene."""
 
     profile_scenes: int = 6
-    """Random scenes that join the real problems of BAL in the performance profiles; each has its own seed."""
+    """Number of random scenes in the performance profiles, in addition to the BAL problems."""
 
 
 @dataclass(frozen=True)
 class PaperConfig:
-    """A reproduction run."""
+    """Configuration of a reproduction run."""
 
     seed: int = 0
-    """Decides scenes and agents."""
+    """Seed of the scenes and agents."""
 
     agents: AgentsConfig = field(default_factory=AgentsConfig)
     """Trained agents."""
@@ -136,10 +136,10 @@ class PaperConfig:
     """Problems of the figures."""
 
     small: tuple[int, ...] = (5, 8)
-    """Sizes of the smallest scenes: as many cameras as points."""
+    """Sizes of the scenes in the table of small problems: the number of cameras and also of points."""
 
     small_scenes: int = 30
-    """Scenes of each of these sizes."""
+    """Number of scenes of each size."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**31:
@@ -158,7 +158,7 @@ class PaperConfig:
 
 
 PAPER_STATE = 5
-"""Errors that the paper's agent sees."""
+"""Number of last errors that the paper's agent observes."""
 
 
 def load(name: str) -> PaperConfig:

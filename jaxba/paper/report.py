@@ -1,4 +1,4 @@
-"""The report: claims, readings, every table and figure, the machine."""
+"""The report in Markdown: claims, interpretations of the paper, all tables and figures, settings and times."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from jaxba.bench.tables import number
 from jaxba.paper.claims import CRITERION
 from jaxba.paper.config import to_yaml
 from jaxba.paper.markdown import Section, claims_table, table
-from jaxba.paper.pieces import figures
-from jaxba.paper.workshop import Workshop
+from jaxba.paper.runner import Runner
+from jaxba.paper.tables_and_figures import figures
 from jaxba.runtime.atomic import atomic_write, write_text
 
-ALONE = 0.9
-"""Processor seconds per second from which on a program was not held up by others."""
+BUSY_CORES = 0.9
+"""With fewer processor cores in use on average, other programs must have slowed the run down."""
 
-READINGS: tuple[tuple[str, str, str], ...] = (
+INTERPRETATIONS: tuple[tuple[str, str, str], ...] = (
     (
         "damping",
         "text: `H + λI`; code: `diag(H)(1 + λ)`",
@@ -80,27 +80,31 @@ READINGS: tuple[tuple[str, str, str], ...] = (
         "trained on synthetic scenes alone, tested on real problems",
     ),
 )
-"""What the paper's text and its released code leave open or contradict, and the reading taken."""
+"""Subjects on which the paper's text and its released code are open or contradict each other: what both say, and what
+is done here."""
 
 
 def write(
-    shop: Workshop, sections: Sequence[Section], path: Path, command: str, seconds: Mapping[str, tuple[float, float]]
+    runner: Runner, sections: Sequence[Section], path: Path, command: str, seconds: Mapping[str, tuple[float, float]]
 ) -> list[Path]:
-    """Writes the report and puts the pictures beside it.
+    """Writes the report, and copies the figures into a folder beside it.
 
     Args:
-        shop: of the run.
-        sections: in order.
-        path: of the Markdown file; pictures go into a folder of its stem.
-        command: that made it.
-        seconds: of the wall clock and of the processor that this folder spent on each piece.
+        runner: the run, with its settings and results.
+        sections: sections of the tables and figures, in order.
+        path: the Markdown file; figures go into a folder with the same stem.
+        command: command line that made the report.
+        seconds: for each table or figure, wall-clock time and processor time spent on it in this folder.
 
     Returns:
-        All files written. Raises OSError.
+        All files written.
+
+    Raises:
+        OSError: a file cannot be written.
     """
     pictures = path.parent / path.stem
     files = []
-    drawn = sorted((shop.folder / figures.FIGURES).glob("*.png"))
+    drawn = sorted((runner.folder / figures.FIGURES).glob("*.png"))
     if drawn:
         pictures.mkdir(parents=True, exist_ok=True)
     for source in drawn:
@@ -108,38 +112,33 @@ def write(
         with atomic_write(target) as file:
             file.write(source.read_bytes())
         files.append(target)
-    text = _text(shop, sections, command, seconds).replace(f"]({figures.FIGURES}/", f"]({path.stem}/")
+    text = _text(runner, sections, command, seconds).replace(f"]({figures.FIGURES}/", f"]({path.stem}/")
     write_text(path, text)
     return [path, *files]
 
 
-def _text(shop: Workshop, sections: Sequence[Section], command: str, seconds: Mapping[str, tuple[float, float]]) -> str:
-    facts = machine()
+def _text(runner: Runner, sections: Sequence[Section], command: str, seconds: Mapping[str, tuple[float, float]]) -> str:
+    properties = machine()
     claims = [claim for section in sections for claim in section.claims]
-    tally = {
-        verdict: sum(c.verdict == verdict for c in claims) for verdict in ("reproduced", "partly", "not", "not run")
-    }
-    config = shop.config
+    tally = {status: sum(c.status == status for c in claims) for status in ("reproduced", "partly", "not", "not run")}
+    config = runner.config
     parts = [
         "# The paper, table by table",
         'Belder, Vivanti, Tal, "A Game of Bundle Adjustment - Learning Efficient Convergence", ICCV 2023, beside '
         "what jaxba "
         f"measures. This file is made by `{command}`; nothing in it is written by hand.",
-        f"Machine: {facts['device']}, {facts['processor']}, Python {facts['python']}, JAX {facts['jax']}, jaxba "
-        f"{facts['jaxba']}. "
-        f"Agents: {config.agents.seeds} training runs of each kind, none picked. All arithmetic in float64. An "
-        "iteration is one "
-        "linear solve, accepted or rejected. Means are arithmetic, as the paper's; **a failure counts as 100 "
-        "iterations**. "
-        "`good ends`: share that ends within 1 % of the best cost that anything in this run found. `seeds: range`: "
-        "number of "
-        "training runs and the range of their means.",
+        f"Machine: {properties['device']}, {properties['processor']}, Python {properties['python']}, "
+        f"JAX {properties['jax']}, jaxba {properties['jaxba']}. "
+        f"Agents: {config.agents.seeds} training runs of each kind, all of which enter the tables. All arithmetic is "
+        "in float64. An iteration is one linear solve, accepted or rejected. Means are arithmetic, as in the paper; "
+        "**a failure counts as 100 iterations**. `good ends`: fraction of the solves that end within 1 % of the best "
+        "cost found in this run. `seeds: range`: number of training runs and the range of their means.",
         "## Claims",
-        "; ".join(f"{count} {verdict}" for verdict, count in tally.items()) + f" of {len(claims)}.",
+        "; ".join(f"{count} {status}" for status, count in tally.items()) + f" of {len(claims)}.",
         CRITERION,
-        claims_table(claims) if claims else "None was looked at.",
-        "## What the paper leaves open, and the reading taken",
-        table(("what", "paper: text and released code", "here"), READINGS, 3),
+        claims_table(claims) if claims else "None was tested.",
+        "## What the paper leaves open, and what is done here",
+        table(("subject", "paper: text and released code", "here"), INTERPRETATIONS, 3),
     ]
     for section in sections:
         parts += [f"## {section.title}", *(paragraph for paragraph in section.body if paragraph)]
@@ -147,9 +146,12 @@ def _text(shop: Workshop, sections: Sequence[Section], command: str, seconds: Ma
     if seconds:
         wall, cpu = (sum(pair[k] for pair in seconds.values()) for k in (0, 1))
         cells = [(name, number(pair[0]), number(pair[1])) for name, pair in seconds.items()]
-        parts += ["## Time", table(("piece", "s", "processor s"), [*cells, ("together", number(wall), number(cpu))])]
+        parts += [
+            "## Time",
+            table(("table or figure", "s", "processor s"), [*cells, ("total", number(wall), number(cpu))]),
+        ]
         parts.append(
-            f"Compilation included. The program had {cpu / wall:.2f} processor cores on average"
-            + ("; it had to wait for others, and all seconds here are too long." if cpu < ALONE * wall else ".")
+            f"Compilation is included. The program used {cpu / wall:.2f} processor cores on average"
+            + ("; other programs slowed it down, so that all times are too long." if cpu < BUSY_CORES * wall else ".")
         )
     return "\n\n".join(parts) + "\n"

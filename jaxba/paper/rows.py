@@ -1,7 +1,7 @@
-"""Rows of the tables: iterations, success and time of a method over problems and seeds. Pure functions over records.
+"""Rows of the tables: iterations, success and time of a method over problems and training runs. Pure functions.
 
-Means are arithmetic, as the paper's "average", and a failure counts as the limit of 100 iterations in them. The mean
-over problems is taken for each seed first; spread is the lowest and highest of those means.
+Means are arithmetic, as the paper's "average", and a failure counts as 100 iterations. The mean over the problems is
+taken for each training run; `low` and `high` are the extremes of these means.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from jaxba.bench.records import Record
 from jaxba.paper.store import Play
 
 NEAR = 1e-3
-"""Distance from the best known cost, relative to it, of the second count in every row."""
+"""Relative tolerance of `Row.near`: iterations until the cost is within this of the best known cost."""
 
 GOOD_END = 1e-2
-"""Distance from the best known cost within which an end counts as good: who stops early in a worse place is fast for
-the wrong reason."""
+"""Relative tolerance of `Row.good_ends`: the final cost is within this of the best known cost. A solver that converges
+to a worse cost needs few iterations without being better."""
 
 
 @dataclass(frozen=True)
@@ -29,16 +29,16 @@ class Outcome:
     """One solve."""
 
     iterations: float
-    """Until it converged; `ITERATION_LIMIT` for a failure."""
+    """Iterations to convergence; `ITERATION_LIMIT` for a failure."""
 
     converged: bool
-    """Within that limit."""
+    """Whether it converged within the limit."""
 
     near: float
-    """Iterations to `NEAR`, at least 1, at most the limit."""
+    """Iterations until the cost is within `NEAR` of the best known cost, between 1 and the limit."""
 
     end: float
-    """Last cost over the best known, less one."""
+    """Final cost relative to the best known cost, minus 1."""
 
     seconds: float = math.nan
     """Set-up and iterations, without compilation."""
@@ -52,36 +52,31 @@ class Row:
     """Name in records."""
 
     iterations: float
-    """Mean, failures counting as the limit. NaN where nothing was run."""
+    """Mean iterations to convergence, with the limit for a failure. NaN if nothing was run."""
 
     low: float
-    """Of the seeds' means, the lowest."""
+    """Lowest mean of a training run."""
 
     high: float
-    """The highest."""
+    """Highest mean of a training run."""
 
     near: float
-    """Mean iterations to `NEAR`, where never counts as the limit."""
+    """Mean iterations until the cost is within `NEAR` of the best known cost, with the limit for never."""
 
     success: float
-    """Share of the solves that converged within the limit."""
+    """Fraction of the solves that converged within the limit."""
 
     good_ends: float
-    """Share that ended within `GOOD_END` of the best known cost."""
+    """Fraction of the solves that ended within `GOOD_END` of the best known cost."""
 
     seeds: int
-    """Training runs; 0 for a rule, which has none."""
+    """Number of training runs; 0 for a rule."""
 
     solves: int
-    """Problems or scenes of each."""
+    """Number of problems or scenes of each training run."""
 
     seconds: float = math.nan
-    """Mean of set-up and iterations, without compilation. NaN where no time was taken."""
-
-    @property
-    def halfwidth(self) -> float:
-        """Half of the spread over the seeds."""
-        return 0.5 * (self.high - self.low)
+    """Mean time of set-up and iterations, without compilation. NaN if it was not measured."""
 
 
 def row(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -> Row:
@@ -89,8 +84,8 @@ def row(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -
 
     Args:
         method: name.
-        outcomes: solves by seed; the same problems for each.
-        trained: whether the seeds are training runs; a rule has one entry and no seed.
+        outcomes: by training run, the outcomes on the same problems; a rule has one entry.
+        trained: whether the method has training runs.
     """
     every = [outcome for solves in outcomes.values() for outcome in solves]
     if not every:
@@ -111,17 +106,17 @@ def row(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -
 
 
 def of_play(play: Play) -> list[Outcome]:
-    """The solves of a set of scenes."""
+    """The outcomes on a set of scenes."""
     cells = zip(play.iterations, play.converged, play.near, play.end, strict=True)
     return [_outcome(iterations, converged, near, end) for iterations, converged, near, end in cells]
 
 
 def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Outcome]:
-    """Solves of problems, repeats of one by their median time.
+    """The outcomes on problems, with the median time of repeats.
 
     Args:
         records: of one method.
-        best: lowest known cost by problem.
+        best: best known cost of each problem.
     """
     found = []
     for name in profile.problem_names(records):
@@ -146,5 +141,5 @@ def _outcome(iterations: int, converged: bool, near: float, end: float, seconds:
 
 
 def ratio(one: float, other: float) -> float:
-    """One over the other; NaN where that says nothing."""
+    """`one / other`; NaN if `one` is not finite or `other` is not positive."""
     return one / other if other > 0 and math.isfinite(one) else math.nan

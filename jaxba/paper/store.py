@@ -1,7 +1,7 @@
-"""What a reproduction run has done, on the disk: one JSON object a line, found again by what was run.
+"""Results of a reproduction run on disk, one JSON object per line.
 
-`solves.jsonl` holds solves of single problems in the format of `jaxba-bench`; `plays.jsonl` holds policies on whole
-sets of small scenes, a line per policy and seed. A killed run loses the line it was about to write.
+`solves.jsonl` has solves of single problems in the format of `jaxba-bench`. `plays.jsonl` has runs of a policy on a
+whole set of small scenes, a line for each policy and seed. A killed run loses at most the line that it was writing.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ SOLVES, PLAYS = "solves.jsonl", "plays.jsonl"
 
 @dataclass(frozen=True)
 class Play:
-    """A policy on every scene of a set. Lists have an entry per scene."""
+    """Solves of all scenes of a set with one policy. Tuples have an entry for each scene."""
 
     scenes: str
-    """Name of the set."""
+    """Name of the set of scenes."""
 
     method: str
     """Name of the policy."""
 
     seed: int
-    """Of the training; 0 for rules."""
+    """Number of the training run, from 0; 0 for rules."""
 
     iterations: tuple[int, ...]
-    """Linear solves until the end."""
+    """Linear solves."""
 
     converged: tuple[bool, ...]
-    """Whether the stop rule ended it, and not the limit."""
+    """Whether the solve converged before the limit of iterations."""
 
     near: tuple[float, ...]
-    """Linear solves until within 1e-3 of the best known cost; infinite (null in the file) if never."""
+    """Linear solves until the cost is within 1e-3 of the best known cost; infinite (null in the file) if never."""
 
     end: tuple[float, ...]
-    """Last accepted cost over the best known, less one."""
+    """Final cost relative to the best known cost, minus 1."""
 
     first: tuple[tuple[float, ...], ...]
     """First lambdas of each solve."""
 
     seconds: float
-    """For all scenes together, compilation included: no measure of speed."""
+    """Time for all scenes together, including compilation, and so not a measure of speed."""
 
 
 def play_to_json(play: Play) -> dict[str, Any]:
-    """The object to write; infinity becomes null."""
+    """The JSON object of a play; infinity becomes null."""
     data = asdict(play)
     data["near"] = [x if math.isfinite(x) else None for x in play.near]
     data["end"] = [x if math.isfinite(x) else None for x in play.end]
@@ -64,7 +64,7 @@ def play_from_json(data: Mapping[str, Any]) -> Play:
     """The inverse of `play_to_json`.
 
     Raises:
-        KeyError, TypeError: it is something else.
+        KeyError, TypeError: the object has another form.
     """
     numbers = lambda name: tuple(math.inf if x is None else float(x) for x in data[name])
     return Play(
@@ -81,13 +81,13 @@ def play_from_json(data: Mapping[str, Any]) -> Play:
 
 
 class Store:
-    """All lines of a run's folder. One process may write at a time."""
+    """The results in the folder of a run. Only one process may write at a time."""
 
     def __init__(self, folder: Path) -> None:
-        """Reads what is there.
+        """Reads the existing results.
 
         Raises:
-            ProblemError: a file is damaged; one line that names it.
+            ProblemError: a file is damaged; the message names the file and the line.
         """
         self.folder = folder
         path = folder / SOLVES
@@ -95,22 +95,22 @@ class Store:
         self.plays = _read_plays(folder / PLAYS)
 
     def solve(self, problem: str, solver: str, repeat: int) -> Record | None:
-        """The solve of a problem by a solver."""
+        """The record of a solve, None if there is none."""
         wanted = (problem, solver, repeat)
         return next((r for r in self.solves if (r.problem, r.solver, r.repeat) == wanted), None)
 
     def play(self, scenes: str, method: str, seed: int) -> Play | None:
-        """A policy on a set of scenes."""
+        """The play of a policy on a set of scenes, None if there is none."""
         wanted = (scenes, method, seed)
         return next((p for p in self.plays if (p.scenes, p.method, p.seed) == wanted), None)
 
     def add_solve(self, record: Record) -> None:
-        """Appends a line, on the disk when this returns. Raises OSError."""
+        """Appends a line to the file, followed by fsync. Raises OSError."""
         append_record(self.folder / SOLVES, record)
         self.solves.append(record)
 
     def add_play(self, play: Play) -> None:
-        """Appends a line, on the disk when this returns. Raises OSError."""
+        """Appends a line to the file, followed by fsync. Raises OSError."""
         line = json.dumps(play_to_json(play), allow_nan=False, separators=(",", ":")).encode() + b"\n"
         with (self.folder / PLAYS).open("ab") as file:
             file.write(line)
@@ -119,7 +119,7 @@ class Store:
         self.plays.append(play)
 
     def solves_of(self, problems: Sequence[str], solvers: Sequence[str]) -> list[Record]:
-        """The solves of some problems by some solvers, in the order of those lists."""
+        """The solves of the given problems by the given solvers, in the order of these lists."""
         rank = lambda r: (problems.index(r.problem), solvers.index(r.solver), r.repeat)
         return sorted((r for r in self.solves if r.problem in problems and r.solver in solvers), key=rank)
 
@@ -128,7 +128,7 @@ def _read_plays(path: Path) -> list[Play]:
     if not path.is_file():
         return []
     *lines, rest = path.read_bytes().split(b"\n")
-    if rest:  # what a kill left half-written
+    if rest:  # an incomplete line of a killed run
         with path.open("r+b") as file:
             file.truncate(path.stat().st_size - len(rest))
     plays = []

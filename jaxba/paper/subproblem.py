@@ -1,4 +1,4 @@
-"""Parts of a problem: some of its cameras, and the points that at least two of them see."""
+"""Sub-problems: some cameras of a problem, and the points that at least two of them observe."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from jaxba.problem.preprocess import MIN_TRACK
 def sub_problem(
     problem: BundleProblem, cameras: Sequence[int] | Int[np.ndarray, " kept"], points: Sequence[int] | None = None
 ) -> BundleProblem:
-    """The problem of some cameras and of the points that they determine, numbered anew in their old order.
+    """The problem restricted to some cameras and to the points that at least two of them observe, in the same order.
 
     Args:
-        problem: the whole.
-        cameras: numbers of the cameras that stay.
-        points: numbers of the points that may stay, all if None; of them those that two of the cameras see.
+        problem: the complete problem.
+        cameras: indices of the cameras to keep.
+        points: indices of the points to choose from; all if None.
 
     Raises:
-        ProblemError: a number out of range, or no point would be left.
+        ProblemError: an index is out of range, or no point is left.
     """
     kept = np.unique(np.asarray(cameras, int))
     allowed = np.arange(problem.num_points) if points is None else np.unique(np.asarray(points, int))
@@ -35,7 +35,9 @@ def sub_problem(
     camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
     keep = np.isin(camera_index, kept) & np.isin(point_index, allowed)
     pairs = np.unique(np.stack([point_index[keep], camera_index[keep]]), axis=1)
-    tracks = np.bincount(pairs[0], minlength=problem.num_points)  # cameras, not observations: both may be of one camera
+    tracks = np.bincount(
+        pairs[0], minlength=problem.num_points
+    )  # counts distinct cameras, since a camera may observe a point twice
     keep &= tracks[point_index] >= MIN_TRACK
     if not keep.any():
         raise ProblemError(f"no point is seen by two of these {len(kept)} cameras")
@@ -51,21 +53,27 @@ def sub_problem(
     )
 
 
-def neighbours(problem: BundleProblem, count: int) -> Int[np.ndarray, " cameras"]:
-    """Cameras that belong together: the one that sees most, then always the one that shares most points with those.
+def neighbouring_cameras(problem: BundleProblem, count: int) -> Int[np.ndarray, " cameras"]:
+    """Cameras with many common points, chosen greedily.
+
+    The first is the camera that observes most points. The next is always the one that shares most points with those
+    already chosen; of equals, the one with the lowest index.
 
     Args:
-        problem: at least `count` cameras.
-        count: how many cameras; of equals the first is taken, so that the choice is the same everywhere.
+        problem: the problem.
+        count: how many cameras.
+
+    Returns:
+        Sorted indices.
 
     Raises:
-        ProblemError: there are not as many cameras.
+        ProblemError: the problem has fewer cameras.
     """
     if not 1 <= count <= problem.num_cameras:
         raise ProblemError(f"cannot take {count} of {problem.num_cameras} cameras")
     pairs = np.asarray(problem.camera_index), np.asarray(problem.point_index)
     seen = csr_matrix((np.ones(len(pairs[0]), np.int64), pairs), (problem.num_cameras, problem.num_points))
-    seen.data[:] = 1  # a camera that sees a point twice
+    seen.data[:] = 1  # a camera may observe a point twice
     chosen = [int(np.argmax(seen.getnnz(axis=1)))]
     shared, covered = np.zeros(problem.num_cameras, int), np.zeros(problem.num_points, bool)
     free = np.ones(problem.num_cameras, bool)
@@ -80,17 +88,17 @@ def neighbours(problem: BundleProblem, count: int) -> Int[np.ndarray, " cameras"
 
 
 @dataclass(frozen=True)
-class Cut(Source):
-    """A sub-problem of neighbouring cameras that has a name and is cut when its turn comes."""
+class SubProblem(Source):
+    """A named sub-problem of neighbouring cameras that has not been read yet."""
 
     cameras: int = 0
-    """How many."""
+    """Number of cameras."""
 
     def read(self) -> BundleProblem:
-        """Reads the whole and cuts.
+        """Reads the complete problem and restricts it.
 
         Raises:
-            ProblemError: bad input, in one line.
+            ProblemError: the input is invalid; the message is one line.
         """
         whole = Source(self.name, self.family, self.location).read()
-        return sub_problem(whole, neighbours(whole, self.cameras))
+        return sub_problem(whole, neighbouring_cameras(whole, self.cameras))

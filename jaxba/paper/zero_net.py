@@ -1,11 +1,11 @@
-"""The paper's Zero-net: a network that chooses lambda so that the very next error is smallest.
+"""The paper's Zero-net: a network that chooses lambda to minimise the cost after the next step.
 
-It sees what the agent sees and did (the last states, actions and rewards) but knows no episode: its gradient is that of
-one step's cost, through the differentiable `lm_step`. Nothing of it is shipped; tables train it at run time.
+Its input is the same history as the agent's (the last states, actions and rewards), but it is trained greedily: the
+gradient is that of the cost after one step, through the differentiable `lm_step`. It is trained when a table needs it.
 
-Since the next cost depends on the network through lambda alone, the chain rule has two factors. The first, the slope of
-the cost in the action, is taken in forward mode, one number a scene; so a factorisation that failed spoils one number
-and not the network.
+The next cost depends on the network through lambda only, so the gradient is a product of two factors. The derivative of
+the cost with respect to the action is computed in forward mode, one number per scene. A failed factorisation thus
+invalidates one number and not the whole gradient.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
 from jaxba.runtime.atomic import atomic_write
 
-STEEPEST = 1.0
-"""Largest slope of a cost's decimal logarithm in the action that a scene may contribute, so that one diverging step
-does not outweigh a batch; a step whose cost is no number counts as that steep, towards a larger lambda."""
+MAX_SLOPE = 1.0
+"""Limit of the derivative of log10(cost) with respect to the action for each scene, so that one diverging step does not
+dominate a batch. A step with a non-finite cost counts as this limit, towards a larger lambda."""
 
 _DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields.index("present")
 
@@ -45,13 +45,13 @@ _DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ZeroNet:
-    """A damping policy: ReLU layers from the last states, actions and rewards to one action."""
+    """A damping policy: a ReLU network from the last states, actions and rewards to one action."""
 
     layers: tuple[Layer, ...]
-    """Hidden layers, then the action before its tanh."""
+    """Hidden layers, then the output layer, whose tanh is the action."""
 
     config: AgentConfig = field(metadata={"static": True})
-    """Observation `paper`, no guard; says how far back the input goes and what an action means."""
+    """Length of the history and range of lambda; must have the observation `paper` and no guard."""
 
     @property
     def min_gain(self) -> float:
@@ -77,13 +77,14 @@ class ZeroNet:
 
 
 def inputs(memory: Memory) -> Float[Array, " features"]:
-    """Last errors, last actions as decades of lambda, last rewards: -1 an iteration, 0 where there was none yet."""
+    """Input of the network: last errors, last actions as log10(lambda), and last rewards, which are -1 for an iteration
+    and 0 where there was none yet."""
     steps = memory.steps
     return jnp.concatenate([memory.errors, steps[:, _DAMPING], -steps[:, _PRESENT]]).astype(jnp.float32)
 
 
-def fresh(config: ZeroNetConfig, agent: AgentConfig, key: Array) -> ZeroNet:
-    """An untrained network: He's normal start for hidden layers, next to zero for the last, as the agent's."""
+def initial_network(config: ZeroNetConfig, agent: AgentConfig, key: Array) -> ZeroNet:
+    """An untrained network: He initialisation for hidden layers, nearly zero for the last, as for the agent."""
     sizes = [3 * agent.history, *[config.width] * config.layers, 1]
     layers = []
     for k, (rows, columns) in enumerate(pairwise(sizes)):
@@ -96,11 +97,10 @@ def fresh(config: ZeroNetConfig, agent: AgentConfig, key: Array) -> ZeroNet:
 def slope_of_next_cost(
     game: Game, episode: Episode, action: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""], Episode, StepInfo]:
-    """One step with an action, and how its cost reacts to the action.
+    """Makes one step, and differentiates its cost with respect to the action.
 
-    Returns:
-        log10 of the proposed cost over the present one, its derivative in the action, the episode after the step, and
-        the step. Rejected steps have a slope too: that of the cost that was refused.
+    Returns: log10 of the candidate's cost over the current cost, its derivative with respect to the action, the episode
+        after the step, and the step. Rejected steps have these values too.
     """
 
     def play(action: Array) -> tuple[Array, tuple[Episode, StepInfo]]:
@@ -123,16 +123,16 @@ def train(config: ZeroNetConfig, game: Game, agent: AgentConfig, key: Array) -> 
     """Trains a network on the first bank of a game.
 
     Args:
-        config: sizes and length.
-        game: its scenes; its rules do not matter, there is no reward.
-        agent: what an action means.
-        key: decides everything.
+        config: sizes of the network and of the training.
+        game: provides the scenes; its rewards are not used.
+        agent: length of the history and range of lambda.
+        key: random key.
 
     Returns:
-        The network, and the mean log10 of the next cost over the present one in every update.
+        The network, and for each update the mean of log10(next cost / current cost).
     """
     start, play = jax.random.split(key)
-    net = fresh(config, agent, start)
+    net = initial_network(config, agent, start)
     layers, means = _train(config, game, net, play)
     return ZeroNet(jax.tree.map(np.asarray, layers), agent), np.asarray(means)
 
@@ -155,7 +155,7 @@ def _train(
             step_one = lambda episode, action: slope_of_next_cost(game, episode, action)
             change, slope, after, step = step_groups(step_one, state.episodes, lax.stop_gradient(actions))
             known = jnp.isfinite(change) & jnp.isfinite(slope)
-            slope = jnp.clip(jnp.where(known, slope, -STEEPEST), -STEEPEST, STEEPEST).astype(jnp.float32)
+            slope = jnp.clip(jnp.where(known, slope, -MAX_SLOPE), -MAX_SLOPE, MAX_SLOPE).astype(jnp.float32)
             counted = jnp.sum(jnp.where(known, change, 0.0)) / jnp.maximum(jnp.sum(known), 1)
             return jnp.mean(lax.stop_gradient(slope) * actions), (after, step, counted)
 
@@ -178,12 +178,12 @@ def _train(
 
 
 def parameters(net: ZeroNet) -> int:
-    """Numbers in a network."""
+    """Number of parameters of a network."""
     return sum(int(np.size(part)) for layer in net.layers for part in layer)
 
 
 def save(path: Any, net: ZeroNet) -> None:
-    """Writes the weights, whole or not at all."""
+    """Writes the weights to a .npz file atomically."""
     with atomic_write(path) as file:
         arrays: dict[str, Any] = {
             f"{name}{k}": np.asarray(getattr(layer, name))
@@ -194,7 +194,7 @@ def save(path: Any, net: ZeroNet) -> None:
 
 
 def restore(path: Any, agent: AgentConfig) -> ZeroNet:
-    """The inverse of `save`."""
+    """Reads the network that `save` wrote."""
     with np.load(path) as file:
         count = len(file.files) // 2
         layers = tuple(Layer(file[f"kernel{k}"], file[f"bias{k}"]) for k in range(count))

@@ -1,4 +1,5 @@
-"""Other libraries that solve the same problem, as peers in `jaxba-bench`. Each is an extra; nothing here imports it."""
+"""Other bundle adjustment libraries that `jaxba-bench` can compare with. Each needs an optional dependency, which is
+imported only by the modules that use it."""
 
 from __future__ import annotations
 
@@ -7,14 +8,14 @@ from importlib.util import find_spec
 from jaxba.solver.names import SolverName, SolverNameError
 
 NEEDS = {"pyceres": ("ceres", ("pyceres", "pycolmap"))}
-"""By the peer's name: the extra that brings it, and the packages of that extra."""
+"""For each library: the extra of jaxba that installs it, and the packages of that extra."""
 
 
 def require(solver: SolverName) -> None:
-    """Refuses a solver whose library is not installed.
+    """Checks that the library of a solver is installed.
 
     Raises:
-        SolverNameError: one line that says what to install.
+        SolverNameError: it is not; the message names the package to install.
     """
     if not solver.peer:
         return

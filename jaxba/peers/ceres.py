@@ -1,6 +1,7 @@
-"""Ceres as a peer: under its own rule, or driven by a damping policy one iteration at a time. Needs the extra `ceres`.
+"""Solves with Ceres under its own trust-region rule, and what this shares with `driven.py`. Needs the extra `ceres`.
 
-Costs are BAL's: observations of points behind their camera, which COLMAP leaves out, are counted (`colmap_problem.py`).
+The cost is that of BAL: observations of points behind their camera, which COLMAP's cost function ignores, are counted
+(see `colmap_problem.py`).
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from jaxba.solver.solve import Solution
 _log = logging.getLogger(__name__)
 
 LINEAR_SOLVERS = {"dense": "DENSE_SCHUR", "sparse": "SPARSE_SCHUR", "iterative": "ITERATIVE_SCHUR"}
-"""Ceres' linear solvers by mode, which may be followed by `naming.INNER`; the iterative one preconditions with
-SCHUR_JACOBI."""
+"""Ceres' linear solver for each mode. The iterative one uses the preconditioner SCHUR_JACOBI. A mode may end in `INNER`
+for Ceres' inner iterations."""
 
 FORCING = 0.1
-"""Forcing term of the iterative mode. Source: Ceres eta."""
+"""Forcing term of conjugate gradients in the iterative mode. Source: default of Ceres' `eta`."""
 
 ENDS = {
     "Function tolerance": Termination.COST,
@@ -42,16 +43,17 @@ ENDS = {
     "Maximum number of iterations": Termination.MAX_ITERATIONS,
     "Minimum trust region radius": Termination.DAMPING_LIMIT,
 }
-"""How the message of Ceres' summary begins; anything else is a failure of five invalid steps in a row."""
+"""Reason to stop for each beginning of Ceres' summary message. Any other message means that Ceres failed, after five
+invalid steps in a row."""
 
-DISCARDED = (Termination.COST, Termination.STEP)
-"""Ceres tests a candidate before it accepts, so that these end a solve with a step that is computed and not taken."""
+ENDS_WITHOUT_STEP = (Termination.COST, Termination.STEP)
+"""Convergence tests that Ceres makes before it accepts a step, so that the last step is computed but not taken."""
 
 Callback = Callable[[IterationRecord], Any]
 
 
 def solver_options(mode: str, threads: int) -> Any:
-    """Ceres' defaults with the linear solver of a mode, inner iterations if it has them, and silence."""
+    """Ceres' default options with the linear solver of a mode, inner iterations if the mode has them, and no output."""
     options = pyceres.SolverOptions()
     options.use_inner_iterations = mode.endswith(INNER)
     options.linear_solver_type = getattr(pyceres.LinearSolverType, LINEAR_SOLVERS[mode.removesuffix(INNER)])
@@ -63,13 +65,13 @@ def solver_options(mode: str, threads: int) -> Any:
 
 
 class Run:
-    """A solve in progress: its problem, its clock, and what was recorded."""
+    """A solve in progress: the Ceres problem, the clock and the recorded iterations."""
 
     def __init__(self, problem: BundleProblem, callback: Callback | None) -> None:
-        """Makes the Ceres problem.
+        """Builds the Ceres problem.
 
         Raises:
-            ProblemError: the cost at the start is not finite, or the problem has covariances.
+            ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses.
         """
         self.initial_cost = geometry.cost(problem)
         if not np.isfinite(self.initial_cost):
@@ -86,26 +88,30 @@ class Run:
             _log.warning("%d observations of points behind their camera: Python evaluates them for Ceres", behind)
 
     def start(self) -> None:
-        """Starts the clock."""
+        """Starts the clock of `total_s`."""
         self.started = time.perf_counter()
         self.paused = 0.0
 
-    def hidden(self) -> Bool[np.ndarray, " observations"]:
-        """Observations that COLMAP leaves out at the present parameters, found while the clock stands."""
+    def newly_behind(self) -> Bool[np.ndarray, " observations"]:
+        """Observations whose point has moved behind its camera, so that COLMAP ignores them. The time that this takes
+        is not counted."""
         now = time.perf_counter()
         behind = geometry.depths(self.colmap.bundle()) < SMALLEST_DEPTH
         self.paused += time.perf_counter() - now
         return behind & ~self.colmap.in_python
 
-    def count(self, hidden: Bool[np.ndarray, " observations"]) -> None:
-        """Has observations counted from here on."""
-        number = self.colmap.keep(hidden)
+    def count_behind(self, behind: Bool[np.ndarray, " observations"]) -> None:
+        """Counts observations of points behind their camera from here on."""
+        number = self.colmap.count_behind(behind)
         _log.info("%d observations of points that went behind their camera: Python evaluates them from here on", number)
 
     def record(self, step: StepInfo) -> bool:
-        """Notes an iteration, the parameters being those after it; returns whether the caller wants to stop.
+        """Records an iteration at the parameters after it, and calls the callback.
 
-        The recorded cost is evaluated anew, by jaxba, while the clock stands.
+        jaxba evaluates the recorded cost; the time of that and of the callback is not counted.
+
+        Returns:
+            Whether the callback asked to stop.
         """
         now = time.perf_counter()
         self.total_s = now - self.started - self.paused
@@ -117,7 +123,7 @@ class Run:
         return bool(stop)
 
     def solution(self, termination: Termination, linear_solver: str, compile_s: float = 0.0) -> Solution:
-        """The end of the run."""
+        """The result, from the recorded iterations."""
         accepted = sum(bool(step.accepted) for step in self.steps)
         return Solution(
             problem=self.colmap.bundle() if accepted else self.colmap.start,
@@ -135,8 +141,8 @@ class Run:
 
 
 def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
-    """The record of a rejected step of which nothing else is known, but for what is `known`."""
-    facts: dict[str, Any] = {
+    """The record of a rejected step. Fields that are not given in `known` are NaN or neutral values."""
+    fields: dict[str, Any] = {
         "cost": cost,
         "previous_cost": cost,
         "candidate_cost": np.nan,
@@ -153,21 +159,21 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
         "damping_share": np.nan,
         "repairs": 0,
     }
-    return StepInfo(**{**facts, **known})
+    return StepInfo(**{**fields, **known})
 
 
 def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: str, **known: Any) -> StepInfo:
-    """The record of one of Ceres' iteration summaries.
+    """Converts an iteration summary of Ceres into a `StepInfo`.
 
     Args:
-        now: of the iteration.
-        before: of the one before it, at whose end the gradient was taken.
-        previous_cost: last accepted cost; the summary of a rejected step has the candidate's.
+        now: summary of the iteration.
+        before: summary of the iteration before it, which has the gradient at the start of the step.
+        previous_cost: last accepted cost; the summary of a rejected step has the candidate's cost only.
         damping: lambda that the step used.
-        mode: a direct solver has no conjugate gradients to count.
+        mode: mode of the linear solver; only the iterative one counts conjugate gradient iterations.
         known: fields that Ceres does not report.
     """
-    facts = {
+    fields = {
         "previous_cost": previous_cost,
         "gradient_max": before.gradient_max_norm,
         "step_norm": now.step_norm,
@@ -175,28 +181,28 @@ def step_of(now: Any, before: Any, previous_cost: float, damping: float, mode: s
         "forcing": FORCING if mode == "iterative" else 0.0,
     }
     if now.step_is_valid:
-        facts["accepted"] = bool(now.step_is_successful)
-        facts["candidate_cost"], facts["gain_ratio"] = now.cost, now.relative_decrease
+        fields["accepted"] = bool(now.step_is_successful)
+        fields["candidate_cost"], fields["gain_ratio"] = now.cost, now.relative_decrease
         if now.relative_decrease != 0:
-            facts["predicted"] = now.cost_change / now.relative_decrease
+            fields["predicted"] = now.cost_change / now.relative_decrease
     else:
-        facts["candidate_cost"] = np.inf
-    return step_info(now.cost if now.step_is_successful else previous_cost, damping, **{**facts, **known})
+        fields["candidate_cost"] = np.inf
+    return step_info(now.cost if now.step_is_successful else previous_cost, damping, **{**fields, **known})
 
 
-class _Watch(pyceres.IterationCallback):
-    """Turns Ceres' iteration callbacks into records, until a step that it accepted has hidden an observation."""
+class _RecordingCallback(pyceres.IterationCallback):
+    """Records every iteration of Ceres. Stops Ceres when an accepted step has moved a point behind its camera."""
 
     def __init__(self, run: Run, mode: str) -> None:
         super().__init__()
         self.run, self.mode = run, mode
-        self.begin()
+        self.reset()
 
-    def begin(self) -> None:
-        """Before a call of Ceres."""
+    def reset(self) -> None:
+        """Must be called before each call of Ceres."""
         self.last: Any = None
         self.before: Any = None
-        self.hidden: Any = None
+        self.behind: Any = None
         self.cost: Any = np.nan
 
     def __call__(self, summary: Any) -> Any:
@@ -204,8 +210,8 @@ class _Watch(pyceres.IterationCallback):
         if self.last is None:
             self.cost = summary.cost
         else:
-            if summary.step_is_successful and (hidden := self.run.hidden()).any():
-                self.hidden = hidden
+            if summary.step_is_successful and (behind := self.run.newly_behind()).any():
+                self.behind = behind
                 return kind.SOLVER_ABORT
             step = step_of(summary, self.last, self.cost, self.damping, self.mode)
             self.cost = step.cost
@@ -228,25 +234,28 @@ def solve_by_ceres(
     threads: int = 1,
     callback: Callback | None = None,
 ) -> Solution:
-    """Ceres under its own trust-region rule and its own stop tests, at jaxba's tolerances.
+    """Solves with Ceres under its own trust-region rule and convergence tests, with jaxba's tolerances.
 
-    The test of a small decrease looks at the candidate: that last linear solve is counted, as a step that is not taken
-    and gains nothing. An accepted step that takes a point behind its camera, which COLMAP rewards with a residual of
-    zero, is undone and repeated from the same radius with that observation counted: one iteration in the time of two.
+    Ceres tests for a small decrease before it accepts a step. That last linear solve is counted here as an iteration
+    whose step is rejected with gain ratio 0.
 
-    `step_norm` is Ceres' (0 for the first step, quaternions instead of angles); `parameter_norm` and `damping_share`
-    are not known.
+    COLMAP gives a point behind its camera a residual of zero. If an accepted step moves a point there, the step is
+    undone and repeated from the same radius with that observation counted. This takes the time of two iterations and
+    counts as one.
+
+    In the history, `step_norm` is the one of Ceres (0 for the first step, with quaternions instead of angles).
+    `parameter_norm` and `damping_share` are NaN.
 
     Args:
         problem: start of the optimisation.
-        mode: a key of `LINEAR_SOLVERS`, followed by `naming.INNER` for Ceres' inner iterations.
+        mode: a key of `LINEAR_SOLVERS`, followed by `INNER` for Ceres' inner iterations.
         max_iterations: limit of linear solves.
-        tolerances: convergence tests; Ceres has no target.
-        threads: of Ceres.
+        tolerances: convergence tests; the target cost is ignored, since Ceres has no such test.
+        threads: number of threads of Ceres.
         callback: called after every iteration; a true return value stops the solve.
 
     Raises:
-        ProblemError: as `Run`.
+        ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses.
     """
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
@@ -254,26 +263,26 @@ def solve_by_ceres(
     options.function_tolerance, options.parameter_tolerance = tolerances.ftol, tolerances.xtol
     options.gradient_tolerance = tolerances.gtol
     options.update_state_every_iteration = True
-    watch, summary = _Watch(run, mode), pyceres.SolverSummary()
-    options.callbacks = [watch]
+    recorder, summary = _RecordingCallback(run, mode), pyceres.SolverSummary()
+    options.callbacks = [recorder]
     run.start()
     while True:
-        watch.begin()
+        recorder.reset()
         options.max_num_iterations = max_iterations - len(run.steps)
         pyceres.solve(options, run.colmap.ceres, summary)
-        if watch.hidden is None:
+        if recorder.behind is None:
             break
-        run.colmap.restore(watch.before)
-        run.count(watch.hidden)
-        options.initial_trust_region_radius = watch.last.trust_region_radius
+        run.colmap.restore(recorder.before)
+        run.count_behind(recorder.behind)
+        options.initial_trust_region_radius = recorder.last.trust_region_radius
     if summary.message.startswith("User callback"):
         end = Termination.STOPPED
     else:
         end = next((end for words, end in ENDS.items() if summary.message.startswith(words)), Termination.STALLED)
     if end == Termination.STALLED:
         _log.warning("Ceres gave up: %s", summary.message)
-    if end in DISCARDED:
-        gradient = watch.last.gradient_max_norm
-        run.record(step_info(watch.cost, watch.damping, gradient_max=gradient, gain_ratio=0.0))
+    if end in ENDS_WITHOUT_STEP:
+        gradient = recorder.last.gradient_max_norm
+        run.record(step_info(recorder.cost, recorder.damping, gradient_max=gradient, gain_ratio=0.0))
     run.total_s = time.perf_counter() - run.started - run.paused
     return run.solution(end, mode)

@@ -1,7 +1,8 @@
-"""COLMAP's cost functions for Ceres, and what their Python bindings lack. Needs the extra `ceres`.
+"""COLMAP's reprojection error for Ceres, and what its Python bindings lack. Needs the extra `ceres`.
 
-Ceres then runs without Python inside. The camera is COLMAP's RADIAL `[f, cx, cy, k1, k2]` with a pose `[quaternion
-xyzw, translation]` in one block, looking down +z with y downwards: BAL's camera turned by pi about x.
+The cost function is C++, so that Ceres does not call Python in its inner loops. The camera model is COLMAP's RADIAL
+with parameters `[f, cx, cy, k1, k2]`, and the pose `[quaternion xyzw, translation]` is one parameter block. COLMAP's
+camera looks along +z with y downwards: it is BAL's camera rotated by pi about x.
 """
 
 from __future__ import annotations
@@ -14,42 +15,42 @@ import numpy as np
 from jaxtyping import Float
 
 try:
-    # in this order: pycolmap hands out pyceres' types
+    # in this order: pycolmap returns objects of pyceres' types
     import pyceres
     import pycolmap
     import pycolmap.cost_functions
 except ModuleNotFoundError:
     raise ImportError("this needs pyceres and pycolmap: pip install jaxba[ceres]") from None
 
-pyceres.logging.minloglevel = pyceres.logging.Level.ERROR.value  # a failed factorisation is a rejected step, no news
+pyceres.logging.minloglevel = pyceres.logging.Level.ERROR.value  # a failed factorisation is only a rejected step
 
 POSE_SIZE, LENS_SIZE = 7, 5
-"""Numbers of a pose and of a RADIAL camera."""
+"""Numbers of parameters of a pose and of a RADIAL camera."""
 
 PRINCIPAL_POINT = (1, 2)
-"""Where cx and cy stand in a RADIAL camera."""
+"""Indices of cx and cy among the parameters of a RADIAL camera."""
 
 SMALLEST_DEPTH = float(np.finfo(np.float64).eps)
-"""COLMAP takes the residual of a point that is less far in front of its camera as zero."""
+"""COLMAP sets the residual of a point to zero if its depth is smaller than this."""
 
 
 def backend(mode: str) -> str:
-    """The library in the words of a record, e.g. `pyceres 2.6 (Ceres 2.2.0, dense)`."""
+    """Name and versions of the library for `Record.backend`, e.g. `pyceres 2.6 (Ceres 2.2.0, dense)`."""
     return f"pyceres {pyceres.__version__} (Ceres {pyceres.__ceres_version__}, {mode})"
 
 
 def reprojection(pixel: Float[np.ndarray, " 2"]) -> Any:
-    """COLMAP's reprojection error of a RADIAL camera, in C++; its blocks are a point, a pose and a camera."""
+    """COLMAP's reprojection error of a RADIAL camera, in C++. Its parameter blocks are point, pose and camera."""
     return pycolmap.cost_functions.ReprojErrorCost(pycolmap.CameraModelId.RADIAL, pixel)
 
 
 @functools.cache
 def pose_manifold() -> Any:
-    """The manifold of a pose: unit quaternions times translations, 6 dimensions.
+    """The 6-dimensional manifold of a pose: unit quaternions times translations.
 
-    Neither package lets Python make one (pyceres 2.6, pycolmap 4.2.1), so it is borrowed from a bundle adjuster of two
-    images and one point. Both that problem and the handle which `get_manifold` returns believe that they own it, and
-    would free it twice: they are kept for ever, a few kilobytes in a process.
+    Neither package can create one from Python (pyceres 2.6, pycolmap 4.2.1), so it is taken from a bundle adjuster of
+    two images and one point. That problem and the object which `get_manifold` returns both own the manifold and would
+    free it twice. Therefore both are kept until the process ends, which costs a few kilobytes.
     """
     model = pycolmap.Reconstruction()
     lens = pycolmap.Camera(camera_id=1, model="RADIAL", width=1, height=1, params=[1.0, 0, 0, 0, 0])
@@ -71,10 +72,10 @@ def pose_manifold() -> Any:
     return manifold
 
 
-class AnySide(pyceres.CostFunction):
-    """The same error for a point on either side of its camera, as BAL counts it.
+class TwoSidedReprojection(pyceres.CostFunction):
+    """The reprojection error of `reprojection`, also for points behind their camera, as BAL defines it.
 
-    Python evaluates it, so it is for the few observations that COLMAP's would leave out.
+    It is evaluated in Python and therefore slow. It is used only for the few observations that COLMAP ignores.
     """
 
     def __init__(self, pixel: Float[np.ndarray, " 2"]) -> None:
@@ -84,7 +85,7 @@ class AnySide(pyceres.CostFunction):
         self.pixel = pixel
 
     def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
-        """`f (1 + k1 r + k2 r^2) p + c - z` with `p = P.xy / P.z`, `r = |p|^2`, and its derivatives where asked for."""
+        """`f (1 + k1 r + k2 r^2) p + c - z` with `p = P.xy / P.z` and `r = |p|^2`, and the requested Jacobians."""
         point, pose, (f, cx, cy, k1, k2) = parameters
         v, w = pose[:3], pose[3]
         turned = np.cross(v, point)
@@ -109,5 +110,5 @@ class AnySide(pyceres.CostFunction):
 
 
 def _cross(v: np.ndarray) -> np.ndarray:
-    """The matrix `[v]x`."""
+    """The cross-product matrix `[v]x`."""
     return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

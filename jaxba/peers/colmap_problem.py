@@ -1,4 +1,4 @@
-"""A bundle adjustment problem as a Ceres problem, and back. Needs the extra `ceres`."""
+"""Converts a bundle adjustment problem to a Ceres problem and back. Needs the extra `ceres`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxba.peers.colmap import LENS_SIZE, PRINCIPAL_POINT, SMALLEST_DEPTH, AnySide, pose_manifold, pyceres, reprojection
+from jaxba.peers.colmap import (
+    LENS_SIZE,
+    PRINCIPAL_POINT,
+    SMALLEST_DEPTH,
+    TwoSidedReprojection,
+    pose_manifold,
+    pyceres,
+    reprojection,
+)
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
@@ -15,21 +23,21 @@ from jaxba.problem.geometry import bal_rotations, colmap_quaternions
 
 
 class ColmapProblem:
-    """The parameters as arrays of our own, and a `pyceres.Problem` that works on them in place.
+    """The parameters as NumPy arrays, and a `pyceres.Problem` that changes them in place.
 
-    Each camera has its own pose, f, k1 and k2; the principal point is constant, the gauge is free. An observation whose
-    point is not in front of its camera at the start has a cost function in Python (`AnySide`), since COLMAP's would be
-    zero; `keep` does the same for those that get there later.
+    Each camera has its own pose, f, k1 and k2. The principal point is constant and the gauge is free. An observation
+    whose point is not in front of its camera at the start gets the cost function `TwoSidedReprojection`, since COLMAP's
+    would be zero. `count_behind` does the same for points that move behind their camera later.
 
-    Ceres holds bare pointers into `poses`, `lenses` and `points`, and to the cost functions. This object owns them all,
-    so keep it for as long as `ceres` is used.
+    Ceres holds raw pointers into `poses`, `lenses` and `points`, and to the cost functions. This object owns all of
+    them, so it must live for as long as `ceres` is used.
     """
 
     def __init__(self, problem: BundleProblem) -> None:
-        """Copies the parameters; the problem itself never changes.
+        """Copies the parameters; `problem` is not changed.
 
         Raises:
-            ProblemError: the problem has covariances or lenses.
+            ProblemError: the problem has covariances, or shared or partly fixed lenses.
         """
         if problem.whitening is not None or problem.lenses is not None:
             raise ProblemError("Ceres as a peer takes no covariances or weights, and no shared or partly fixed lenses")
@@ -42,31 +50,36 @@ class ColmapProblem:
         self._costs: list[Any] = [None] * problem.num_observations
         self._residuals: list[Any] = [None] * problem.num_observations
         self.in_python = geometry.depths(problem) < SMALLEST_DEPTH
-        """Per observation: whether its cost function is in Python."""
-        for observation, hidden in enumerate(self.in_python):
-            self._add(observation, AnySide if hidden else reprojection)
-        self.seen = np.unique(problem.camera_index)
-        for camera in self.seen:
+        """Whether the cost function of an observation is the one in Python, shape `(observations,)`."""
+        for observation, behind in enumerate(self.in_python):
+            self._add_observation(observation, TwoSidedReprojection if behind else reprojection)
+        self.observing = np.unique(problem.camera_index)
+        """Cameras that have observations."""
+        for camera in self.observing:
             self.ceres.set_manifold(self._poses[camera], self._manifolds[0])
             self.ceres.set_manifold(self._lenses[camera], self._manifolds[1])
 
-    def _add(self, observation: int, cost: Any) -> None:
+    def _add_observation(self, observation: int, cost: Any) -> None:
         camera, point = self.start.camera_index[observation], self.start.point_index[observation]
         self._costs[observation] = cost(self.pixels[observation])
         blocks = [self._points[point], self._poses[camera], self._lenses[camera]]
         self._residuals[observation] = self.ceres.add_residual_block(self._costs[observation], None, blocks)
 
-    def keep(self, hidden: Bool[np.ndarray, " observations"]) -> int:
-        """Gives observations whose points went behind their camera a cost function that counts; returns how many."""
-        new = np.flatnonzero(hidden & ~self.in_python).tolist()
+    def count_behind(self, behind: Bool[np.ndarray, " observations"]) -> int:
+        """Replaces the cost function of observations whose points moved behind their camera.
+
+        Returns:
+            How many were replaced.
+        """
+        new = np.flatnonzero(behind & ~self.in_python).tolist()
         for observation in new:
             self.ceres.remove_residual_block(self._residuals[observation])
-            self._add(observation, AnySide)
+            self._add_observation(observation, TwoSidedReprojection)
         self.in_python[new] = True
         return len(new)
 
-    def add(self, cost: Any, point: int) -> None:
-        """Adds an error of one point that is no observation."""
+    def add_point_cost(self, cost: Any, point: int) -> None:
+        """Adds a cost function of one point that is not an observation."""
         self._costs.append(cost)
         self.ceres.add_residual_block(cost, None, [self._points[point]])
 
@@ -75,28 +88,28 @@ class ColmapProblem:
         return self.poses.copy(), self.lenses.copy(), self.points.copy()
 
     def restore(self, parameters: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-        """Puts back what `parameters` returned, in place."""
+        """Sets the parameters to what `parameters` returned, in place."""
         for block, old in zip((self.poses, self.lenses, self.points), parameters, strict=True):
             block[:] = old
 
-    def move_to(self, problem: BundleProblem) -> None:
-        """Takes over the parameters of another problem of the same shape, in place."""
+    def set_parameters_of(self, problem: BundleProblem) -> None:
+        """Sets the parameters to those of a problem of the same shape, in place."""
         self.restore(_parameters(problem))
 
     def residuals(self) -> Float[np.ndarray, " residuals"]:
-        """What Ceres sees at the present parameters, pixels."""
+        """The residuals that Ceres evaluates at the current parameters, pixels."""
         return np.array(self.ceres.evaluate_residuals())
 
     def bundle(self) -> BundleProblem:
-        """The problem at the present parameters; what nobody observes is unchanged."""
+        """The problem at the current parameters. Cameras without observations are unchanged."""
         cameras: Any = np.array(self.start.cameras, np.float64)
-        poses, lenses = self.poses[self.seen], self.lenses[self.seen]
-        cameras[self.seen] = np.hstack([bal_rotations(poses[:, :4]), poses[:, 4:] * FLIP, lenses[:, [0, 3, 4]]])
+        poses, lenses = self.poses[self.observing], self.lenses[self.observing]
+        cameras[self.observing] = np.hstack([bal_rotations(poses[:, :4]), poses[:, 4:] * FLIP, lenses[:, [0, 3, 4]]])
         return self.start.replace(cameras=cameras, points=self.points.copy())
 
 
 def _parameters(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Poses, lenses and points, in arrays of their own."""
+    """New arrays of poses `(cameras, 7)`, lenses `(cameras, 5)` and points `(points, 3)` in COLMAP's convention."""
     cameras = np.asarray(problem.cameras, np.float64)
     lenses = np.zeros((len(cameras), LENS_SIZE))
     lenses[:, [0, 3, 4]] = cameras[:, 6:]

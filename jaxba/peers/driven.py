@@ -1,9 +1,9 @@
-"""Ceres driven by a damping policy, one linear solve at a time. Needs the extra `ceres`.
+"""Ceres' steps with lambda chosen by a damping policy, one linear solve at a time. Needs the extra `ceres`.
 
-An iteration is one call of `pyceres.solve` with one iteration and `initial_trust_region_radius = 1 / lambda`: the same
-algorithm, since what Ceres keeps between iterations is the radius and the column scaling, and `lambda diag(H)` does not
-depend on the scaling. A call repeats Ceres' preparations and the first linearisation, so driven times compare with
-driven times only.
+Each iteration is a call of `pyceres.solve` with one iteration and `initial_trust_region_radius = 1 / lambda`. This is
+the same algorithm as one long solve: between iterations Ceres keeps only the radius and the column scaling, and
+`lambda diag(H)` does not depend on the scaling. Every call repeats Ceres' preprocessing and one linearisation, so that
+these times are comparable with each other only.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ import numpy as np
 from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Termination, Tolerances
+from jaxba.peers.acceptance import ReportedByCeres, StepAcceptance
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
-from jaxba.peers.model import Observed, observed, step_facts
-from jaxba.peers.verdict import Told, Verdict
+from jaxba.peers.model import Observations, observations_of, step_metrics
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
@@ -32,20 +32,20 @@ from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution
 
 LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
-"""Limits of the radius that leave every lambda of a policy as it is."""
+"""Limits of the radius, so wide that they do not change the lambda of any policy."""
 
-REJECTED_SHARE = 0.0
-"""Stand-in for `damping_share` of a rejected step, which Ceres does not show. Steps are rejected for too little
-damping: of jaxba's own it was 0.0003 to 0.006 on Ladybug-49 and kittistereo00s under `learned-driver`."""
+REJECTED_DAMPING_SHARE = 0.0
+"""Assumed `damping_share` of a rejected step, which Ceres does not return. Steps are rejected for too little damping,
+so that it is near 0: for jaxba's own steps it was 0.0003 to 0.006 on Ladybug-49 and kittistereo00s."""
 
 _after_step = jax.jit(after_step)
 _init = jax.jit(lambda policy, info: policy.init(info))
 
 
-class _Last(pyceres.IterationCallback):
-    """Keeps the summaries of a call: the start, and the iteration if it came to its end.
+class _SummaryRecorder(pyceres.IterationCallback):
+    """Keeps the summaries of a call of Ceres: of the start, and of the iteration if it was completed.
 
-    One for all calls: to assign to `SolverOptions.callbacks` again adds to what is there (pyceres 2.6).
+    One object serves all calls, since assigning `SolverOptions.callbacks` a second time appends to it (pyceres 2.6).
     """
 
     def __init__(self) -> None:
@@ -68,31 +68,34 @@ def drive_ceres(
     callback: Callback | None = None,
     embedded: StepOptions | None = None,
 ) -> Solution:
-    """Ceres' steps under a policy, with jaxba's stop tests.
+    """Solves with Ceres' steps, lambda from a policy, and jaxba's convergence tests.
 
-    The policy sees what it sees of `lm_step`: costs, gain ratio, predicted decrease and gradient as Ceres reports them
-    (the gradient by a quaternion's three tangent coordinates, twice that by angles), the rest by `step_facts`. Of a
-    rejected step the length stays unknown (NaN, by which stop rules know it), the share of damping is `REJECTED_SHARE`.
-    Where an accepted step takes points behind their camera, which COLMAP rewards with a residual of zero, the whole
-    cost decides once more.
+    The policy gets the same record of a step as from `lm_step`. Costs, gain ratio, predicted decrease and gradient are
+    those that Ceres reports (its gradient by the three tangent coordinates of a quaternion is twice the one by angles);
+    `step_metrics` computes the rest. For a rejected step, `step_norm` is NaN and `damping_share` is
+    `REJECTED_DAMPING_SHARE`.
+
+    COLMAP gives a point behind its camera a residual of zero. If a step that Ceres accepts moves points there, it is
+    tested once more with the cost that counts them.
 
     Args:
         problem: start of the optimisation.
         mode: a key of `LINEAR_SOLVERS`.
-        policy: chooses lambda; its `min_gain` is Ceres' `min_relative_decrease`.
+        policy: chooses lambda; its `min_gain` becomes Ceres' `min_relative_decrease`.
         max_iterations: limit of linear solves.
         tolerances: convergence tests.
-        threads: of Ceres.
+        threads: number of threads of Ceres.
         callback: called after every iteration; a true return value stops the solve.
-        embedded: what surrounds each step, and how it is added to a camera; then jaxba judges it (verdict.py), and the
-            policy sees what it sees of `lm_step`. How a step is solved does not matter, and how many point iterations a
-            policy would have is not asked.
+        embedded: if given, jaxba refines each step with these embedded iterations and accepts or rejects it
+            (`acceptance.py`). Options of the linear solver are ignored, and the policy cannot change the number of
+            point iterations.
 
     Returns:
-        `total_s` holds Ceres' calls, the policy and `step_facts` or the verdict, without compilation.
+        The solution. `total_s` has the time of Ceres, of the policy and of `step_metrics` or the acceptance test,
+        without compilation.
 
     Raises:
-        ProblemError: as `Run`.
+        ProblemError: the initial cost is not finite, or the problem has covariances or shared lenses.
     """
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
@@ -100,8 +103,8 @@ def drive_ceres(
     options.max_num_iterations = 1
     options.function_tolerance = options.parameter_tolerance = options.gradient_tolerance = 0.0
     options.min_relative_decrease = float(policy.min_gain)
-    last = _Last()
-    options.callbacks = [last]
+    recorder = _SummaryRecorder()
+    options.callbacks = [recorder]
     options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
     with jax.enable_x64(True), process.single_blas_thread(), CompileClock() as clock:
         started = time.perf_counter()
@@ -109,82 +112,88 @@ def drive_ceres(
         # everything is compiled before the clock starts
         same = run.colmap.parameters()
         if embedded is None:
-            constant = observed(problem, run.colmap.pixels)
-            jax.block_until_ready(step_facts(constant, same, same))
-            iterate = functools.partial(_iterate, run, options, last.summaries, constant, mode)
+            observations = observations_of(problem, run.colmap.pixels)
+            jax.block_until_ready(step_metrics(observations, same, same))
+            iterate = functools.partial(_iterate_under_ceres_rule, run, options, recorder.summaries, observations, mode)
         else:
-            verdict = Verdict(run, embedded, policy.min_gain)
-            jax.block_until_ready(verdict.judged(same, float(damping), Told.nothing()))
-            iterate = functools.partial(_judged, run, options, last.summaries, verdict, mode)
-        idle = _idle(run.cost, float(damping))
-        # twice: the state that a policy returns need not be of the type of its first
-        warm, _, _ = _answer(policy, state, idle, 1, tolerances, max_iterations)
-        jax.block_until_ready(_answer(policy, warm, idle, 1, tolerances, max_iterations))
+            acceptance = StepAcceptance(run, embedded, policy.min_gain)
+            jax.block_until_ready(acceptance.evaluate(same, float(damping), ReportedByCeres.empty()))
+            iterate = functools.partial(_iterate_under_jaxba_rule, run, options, recorder.summaries, acceptance, mode)
+        null_step = _null_step(run.cost, float(damping))
+        # twice, since the state that a policy returns may differ in type from its initial state
+        warm, _, _ = _update_policy(policy, state, null_step, 1, tolerances, max_iterations)
+        jax.block_until_ready(_update_policy(policy, warm, null_step, 1, tolerances, max_iterations))
         run.setup_s += max(0.0, time.perf_counter() - started - clock.seconds)
         run.start()
         end, iteration = Termination.RUNNING, 0
         while end == Termination.RUNNING:
             iteration += 1
             step = iterate(float(damping))
-            state, damping, answer = _answer(policy, state, step, iteration, tolerances, max_iterations)
+            state, damping, answer = _update_policy(policy, state, step, iteration, tolerances, max_iterations)
             end = Termination(int(answer))
             if run.record(step) and end == Termination.RUNNING:
                 end = Termination.STOPPED
     return run.solution(end, mode, clock.seconds)
 
 
-def _iterate(run: Run, options: Any, summaries: list[Any], constant: Observed, mode: str, damping: float) -> StepInfo:
-    """One linear solve by one call of Ceres; the parameters change if its step is accepted."""
+def _iterate_under_ceres_rule(
+    run: Run, options: Any, summaries: list[Any], observations: Observations, mode: str, damping: float
+) -> StepInfo:
+    """One linear solve by one call of Ceres, which accepts or rejects the step."""
     before = run.colmap.parameters()
-    _ask(run, options, summaries, damping)
+    _call_ceres(run, options, summaries, damping)
     if len(summaries) < 2:  # the gradient is zero, or the candidate's cost or parameters are those before it
-        return _idle(run.cost, damping, *(summary.gradient_max_norm for summary in summaries))
+        return _null_step(run.cost, damping, *(summary.gradient_max_norm for summary in summaries))
     first, second = summaries
     if not second.step_is_successful:
-        unknown = {"step_norm": np.nan, "damping_share": REJECTED_SHARE}
+        unknown = {"step_norm": np.nan, "damping_share": REJECTED_DAMPING_SHARE}
         return step_of(second, first, first.cost, damping, mode, **unknown)
-    facts = step_facts(constant, before, run.colmap.parameters())
+    metrics = step_metrics(observations, before, run.colmap.parameters())
     names = ("step_norm", "parameter_norm", "damping_share")
-    known = {name: float(getattr(facts, name)) for name in names}
+    known = {name: float(getattr(metrics, name)) for name in names}
     step = step_of(second, first, first.cost, damping, mode, **known)
-    hidden = np.asarray(facts.behind) & ~run.colmap.in_python
-    if not hidden.any():
+    behind = np.asarray(metrics.behind) & ~run.colmap.in_python
+    if not behind.any():
         return step
-    whole = float(facts.cost)
-    gain = (first.cost - whole) / step.predicted
-    step = step._replace(candidate_cost=whole, gain_ratio=gain)
+    full_cost = float(metrics.cost)
+    gain = (first.cost - full_cost) / step.predicted
+    step = step._replace(candidate_cost=full_cost, gain_ratio=gain)
     if gain > options.min_relative_decrease:
-        run.count(hidden)
-        return step._replace(cost=whole)
+        run.count_behind(behind)
+        return step._replace(cost=full_cost)
     run.colmap.restore(before)
-    return step._replace(accepted=False, cost=first.cost, step_norm=np.nan, damping_share=REJECTED_SHARE)
+    return step._replace(accepted=False, cost=first.cost, step_norm=np.nan, damping_share=REJECTED_DAMPING_SHARE)
 
 
-def _ask(run: Run, options: Any, summaries: list[Any], damping: float) -> None:
-    """One call of Ceres; its callback fills the summaries."""
+def _call_ceres(run: Run, options: Any, summaries: list[Any], damping: float) -> None:
+    """Calls Ceres for one iteration with the given lambda; its callback fills `summaries`."""
     options.initial_trust_region_radius = float(np.clip(1 / damping, SMALLEST_RADIUS, LARGEST_RADIUS))
     summaries.clear()
     pyceres.solve(options, run.colmap.ceres, pyceres.SolverSummary())
 
 
-def _judged(run: Run, options: Any, summaries: list[Any], verdict: Verdict, mode: str, damping: float) -> StepInfo:
-    """One linear solve by one call of Ceres; what becomes of its step jaxba decides."""
+def _iterate_under_jaxba_rule(
+    run: Run, options: Any, summaries: list[Any], acceptance: StepAcceptance, mode: str, damping: float
+) -> StepInfo:
+    """One linear solve by one call of Ceres; jaxba refines the step and accepts or rejects it."""
     before = run.colmap.parameters()
-    verdict.forgiving.begin()
-    _ask(run, options, summaries, damping)
+    acceptance.accept_any.reset()
+    _call_ceres(run, options, summaries, damping)
     if len(summaries) < 2 or not summaries[1].step_is_successful:  # no step could be computed
-        return _idle(run.cost, damping, *(summary.gradient_max_norm for summary in summaries[:1]))
-    return verdict.settle(before, damping, Told.of(summaries, mode))
+        return _null_step(run.cost, damping, *(summary.gradient_max_norm for summary in summaries[:1]))
+    return acceptance.apply(before, damping, ReportedByCeres.from_summaries(summaries, mode))
 
 
-def _idle(cost: float, damping: float, gradient_max: float = np.nan) -> StepInfo:
-    """A step that leads nowhere."""
-    facts = {"candidate_cost": cost, "predicted": 0.0, "gain_ratio": 0.0, "damping_share": REJECTED_SHARE}
-    return step_info(cost, damping, gradient_max=gradient_max, **facts)
+def _null_step(cost: float, damping: float, gradient_max: float = np.nan) -> StepInfo:
+    """The record of a rejected step of length zero."""
+    fields = {"candidate_cost": cost, "predicted": 0.0, "gain_ratio": 0.0, "damping_share": REJECTED_DAMPING_SHARE}
+    return step_info(cost, damping, gradient_max=gradient_max, **fields)
 
 
-def _answer(policy: DampingPolicy, state: Any, step: StepInfo, iteration: int, tolerances: Any, limit: int) -> Any:
-    """`after_step` on arrays of fixed types, so that it compiles once."""
+def _update_policy(
+    policy: DampingPolicy, state: Any, step: StepInfo, iteration: int, tolerances: Any, limit: int
+) -> Any:
+    """`after_step` with all arguments as arrays of fixed types, so that it is compiled once."""
     kinds = {"accepted": np.bool_, "cg_iterations": np.int32, "repairs": np.int32}
     arrays = StepInfo(**{k: jnp.asarray(x, kinds.get(k, np.float64)) for k, x in step._asdict().items()})
     limits = Tolerances(*(np.float64(x) for x in tolerances))
@@ -192,7 +201,7 @@ def _answer(policy: DampingPolicy, state: Any, step: StepInfo, iteration: int, t
 
 
 def _problem_info(problem: BundleProblem, cost: float, max_iterations: int) -> ProblemInfo:
-    """As `solve` has it under diagonal damping."""
+    """The `ProblemInfo` that `solve` makes for diagonal damping."""
     cameras = np.unique(problem.camera_index)
     count = lambda n: jnp.asarray(n, jnp.int32)
     return ProblemInfo(

@@ -74,7 +74,7 @@ class Loss:
         if not callable(self.name) and self.name not in _SHAPES:
             raise ValueError(f"unknown loss {self.name!r}; known: {', '.join(NAMES)}")
         if not (self.scale > 0 and 0 < self.scale * self.scale < float("inf")):
-            raise ValueError(f"the scale of a loss must be positive, and its square a finite number, not {self.scale}")
+            raise ValueError(f"scale must be positive, and its square a finite number, is {self.scale}")
 
     @property
     def trivial(self) -> bool:

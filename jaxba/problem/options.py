@@ -185,7 +185,7 @@ class StepOptions:
         _check_known("linear_solver", self.linear_solver, LinearSolver)
         _check_known("intrinsics", self.intrinsics, Intrinsics)
         if self.intrinsics == "fixed" and (self.method is not None or self.linear_solver != "explicit"):
-            raise ValueError(f"fixed intrinsics need the explicit solver, not {self.solver_name}")
+            raise ValueError(f"intrinsics 'fixed' need the explicit solver, not {self.solver_name}")
 
     @property
     def solver_name(self) -> str:

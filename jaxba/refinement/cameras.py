@@ -11,6 +11,7 @@ from jaxba.model import camera
 from jaxba.model.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.fusion import compute_unfused
+from jaxba.structure.conventions import components_first
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
@@ -48,7 +49,7 @@ def refine_cameras(
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         best, done, turn = carry
         damped = blocks + (dampings[turn] * diagonal)[:, :, None] * jnp.eye(9, dtype=blocks.dtype)
-        step = -solve_positive(damped, gradient).T
+        step = -components_first(solve_positive(damped, gradient))
         # on the manifold, in which the Jacobian is written
         moved = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
         costs = observation_costs(layout, moved, points, options.loss)

@@ -9,10 +9,10 @@ import re
 from dataclasses import dataclass, replace
 from typing import cast, get_args
 
-from jaxba.damping import DampingPolicy, is_learned, make_policy
+from jaxba.damping import DampingPolicy, brings_embedded, make_policy
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.policy import trained_step
-from jaxba.damping.registry import LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
+from jaxba.damping.registry import BOLD, BOLD_DRIVER, BOLD_PLAIN, LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
 from jaxba.methods.registry import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.solver.options import Dtype, SolveOptions
@@ -40,7 +40,7 @@ class SolverName:
 
     refine_points: int | None = 0
     """Embedded point iterations and no others. None: all embedded iterations; a learned policy brings those that it
-    was trained with, a rule gets the default ones under the name `RULE+embedded`."""
+    was trained with, `bold` those of `learned`, and a rule gets the default ones under the name `RULE+embedded`."""
 
     dtype: Dtype = DTYPES[0]
     """Floating point type."""
@@ -54,8 +54,8 @@ class SolverName:
     def __str__(self) -> str:
         around = ""
         if self.refine_points is None:
-            around = "" if is_learned(self.policy) else "+embedded"
-        elif self.embeds or is_learned(self.policy):
+            around = "" if brings_embedded(self.policy) else "+embedded"
+        elif self.embeds or brings_embedded(self.policy):
             around = f"+refine{self.refine_points}"
         if self.peer:
             return f"{self.peer}+{self.policy}{around}" if self.policy else self.peer
@@ -79,7 +79,7 @@ class SolverName:
         step = trained_step(policy)
         if self.refine_points is not None:
             step = replace(step, refinement=Refinement(points=self.refine_points))
-        elif not is_learned(self.policy):
+        elif not brings_embedded(self.policy):
             step = AgentConfig().step_options(StepOptions())
         return policy, SolveOptions(
             method=self.method, refinement=step.refinement, coordinates=step.coordinates, dtype=self.dtype
@@ -87,7 +87,7 @@ class SolverName:
 
 
 def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> str:
-    """The policy that a name means: `learned` is the shipped one that was found best for the step (docs/game.md).
+    """The policy that a name means: `learned` is the best of the shipped ones for the step, and `bold` has its guard.
 
     Args:
         policy: see `make_policy`.
@@ -95,13 +95,16 @@ def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> s
         peer: whether another library makes the step, which damps cameras as points.
 
     Returns:
-        A name for `make_policy`; any but `learned` as it is.
+        A name for `make_policy`; any but `learned` and `bold` as it is.
     """
-    if policy != LEARNED:
+    if policy not in _ALONE or not alone:
         return policy
-    if not alone:
-        return LEARNED
-    return LEARNED_DRIVER if peer else LEARNED_PLAIN
+    plain, driver = _ALONE[policy]
+    return driver if peer else plain
+
+
+_ALONE = {LEARNED: (LEARNED_PLAIN, LEARNED_DRIVER), BOLD: (BOLD_PLAIN, BOLD_DRIVER)}
+"""What these names mean for lambda alone: with jaxba's step, and with another library's."""
 
 
 def parse_solver(name: str) -> SolverName:
@@ -149,7 +152,7 @@ def parse_solver(name: str) -> SolverName:
     if at and dtype not in DTYPES:
         raise SolverNameError(f"unknown type {dtype!r} in {name!r}; known: {', '.join(DTYPES)}")
     make_policy(merged[0])
-    if is_learned(merged[0]) and not stated:
+    if brings_embedded(merged[0]) and not stated:
         refine = None
     return SolverName(merged[0], refine, cast(Dtype, dtype or DTYPES[0]), method)
 

@@ -22,6 +22,7 @@ from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.names import fitting_policy
 from jaxba.solver.options import SolveOptions
+from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
@@ -135,7 +136,7 @@ def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: 
     """Optimised parameters in the problem's own order; what was not optimised is copied bit by bit."""
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
     seen = np.flatnonzero(layout.camera_seen)  # cameras of padding are not seen
-    cameras[seen] = np.asarray(state.cameras, np.float64).T[seen]
+    cameras[seen] = items_first(np.asarray(state.cameras, np.float64))[seen]
     if options.intrinsics == "fixed":
         cameras[:, 6:] = problem.cameras[:, 6:]
     elif problem.lenses is not None:  # what nobody observes has the lens of the others
@@ -146,5 +147,5 @@ def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: 
         cameras[:, 6:] = np.where(np.asarray(problem.lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
     order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = order < problem.num_points
-    points[order[real]] = np.asarray(state.points, np.float64).T[real]
+    points[order[real]] = items_first(np.asarray(state.points, np.float64))[real]
     return problem.replace(cameras=cameras, points=points)

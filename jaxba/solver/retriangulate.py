@@ -33,6 +33,7 @@ from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import compile_and_run, level_after, program, stages
 from jaxba.solver.prepare import explain_start
+from jaxba.structure.conventions import components_first, items_first
 from jaxba.structure.layout import Layout, build_layout
 
 PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
@@ -104,7 +105,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         first = np.zeros(problem.num_points, np.int64)
         first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
         origin = np.zeros((3, len(order)))
-        origin[:, real] = geometry.camera_centers(problem.cameras)[first[order[real]]].T
+        origin[:, real] = components_first(geometry.camera_centers(problem.cameras)[first[order[real]]])
         level = level_after(VERDICTS, stages("acceptance", problem.num_observations))
         search = program(_search, "loss", level=level)
         given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss())
@@ -113,7 +114,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem))
     points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real
-    points[order[moved]] = np.asarray(found.points).T[moved]
+    points[order[moved]] = items_first(np.asarray(found.points))[moved]
     return Retriangulation(
         problem.replace(points=points), int(moved.sum()), float(found.cost_before), float(found.cost_after)
     )

@@ -1,7 +1,7 @@
-"""Checkpoints: a tree of arrays and a few facts, written whole or not at all.
+"""Checkpoints: a tree of arrays and JSON metadata, written atomically.
 
-Orbax writes into a temporary folder and renames it, so that a checkpoint that has its name is complete. A tree is
-stored as a flat mapping from paths to NumPy arrays: what is restored must fit what the program expects, leaf by leaf.
+Orbax writes into a temporary folder and renames it, so that a checkpoint with its final name is complete. A tree is
+stored as a flat mapping from paths to NumPy arrays; every leaf that is restored must have the expected shape and type.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 _PREFIX = "step_"
-_FACTS = "facts"
+_METADATA = "metadata"
 
 
 class CheckpointError(ValueError):
@@ -25,17 +25,17 @@ class CheckpointError(ValueError):
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
-    """Leaves of a tree by path, copied to the host; random keys as their data."""
+    """Leaves of a tree by path, copied to the host; random keys as arrays."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {_name(path): np.array(jax.random.key_data(x) if _is_key(x) else x) for path, x in leaves}
 
 
 def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
-    """The inverse of `pack`, on the device and in memory of its own.
+    """The inverse of `pack`, on the device and in newly allocated memory.
 
     Args:
         arrays: leaves by path.
-        like: a tree of that structure, of arrays or of `jax.ShapeDtypeStruct`.
+        like: a tree of the expected structure, of arrays or of `jax.ShapeDtypeStruct`.
 
     Raises:
         CheckpointError: a leaf is missing, or is of another shape or type.
@@ -45,7 +45,7 @@ def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
         name = _name(path)
         if name not in arrays:
             raise CheckpointError(f"{name} is missing")
-        value = jnp.array(arrays[name], copy=True)  # of its own, since training donates it
+        value = jnp.array(arrays[name], copy=True)  # a copy, since training donates its argument
         if _is_key(expected):
             value = jax.random.wrap_key_data(value)
         if (value.shape, value.dtype) != (expected.shape, expected.dtype):
@@ -72,20 +72,20 @@ def steps(folder: Path) -> list[int]:
     return sorted(int(name) for name in names if name.isdigit())
 
 
-def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], facts: Mapping[str, Any], keep: int) -> None:
-    """Writes a checkpoint, then removes those before the last `keep`, and what a kill left half-written.
+def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any], keep: int) -> None:
+    """Writes a checkpoint, then removes all but the last `keep`, and incomplete ones of a killed process.
 
     Args:
-        folder: of all checkpoints; is made.
-        step: number of this one; one of the same number is replaced.
+        folder: of all checkpoints; created if missing.
+        step: number of this checkpoint; an old one of the same number is replaced.
         arrays: see `pack`.
-        facts: must be JSON; they are part of the checkpoint.
-        keep: checkpoints that stay, this one included.
+        metadata: anything that JSON can hold.
+        keep: number of checkpoints kept, this one included.
     """
     import orbax.checkpoint as ocp
 
     folder.mkdir(parents=True, exist_ok=True)
-    content = {**arrays, _FACTS: np.frombuffer(json.dumps(facts).encode(), np.uint8)}
+    content = {**arrays, _METADATA: np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
     with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save((folder / f"{_PREFIX}{step}").absolute(), content, force=True)
         checkpointer.wait_until_finished()
@@ -96,7 +96,7 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], facts: Mappi
 
 
 def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Arrays and facts of a checkpoint.
+    """Arrays and metadata of a checkpoint.
 
     Raises:
         CheckpointError: it cannot be read.
@@ -110,5 +110,5 @@ def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, A
     except (OSError, ValueError, KeyError) as error:
         raise CheckpointError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
     arrays = {name: np.asarray(value) for name, value in content.items()}
-    facts = json.loads(arrays.pop(_FACTS).tobytes())
-    return arrays, facts
+    metadata = json.loads(arrays.pop(_METADATA).tobytes())
+    return arrays, metadata

@@ -1,6 +1,6 @@
-"""Everything that a training run depends on, and the YAML files that say it.
+"""The configuration of a training run, and the YAML files that hold it.
 
-A file in `configs/train` states differences to the file that it extends, or to the defaults of the classes
+A file in `configs/train` lists differences to the file that it extends, or to the defaults of the classes
 (jaxba/io/configurations.py); a run writes all settings into its folder.
 """
 
@@ -24,7 +24,7 @@ from jaxba.training.settings import SettingsError
 from jaxba.training.train_loop import LoopConfig
 
 METADATA_BYTES = 1 << 14
-"""Left for what a policy file says about itself: the configuration in 3 kB."""
+"""Reserved for the metadata of a policy file, of which the configuration takes 3 kB."""
 
 
 @dataclass(frozen=True)
@@ -32,49 +32,49 @@ class TrainConfig:
     """A training run."""
 
     seed: int = 0
-    """Decides the scenes and, with the number of the agent, all of its training."""
+    """Of all random numbers: the scenes, and with the number of an agent its training."""
 
     seeds: int = 1
-    """Agents trained one after the other on the same scenes with one compiled program; the best on held-out scenes is
-    kept. One after the other, since on a CPU neither the small matrix products of several agents nor the LM steps of
-    their scenes gain anything from a further batch axis, while replay buffers would all be held at once."""
+    """Agents trained one after the other on the same scenes with one compiled program; the best one on held-out scenes
+    is kept. Training them in one batch would not be faster on a CPU and would hold all replay buffers at once."""
 
     chunks: int = 40
-    """Length of the training of each agent: calls of the compiled loop, of `loop.steps_per_chunk` vector steps."""
+    """Length of each agent's training in calls of the compiled loop, each of `loop.steps_per_chunk` vector steps."""
 
     evaluate_every: int = 4
-    """Chunks from one evaluation on held-out scenes to the next; after the last chunk there always is one."""
+    """Chunks between evaluations on held-out scenes; the last chunk is always followed by one."""
 
     checkpoint_every: int = 4
-    """Chunks from one checkpoint to the next: what a kill loses at most."""
+    """Chunks between checkpoints."""
 
     keep: int = 2
-    """Checkpoints kept. Each holds the best policy so far too."""
+    """Checkpoints kept. Each also holds the best policy so far."""
 
     envs: tuple[int, ...] = (64,)
     """Environments of each class of scenes."""
 
     method: MethodName = "lm"
-    """How a step is made (jaxba/methods/registry.py). Best costs and the selection of scenes are those of plain LM."""
+    """How a step is computed (jaxba/methods/registry.py). Scenes are solved and selected with plain LM."""
 
     cluster_cameras: int = 4
-    """Cameras of a cluster at most, for methods with clusters: scenes are too small for those of real problems."""
+    """Largest number of cameras in a cluster, for methods with clusters; the default for real problems is too large for
+    scenes of the game."""
 
     bank: BankConfig = field(default_factory=BankConfig)
     """Scenes."""
 
     game: GameConfig = field(default_factory=GameConfig)
-    """Rules of the game, and what the agent sees and does."""
+    """Rules of the game, and what the agent observes and decides."""
 
     sac: SacConfig = field(default_factory=SacConfig)
-    """The agent."""
+    """Networks and learning."""
 
     loop: LoopConfig = field(default_factory=LoopConfig)
     """Sizes of the training loop."""
 
     @property
     def step_options(self) -> StepOptions:
-        """Of the method's steps, without embedded iterations."""
+        """Options of the method's steps, without embedded iterations."""
         plain = StepOptions(intrinsics=self.bank.intrinsics)
         if self.method == DEFAULT_METHOD:
             return plain
@@ -103,18 +103,18 @@ class TrainConfig:
 
 
 def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None:
-    """What an agent chooses must be something that the method has."""
+    """Refuses an effort that the method cannot use."""
     if effort != "fixed" and not options.single_solve:
         raise ValueError(
-            f"game.agent.effort: {effort!r} means nothing to method {method}, "
-            "whose rounds always take all point iterations"
+            f"game.agent.effort: {effort!r} has no effect on method {method}, "
+            "whose rounds always have all point iterations"
         )
     if effort == "points+forcing" and options.truncated is None:
         raise ValueError("game.agent.effort: a forcing term needs conjugate gradients, as method deeplm has them")
 
 
 def _check_agent(sac: SacConfig) -> None:
-    """Numbers of `sac` that make no sense would otherwise show as a program that cannot be traced, or as nan."""
+    """Refuses impossible numbers, which would otherwise fail in tracing or give NaN."""
     for name in ("width", "layers", "batch", "target_every"):
         if getattr(sac, name) < 1:
             raise ValueError(f"sac.{name} must be at least 1, not {getattr(sac, name)}")
@@ -131,7 +131,7 @@ def _check_agent(sac: SacConfig) -> None:
 
 
 def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
-    """A policy that is too large for its file would be noticed when all is trained."""
+    """Refuses networks that are too large for a policy file."""
     sizes = [observation_size(agent), *[sac.width] * sac.layers, 2 * agent.action_size]
     numbers = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     if 4 * numbers > LARGEST_FILE - METADATA_BYTES:
@@ -146,7 +146,7 @@ def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
 
     Args:
         name: a preset (`preset_names`), or the path of a YAML file: anything with a slash or an ending.
-        overrides: `key.key=value` each, the value in YAML; they win over the file.
+        overrides: `key.key=value` each, the value in YAML; they override the file.
 
     Raises:
         SettingsError: no such file or base, not YAML, an unknown key or an impossible value; one line.
@@ -174,5 +174,5 @@ def to_yaml(config: TrainConfig) -> str:
 
 
 def preset_names() -> list[str]:
-    """Names that `load` finds without a path."""
+    """Names of the presets."""
     return configurations.names("train")

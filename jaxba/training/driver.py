@@ -1,8 +1,8 @@
-"""The training driver: compiled chunks, evaluations in between, checkpoints, and going on after a kill, bit for bit.
+"""The training driver: compiled chunks, evaluations between them, checkpoints, and bitwise identical resuming.
 
-A run lives in a folder: `config.yaml`, `metrics.jsonl`, `tensorboard/`, `checkpoints/`. A checkpoint holds all of the
-driver: the loop's state, the best policy so far, its score, and how far the log had come. A run that is started again
-cuts the log there and repeats what followed, with the same numbers.
+A run has a folder with `config.yaml`, `metrics.jsonl`, `tensorboard/` and `checkpoints/`. A checkpoint holds the loop's
+state, the best policy so far, its score, and the length of the log. A run that is resumed cuts the log to that length
+and repeats what followed, with the same numbers.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 
 CHANGEABLE = ("chunks", "keep", "checkpoint_every")
-"""Settings that a resumed run may change; `chunks` only with one seed, or its agents would be trained unequally."""
+"""Settings that a resumed run may change; `chunks` only with one seed, since all agents are trained equally long."""
 
 
 class TrainError(ValueError):
-    """A run that cannot start or go on. The message is one line for a person."""
+    """A run that cannot start or continue. The message is one line for a person."""
 
 
 class Best(NamedTuple):
@@ -46,48 +46,48 @@ class Best(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What a call of `train` came to."""
+    """Result of a call of `train`."""
 
-    finished: bool  # false where it was asked to stop
-    best: Best | None  # None where nothing was evaluated yet
+    finished: bool  # false if `Hooks.stop` ended it
+    best: Best | None  # None if nothing was evaluated yet
     state: LoopState  # of the last agent
 
 
 @dataclass(frozen=True)
 class Hooks:
-    """Who is told what; each may be left out."""
+    """Callbacks of a run."""
 
     stage: Callable[[str], None] = lambda _: None
-    """Told in words what begins and takes a while."""
+    """Called with a line of text when something begins that takes a while."""
 
     row: Callable[[Row], None] = lambda _: None
-    """Given every row of the log."""
+    """Called with every row of the log."""
 
     best: Callable[[Best], None] = lambda _: None
-    """Given every policy that is better than all before."""
+    """Called with every policy that is better than all before."""
 
     stop: Callable[[], bool] = lambda: False
-    """Asked after each chunk; if true, the run is saved and ends."""
+    """Called after each chunk; if it returns true, the run is saved and ends."""
 
 
 def prepare_folder(
     folder: Path, config: TrainConfig | None, resume: bool, overrides: tuple[str, ...] = ()
 ) -> TrainConfig:
-    """Makes the folder of a new run, or finds the configuration of the one in it.
+    """Creates the folder of a new run, or reads the configuration of the run to resume.
 
     Args:
         folder: of the run.
-        config: of a new run; of a resumed one, None for what its folder says.
-        resume: whether a run in the folder goes on.
+        config: of a new run; of a resumed one, None for the configuration in its folder.
+        resume: whether a run in the folder is resumed.
         overrides: `key=value` of a resumed run.
 
     Raises:
-        TrainError: there is a run where a new one should be, or none to resume, or another one; or the folder's name
-            is one with which checkpoints could not be read again.
-        SettingsError: the folder's configuration cannot be read.
+        TrainError: a new run would overwrite another one, there is no run to resume or its configuration differs, or
+            checkpoints could not be read again from a folder of this name.
+        SettingsError: the configuration in the folder cannot be read.
     """
     path = folder / CONFIG
-    if glob.escape(place := str(folder.absolute())) != place:  # Orbax would look for parts of checkpoints elsewhere
+    if glob.escape(name := str(folder.absolute())) != name:  # Orbax would take the name for a pattern
         raise TrainError(f"{folder}: checkpoints cannot be kept where a name holds one of * ? [")
     if path.is_file() and not resume and _others(folder):
         raise TrainError(f"{folder} holds a run already; --resume goes on with it, --out names another folder")
@@ -115,7 +115,7 @@ def prepare_folder(
 
 
 def _others(folder: Path) -> bool:
-    """Whether there is more than the configuration of a run that never came to anything."""
+    """Whether the folder holds anything but a configuration."""
     return any(item.name != CONFIG and not item.match(TEMPORARY.format("*")) for item in folder.iterdir())
 
 
@@ -129,14 +129,14 @@ def train(
     """Trains to the end, from the last checkpoint in the folder if there is one.
 
     Args:
-        config: `bank` and `game` are not looked at.
+        config: of the run; `bank` and `game` are not used.
         env: a `protocol.Environment`.
-        evaluate: numbers about a learner, among them `score`, lower is better; the same learner gives the same ones.
+        evaluate: metrics of a learner, deterministic; `score` is one of them, lower is better.
         folder: see `prepare_folder`.
-        hooks: who is told.
+        hooks: callbacks.
 
     Raises:
-        TrainError: the losses are no numbers any more, or the last checkpoint does not fit.
+        TrainError: the losses are not finite any more, or the last checkpoint does not fit.
     """
     run = _Run(config, env, evaluate, folder, hooks or Hooks())
     try:
@@ -167,35 +167,37 @@ class _Run:
         self.log = Log(folder, size, self.seed, self.chunk)
 
     def _key(self) -> Any:
-        """Of the agent; the scenes have one of their own."""
+        """Random key of the agent; scenes have another one."""
         return jax.random.fold_in(jax.random.key(self.config.seed), 1 + self.seed)
 
     def _begin(self) -> None:
         self.hooks.stage(f"filling the replay buffer of agent {self.seed + 1}")
         fresh = start(self.config.sac, self.config.loop, self.env, self._key())
-        self.state: LoopState = checkpoint.unpack(checkpoint.pack(fresh), fresh)  # exactly as from a checkpoint
+        self.state: LoopState = checkpoint.unpack(
+            checkpoint.pack(fresh), fresh
+        )  # the same memory layout as after a checkpoint
 
     def _restore(self, like: Any) -> int:
         try:
-            arrays, facts = checkpoint.restore(self.folder, self.step)
-            whole: dict[str, Any] = {"state": like}
-            if facts["best"] is not None:
-                whole["best"] = like.learner.actor
-            whole = checkpoint.unpack(arrays, whole)
+            arrays, metadata = checkpoint.restore(self.folder, self.step)
+            tree: dict[str, Any] = {"state": like}
+            if metadata["best"] is not None:
+                tree["best"] = like.learner.actor
+            tree = checkpoint.unpack(arrays, tree)
         except checkpoint.CheckpointError as error:
             raise TrainError(f"the last checkpoint does not fit: {error}") from None
-        self.state = whole["state"]
-        self.seed, self.chunk, self.wall_s = facts["seed"], facts["chunk"], facts["wall_s"]
-        self.evaluated = facts.get("evaluated", 0)
-        if facts["best"] is not None:
-            self.best = Best(whole["best"], **facts["best"])
-        return facts["log_size"]
+        self.state = tree["state"]
+        self.seed, self.chunk, self.wall_s = metadata["seed"], metadata["chunk"], metadata["wall_s"]
+        self.evaluated = metadata["evaluated"]
+        if metadata["best"] is not None:
+            self.best = Best(tree["best"], **metadata["best"])
+        return metadata["log_size"]
 
     def _save(self) -> None:
         tree: dict[str, Any] = {"state": self.state}
         if self.best is not None:
             tree["best"] = self.best.actor
-        facts = {
+        metadata = {
             "seed": self.seed,
             "chunk": self.chunk,
             "wall_s": self.wall_s,
@@ -203,9 +205,10 @@ class _Run:
             "log_size": self.log.size,
             "best": None if self.best is None else {k: getattr(self.best, k) for k in ("score", "seed", "chunk")},
         }
-        checkpoint.save(self.folder, self.step, checkpoint.pack(tree), facts, self.config.keep)
+        checkpoint.save(self.folder, self.step, checkpoint.pack(tree), metadata, self.config.keep)
 
     def finish(self) -> Outcome:
+        """Trains the remaining chunks of all agents."""
         config = self.config
         while True:
             while self.chunk < config.chunks:
@@ -215,7 +218,7 @@ class _Run:
                     self._save()
                 if stopping:
                     return Outcome(False, self.best, self.state)
-            if self.evaluated != self.chunk:  # it was to end later when it was begun
+            if self.evaluated != self.chunk:  # `chunks` was larger when the run began
                 self.hooks.stage("evaluating the last policy")
                 self._evaluate()
             if self.seed + 1 >= config.seeds:
@@ -224,7 +227,7 @@ class _Run:
             self._begin()
 
     def _advance(self) -> None:
-        """One chunk, its evaluation if one is due, and its row."""
+        """One chunk, its evaluation if one is due, and its row of the log."""
         steps, updates = int(self.state.env_steps), int(self.state.updates)
         wall, cpu = time.perf_counter(), time.process_time()
         self.state, found = self._compiled(self.env, self.state)
@@ -245,11 +248,11 @@ class _Run:
         self.hooks.row(self.log.write(row))
 
     def _evaluate(self) -> dict[str, float]:
-        """Scores of the policy as it is; it is kept if it is better than all before."""
+        """Scores of the current policy, which is kept if it is better than all before."""
         scores = {name: float(value) for name, value in self.evaluate(self.state.learner).items()}
         self.evaluated = self.chunk
         if self.best is None or scores["score"] < self.best.score:
-            actor = jax.tree.map(jnp.copy, self.state.learner.actor)  # the next chunk uses the state's memory up
+            actor = jax.tree.map(jnp.copy, self.state.learner.actor)  # the next chunk donates the state's memory
             self.best = Best(actor, scores["score"], self.seed, self.chunk)
             self.hooks.best(self.best)
         return scores

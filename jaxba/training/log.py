@@ -1,4 +1,4 @@
-"""The log of a run: one JSON object a line, and the same numbers for TensorBoard."""
+"""The log of a run: one JSON object per line, and the same numbers for TensorBoard."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ FILE = "metrics.jsonl"
 BOARD = "tensorboard"
 
 Row = dict[str, Any]
-"""Numbers of one chunk by name; None stands for one that is not finite."""
+"""Metrics of one chunk by name; None if not finite."""
 
 
 class Log:
-    """Appends rows; what a killed run wrote after its last checkpoint is taken back first."""
+    """Appends rows, after removing those that a killed run wrote after its last checkpoint."""
 
     def __init__(self, folder: Path, size: int, seed: int, chunk: int) -> None:
         """Opens the log of a run.
 
         Args:
             folder: of the run.
-            size: bytes of the file that count; what follows is cut off.
-            seed: number of the agent that goes on, for TensorBoard.
-            chunk: chunks that it has done.
+            size: length to which the file is cut, bytes.
+            seed: number of the agent that is trained next, for TensorBoard.
+            chunk: chunks that this agent has done.
         """
         self.path = folder / FILE
         self._boards = folder / BOARD
@@ -39,11 +39,11 @@ class Log:
 
     @property
     def size(self) -> int:
-        """Bytes written, all of them with the system."""
+        """Bytes written and flushed."""
         return self._file.tell()
 
     def write(self, row: Mapping[str, Any]) -> Row:
-        """Appends a row and returns it as it can be read back."""
+        """Appends a row and returns it as `read` does."""
         clean: Row = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
         self._file.write(json.dumps(clean, allow_nan=False) + "\n")
         self._file.flush()
@@ -61,7 +61,7 @@ class Log:
             if self._board:
                 self._board[1].close()
             folder = self._boards / f"seed{seed}"
-            # TensorBoard then drops what a killed run wrote after its last checkpoint
+            # with `purge_step` TensorBoard ignores what a killed run wrote after its last checkpoint
             self._board = seed, SummaryWriter(str(folder), purge_step=self._purge.pop(seed, 0))
         return self._board[1]
 
@@ -73,7 +73,7 @@ class Log:
 
 
 def read(folder: Path) -> list[Row]:
-    """All rows of a run; a last line that a kill cut short is left out."""
+    """All rows of a run, without an incomplete last line."""
     path = folder / FILE
     if not path.is_file():
         return []

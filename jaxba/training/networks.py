@@ -1,7 +1,7 @@
-"""Networks of the agent and its distribution over actions. The only module that knows flax.
+"""Networks of the agent and its distribution over actions. The only module that uses flax.
 
-Parameters are plain trees of float32 arrays, also where JAX counts in float64. Actions live in (-1, 1): an action is
-`u = tanh(x)` with a normal `x`, and its log-probability is that of `u`, so that no action scale enters the entropy.
+Parameters are plain trees of float32 arrays, also with 64-bit JAX. Actions are in (-1, 1): `u = tanh(x)` with a normal
+`x`. Log-probabilities are those of `u`, so that the entropy does not depend on the scale of what an action means.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from jax import Array
 from jaxtyping import Float
 
 LAST_LAYER = 3e-3
-"""Bound of the uniform start of every last layer. Source: Lillicrap et al. 2016 (DDPG), section 7."""
+"""Bound of the uniform initial weights of every last layer. Source: Lillicrap et al. 2016 (DDPG), section 7."""
 
 LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))
-"""Where float32 would round a hyperbolic tangent to one."""
+"""Largest float32 below one; tanh in float32 can round to one."""
 
 
 def _small(key: Array, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
@@ -28,7 +28,7 @@ def _small(key: Array, shape: tuple[int, ...], dtype=jnp.float32) -> Array:
 
 
 class MLP(nn.Module):
-    """Hidden layers of one width with ReLU, and a linear last layer that starts next to zero."""
+    """Hidden layers of one width with ReLU, and a linear last layer with small initial weights."""
 
     width: int
     """Units of a hidden layer."""
@@ -42,11 +42,12 @@ class MLP(nn.Module):
     layer_norm: bool = False
     """Whether each hidden layer is normalised before its ReLU. Source: Ba et al. 2016; in critics Ball et al. 2023.
 
-    Without a learned scale and shift, which its neighbours provide: an update of width 64 costs a tenth less so.
+    Without learned scale and shift, which the layers around it can provide: an update of width 64 takes a tenth less
+    time.
     """
 
     bias: float = 0.0
-    """First bias of the last layer: the output of a fresh network."""
+    """Initial bias of the last layer, which is about the initial output."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
@@ -74,7 +75,7 @@ class Value(nn.Module):
     """See `MLP`."""
 
     bias: float = 0.0
-    """Value of everything at the start."""
+    """Initial value of every observation."""
 
     @nn.compact
     def __call__(self, observation: Float[Array, "*batch features"]) -> Float[Array, "*batch"]:
@@ -95,7 +96,7 @@ class Critic(nn.Module):
     """See `MLP`."""
 
     bias: float = 0.0
-    """Value of everything at the start."""
+    """Initial value of every observation."""
 
     members: int = 2
     """Networks in the ensemble."""
@@ -104,12 +105,12 @@ class Critic(nn.Module):
     def __call__(
         self, observation: Float[Array, "*batch features"], action: Float[Array, "*batch actions"]
     ) -> Float[Array, "members *batch"]:  # noqa: F821 - reads as a product
-        """Each member's opinion."""
+        """Each member's value."""
         ensemble = nn.vmap(
             Value,
             variable_axes={"params": 0},
             split_rngs={"params": True},
-            in_axes=None,  # pyright: ignore[reportArgumentType]  # flax's own documentation has it
+            in_axes=None,  # pyright: ignore[reportArgumentType]  # as in flax's documentation
             out_axes=0,
             axis_size=self.members,
         )
@@ -120,8 +121,8 @@ class Critic(nn.Module):
 class Actor(nn.Module):
     """Mean and logarithm of the standard deviation of the pre-tanh action.
 
-    The logarithm is bounded by a sigmoid, whose gradient never vanishes as that of a clip does; it passes through
-    zero with the network's output, so that a fresh policy is spread over all of (-1, 1).
+    The logarithm is bounded by a sigmoid, whose gradient never vanishes as that of a clip does. It is zero where the
+    network's output is zero, so that an untrained policy is spread over all of (-1, 1).
     """
 
     width: int
@@ -152,7 +153,7 @@ class Actor(nn.Module):
 
 
 def squash(pre_tanh: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Action of a pre-tanh number, kept inside (-1, 1) after rounding too."""
+    """Action of a pre-tanh number, inside (-1, 1) also after rounding."""
     return jnp.clip(jnp.tanh(pre_tanh), -LARGEST_ACTION, LARGEST_ACTION)
 
 
@@ -181,5 +182,5 @@ def sample_action(
 
 
 def action_size(actor_params: Any, layers: int) -> int:
-    """Numbers of an action of the actor that has these parameters and this many hidden layers."""
+    """Numbers of an action of an actor with these parameters and this many hidden layers."""
     return actor_params["params"]["MLP_0"][f"Dense_{layers}"]["bias"].shape[-1] // 2

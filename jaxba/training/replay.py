@@ -1,7 +1,7 @@
-"""Replay buffer: a ring of transitions in one float32 array.
+"""Replay buffer: a ring buffer of transitions in one float32 array.
 
-A transition with a number that is not finite is left out. Replacing it by zeros would teach the critic that a crash
-leads to an ordinary place; a game that wants crashes to cost something says so with a finite reward.
+Transitions with a number that is not finite are dropped. Replacing the number by zero would teach the critic a wrong
+value; a game that wants to penalise failures must give a finite reward.
 """
 
 from __future__ import annotations
@@ -15,52 +15,52 @@ from jaxtyping import Float, Int
 
 
 class Transition(NamedTuple):
-    """What one action led to; leading axes are a batch."""
+    """One transition of an environment; leading axes are a batch."""
 
     observation: Float[Array, "*batch features"]
     action: Float[Array, "*batch actions"]
     reward: Float[Array, "*batch"]
-    next_observation: Float[Array, "*batch features"]  # the true one, before any reset
-    discount: Float[Array, "*batch"]  # 0 where the episode ended for good, else 1
+    next_observation: Float[Array, "*batch features"]  # before any reset
+    discount: Float[Array, "*batch"]  # 0 if the episode was terminated, else 1
 
 
 class Replay(NamedTuple):
-    """The ring. Rows hold observation, action, next observation, reward and discount, in this order."""
+    """The buffer. Rows hold observation, action, next observation, reward and discount, in this order."""
 
     rows: Float[Array, "capacity numbers"]
-    action: Float[Array, " actions"]  # zeros; only its size matters
-    position: Int[Array, ""]  # row that is written next
+    action: Float[Array, " actions"]  # zeros; holds the size of an action
+    position: Int[Array, ""]  # next row to write
     size: Int[Array, ""]  # rows that hold a transition
-    dropped: Int[Array, ""]  # transitions left out so far
+    dropped: Int[Array, ""]  # transitions dropped so far
 
 
 def init(capacity: int, observation_size: int, action_size: int) -> Replay:
     """An empty buffer; takes `4 capacity (2 observation_size + action_size + 2)` bytes."""
     rows = jnp.zeros((capacity, 2 * observation_size + action_size + 2), jnp.float32)
-    zero = lambda: jnp.zeros((), jnp.int32)  # arrays of their own: a donated buffer may be handed over only once
+    zero = lambda: jnp.zeros((), jnp.int32)  # separate arrays, since a buffer can be donated only once
     return Replay(rows, jnp.zeros(action_size, jnp.float32), zero(), zero(), zero())
 
 
 def add(buffer: Replay, transitions: Transition) -> Replay:
-    """Writes a batch of transitions, over the oldest ones where the ring is full.
+    """Writes a batch of transitions, over the oldest ones if the buffer is full.
 
     Args:
-        buffer: of a capacity of at least the batch.
+        buffer: with a capacity of at least the batch.
         transitions: with one leading axis; of any floating point type.
     """
     capacity = buffer.rows.shape[0]
     columns = [jnp.asarray(x, jnp.float32) for x in transitions]
-    observation, action, reward, following, discount = columns
-    rows = jnp.concatenate([observation, action, following, reward[:, None], discount[:, None]], axis=1)
+    observation, action, reward, next_observation, discount = columns
+    rows = jnp.concatenate([observation, action, next_observation, reward[:, None], discount[:, None]], axis=1)
     count = rows.shape[0]
     if count > capacity:
         raise ValueError(f"a batch of {count} transitions does not fit a buffer of {capacity}")
     finite = jnp.all(jnp.isfinite(rows), axis=1)
     after = jnp.cumsum(finite, dtype=jnp.int32)
-    places = jnp.where(finite, (buffer.position + after - 1) % capacity, capacity)
+    indices = jnp.where(finite, (buffer.position + after - 1) % capacity, capacity)
     written = after[-1]
     return buffer._replace(
-        rows=buffer.rows.at[places].set(rows, mode="drop"),
+        rows=buffer.rows.at[indices].set(rows, mode="drop"),
         position=(buffer.position + written) % capacity,
         size=jnp.minimum(buffer.size + written, capacity),
         dropped=buffer.dropped + count - written,
@@ -68,12 +68,12 @@ def add(buffer: Replay, transitions: Transition) -> Replay:
 
 
 def sample(buffer: Replay, key: Array, batch: int) -> Transition:
-    """Transitions drawn uniformly and independently, with replacement. Zeros from an empty buffer."""
-    places = jax.random.randint(key, (batch,), 0, jnp.maximum(buffer.size, 1), jnp.int32)
-    rows = buffer.rows[places]
+    """Transitions drawn uniformly with replacement; zeros from an empty buffer."""
+    indices = jax.random.randint(key, (batch,), 0, jnp.maximum(buffer.size, 1), jnp.int32)
+    rows = buffer.rows[indices]
     actions = buffer.action.shape[0]
     features = (rows.shape[1] - actions - 2) // 2
-    observation, action, following, last = jnp.split(
+    observation, action, next_observation, last = jnp.split(
         rows, [features, features + actions, 2 * features + actions], axis=1
     )
-    return Transition(observation, action, last[:, 0], following, last[:, 1])
+    return Transition(observation, action, last[:, 0], next_observation, last[:, 1])

@@ -1,20 +1,9 @@
 """Soft actor-critic in two forms, as pure functions of a learner and a batch.
 
-`twin` is Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications": two critics, a slowly following copy
-of both, a learned temperature. `value` is the form of the seed paper (Belder et al. 2023), which is that of Haarnoja
-et al. 2018, "Soft Actor-Critic: Off-Policy Maximum Entropy Deep RL": policy, two critics, a value network and a copy of
-it, a fixed temperature.
-
-Tried and not kept, since no gain pays for its complication. Time of a scan of updates over that of the form below, two
-hidden layers, batch 256, two cores, in turns in one process, least of 40:
-
-| variant | width 256 (1.98 ms) | width 64 (0.33 ms) |
-| --- | --: | --: |
-| two separate critics instead of a stacked pair | 1.01 | 0.98 |
-| actor's loss with the critics from before the update | 0.96 | 1.02 |
-| both | 0.94 | 1.02 |
-| Adam over one raveled vector (`optax.flatten`) | 1.02 | 1.00 |
-| gradients of biases as matrix products | 1.01 | 1.12 |
+`twin` is Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications": two critics, target networks of both,
+a learned temperature. `value` is the form of the seed paper (Belder et al. 2023), that of Haarnoja et al. 2018,
+"Soft Actor-Critic: Off-Policy Maximum Entropy Deep RL": policy, two critics, a value network and its target network, a
+fixed temperature.
 """
 
 from __future__ import annotations
@@ -34,7 +23,7 @@ from jaxba.training.replay import Transition
 
 @dataclass(frozen=True)
 class SacConfig:
-    """Everything about the agent. Hashable: it is static in compiled programs."""
+    """Settings of the agent. Hashable: static in compiled programs."""
 
     variant: Literal["twin", "value"] = "twin"
     """`twin`: target critics, learned temperature. `value`: the seed paper's, with a value network and its target."""
@@ -55,46 +44,46 @@ class SacConfig:
     """Discount of a step."""
 
     tau: float = 0.005
-    """Part of the way that a target network goes at each refresh. Source: Haarnoja et al. 2018."""
+    """Step fraction of the target networks at each refresh. Source: Haarnoja et al. 2018."""
 
     target_every: int = 1
-    """Updates from one refresh of the target network to the next."""
+    """Updates between refreshes of the target networks."""
 
     batch: int = 256
     """Transitions in an update."""
 
     initial_temperature: float = 0.1
-    """First weight of the entropy, in units of the reward."""
+    """Initial weight of the entropy, in units of the reward."""
 
     learn_temperature: bool = True
-    """Whether the temperature follows the entropy; otherwise it stays."""
+    """Whether the temperature is adapted to the target entropy; otherwise it is constant."""
 
     target_entropy: float | None = None
-    """Nats, of the action in (-1, 1); minus the number of actions when None. Source: Haarnoja et al. 2018."""
+    """Nats, of the action in (-1, 1); if None, minus the numbers of an action. Source: Haarnoja et al. 2018."""
 
     log_std_min: float = -5.0
-    """Lower bound of the log standard deviation before tanh; lower ones make tanh saturate."""
+    """Lower bound of the log standard deviation before tanh."""
 
     log_std_max: float = 2.0
-    """Upper bound of it. Source: Haarnoja et al.'s code."""
+    """Upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code."""
 
     reward_scale: float = 1.0
     """Factor on rewards, so that returns lie in about [-10, 10]."""
 
     initial_value: float = 0.0
-    """What fresh critics say everywhere; near the mean return, constant negative rewards slow nothing down."""
+    """Initial output of the critics. Near the mean return, learning from constant negative rewards starts faster."""
 
     max_grad_norm: float | None = None
-    """Gradients of a network are shortened to this length; never when None."""
+    """Largest norm of a network's gradient, which is scaled down to it; no limit if None."""
 
     @classmethod
     def default(cls) -> SacConfig:
-        """The preset for a CPU."""
+        """The defaults, chosen for a CPU."""
         return cls()
 
     @classmethod
     def paper(cls) -> SacConfig:
-        """The seed paper's agent; numbers that it does not print are those of its released code.
+        """The seed paper's agent; what the paper does not state is taken from its released code.
 
         Three fully connected layers of 256, mean squared errors, target value network refreshed every 5 iterations.
         """
@@ -114,11 +103,11 @@ class SacConfig:
 
 
 class Learner(NamedTuple):
-    """Parameters and everything that training needs to go on. A plain tree of arrays."""
+    """Parameters and all other state of training. A plain tree of arrays."""
 
     actor: Any
     critic: Any  # of both critics, stacked
-    value: Any  # None in `twin`
+    value: Any  # None with `twin`
     target: Any  # copy of the critics, or of the value network
     log_temperature: Float[Array, ""]
     optimizers: dict[str, Any]  # Adam's states
@@ -144,11 +133,11 @@ def _optimizer(config: SacConfig) -> optax.GradientTransformation:
 
 
 def init(config: SacConfig, key: Array, observation_size: int, action_size: int) -> Learner:
-    """A fresh agent.
+    """An untrained agent.
 
     Args:
         config: static.
-        key: decides the parameters and all that follows.
+        key: of the parameters and all later random numbers.
         observation_size: features of an observation.
         action_size: numbers of an action.
     """
@@ -182,7 +171,7 @@ def act(
         config: static.
         actor: `Learner.actor`.
         observation: of any floating point type.
-        key: of the sample; the hyperbolic tangent of the mean when None.
+        key: of the sample; if None, the action is the hyperbolic tangent of the mean.
     """
     network = _actor(config, networks.action_size(actor, config.layers))
     mean, log_std = network.apply(actor, jnp.asarray(observation, jnp.float32))
@@ -190,18 +179,18 @@ def act(
 
 
 def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Learner, dict[str, Float[Array, ""]]]:
-    """One gradient step of everything: critics, then actor, then temperature or value network, then the target.
+    """One gradient step: critics, then actor, then temperature or value network, then target network.
 
     Args:
         config: static.
-        learner: before.
+        learner: before the step.
         batch: transitions with one leading axis.
 
     Returns:
-        The learner after, and `critic_loss`, `actor_loss`, `q_mean`, `entropy` (nats, of the action in (-1, 1)),
-        `temperature` (before the step) and, with a value network, `value_loss`.
+        The new learner, and `critic_loss`, `actor_loss`, `q_mean`, `entropy` (nats, of the action in (-1, 1)),
+        `temperature` (before its step) and, with a value network, `value_loss`.
     """
-    observation, action, reward, following, discount = (jnp.asarray(x, jnp.float32) for x in batch)
+    observation, action, reward, next_observation, discount = (jnp.asarray(x, jnp.float32) for x in batch)
     key, next_key, policy_key = jax.random.split(learner.key, 3)
     actor_network, critic_network = _actor(config, action.shape[-1]), _critic(config)
     temperature = jnp.exp(learner.log_temperature)
@@ -212,17 +201,17 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
         return optax.apply_updates(params, change)
 
     if config.variant == "twin":
-        mean, log_std = actor_network.apply(learner.actor, following)
+        mean, log_std = actor_network.apply(learner.actor, next_observation)
         next_action, next_log = networks.sample_action(mean, log_std, next_key)
-        opinions = critic_network.apply(learner.target, following, next_action)
-        future = jnp.min(opinions, axis=0) - temperature * next_log
+        values = critic_network.apply(learner.target, next_observation, next_action)
+        future = jnp.min(values, axis=0) - temperature * next_log
     else:
-        future = _value(config).apply(learner.target, following)
-    goal = config.reward_scale * reward + config.gamma * discount * future
+        future = _value(config).apply(learner.target, next_observation)
+    target_value = config.reward_scale * reward + config.gamma * discount * future
 
     def critic_loss(params):
-        opinions = critic_network.apply(params, observation, action)
-        return jnp.sum(jnp.mean((opinions - goal) ** 2, axis=-1)), jnp.mean(opinions)
+        values = critic_network.apply(params, observation, action)
+        return jnp.sum(jnp.mean((values - target_value) ** 2, axis=-1)), jnp.mean(values)
 
     (critic_error, q_mean), gradient = jax.value_and_grad(critic_loss, has_aux=True)(learner.critic)
     critic = step("critic", learner.critic, gradient)
@@ -244,9 +233,9 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
     }
 
     log_temperature, value, source = learner.log_temperature, learner.value, critic
-    if config.learn_temperature:  # gradient of log_temperature (entropy - wanted): the same at every temperature
-        wanted = -float(action.shape[-1]) if config.target_entropy is None else config.target_entropy
-        log_temperature = step("temperature", log_temperature, entropy - wanted)
+    if config.learn_temperature:  # gradient of log_temperature (entropy - target_entropy)
+        target_entropy = -float(action.shape[-1]) if config.target_entropy is None else config.target_entropy
+        log_temperature = step("temperature", log_temperature, entropy - target_entropy)
     if config.variant == "value":
 
         def value_loss(params):

@@ -1,7 +1,7 @@
-"""Strict reading of nested frozen dataclasses from plain data, as a YAML file holds it, and the way back.
+"""Strict conversion between nested frozen dataclasses and plain data, as a YAML file holds it.
 
-Nothing is guessed: an unknown key, a value of another type and a value that the class refuses are each one line that
-names the key by its path.
+Unknown keys, values of a wrong type and values that the class refuses raise an error of one line with the path of the
+key.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from jaxba.io.configurations import SettingsError
 Settings = TypeVar("Settings")
 
 _SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
-"""Numbers such as 3e-4, which YAML 1.1 takes for text."""
+"""Numbers such as 3e-4, which YAML 1.1 reads as text."""
 
 
 def read(kind: type[Settings], data: Any, path: str = "") -> Settings:
-    """An instance of a dataclass; keys that are left out keep their defaults.
+    """An instance of a dataclass; missing keys have their defaults.
 
     Args:
         kind: dataclass of numbers, strings, literals, tuples, optional values and further dataclasses.
@@ -31,7 +31,7 @@ def read(kind: type[Settings], data: Any, path: str = "") -> Settings:
         path: of the mapping inside a larger one, for messages.
 
     Raises:
-        SettingsError: naming the key and what it should be.
+        SettingsError: with the key and what it should be.
     """
     if not isinstance(data, Mapping):
         raise SettingsError(f"{path or 'settings'} must be a mapping, is {_show(data)}")
@@ -62,16 +62,16 @@ def plain(value: Any) -> Any:
 
 
 def assign(data: dict[str, Any], path: str, value: Any, kind: type) -> None:
-    """Sets one value inside nested mappings, which are made where they are missing.
+    """Sets one value inside nested mappings; missing mappings are created.
 
     Args:
-        data: is changed.
-        path: keys with dots between them.
+        data: is modified.
+        path: keys joined by dots.
         value: plain data.
         kind: the dataclass that `data` describes.
 
     Raises:
-        SettingsError: there is no such key, or the path goes on below a value.
+        SettingsError: there is no such key, or the path continues below a value.
     """
     *above, last = path.split(".")
     for depth, key in enumerate(above):
@@ -108,7 +108,7 @@ def _value(kind: Any, value: Any, path: str) -> Any:
         return _value(rest[0], value, path)
     if origin is Literal:
         if value is False and "off" in inside:
-            value = "off"  # YAML 1.1 takes the word for a truth value
+            value = "off"  # YAML 1.1 reads the word as false
         if value not in inside or isinstance(value, bool) != any(isinstance(x, bool) for x in inside):
             raise SettingsError(f"{path} must be one of {', '.join(map(str, inside))}, is {_show(value)}")
         return value

@@ -1,4 +1,4 @@
-"""What a training run is about: scenes, game, and the comparison with hand-written rules on held-out scenes."""
+"""What a training run consists of: scenes, game, and the comparison with baselines on held-out scenes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.learned import LearnedPolicy, learned_from
+from jaxba.damping.learned import LearnedPolicy, boldest, learned_from
+from jaxba.damping.registry import BOLD
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
 from jaxba.game.rollout import Trajectories
@@ -32,11 +33,21 @@ from jaxba.training.sac import Learner
 BANK = "bank.npz"
 RULES = "rules.npz"
 
-YARDSTICKS = ("ceres", "classic", "gtsam", "gauss-newton", "schedule")
-"""Rules that a run is measured against, with plain LM steps."""
-
 EMBEDDED = "+embedded"
-"""Ending of the name of a rule that has the embedded iterations of the agent's steps too."""
+"""Ending of the name of a rule that has the embedded iterations of the agent's step."""
+
+BASELINES = (
+    "ceres",
+    "classic",
+    "gtsam",
+    "gauss-newton",
+    "schedule",
+    f"ceres{EMBEDDED}",
+    f"constant:1e-8{EMBEDDED}",
+    BOLD,
+)
+"""What a trained policy is compared with. Without the ending, rules have plain steps of the method. `bold` is the
+smallest lambda that the game's own guard allows, with the agent's step."""
 
 LEARNED = "learned"
 """Name of the trained policy in tables."""
@@ -44,7 +55,7 @@ LEARNED = "learned"
 
 @dataclass(frozen=True)
 class Task:
-    """Everything that `train.train` needs, and the yardsticks."""
+    """Everything that `driver.train` needs, and the baselines."""
 
     config: TrainConfig
     """Of the run."""
@@ -55,12 +66,12 @@ class Task:
     held_out: tuple[Bank, ...]
     """Scenes that training never sees, a bank per class."""
 
-    rule_runs: dict[str, Runs]
-    """What the yardsticks did on the held-out scenes."""
+    baseline_runs: dict[str, Runs]
+    """What the baselines did on the held-out scenes."""
 
     @cached_property
     def rules(self) -> dict[str, Score]:
-        """Scores of the yardsticks, `virtual best` among them."""
+        """Scores of the baselines, and of their `virtual best`."""
         return self._scores({})
 
     def policy(self, actor: Any) -> LearnedPolicy:
@@ -82,80 +93,95 @@ class Task:
         return {"score": numbers.pop("mean"), **numbers}
 
     def compare(self, actor: Any) -> dict[str, Score]:
-        """A trained policy beside the yardsticks, by the best costs of all; the virtual best is that of the rules."""
+        """Scores of a trained policy and the baselines, relative to the best costs of all of them."""
         learned = {LEARNED: (self.policy(actor), self.game.options)}
         return self._scores(_play(self.config, self.held_out, learned))
 
     def _scores(self, more: Mapping[str, Runs]) -> dict[str, Score]:
         game = self.config.game
-        return scores(more, self.rule_runs, self.held_out, game.tolerance, game.max_iterations)
+        return scores(more, self.baseline_runs, self.held_out, game.tolerance, game.max_iterations)
 
 
 def build(
     config: TrainConfig,
     folder: Path,
-    say: Callable[[str], None] = lambda _: None,
-    yardsticks: Sequence[str] | None = None,
+    report: Callable[[str], None] = lambda _: None,
+    baselines: Sequence[str] | None = None,
 ) -> Task:
-    """Makes banks and yardsticks, or reads those that an earlier call left in the folder.
+    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder.
 
     Args:
         config: of the run that the folder belongs to.
         folder: of the run.
-        say: told in words what begins.
-        yardsticks: rules to measure against where that has not been done yet; `YARDSTICKS` if None.
+        report: called with a line of text when something begins that takes a while.
+        baselines: names to compare with, unless the folder has their results already; `BASELINES` if None.
 
     Raises:
-        ValueError: too few scenes are of use, or another version wrote what is there. One line for a person.
-        OSError: the folder cannot be written, or not read.
+        ValueError: too few scenes are usable, or another version wrote the files. One line for a person.
+        OSError: the folder cannot be written or read.
     """
     path = folder / BANK
     if path.is_file():
-        say("reading the scenes")
+        report("reading the scenes")
         splits = read_banks(path)
     else:
         key = jax.random.key(config.seed)
         splits = make_banks(
-            config.bank, key, config.bank.options, config.game.max_iterations, say, config.game.tolerance
+            config.bank, key, config.bank.options, config.game.max_iterations, report, config.game.tolerance
         )
         _write_banks(path, splits)
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
     held_out = tuple(split.held_out for split in splits)
-    return Task(config, game, held_out, _rules(config, game, held_out, folder / RULES, say, yardsticks or YARDSTICKS))
-
-
-def _rules(
-    config: TrainConfig,
-    game: Game,
-    held_out: tuple[Bank, ...],
-    path: Path,
-    say: Callable[[str], None],
-    yardsticks: Sequence[str],
-) -> dict[str, Runs]:
+    path = folder / RULES
     if path.is_file():
-        return _read_runs(path)
-    say("hand-written rules on the held-out scenes")
+        return Task(config, game, held_out, _read_runs(path))
+    report("baselines on the held-out scenes")
+    runs = _play(config, held_out, baseline_policies(config, game.options, baselines or BASELINES))
+    _write_runs(path, runs)
+    return Task(config, game, held_out, runs)
+
+
+def baseline_policies(
+    config: TrainConfig, options: StepOptions, names: Sequence[str]
+) -> dict[str, tuple[DampingPolicy, StepOptions]]:
+    """Policy and step of every baseline, in the order of the table.
+
+    Args:
+        config: of the run.
+        options: of the agent's step.
+        names: as in `BASELINES`. Those with embedded iterations are left out if the agent's step has none; the rule
+            that belongs to the method comes first.
+    """
     plain = config.step_options
+    coordinates = replace(options.coordinates, camera_damping=plain.coordinates.camera_damping)
+    embedded = replace(options, coordinates=coordinates)
+    # where points start and which steps are remembered are no embedded iterations
+    start, remembered = plain.refinement.starts, plain.refinement.previous_steps
+    has_embedded = replace(embedded.refinement, starts=start, previous_steps=remembered) != plain.refinement
     own = () if config.method == DEFAULT_METHOD else (make_method(config.method).rule,)
-    names = tuple(dict.fromkeys((*own, *yardsticks)))
-    policies: dict[str, tuple[DampingPolicy, StepOptions]] = {name: (make_policy(name), plain) for name in names}
-    coordinates = replace(game.options.coordinates, camera_damping=plain.coordinates.camera_damping)
-    embedded = replace(game.options, coordinates=coordinates)
-    own_refinement = embedded.refinement  # of which the starts of points and previous steps alone embed nothing
-    if replace(own_refinement, starts="step", previous_steps=0) != plain.refinement:
-        policies[yardsticks[0] + EMBEDDED] = make_policy(yardsticks[0]), embedded
-    runs = _play(config, held_out, policies)
-    fields = lambda name, number, run: {f"{name}/{number}/{field}": x for field, x in run._asdict().items()}
-    together = [fields(name, k, run) for name, own in runs.items() for k, run in enumerate(own)]
-    _write(path, {name: x for arrays in together for name, x in arrays.items()})  # in the order of the table
-    return runs
+    found: dict[str, tuple[DampingPolicy, StepOptions]] = {}
+    for name in (*own, *names):
+        rule = name.removesuffix(EMBEDDED)
+        if name == BOLD:
+            found[name] = boldest(config.game.agent), options
+        elif rule == name:
+            found[name] = make_policy(rule), plain
+        elif has_embedded:
+            found[name] = make_policy(rule), embedded
+    return found
 
 
 def _play(
     config: TrainConfig, held_out: tuple[Bank, ...], policies: Mapping[str, tuple[DampingPolicy, StepOptions]]
 ) -> dict[str, Runs]:
     return play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
+
+
+def _write_runs(path: Path, runs: dict[str, Runs]) -> None:
+    fields = lambda name, number, run: {f"{name}/{number}/{field}": x for field, x in run._asdict().items()}
+    parts = [fields(name, k, run) for name, banks in runs.items() for k, run in enumerate(banks)]
+    _write(path, {name: x for arrays in parts for name, x in arrays.items()})  # in the order of the table
 
 
 def _write_banks(path: Path, splits: list[Split]) -> None:
@@ -200,7 +226,7 @@ def _opened(path: Path) -> Iterator[Any]:
 def _named_tuple(
     kind: Any, prefix: str, arrays: Mapping[str, np.ndarray], make: Callable[[Any], Any] = jnp.asarray
 ) -> Any:
-    """Puts nested named tuples together again, by the types of their fields."""
+    """Rebuilds nested named tuples from the types of their fields."""
     values = {}
     for name, inner in typing.get_type_hints(kind).items():
         nested = isinstance(inner, type) and hasattr(inner, "_fields")

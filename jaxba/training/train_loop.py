@@ -1,7 +1,7 @@
-"""Training as one compiled program: act, play, store, sample, update, in one scan.
+"""Training as one compiled program: act, step, store, sample and update in one scan.
 
-Nothing leaves the device between two chunks. A chunk compiles once per configuration and environment; a Python loop
-over chunks is the place for evaluation, checkpoints and logs.
+No data leaves the device within a chunk. A chunk compiles once per configuration and environment; the driver evaluates,
+saves checkpoints and logs between chunks.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from jaxba.training.sac import Learner, SacConfig
 from jaxba.typing import LARGEST_COUNT
 
 TRACES: collections.Counter[str] = collections.Counter()
-"""How often each compiled function was traced in this process; a test holds it at one per configuration."""
+"""How often each compiled function was traced in this process."""
 
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Sizes of the training loop. Hashable: it is static in compiled programs."""
+    """Sizes of the training loop. Hashable: static in compiled programs."""
 
     replay_capacity: int = 100_000
-    """Transitions in the replay buffer; the oldest go first."""
+    """Transitions in the replay buffer; the oldest are overwritten first."""
 
     warmup_steps: int = 500
-    """Environment steps over all environments that `Environment.demonstrate` plays before the agent does; rounded up to
-    whole vector steps. Source of the default: Belder et al. 2023."""
+    """Environment steps, over all environments, with actions of `Environment.demonstrate` before the agent acts.
+    Rounded up to whole vector steps. Source of the default: Belder et al. 2023."""
 
     updates_per_step: int = 1
-    """Gradient updates after each vector step. Updates per environment step are this over the environments."""
+    """Gradient updates after each vector step, that is, of all environments."""
 
     steps_per_chunk: int = 1000
     """Vector steps in one call of `run_chunk`."""
 
     def __post_init__(self) -> None:
-        """Every number counts something that there must be."""
+        """Checks that all counts are positive and fit 32 bits."""
         for name in ("replay_capacity", "warmup_steps", "updates_per_step", "steps_per_chunk"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
@@ -54,19 +54,19 @@ class LoopConfig:
 
 
 class LoopState(NamedTuple):
-    """All of a run: with it and the configurations a run goes on, bit for bit."""
+    """Complete state of a run, from which it continues bitwise identically."""
 
     learner: Learner
     replay: Replay
     env_state: Any
-    observation: Float[Array, "envs features"]  # to act on next
+    observation: Float[Array, "envs features"]  # for the next action
     key: Array
     env_steps: Int[Array, ""]  # over all environments, warm-up included
     updates: Int[Array, ""]
 
 
 def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions"]) -> tuple[LoopState, Step]:
-    """One vector step into the buffer. A truncated episode keeps its discount and its true last observation."""
+    """One vector step, stored in the buffer. A truncated episode has discount 1 and its true last observation."""
     env_state, step = env.step(state.env_state, action)
     transitions = Transition(
         state.observation, action, step.reward, step.final_observation, 1.0 - jnp.asarray(step.terminated, jnp.float32)
@@ -82,13 +82,13 @@ def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions
 
 @functools.partial(jax.jit, static_argnames=("sac", "loop"))
 def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
-    """A fresh agent, and a replay buffer with `warmup_steps` demonstrated transitions.
+    """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions.
 
     Args:
         sac: static.
         loop: static.
         env: a pytree; its arrays are traced.
-        key: decides everything: the same key gives the same numbers, bit for bit, on the same machine.
+        key: of all random numbers; the same key gives bitwise identical results on the same machine.
     """
     TRACES["start"] += 1
     key, learner_key, reset_key, warmup_key = jax.random.split(key, 4)
@@ -122,12 +122,12 @@ def run_chunk(
         sac: static.
         loop: static.
         env: the one of `start`.
-        state: is used up: its memory becomes the result's.
+        state: donated; its memory is reused for the result.
 
     Returns:
-        The state after, and means over the chunk: those of `sac.update`; `reward` of a step; `action_mean`,
-        `action_std`; `episodes`, the number of episodes that ended, and `episode/NAME`, the mean over those of what
-        the environment says about them (0 where none ended); `dropped`, transitions with numbers that are not finite.
+        The state after the chunk, and means over it: those of `sac.update`; `reward` of a step; `action_mean`,
+        `action_std`; `episodes`, the number of episodes that ended, and `episode/NAME`, the mean of a metric of the
+        environment over them (0 if none ended); `dropped`, transitions with numbers that are not finite.
     """
     TRACES["run_chunk"] += 1
 

@@ -56,7 +56,7 @@ def test_best_cost_is_the_lowest_accepted_cost_of_any_solver_or_a_known_one():
     assert profile.initial_costs(RECORDS) == {"p": 1000.0}
 
 
-def test_of_a_float32_run_only_the_end_counts_which_is_a_cost_in_float64():
+def test_of_a_float32_run_only_the_final_cost_counts_which_is_computed_in_float64():
     rough = replace(make_record("p", "rough", [1000.0, 99.99, 99.98]), dtype="float32", final_cost=100.01)
     assert profile.best_cost([FAST, rough]) == {"p": 100.0}
     assert profile.best_cost([FAST, replace(rough, final_cost=99.0)]) == {"p": 99.0}
@@ -75,7 +75,7 @@ def test_start_below_the_threshold_counts_as_iteration_zero():
     assert profile.first_time(FAST, 1000.0) == 0.0
 
 
-def test_zero_residual_problem_does_not_ask_everyone_for_the_same_noise():
+def test_a_zero_residual_problem_does_not_demand_the_same_rounding_error_of_every_solver():
     exact = make_record("z", "exact", [1.0, 1e-3, 1e-26])
     other = make_record("z", "other", [1.0, 1e-2, 1e-11, 3e-13])
     table = profile.reach_table([exact, other], Target("relative", 1e-4))
@@ -101,7 +101,7 @@ def test_the_solver_and_the_benchmark_agree_about_what_is_converged():
     assert profile.converged(replace(FAST, termination="CONVERGENCE"))
 
 
-def test_repeats_enter_by_their_median_and_half_failed_is_failed():
+def test_repeats_are_combined_by_their_median_and_half_failed_is_failed():
     def repeats(*steps):
         return [make_record("p", "a", [1000.0, 100.0], step_s=step, repeat=i) for i, step in enumerate(steps)]
 
@@ -113,7 +113,7 @@ def test_repeats_enter_by_their_median_and_half_failed_is_failed():
     assert profile.reach_table(one_of_two, Target("converged"))["a"]["p"] == Reach(math.inf, math.inf)
 
 
-def test_profile_with_a_tie_a_failure_and_a_problem_that_nobody_solves():
+def test_profile_with_a_tie_a_failure_and_a_problem_that_no_solver_solves():
     times = {
         "a": {"p": 1.0, "q": 2.0, "r": math.inf, "s": math.inf},
         "b": {"p": 1.0, "q": 1.0, "r": 4.0, "s": math.nan},
@@ -125,13 +125,13 @@ def test_profile_with_a_tie_a_failure_and_a_problem_that_nobody_solves():
     assert curves["b"] == Curve((1.0,), (0.75,))  # never 1: s stays in the denominator
     assert curves["c"] == Curve((1.0, 3.0), (0.0, 0.25))
     assert curves["d"] == Curve((1.0,), (0.0,))
-    shares = [curves["a"].share_at(alpha) for alpha in (0.9, 1.0, 1.99, 2.0, 1e9)]
-    assert shares == [0.0, 0.25, 0.25, 0.5, 0.5]
+    fractions = [curves["a"].fraction_at(alpha) for alpha in (0.9, 1.0, 1.99, 2.0, 1e9)]
+    assert fractions == [0.0, 0.25, 0.25, 0.5, 0.5]
 
 
 def test_profile_of_problems_solved_at_the_start_and_of_nothing():
     curves = profile.performance_profile({"a": {"p": 0.0}, "b": {"p": 0.0}, "c": {"p": 1.0}})
-    assert [curves[s].share_at(10.0) for s in "abc"] == [1.0, 1.0, 0.0]
+    assert [curves[s].fraction_at(10.0) for s in "abc"] == [1.0, 1.0, 0.0]
     assert profile.performance_profile({}) == {}
     assert profile.performance_profile({"a": {}}) == {"a": Curve((1.0,), (0.0,))}
 

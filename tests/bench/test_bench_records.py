@@ -1,4 +1,4 @@
-"""results.jsonl: the line format, damaged files, and what is said about them."""
+"""results.jsonl: the line format, damaged files, and the messages about them."""
 
 import json
 import math
@@ -22,7 +22,7 @@ def make_record(repeat=0, problem="ladybug"):
     return Record(*sizes, 0.1, 1.5, 2.1, 8.0, 2.0, 1, 1, 3, "ftol", trace)
 
 
-def test_line_has_exactly_the_keys_of_the_contract_in_order():
+def test_a_line_has_exactly_the_documented_keys_in_order():
     data = record_to_json(make_record())
     assert list(data) == CONTRACT_KEYS
     assert list(data["trace"][0]) == TRACE_KEYS

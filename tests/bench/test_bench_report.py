@@ -12,7 +12,7 @@ import pytest
 from jaxba.bench import plots
 from jaxba.bench.profile import Target
 from jaxba.bench.records import Record, TracePoint
-from jaxba.bench.report import file_names, run_facts, write_all
+from jaxba.bench.report import file_names, run_metadata, write_all
 from jaxba.problem.bundle_problem import ProblemError
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -50,9 +50,9 @@ class Tags(HTMLParser):
         assert self.stack.pop() == tag
 
 
-def test_write_all_leaves_the_files_of_the_contract(tmp_path):
+def test_write_all_writes_the_documented_files(tmp_path):
     records = [make_record("a", "classic", 30), make_record("a", "ceres", 14), make_record("dir/b c", "classic", 12)]
-    files = write_all(records, tmp_path / "out", 1e-3, facts={"device": "<cpu>", "threads": 2})
+    files = write_all(records, tmp_path / "out", 1e-3, metadata={"device": "<cpu>", "threads": 2})
     stems = (
         "profile_tau_0.001",
         "profile_relative",
@@ -72,7 +72,7 @@ def test_write_all_leaves_the_files_of_the_contract(tmp_path):
 
 def test_report_is_self_contained_well_formed_and_escaped(tmp_path):
     hostile = "<script>alert(1)</script>&\"'"
-    write_all([make_record(hostile, hostile, 3)], tmp_path, facts={hostile: hostile})
+    write_all([make_record(hostile, hostile, 3)], tmp_path, metadata={hostile: hostile})
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "<script" not in text
     parser = Tags()
@@ -109,7 +109,7 @@ def test_run_that_produced_no_numbers_still_makes_a_report(tmp_path):
     assert "no solver has a finite initial cost" in text
 
 
-def test_many_solvers_keep_different_styles_and_the_yardsticks_theirs():
+def test_many_solvers_have_different_styles_and_yardsticks_always_the_same():
     solvers = [f"s{i}" for i in range(20)] + ["ceres", "classic"]
     styles = plots.solver_styles(solvers)
     assert len({(s.color, str(s.linestyle)) for s in styles.values()}) == len(solvers)
@@ -117,7 +117,7 @@ def test_many_solvers_keep_different_styles_and_the_yardsticks_theirs():
     assert list(styles) == solvers
 
 
-def test_profile_curves_lie_at_the_shares_computed_by_hand():
+def test_profile_curves_have_the_fractions_computed_by_hand():
     # x needs 3 accepted steps to 1e-2 f* (900 * 0.1**3 < 1), y 9 iterations with two rejections (900 * 0.37**7 < 1).
     records = [make_record("a", "x", 12, rate=0.1), make_record("a", "y", 12, rate=0.37)]
     figure = plots.plot_profiles(records, [Target("relative", 1e-2)], known_best={"a": 100.0})
@@ -163,10 +163,10 @@ def test_file_names_are_safe_and_different():
     assert found["ok-1.2"] == "ok-1.2"
 
 
-def test_facts_come_from_the_records_when_none_are_given():
-    facts = run_facts([make_record("a", "x", 2), replace(make_record("a", "y", 2), device="gpu", repeat=2)])
-    assert facts["device"] == "cpu, gpu"
-    assert facts["repeats"] == "3"
+def test_metadata_come_from_the_records_if_none_are_given():
+    metadata = run_metadata([make_record("a", "x", 2), replace(make_record("a", "y", 2), device="gpu", repeat=2)])
+    assert metadata["device"] == "cpu, gpu"
+    assert metadata["repeats"] == "3"
 
 
 def test_nothing_to_report_and_bad_tolerance_are_refused(tmp_path):

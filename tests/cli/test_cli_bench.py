@@ -1,4 +1,4 @@
-"""`jaxba-bench` in this process: result files, continuing, and what happens when something is wrong."""
+"""`jaxba-bench` in this process: result files, continuing a run, and errors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def bench(folder: Path, *argv: str) -> int:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
-    """A whole run with everything that it draws."""
+    """A complete run with all of its figures."""
     folder = tmp_path_factory.mktemp("bench") / "run"
     assert bench(folder, "scene:tiny", *BRIEF) == 0
     return folder
@@ -48,13 +48,13 @@ def finished(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def folder(finished, tmp_path) -> Path:
-    """A copy of that run to do something to."""
+    """A copy of that run."""
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Leaves out the drawing, which has tests of its own and takes seconds."""
+    """Writes no figures, which takes seconds and is tested elsewhere."""
     monkeypatch.setattr(report, "write_all", lambda *_, **__: [])
 
 
@@ -68,7 +68,7 @@ def check_one_line(status: int, error: str, message: str) -> None:
 # Results
 
 
-def test_every_line_has_exactly_the_keys_of_the_contract_in_order(finished):
+def test_every_line_has_exactly_the_documented_keys_in_order(finished):
     found = lines(finished)
     assert [line["solver"] for line in found] == ["classic", "ceres"]
     for line in found:
@@ -113,7 +113,7 @@ def test_summary_figures_and_report_are_written(finished):
 # Continuing
 
 
-def test_a_second_run_into_the_folder_adds_nothing(folder, undrawn, capsys):
+def test_a_second_run_with_the_same_folder_adds_nothing(folder, undrawn, capsys):
     before = (folder / "results.jsonl").read_bytes()
     assert bench(folder, "scene:tiny", *BRIEF) == 0
     assert (folder / "results.jsonl").read_bytes() == before
@@ -129,7 +129,7 @@ def test_a_second_run_adds_only_what_is_new(folder, undrawn, capsys):
     assert [line["solver"] for line in lines(folder)] == ["classic", "ceres", "gtsam"]
 
 
-def test_the_half_line_of_a_killed_run_is_repaired(folder, undrawn, capsys):
+def test_the_incomplete_line_of_a_killed_run_is_removed(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) - 300])
@@ -156,7 +156,7 @@ def test_another_problem_of_the_same_name_may_not_continue_in_the_folder(folder,
 
 
 def changed_file(folder: Path) -> Path:
-    """A problem of which the folder has results, and that has become another one since."""
+    """A file that has changed since the folder got results of it."""
     path = folder.parent / "one.txt"
     write_bal(support.tiny(), path)
     assert bench(folder, str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "5") == 0
@@ -169,7 +169,7 @@ def test_another_problem_in_the_same_file_may_not_continue_in_the_folder(folder,
     check_one_line(bench(folder, str(path), *BRIEF), capsys.readouterr().err, "another one;")
 
 
-def test_a_folder_that_knows_no_files_yet_is_continued(folder, undrawn, capsys):
+def test_a_folder_without_checksums_is_continued(folder, undrawn, capsys):
     path = changed_file(folder)
     settings = json.loads((folder / "settings.json").read_text())
     assert list(settings.pop("files")) == ["one"]
@@ -186,13 +186,13 @@ def test_another_policy_in_the_same_file_may_not_continue_in_the_folder(folder, 
     check_one_line(bench(folder, *argv), capsys.readouterr().err, f"another {mine};")
 
 
-def test_a_damaged_result_file_is_named_with_its_line(folder, undrawn, capsys):
+def test_the_error_names_a_damaged_result_file_and_its_line(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     path.write_bytes(b"no json\n" + path.read_bytes())
     check_one_line(bench(folder, "scene:tiny", *BRIEF), capsys.readouterr().err, "results.jsonl, line 1")
 
 
-def test_ctrl_c_keeps_what_is_done_and_the_next_run_does_the_rest(tmp_path, undrawn, capsys, monkeypatch):
+def test_ctrl_c_keeps_the_results_and_the_next_run_does_the_rest(tmp_path, undrawn, capsys, monkeypatch):
     solve_one = bench_run.run_solver
     done = []
 
@@ -220,7 +220,7 @@ def test_two_processes_may_not_write_into_one_folder(folder, undrawn, capsys):
     assert (folder / "results.jsonl").read_bytes() == before
 
 
-def test_a_run_that_two_processes_have_done_counts_once(folder, undrawn, capsys):
+def test_a_run_with_two_records_counts_once(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     path.write_bytes(2 * path.read_bytes())
     assert bench(folder, "scene:tiny", *BRIEF) == 0
@@ -237,7 +237,7 @@ def test_a_full_disk_is_one_line_and_status_2(module, writer, tmp_path, capsys, 
     check_one_line(status, capsys.readouterr().err, f"--out {tmp_path / 'run'}: No space left on device")
 
 
-def test_repeats_are_lines_of_their_own(tmp_path, undrawn, capsys):
+def test_every_repeat_has_its_line(tmp_path, undrawn, capsys):
     argv = ["--solvers", "ceres", "--repeats", "2", "--max-iterations", "5"]
     assert bench(tmp_path / "run", "scene:tiny", *argv) == 0
     first, second = lines(tmp_path / "run")
@@ -260,7 +260,7 @@ def test_a_bad_file_among_good_ones_is_reported_once_and_the_others_are_done(tmp
     ]
 
 
-def test_a_bad_file_that_was_mended_is_done_in_the_same_folder(tmp_path, undrawn, capsys):
+def test_a_bad_file_that_was_repaired_is_solved_in_the_same_folder(tmp_path, undrawn, capsys):
     good, bad, folder = tmp_path / "good.txt", tmp_path / "bad.txt", tmp_path / "run"
     write_bal(support.tiny(), good)
     bad.write_bytes(good.read_bytes()[:500])
@@ -270,7 +270,7 @@ def test_a_bad_file_that_was_mended_is_done_in_the_same_folder(tmp_path, undrawn
     assert sorted({line["problem"] for line in lines(folder)}) == ["bad", "good"]
 
 
-def test_what_a_solver_has_no_memory_for_is_reported_and_others_are_done(tmp_path, undrawn, capsys, monkeypatch):
+def test_a_solver_that_runs_out_of_memory_is_reported_and_others_are_done(tmp_path, undrawn, capsys, monkeypatch):
     def greedy(problem, source, solver, *arguments):
         if str(solver) == "classic":
             raise MemoryError
@@ -294,7 +294,7 @@ def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undraw
     assert f"see {tmp_path / 'run[bold]' / 'report.html'}" in out.replace("\n", "")
 
 
-def test_a_file_whose_name_is_no_text_is_reported_under_an_escaped_one(tmp_path, capsys):
+def test_a_file_name_that_is_not_valid_text_is_escaped(tmp_path, capsys):
     path = tmp_path / os.fsdecode(b"b\xfcro.txt")
     write_bal(support.tiny(), path)
     argv = [str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
@@ -321,13 +321,13 @@ def test_a_problem_that_is_named_twice_is_one(tmp_path, undrawn, capsys):
     assert [line["family"] for line in lines(tmp_path / "run")] == [tmp_path.name, "scene"]
 
 
-def test_the_ends_of_float32_are_costs_in_float64(tmp_path, undrawn, capsys):
+def test_the_final_costs_of_float32_are_computed_in_float64(tmp_path, undrawn, capsys):
     write_bal(support.tiny(), tmp_path / "tiny.txt")
     argv = ["--solvers", "ceres@float32,ceres", "--repeats", "1", "--max-iterations", "3"]
     assert bench(tmp_path / "run", str(tmp_path / "tiny.txt"), *argv) == 0
     rough, exact = lines(tmp_path / "run")
     assert rough["initial_cost"] == pytest.approx(exact["initial_cost"], rel=1e-14)
-    # the same steps but for rounding: their ends lie nearer to each other than float32 adds up
+    # the steps differ by rounding only, and by less than the error of a sum in float32
     assert rough["final_cost"] != rough["trace"][-1]["cost"]
     assert rough["final_cost"] == pytest.approx(rough["trace"][-1]["cost"], rel=1e-4)
 
@@ -338,7 +338,7 @@ def suite(tmp_path: Path, **entries) -> str:
     return str(path)
 
 
-def test_a_suite_names_problems_by_globs_and_variables(tmp_path, undrawn, capsys, monkeypatch):
+def test_wildcards_and_variables_in_a_suite_are_expanded(tmp_path, undrawn, capsys, monkeypatch):
     (tmp_path / "data").mkdir()
     write_bal(support.tiny(), tmp_path / "data" / "one.txt")
     write_bal(support.tiny(), tmp_path / "data" / "two.txt.gz")
@@ -394,7 +394,7 @@ def test_a_suite_is_found_by_its_name(tmp_path, undrawn, capsys):
     ]
 
 
-def test_a_suite_of_real_problems_says_which_variable_names_their_folder(tmp_path, monkeypatch, capsys):
+def test_the_error_names_the_variable_of_the_folder_of_real_problems(tmp_path, monkeypatch, capsys):
     wanted = (
         "--suite rules: $JAXBA_DATA/bal/problem-*.bz2: the environment variable JAXBA_DATA, a folder of problems, is"
     )
@@ -409,10 +409,10 @@ def test_a_suite_of_real_problems_says_which_variable_names_their_folder(tmp_pat
 
 
 BAD_SUITES = {
-    "unknown key": ({"problem": ["scene:tiny"]}, "unknown key 'problem'; known: problems, solvers"),
-    "wrong type": ({"problems": "scene:tiny"}, "problems is 'scene:tiny', not a list"),
-    "wrong number": ({"problems": ["scene:tiny"], "repeats": 1.5}, "repeats is 1.5"),
-    "truth as number": ({"problems": ["scene:tiny"], "repeats": True}, "repeats is True"),
+    "unknown key": ({"problem": ["scene:tiny"]}, "unknown key problem; did you mean problems?"),
+    "wrong type": ({"problems": "scene:tiny"}, "problems must be a list, is 'scene:tiny'"),
+    "wrong number": ({"problems": ["scene:tiny"], "repeats": 1.5}, "repeats must be a whole number, is 1.5"),
+    "truth as number": ({"problems": ["scene:tiny"], "repeats": True}, "repeats must be a whole number, is True"),
     "unset variable": (
         {"problems": ["$JAXBA_NO_SUCH_VARIABLE/x.txt"]},
         "/x.txt: the environment variable JAXBA_NO_SUCH_VARIABLE, a folder of problems, is not set",

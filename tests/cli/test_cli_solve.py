@@ -44,7 +44,7 @@ def rows(text: str) -> list[list[str]]:
     return [line.split() for line in text.splitlines() if line[:4].strip().isdigit()]
 
 
-# What works
+# Solves
 
 
 def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
@@ -84,13 +84,13 @@ def test_without_a_problem_a_built_in_scene_is_solved(capsys):
     assert printed.err == ""
 
 
-def test_a_search_for_points_is_told_and_rows_count_through(tmp_path, capsys):
+def test_a_search_for_points_is_reported_and_rows_are_numbered_consecutively(tmp_path, capsys):
     """One point behind its cameras, with which the solve alone converges far above the minimum."""
     problem, log = solve(support.tiny()).problem, tmp_path / "log.json"
     points, center = np.array(problem.points), geometry.camera_centers(problem.cameras)[problem.camera_index[0]]
     points[0] = center - 3 * (points[0] - center)
     write_bal(problem.replace(points=points), tmp_path / "strayed.txt")
-    stranding = ["--damping", "ceres", "--refine-points", "3"]
+    stranding = ["--policy", "ceres", "--refine-points", "3"]
     assert run([str(tmp_path / "strayed.txt"), *stranding, "--retriangulate", "--log", str(log)]) == 0
     printed, record = capsys.readouterr().out, json.loads(log.read_text())
     searches = re.findall(
@@ -115,15 +115,15 @@ def test_the_rms_is_that_of_the_residuals_whatever_the_loss(loss, tiny, tmp_path
     np.testing.assert_allclose([float(number) for number in found.groups()], rms, rtol=1e-3)
 
 
-def test_padded_sizes_are_said_and_so_is_why_there_are_none(tiny, capsys):
-    fast = [str(tiny), "--max-iterations", "1", "--damping", "ceres", "--pad"]
+def test_padded_sizes_are_reported_or_why_there_is_no_padding(tiny, capsys):
+    fast = [str(tiny), "--max-iterations", "1", "--policy", "ceres", "--pad"]
     assert run(fast) == 0
     assert "padded to 8 cameras, 512 points, 1024 observations, 4096 pairs\n" in capsys.readouterr().out
     assert run([*fast, "--linear-solver", "implicit"]) == 0
     assert "note: not padded: that is for the explicit linear solver\n" in capsys.readouterr().out
 
 
-def test_the_iteration_limit_is_no_error_and_is_said(tiny, tmp_path, capsys):
+def test_the_iteration_limit_is_reported_and_not_an_error(tiny, tmp_path, capsys):
     output = tmp_path / "out.txt"
     assert run([str(tiny), "--max-iterations", "2", "--ftol", "0", "--output", str(output)]) == 0
     printed = capsys.readouterr().out
@@ -133,7 +133,7 @@ def test_the_iteration_limit_is_no_error_and_is_said(tiny, tmp_path, capsys):
 
 
 def test_a_rejected_step_is_marked(tiny, capsys):
-    assert run([str(tiny), "--damping", "constant:1e30", "--compilation", "full"]) == 0
+    assert run([str(tiny), "--policy", "constant:1e30", "--compilation", "full"]) == 0
     printed = capsys.readouterr().out
     assert rows(printed)[1][-1] == "rejected"
     assert "not converged: " in printed
@@ -153,12 +153,12 @@ def test_the_point_cloud_has_every_point_and_camera(tiny, tmp_path, capsys):
 @pytest.mark.slow
 def test_options_reach_the_solver(tiny, tmp_path, capsys):
     log = tmp_path / "log.json"
-    options = ["--damping", "classic:0.03", "--refine-points", "3", "--max-iterations", "3", "--log", str(log)]
+    options = ["--policy", "classic:0.03", "--refine-points", "3", "--max-iterations", "3", "--log", str(log)]
     assert run([str(tiny), *options]) == 0
     record = json.loads(log.read_text())
     assert record["solver"] == "classic:0.03+refine3"
     assert [point["lambda"] for point in record["trace"]][:2] == [None, 0.03]
-    assert "damping classic:0.03 + 3 point iterations, float64" in capsys.readouterr().out
+    assert "policy classic:0.03 + 3 point iterations, float64" in capsys.readouterr().out
     assert run([str(tiny), "--dtype", "float32", "--max-iterations", "2", "--log", str(log)]) == 0
     record = json.loads(log.read_text())
     assert (record["solver"], record["dtype"]) == ("learned@float32", "float32")
@@ -166,12 +166,12 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     record = json.loads(log.read_text())
     assert record["cg_iterations"] > 0
     assert record["backend"].endswith("(implicit)")
-    assert run([str(tiny), "--method", "stba:3", "--damping", "stba", "--max-iterations", "2", "--log", str(log)]) == 0
+    assert run([str(tiny), "--method", "stba:3", "--policy", "stba", "--max-iterations", "2", "--log", str(log)]) == 0
     assert json.loads(log.read_text())["solver"] == "stba:3+stba"
     assert "method stba:3" in capsys.readouterr().out
 
 
-def test_fixed_intrinsics_stay_to_the_last_bit_and_the_rest_is_optimised(tiny, tmp_path):
+def test_fixed_intrinsics_are_bitwise_unchanged_and_the_rest_is_optimised(tiny, tmp_path):
     out = tmp_path / "out.txt"
     assert run([str(tiny), "--intrinsics", "fixed", "--output", str(out)]) == 0
     before, after = read_bal(tiny), read_bal(out)
@@ -180,7 +180,7 @@ def test_fixed_intrinsics_stay_to_the_last_bit_and_the_rest_is_optimised(tiny, t
     assert geometry.cost(after) < 0.5 * geometry.cost(before)
 
 
-def test_what_is_odd_about_the_data_is_counted(tmp_path, capsys):
+def test_notes_on_the_data_have_the_right_counts(tmp_path, capsys):
     problem = support.odd()
     path, output = tmp_path / "odd.txt", tmp_path / "out.txt"
     write_bal(problem, path)
@@ -228,7 +228,7 @@ def test_the_input_may_be_the_output(tiny, capsys):
     assert geometry.cost(read_bal(tiny)) < geometry.cost(support.tiny())
 
 
-def test_a_start_that_is_not_finite_ends_with_an_honest_word(tmp_path, capsys):
+def test_a_start_without_a_finite_cost_is_reported(tmp_path, capsys):
     """A point on its camera's plane: there is nothing to descend from."""
     problem = support.single().replace(
         cameras=np.array([[0, 0, 0, 0, 0, 0, 500.0, 0, 0]]), points=np.array([[1.0, 2.0, 0.0]])
@@ -244,7 +244,7 @@ def test_a_start_that_is_not_finite_ends_with_an_honest_word(tmp_path, capsys):
         check_one_line(status, printed.err)
 
 
-def test_ctrl_c_stops_after_the_iteration_and_writes_what_there_is(tiny, tmp_path, capsys, monkeypatch):
+def test_ctrl_c_stops_after_the_iteration_and_writes_the_solution(tiny, tmp_path, capsys, monkeypatch):
     output = tmp_path / "out.txt"
     row = table.row
 
@@ -277,7 +277,7 @@ def test_a_second_ctrl_c_ends_at_once_with_one_line(tiny, tmp_path, capsys, monk
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_the_solution_is_written_where_nobody_reads_the_table_to_its_end(tiny, tmp_path, monkeypatch):
+def test_the_solution_is_written_if_the_reader_of_stdout_closes_it(tiny, tmp_path, monkeypatch):
     output, (reader, writer) = tmp_path / "out.txt", os.pipe()
     os.close(reader)
     with open(writer, "w") as closed:
@@ -301,7 +301,7 @@ def test_outputs_may_be_devices_and_streams(tiny, capfd):
     assert '"problem"' in capfd.readouterr().out
 
 
-def test_a_solution_on_standard_output_is_alone_there(tiny, tmp_path, capfd):
+def test_a_solution_on_standard_output_has_no_other_output_beside_it(tiny, tmp_path, capfd):
     assert run([str(tiny), "--max-iterations", "1", "--output", "/dev/stdout"]) == 0
     captured = capfd.readouterr()
     (tmp_path / "out.txt").write_text(captured.out)
@@ -323,12 +323,12 @@ def test_not_enough_memory_is_one_line(tiny, capsys, monkeypatch):
     def solve(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr(sys.modules["jaxba.solver.solve"], "solve", solve)
+    monkeypatch.setattr("jaxba.cli.solve.solve", solve)
     assert run([str(tiny)]) == 2
     assert capsys.readouterr().err == "error: not enough memory\n"
 
 
-def test_a_log_goes_where_a_link_points_and_into_a_pipe(tiny, tmp_path):
+def test_a_log_is_written_to_the_target_of_a_link_and_to_a_pipe(tiny, tmp_path):
     target, link, pipe = tmp_path / "log.json", tmp_path / "link.json", tmp_path / "pipe"
     link.symlink_to(target)
     os.mkfifo(pipe)
@@ -356,7 +356,7 @@ def test_ctrl_c_before_or_after_the_iterations_is_one_line(moment, tiny, capsys,
     assert capsys.readouterr().err == "interrupted\n"
 
 
-# What does not
+# Errors
 
 
 def check_one_line(status: int, error: str) -> None:
@@ -383,25 +383,28 @@ BAD = {
     "directory": (lambda tiny: [str(tiny.parent)], "directory"),
     "truncated file": (lambda tiny: [str(cut_short(tiny, 0.5))], "tiny.txt"),
     "empty file": (lambda tiny: [str(cut_short(tiny, 0))], "tiny.txt"),
-    "unknown damping": (lambda tiny: [str(tiny), "--damping", "cerse"], "unknown damping policy 'cerse'"),
-    "lambda that is no number": (lambda tiny: [str(tiny), "--damping", "constant:x"], "positive number"),
-    "missing policy": (lambda tiny: [str(tiny), "--damping", "no.safetensors"], "no.safetensors: No such file"),
-    "policy that is none": (lambda tiny: [str(tiny), "--damping", str(garbage(tiny))], "not a safetensors file"),
+    "unknown policy": (lambda tiny: [str(tiny), "--policy", "cerse"], "unknown damping policy 'cerse'"),
+    "lambda that is no number": (lambda tiny: [str(tiny), "--policy", "constant:x"], "positive number"),
+    "missing policy": (lambda tiny: [str(tiny), "--policy", "no.safetensors"], "no.safetensors: No such file"),
+    "policy that is none": (lambda tiny: [str(tiny), "--policy", str(garbage(tiny))], "not a safetensors file"),
     "unknown method": (lambda tiny: [str(tiny), "--method", "magic"], "known: lm, stba, deeplm, ddlm, poba"),
     "size of no clusters": (lambda tiny: [str(tiny), "--method", "poba:3"], "no clusters"),
     "solver of a method": (lambda tiny: [str(tiny), "--method", "poba", "--linear-solver", "sparse"], "has its own"),
     "fixed intrinsics of a method": (
         lambda tiny: [str(tiny), "--intrinsics", "fixed", "--method", "ddlm"],
-        "--intrinsics",
+        "--intrinsics 'fixed' need the explicit solver, not ddlm",
     ),
-    "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must not be negative"),
+    "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must be at least 0"),
     "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "not with scaling 'identity'"),
-    "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be positive"),
-    "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be positive"),
+    "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be at least 1"),
+    "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be at least 1"),
     "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
     "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
     "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
-    "loss without scale": (lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"], "--loss-scale"),
+    "loss without scale": (
+        lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"],
+        "--loss-scale must be positive",
+    ),
     "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
     "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "--output"),
     "output named as a directory": (
@@ -437,7 +440,7 @@ def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(kind, tiny, t
 
 
 @pytest.mark.parametrize("argv", [["--dtype", "float16"], ["--max-iterations", "many"], ["--no-such-option", "1"]])
-def test_what_the_parser_refuses_is_status_2_and_nothing_on_stdout(argv, capsys):
+def test_parser_errors_have_status_2_and_print_nothing_on_stdout(argv, capsys):
     with pytest.raises(SystemExit) as caught:
         run(argv)
     assert caught.value.code == 2
@@ -447,7 +450,7 @@ def test_what_the_parser_refuses_is_status_2_and_nothing_on_stdout(argv, capsys)
 
 
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])
-def test_the_heading_says_where_cameras_are_damped_otherwise_than_points(factor, said):
-    args = SimpleNamespace(damping="mine.safetensors", dtype="float64", method="lm", linear_solver="auto")
+def test_the_heading_reports_a_different_damping_of_cameras(factor, said):
+    args = SimpleNamespace(policy="mine.safetensors", dtype="float64", method="lm", linear_solver="auto")
     text = table.heading("scene", support.tiny(), args, StepOptions(coordinates=Coordinates(camera_damping=factor)))
     assert ("cameras damped by 0.01 lambda" in text) == said

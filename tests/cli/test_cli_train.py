@@ -1,4 +1,4 @@
-"""`jaxba-train` in this process on a tiny bank: what it writes, Ctrl-C, going on, and one-line errors."""
+"""`jaxba-train` in this process on few scenes: its files, Ctrl-C, continuing, and errors of one line."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ CLOCKS = ("wall_s", "chunk_s", "steps_per_s", "updates_per_s", "cpu_per_wall", "
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    """Few lanes and rules, since every rule is a program of its own."""
+    """Few lanes and rules, since every rule needs its own compiled program."""
     monkeypatch.setattr(rollout, "LANES", rollout.GROUP)
-    monkeypatch.setattr(task, "YARDSTICKS", ("ceres",))
+    monkeypatch.setattr(task, "BASELINES", ("ceres",))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def scenes(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("train") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollout, "LANES", rollout.GROUP)
-        patch.setattr(task, "YARDSTICKS", ("ceres",))
+        patch.setattr(task, "BASELINES", ("ceres",))
         interrupt_at(1, patch)
         assert run([*COMMAND, "--out", str(folder)]) == 130
     return folder
@@ -59,13 +59,13 @@ def finished(scenes, tmp_path_factory) -> Path:
     folder = Path(shutil.copytree(scenes, tmp_path_factory.mktemp("done") / "run"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollout, "LANES", rollout.GROUP)
-        patch.setattr(task, "YARDSTICKS", ("ceres",))
+        patch.setattr(task, "BASELINES", ("ceres",))
         assert run(["--out", str(folder), "--resume"]) == 0
     return folder
 
 
 def interrupt_at(chunk: int, patch: pytest.MonkeyPatch, times: int = 1) -> None:
-    """Presses Ctrl-C while a chunk is being written down."""
+    """Sends Ctrl-C while the log of a chunk is written."""
     write = log.Log.write
 
     def pressed(self, row):
@@ -90,7 +90,7 @@ def error_of(capsys, *argv: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_run_leaves_policy_curve_log_and_configuration(finished):
+def test_a_run_writes_policy_curve_log_and_configuration(finished):
     names = {path.name for path in finished.iterdir()}
     assert names == {
         *("config.yaml", "bank.npz", "rules.npz", "metrics.jsonl", "tensorboard", "checkpoints"),
@@ -101,16 +101,16 @@ def test_a_run_leaves_policy_curve_log_and_configuration(finished):
     assert log.read(finished)[1]["episode/ceres"] > 0
 
 
-def test_the_policy_file_is_the_best_policy_and_says_where_it_comes_from(finished):
+def test_the_policy_file_has_the_best_policy_and_its_origin(finished):
     policy = load_policy(finished / "policy.safetensors")
     assert policy.config == load("fast", TINY).game.agent
     scored = [row for row in log.read(finished) if "held_out/score" in row]
     best = min(scored, key=lambda row: row["held_out/score"])
     with safe_open(finished / "policy.safetensors", framework="numpy") as file:
-        facts = file.metadata()
-    assert facts["chunk"] == str(best["chunk"])
-    assert facts["held_out_iterations"] == f"{best['held_out/score']:.4f}"
-    assert "cameras: 4" in facts["config"]
+        metadata = file.metadata()
+    assert metadata["chunk"] == str(best["chunk"])
+    assert metadata["held_out_iterations"] == f"{best['held_out/score']:.4f}"
+    assert "cameras: 4" in metadata["config"]
     actor = {"params": {"MLP_0": {f"Dense_{k}": x._asdict() for k, x in enumerate(policy.layers)}}}
     work = task.build(load("fast", TINY), finished)
     assert work.compare(actor)["learned"].mean == pytest.approx(best["held_out/score"], abs=1)
@@ -128,7 +128,7 @@ def test_a_finished_run_resumed_prints_the_table_again(finished, capsys):
 # Interruptions
 
 
-def test_ctrl_c_saves_and_says_how_to_go_on(folder, capsys, monkeypatch):
+def test_ctrl_c_saves_the_run_and_prints_how_to_continue(folder, capsys, monkeypatch):
     before = signal.getsignal(signal.SIGINT)  # a shell's background job ignores the signal
     interrupt_at(3, monkeypatch)
     assert run(["--out", str(folder), "--resume"]) == 130
@@ -139,7 +139,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(folder, capsys, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_an_interrupted_run_goes_on_as_if_it_had_not_been(folder, finished, capsys, monkeypatch):
+def test_an_interrupted_run_continues_with_the_same_results(folder, finished, capsys, monkeypatch):
     with monkeypatch.context() as patch:
         interrupt_at(3, patch, times=2)
         assert run(["--out", str(folder), "--resume"]) == 130
@@ -147,7 +147,7 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(folder, finished, caps
     assert run(["--out", str(folder), "--resume"]) == 0
     plain = lambda row: {k: v for k, v in row.items() if k not in CLOCKS}
     assert list(map(plain, log.read(folder))) == list(map(plain, log.read(finished)))
-    ours, theirs = (load_policy(place / "policy.safetensors") for place in (folder, finished))
+    ours, theirs = (load_policy(run_folder / "policy.safetensors") for run_folder in (folder, finished))
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -156,14 +156,14 @@ def test_an_interrupted_run_goes_on_as_if_it_had_not_been(folder, finished, caps
 
 
 @pytest.mark.slow
-def test_an_agent_is_trained_for_the_method_that_is_named(tmp_path):
+def test_an_agent_is_trained_for_the_given_method(tmp_path):
     out = tmp_path / "run"
     assert run([*COMMAND, "method=stba", "cluster_cameras=2", "chunks=1", "--out", str(out)]) == 0
     assert list(task.build(load(str(out / "config.yaml")), out).rules) == ["stba", "ceres", "virtual best"]
     assert (out / "policy.safetensors").is_file()
 
 
-def test_a_folder_with_a_run_is_refused(folder, capsys):
+def test_a_folder_that_has_a_run_is_refused(folder, capsys):
     assert "holds a run already; --resume goes on with it" in error_of(capsys, *COMMAND, "--out", str(folder))
 
 
@@ -185,7 +185,7 @@ def test_a_resumed_run_of_other_settings_is_refused(folder, capsys):
 
 def test_a_bank_without_useful_scenes_is_one_line(capsys, tmp_path, monkeypatch):
     def none(*_args, **_kwargs):
-        raise TooFewScenes("only 0 of 9 scenes are of use: draw more")
+        raise TooFewScenes("only 0 of 9 scenes are usable: draw more")
 
     monkeypatch.setattr(task, "make_banks", none)
     assert "draw more" in error_of(capsys, *COMMAND, "--out", str(tmp_path / "run"))

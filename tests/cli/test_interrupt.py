@@ -1,4 +1,4 @@
-"""Ctrl-C while a long program computes, where Python itself hears nothing."""
+"""Ctrl-C while a long compiled program runs, in which Python handles no signals."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ import sys
 
 import pytest
 
-from jaxba.cli.interrupt import PATIENCE_S
+from jaxba.cli.interrupt import EXIT_DELAY_S
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to another process")
 
 BUSY = """
 import hashlib
 from jaxba.cli.interrupt import Interrupt
-with Interrupt("iteration", gentle=True):
+with Interrupt("iteration", graceful=True):
     print("ready", flush=True)
-    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # many minutes in one call that hears no signal
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # many minutes in one call in which Python handles no signals
 """
 
 
-def test_the_first_is_answered_and_the_second_ends_a_program_that_hears_nothing():
+def test_the_first_prints_a_message_and_the_second_ends_the_process():
     child = subprocess.Popen([sys.executable, "-c", BUSY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     with child:
         try:
@@ -30,8 +30,8 @@ def test_the_first_is_answered_and_the_second_ends_a_program_that_hears_nothing(
             assert child.stdout.readline() == "ready\n"
             child.send_signal(signal.SIGINT)
             assert child.stderr.readline() == "stopping after this iteration; Ctrl-C again stops at once\n"
-            with pytest.raises(subprocess.TimeoutExpired):  # one alone ends nothing
-                child.wait(1.5 * PATIENCE_S)
+            with pytest.raises(subprocess.TimeoutExpired):  # the first one alone does not end it
+                child.wait(1.5 * EXIT_DELAY_S)
             child.send_signal(signal.SIGINT)
             assert child.wait(60) == 130
             assert child.stderr.read() == "interrupted\n"

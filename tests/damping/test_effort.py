@@ -201,7 +201,7 @@ def test_an_iteration_is_paid_by_its_conjugate_gradients_where_the_action_choose
     [
         (("game.agent.effort=all",), "effort must be one of fixed, points"),
         (("game.agent={effort: points, refine_points: 0}",), "needs embedded point iterations"),
-        (("game.agent.effort=points", "method=ddlm"), "means nothing to method ddlm"),
+        (("game.agent.effort=points", "method=ddlm"), "has no effect on method ddlm"),
         (("game.agent.effort=points+forcing",), "needs conjugate gradients"),
     ],
 )

@@ -227,6 +227,7 @@ def test_every_name_makes_its_policy_with_the_lambda_that_was_asked_for():
         ("constant", "must be a positive number, not ''"),
         ("constant:", "must be a positive number, not ''"),
         ("constant:0", "must be a positive number, not '0'"),
+        ("bold:0.1", "'bold' has no first lambda to set; use constant:LAMBDA"),
         ("schedule:0.1", "has no first lambda to set; use constant:LAMBDA"),
         ("gauss-newton:1", "has no first lambda to set"),
         ("ceres:", "must be a positive number"),

@@ -172,7 +172,7 @@ def test_download_without_names_and_without_pooch_are_one_line(folder, capsys, m
 
 def test_solve_takes_a_name(stored, tmp_path, capsys):
     log = tmp_path / "log.json"
-    assert solve.run(["ladybug-49", "--damping", "ceres", "--max-iterations", "1", "--log", str(log)]) == 0
+    assert solve.run(["ladybug-49", "--policy", "ceres", "--max-iterations", "1", "--log", str(log)]) == 0
     assert capsys.readouterr().out.startswith("ladybug-49: 6 cameras, 40 points, 200 observations\n")
     assert json.loads(log.read_text())["problem"] == "ladybug-49"
 

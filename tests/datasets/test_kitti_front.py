@@ -188,7 +188,7 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     start = ["--start", "noisy-poses", "--rotation-sigma", "0.3", "--translation-sigma", "0.1"]
     assert build(rendered[OTHER], out, *start, "--keyframes", "all") == 0
     ate = start_error(capsys.readouterr().out)
-    assert solve([str(out), "--damping", "ceres", "--output", str(solved)]) == 0
+    assert solve([str(out), "--policy", "ceres", "--output", str(solved)]) == 0
     capsys.readouterr()
     assert run(["evaluate", str(out), str(solved), "--poses", str(poses), "--out", str(folder), "--lengths", "2"]) == 0
     printed = capsys.readouterr()

@@ -26,7 +26,7 @@ from jaxba.game.evaluate import evaluate, play_all, score, scores
 from jaxba.game.protocol import Environment
 from jaxba.game.random_scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
 from jaxba.game.rollout import Trajectories, play
-from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, sieve
+from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, select
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState
 from jaxba.lm.step import lm_step
@@ -238,7 +238,7 @@ def test_lanes_do_not_mix_scenes(monkeypatch):
     order = np.random.default_rng(0).permutation(len(bank.initial_cost))
     monkeypatch.setattr(module, "LANES", 8)
     assert len(order) > 8
-    mixed = play(KIND, sieve(bank, order), CERES, StepOptions(), LIMIT - 1)  # another limit: a program of its own
+    mixed = play(KIND, select(bank, order), CERES, StepOptions(), LIMIT - 1)  # another limit: a program of its own
     straight = played()
     np.testing.assert_allclose(mixed.costs, straight.costs[order][:, :-1], rtol=1e-5)
     np.testing.assert_array_equal(np.minimum(straight.iterations[order], LIMIT - 1), mixed.iterations)

@@ -17,7 +17,8 @@ from support import DATA, needs_data
 from jaxba import (
     BundleProblem,
     ProblemError,
-    StepOptions,
+    Refinement,
+    SolveOptions,
     read_colmap,
     read_problem,
     solve,
@@ -30,7 +31,6 @@ from jaxba.cli.solve import run
 from jaxba.io import colmap
 from jaxba.io.colmap import MODELS
 from jaxba.problem import geometry
-from jaxba.problem.options import Refinement
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
 
@@ -223,7 +223,7 @@ def test_a_name_with_a_dot_is_a_folder_and_a_file_says_what_it_lacks(tmp_path, c
     assert "has no place" not in capsys.readouterr().out
     assert run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "flat.txt.gz")]) == 0
     lost = "which images share a lens, which numbers of a lens stay as they are, weights of observations"
-    assert f"note: that file has no place for: {lost}\n" in capsys.readouterr().out
+    assert f"note: that file cannot store: {lost}\n" in capsys.readouterr().out
 
 
 def test_robust_losses_and_the_search_for_points_work_with_shared_lenses(tmp_path, capsys):
@@ -320,7 +320,7 @@ def test_a_problem_of_another_model_is_not_written(tmp_path):
     for other in (support.tiny(), fewer):
         with pytest.raises(ProblemError, match="the problem is not one of"):
             write_colmap(other, tmp_path / "out", like=folder)
-    apart = solve(problem.replace(lenses=None), "ceres", max_iterations=2).problem
+    apart = solve(problem.replace(lenses=None), "ceres", SolveOptions(max_iterations=2)).problem
     with pytest.raises(ProblemError, match="images of camera 9 have different f, k1 or k2"):
         write_colmap(apart, tmp_path / "out", like=folder)
     assert not (tmp_path / "out").exists()
@@ -436,5 +436,5 @@ def test_a_start_far_from_the_end_is_solved_with_a_shared_lens(tmp_path):
     rng = np.random.default_rng(2)
     far: BundleProblem = problem.replace(points=problem.points + rng.normal(scale=0.3, size=problem.points.shape))
     near = solve(problem, "learned").final_cost
-    options = StepOptions(refinement=Refinement(points=3))
+    options = SolveOptions(refinement=Refinement(points=3))
     np.testing.assert_allclose(solve(far, "ceres", options).final_cost, near, rtol=1e-4)

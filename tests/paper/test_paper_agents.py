@@ -1,4 +1,4 @@
-"""Agents of the reproduction run: one thing changed in each, scenes kept for the tables, known lenses."""
+"""Agents of the reproduction run: their settings, the scenes that are kept for the tables, and fixed lenses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, make_banks
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
-from jaxba.paper.pieces.small import SmallScene
+from jaxba.paper.tables_and_figures.small import SmallScene
 from jaxba.training import settings
 
 CONFIG = config.load("fast")
@@ -21,14 +21,14 @@ CONFIG = config.load("fast")
 @pytest.mark.parametrize(
     ("agent", "changed"),
     [
-        (agents.of_state(5), []),
-        (agents.of_state(20), ["game.agent.history"]),
+        (agents.with_state_size(5), []),
+        (agents.with_state_size(20), ["game.agent.history"]),
         (agents.REDUCTION, ["game.reward"]),
         (agents.REVERSED, ["game.agent.observation", "game.reward"]),
         (agents.FEW, []),
     ],
 )
-def test_agents_differ_in_what_their_table_is_about_and_nothing_else(agent, changed):
+def test_agents_differ_only_in_the_settings_that_their_table_compares(agent, changed):
     ours, theirs = (agents.train_config(CONFIG, one, 0) for one in (agents.OURS, agent))
     assert sorted(settings.differences(ours, theirs)) == changed
 
@@ -57,23 +57,23 @@ def split() -> Split:
         return make_banks(made, jax.random.key(0), made.options, 40)[0]
 
 
-def test_held_out_scenes_are_no_scenes_to_train_on(split):
+def test_held_out_scenes_are_not_training_scenes(split):
     train, held_out = (set(map(bytes, np.asarray(bank.scenes.pixels))) for bank in split)
     assert len(train) == len(split.train.initial_cost)
     assert len(held_out) == len(split.held_out.initial_cost) == round((len(train) + len(held_out)) / 10)
     assert not train & held_out
 
 
-def test_scenes_of_use_are_neither_solved_at_the_start_nor_out_of_reach(split):
+def test_scenes_are_neither_solved_at_the_start_nor_unsolvable(split):
     for bank in split:
         ratio = np.asarray(bank.initial_cost) / np.asarray(bank.best_cost)
         assert (ratio > MIN_RATIO).all()
         assert (ratio < MAX_RATIO).all()
-        assert (np.asarray(bank.ceres_iterations) <= EASY_ENOUGH).all()  # the portfolio is that rule alone
+        assert (np.asarray(bank.ceres_iterations) <= EASY_ENOUGH).all()  # the portfolio has only this rule
 
 
-def test_the_tables_scenes_are_no_agents(split, monkeypatch, tmp_path):
-    monkeypatch.setattr(agents, "_shared", lambda *_: split)
+def test_the_scenes_of_the_tables_are_not_used_in_training(split, monkeypatch, tmp_path):
+    monkeypatch.setattr(agents, "_shared_scenes", lambda *_: split)
     train_on, test = agents.scenes(CONFIG, tmp_path, lambda _: None)
     costs = [set(np.asarray(bank.initial_cost).tolist()) for bank in (train_on, test, split.held_out)]
     assert len(costs[1]) == len(costs[2]) == len(split.held_out.initial_cost)
@@ -82,7 +82,7 @@ def test_the_tables_scenes_are_no_agents(split, monkeypatch, tmp_path):
     assert costs[0] | costs[1] == set(np.asarray(split.train.initial_cost).tolist())
 
 
-def test_the_agent_of_few_scenes_plays_the_first_ones(split):
+def test_the_agent_with_few_scenes_trains_on_the_first_ones(split):
     few = PaperConfig(agents=AgentsConfig(trajectories=3))
     wanted = agents.train_config(few, agents.FEW, 0)
     game = agents.game(few, agents.FEW, wanted, split.train)
@@ -92,19 +92,19 @@ def test_the_agent_of_few_scenes_plays_the_first_ones(split):
     assert len(whole.banks[0].initial_cost) == len(split.train.initial_cost)
 
 
-def test_a_known_lens_stays_bit_for_bit_and_poses_move():
+def test_a_fixed_lens_is_bitwise_unchanged_and_poses_change():
     problem = paper(0)
     found = solve(problem, "ceres", StepOptions(intrinsics="fixed"), max_iterations=10).problem
     assert found.cameras[:, 6:].tobytes() == np.asarray(problem.cameras[:, 6:]).tobytes()
     assert (np.asarray(found.cameras[:, :6]) != problem.cameras[:, :6]).all()
 
 
-def test_a_small_scene_is_determined_by_its_known_lens():
+def test_a_small_scene_is_determined_if_the_lens_is_known():
     problem = SmallScene("s", "small", "5 x 5", 5, 3).read()
     assert (problem.num_cameras, problem.num_points, problem.num_observations) == (5, 5, 25)
     assert 2 * problem.num_observations > 6 * 5 + 3 * 5 - 7
     assert 2 * problem.num_observations < 9 * 5 + 3 * 5 - 7
     truth = solve(problem, "ceres", StepOptions(intrinsics="fixed"))
     assert truth.converged
-    # half a pixel of noise on each of 50 numbers, of which 38 unknowns take their share
+    # half a pixel of noise on each of 50 residuals, of which 38 unknowns fit a part
     assert truth.final_cost < 0.5 * 0.25 * 50

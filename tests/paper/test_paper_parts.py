@@ -1,4 +1,4 @@
-"""Parts of the reproduction run by hand: sub-problems, schedules, rows, claims, records, settings and places."""
+"""Parts of the reproduction: sub-problems, schedules, rows, claims, results, configuration and real problems."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import pytest
 
 from jaxba import BundleProblem, ProblemError
 from jaxba.bench.records import Record, TracePoint
-from jaxba.paper import claims, config, places, rows
+from jaxba.paper import claims, config, real_problems, rows
 from jaxba.paper.markdown import Line, disagreements, lines_table
 from jaxba.paper.rows import Outcome, Row
 from jaxba.paper.schedule import average_schedule
 from jaxba.paper.store import PLAYS, SOLVES, Play, Store
-from jaxba.paper.subproblem import Cut, neighbours, sub_problem
+from jaxba.paper.subproblem import SubProblem, neighbouring_cameras, sub_problem
 from jaxba.training.settings import SettingsError
 
 # Sub-problems
 
 
 def hand_made() -> BundleProblem:
-    """Who sees which point: 0: cameras 0, 1, 2; 1: 0, 1; 2: 2, 3; 3: camera 3 twice; 4: 1, 3."""
+    """Cameras that observe each point: 0: cameras 0, 1, 2; 1: 0, 1; 2: 2, 3; 3: camera 3 twice; 4: 1, 3."""
     seen = [(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 2), (3, 2), (3, 3), (3, 3), (1, 4), (3, 4)]
     cameras = np.zeros((4, 9))
     cameras[:, 0], cameras[:, 6] = np.arange(4), 100.0
@@ -32,7 +32,7 @@ def hand_made() -> BundleProblem:
     return BundleProblem.create(cameras, points, pixels, [c for c, _ in seen], [p for _, p in seen])
 
 
-def test_a_sub_problem_has_the_cameras_asked_for_and_points_that_two_of_them_see():
+def test_a_sub_problem_has_the_given_cameras_and_the_points_that_two_of_them_observe():
     whole = hand_made()
     part = sub_problem(whole, [0, 1, 3])
     assert part.cameras[:, 0].tolist() == [0.0, 1.0, 3.0]
@@ -42,13 +42,13 @@ def test_a_sub_problem_has_the_cameras_asked_for_and_points_that_two_of_them_see
     assert part.observations[:, 0].tolist() == [0.0, 2.0, 6.0, 8.0, 18.0, 20.0]
 
 
-def test_points_that_were_not_asked_for_are_left_out():
+def test_only_the_given_points_are_kept():
     part = sub_problem(hand_made(), [0, 1, 2], points=[1, 2])
     assert part.points[:, 0].tolist() == [1.0]
     assert part.num_observations == 2
 
 
-def test_a_sub_problem_of_everything_that_tracks_is_the_problem():
+def test_a_sub_problem_of_all_cameras_keeps_all_cameras():
     whole = hand_made()
     part = sub_problem(sub_problem(whole, range(4)), range(4))
     assert part.num_points == 4
@@ -64,31 +64,31 @@ def test_a_sub_problem_of_everything_that_tracks_is_the_problem():
         ([0, 3], None, "no point is seen"),
     ],
 )
-def test_a_sub_problem_that_cannot_be_is_one_line(cameras, points, words):
+def test_an_impossible_sub_problem_is_an_error_of_one_line(cameras, points, words):
     with pytest.raises(ProblemError, match=words):
         sub_problem(hand_made(), cameras, points)
 
 
-def test_neighbours_grow_from_the_camera_that_sees_most():
+def test_neighbouring_cameras_start_with_the_one_that_observes_most_points():
     # camera 1 and 3 see three points each, the first of them is 1; it shares two points with 0, one with 2 and with 3
-    assert neighbours(hand_made(), 1).tolist() == [1]
-    assert neighbours(hand_made(), 2).tolist() == [0, 1]
-    assert neighbours(hand_made(), 4).tolist() == [0, 1, 2, 3]
+    assert neighbouring_cameras(hand_made(), 1).tolist() == [1]
+    assert neighbouring_cameras(hand_made(), 2).tolist() == [0, 1]
+    assert neighbouring_cameras(hand_made(), 4).tolist() == [0, 1, 2, 3]
     with pytest.raises(ProblemError, match="cannot take 5 of 4"):
-        neighbours(hand_made(), 5)
+        neighbouring_cameras(hand_made(), 5)
 
 
-def test_a_cut_of_a_scene_is_made_when_it_is_read():
-    part = Cut("part", "scene", "scene:tiny", cameras=3).read()
+def test_a_sub_problem_of_a_scene_is_made_when_it_is_read():
+    part = SubProblem("part", "scene", "scene:tiny", cameras=3).read()
     assert part.num_cameras == 3
     tracks = np.bincount(part.point_index)
     assert tracks.min() >= 2
 
 
-# The schedule made the paper's way
+# Average schedules
 
 
-def test_a_schedule_is_the_arithmetic_mean_of_each_place():
+def test_a_schedule_is_the_arithmetic_mean_at_each_iteration():
     assert average_schedule([[1.0, 2.0, 3.0, 4.0, 9.0], [3.0, 4.0, 5.0, 8.0]]) == (2.0, 3.0, 4.0, 6.0)
 
 
@@ -113,7 +113,7 @@ def solved(
     return Outcome(float(iterations), converged, near, end, seconds)
 
 
-def test_a_row_averages_over_problems_and_spreads_over_seeds():
+def test_a_row_has_the_mean_over_problems_and_the_range_over_seeds():
     found = rows.row(
         "x", {0: [solved(4), solved(6)], 1: [solved(8, end=0.02), solved(100, False, near=100.0)]}, trained=True
     )
@@ -122,7 +122,7 @@ def test_a_row_averages_over_problems_and_spreads_over_seeds():
     assert (found.seeds, found.solves, found.seconds) == (2, 2, 1.0)
 
 
-def test_a_rule_has_no_seeds_and_nothing_run_is_no_number():
+def test_a_rule_has_no_seeds_and_without_solves_the_mean_is_nan():
     assert rows.row("x", {0: [solved(4)]}, trained=False).seeds == 0
     nothing = rows.row("x", {}, trained=True)
     assert nothing.solves == 0
@@ -163,7 +163,7 @@ def record(
     return Record(problem=problem, trace=trace, **sizes, **where, **ends, **times)
 
 
-def test_outcomes_of_records_by_hand():
+def test_outcomes_of_records_agree_with_numbers_by_hand():
     records = [
         record("a", [100.0, 50.0, 10.005, 10.0]),
         record("a", [100.0, 50.0, 10.005, 10.0], repeat=1, step_s=3.0),
@@ -186,7 +186,7 @@ def of(
 
 
 @pytest.mark.parametrize(
-    ("ours", "base", "verdict"),
+    ("ours", "base", "status"),
     [
         (of(4), of(20), "reproduced"),
         (of(5), of(20), "reproduced"),
@@ -199,22 +199,22 @@ def of(
         (of(math.nan), of(20), "not run"),
     ],
 )
-def test_a_ratio_is_judged_by_the_rule(ours, base, verdict):
-    assert claims.ratio_claim("claim", 0.2, ours, base).verdict == verdict
+def test_rule_for_ratios(ours, base, status):
+    assert claims.ratio_claim("claim", 0.2, ours, base).status == status
 
 
 @pytest.mark.parametrize(
-    ("ours_s", "success", "verdict"),
+    ("ours_s", "success", "status"),
     [(2.5, 1.0, "reproduced"), (2.6, 1.0, "partly"), (9.1, 1.0, "not"), (2.0, 0.9, "not"), (math.nan, 1.0, "not run")],
 )
-def test_a_share_of_time_is_judged_as_one_of_iterations(ours_s, success, verdict):
+def test_rule_for_times_is_that_for_ratios(ours_s, success, status):
     ours = dataclasses.replace(of(4, success=success), seconds=ours_s)
     base = dataclasses.replace(of(20), seconds=10.0)
-    assert claims.time_claim("claim", 0.2, ours, base).verdict == verdict
+    assert claims.time_claim("claim", 0.2, ours, base).status == status
 
 
 @pytest.mark.parametrize(
-    ("better", "worse", "verdict"),
+    ("better", "worse", "status"),
     [
         (of(4, 3, 5), of(8, 7, 9), "reproduced"),
         (of(4, 3, 7.5), of(8, 7, 9), "partly"),
@@ -227,27 +227,27 @@ def test_a_share_of_time_is_judged_as_one_of_iterations(ours_s, success, verdict
         (of(4), None, "not run"),
     ],
 )
-def test_an_order_is_judged_by_the_ranges_over_the_seeds(better, worse, verdict):
-    assert claims.order_claim("claim", "4 against 8", better, worse).verdict == verdict
+def test_rule_for_orders_uses_the_ranges_over_the_seeds(better, worse, status):
+    assert claims.order_claim("claim", "4 against 8", better, worse).status == status
 
 
 @pytest.mark.parametrize(
-    ("ours", "verdict"), [(0.66, "reproduced"), (0.6, "partly"), (0.5, "not"), (math.nan, "not run")]
+    ("ours", "status"), [(0.66, "reproduced"), (0.6, "partly"), (0.5, "not"), (math.nan, "not run")]
 )
-def test_a_share_is_judged_by_its_distance(ours, verdict):
-    assert claims.share_claim("claim", 0.7, ours).verdict == verdict
+def test_rule_for_fractions(ours, status):
+    assert claims.fraction_claim("claim", 0.7, ours).status == status
 
 
 def test_only_claims_that_failed_are_disagreements():
     good, bad = claims.ratio_claim("good one", 0.2, of(4), of(20)), claims.ratio_claim("bad one", 0.2, of(19), of(20))
     assert disagreements([good], "why") == ""
-    said = disagreements([good, bad], "another machine.")
-    assert "bad one: no (paper 0.20, ours 0.95" in said
-    assert said.endswith("another machine.")
-    assert "good one" not in said
+    text = disagreements([good, bad], "another machine.")
+    assert "bad one: no (paper 0.20, ours 0.95" in text
+    assert text.endswith("another machine.")
+    assert "good one" not in text
 
 
-def test_a_table_has_the_papers_figure_and_both_ratios():
+def test_a_table_has_the_numbers_of_the_paper_and_both_ratios():
     classic, ceres = of(20, seeds=0), of(8, seeds=0)
     lines = [Line("classic", Row("classic", *[20.0] * 3, 1.0, 1.0, 1.0, 0, 3), 20.0), Line("ours", of(4, 3, 5), 4.0)]
     text = lines_table(lines, lines[0].row, ceres)
@@ -259,7 +259,7 @@ def test_a_table_has_the_papers_figure_and_both_ratios():
 # Records
 
 
-def test_lines_come_back_as_they_were_written(tmp_path):
+def test_results_are_read_as_they_were_written(tmp_path):
     play = Play("test", "x", 1, (3, 4), (True, False), (1.0, math.inf), (0.0, 1e-3), ((1e-15, 2.0), ()), 0.25)
     store = Store(tmp_path)
     store.add_play(play)
@@ -271,7 +271,7 @@ def test_lines_come_back_as_they_were_written(tmp_path):
     assert json.loads((tmp_path / PLAYS).read_text())["near"] == [1.0, None]
 
 
-def test_a_half_written_line_is_dropped_and_the_next_one_is_whole(tmp_path):
+def test_an_incomplete_line_is_removed_before_the_next_is_written(tmp_path):
     play = Play("test", "x", 1, (3,), (True,), (1.0,), (0.0,), ((1.0,),), 0.25)
     Store(tmp_path).add_play(play)
     with (tmp_path / PLAYS).open("a") as file:
@@ -282,18 +282,18 @@ def test_a_half_written_line_is_dropped_and_the_next_one_is_whole(tmp_path):
     assert [p.method for p in Store(tmp_path).plays] == ["x", "y"]
 
 
-def test_a_damaged_line_is_named(tmp_path):
+def test_the_error_names_a_damaged_line(tmp_path):
     (tmp_path / PLAYS).write_text("{}\n")
     with pytest.raises(ProblemError, match=r"plays.jsonl, line 1: not a line of this program"):
         Store(tmp_path)
     assert not (tmp_path / SOLVES).exists()
 
 
-# Settings and places
+# Configuration and real problems
 
 
 @pytest.mark.parametrize("name", config.preset_names())
-def test_presets_load_and_come_back(name, tmp_path):
+def test_presets_are_read_as_they_were_written(name, tmp_path):
     loaded = config.load(name)
     path = tmp_path / "again.yaml"
     path.write_text(config.to_yaml(loaded))
@@ -316,31 +316,31 @@ def test_the_presets_are_full_and_fast():
         ("agents: [", "not YAML"),
     ],
 )
-def test_a_wrong_file_is_one_line(text, words, tmp_path):
+def test_a_wrong_file_is_an_error_of_one_line(text, words, tmp_path):
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
     with pytest.raises(SettingsError, match=words):
         config.load(str(path))
 
 
-def test_an_unknown_preset_is_named():
+def test_the_error_names_an_unknown_preset():
     with pytest.raises(SettingsError, match="no configuration 'quick'; known: fast, full"):
         config.load("quick")
 
 
-def test_real_problems_come_through_the_variable_alone(monkeypatch):
+def test_without_the_variable_there_are_no_real_problems(monkeypatch):
     monkeypatch.delenv("JAXBA_DATA", raising=False)
     settings = config.load("fast").real
-    assert places.find(settings.kitti).reason == "not run: JAXBA_DATA is not set"
-    assert places.why_no_bal(settings) == "not run: JAXBA_DATA is not set"
-    assert places.bal(settings) == ()
+    assert real_problems.find(settings.kitti).reason == "not run: JAXBA_DATA is not set"
+    assert real_problems.reason_without_bal(settings) == "not run: JAXBA_DATA is not set"
+    assert real_problems.bal(settings) == ()
 
 
-def test_files_and_their_parts_are_found_and_what_is_missing_is_told(monkeypatch, tmp_path):
+def test_files_and_their_sub_problems_are_found_and_missing_ones_are_reported(monkeypatch, tmp_path):
     monkeypatch.setenv("JAXBA_DATA", str(tmp_path))
     (tmp_path / "problem-6-40-pre.txt").write_text("")
     family = config.FamilyConfig("Ladybug", ("$JAXBA_DATA/problem-*.txt", "$JAXBA_DATA/other.txt"), (3, 4))
-    found = places.find(family)
+    found = real_problems.find(family)
     assert [source.name for source in found.all] == [
         "problem-6-40-pre",
         "problem-6-40-pre-first3",
@@ -349,6 +349,10 @@ def test_files_and_their_parts_are_found_and_what_is_missing_is_told(monkeypatch
     assert found.missing == ("$JAXBA_DATA/other.txt",)
     assert found.reason == ""
     names = lambda whole, of: [s.name for s in of(config.RealConfig((dataclasses.replace(family, whole=whole),)))]
-    assert names(True, places.bal) == ["problem-6-40-pre"]
-    assert names(True, places.bal_and_parts) == [source.name for source in found.all]
-    assert names(False, places.bal) == names(False, places.bal_and_parts) == [source.name for source in found.cuts]
+    assert names(True, real_problems.bal) == ["problem-6-40-pre"]
+    assert names(True, real_problems.bal_and_sub_problems) == [source.name for source in found.all]
+    assert (
+        names(False, real_problems.bal)
+        == names(False, real_problems.bal_and_sub_problems)
+        == [source.name for source in found.sub_problems]
+    )

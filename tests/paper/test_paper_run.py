@@ -1,4 +1,4 @@
-"""`jaxba-paper` in this process: one table on tiny scenes, a second call, a record lost, and one-line errors."""
+"""`jaxba-paper` in this process: one table on tiny scenes, continuing, a missing record, and errors of one line."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 
 from jaxba.cli.paper import run
 from jaxba.game import rollout, scene_bank
-from jaxba.paper.pieces import PIECES
 from jaxba.paper.store import PLAYS
+from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
 
 TINY = """
 agents:
@@ -68,7 +68,7 @@ def finished(settings, tmp_path_factory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("JAXBA_DATA", raising=False)
         patch.setattr(rollout, "LANES", rollout.GROUP)
-        patch.setattr(scene_bank, "PORTFOLIO", ("ceres",))  # every rule is a program of its own
+        patch.setattr(scene_bank, "PORTFOLIO", ("ceres",))  # every rule needs its own compiled program
         assert run(command(settings, folder)) == 0
     return folder
 
@@ -80,7 +80,7 @@ def runs(capsys) -> int:
 
 
 @pytest.mark.slow
-def test_one_table_is_made_from_nothing(finished):
+def test_one_table_in_an_empty_folder(finished):
     plays = [json.loads(line) for line in (finished / PLAYS).read_text().splitlines()]
     assert [(p["method"], p["seed"]) for p in plays] == [("classic", 0), ("ceres", 0), ("agent", 0)]
     assert len({len(p["iterations"]) for p in plays}) == 1
@@ -93,12 +93,12 @@ def test_one_table_is_made_from_nothing(finished):
     row = next(line for line in text.splitlines() if line.startswith("| classic | 20 |"))
     mean = sum(i if c else 100 for i, c in zip(plays[0]["iterations"], plays[0]["converged"], strict=True))
     assert row.split("|")[3].strip() == f"{mean / len(plays[0]['iterations']):.1f}".removesuffix(".0")
-    for piece in PIECES.values():
-        assert piece.title
-    assert text.count("\n## ") >= len(PIECES)
+    for entry in TABLES_AND_FIGURES.values():
+        assert entry.title
+    assert text.count("\n## ") >= len(TABLES_AND_FIGURES)
 
 
-def test_a_second_call_does_no_work(finished, settings, capsys):
+def test_a_second_call_computes_nothing(finished, settings, capsys):
     before = (finished / PLAYS).read_bytes()
     assert run(command(settings, finished)) == 0
     assert runs(capsys) == 0
@@ -106,7 +106,7 @@ def test_a_second_call_does_no_work(finished, settings, capsys):
 
 
 @pytest.mark.parametrize("lost", [0, 2])
-def test_a_record_that_is_lost_is_the_only_one_made_again(finished, settings, capsys, lost, monkeypatch):
+def test_only_a_missing_record_is_computed_again(finished, settings, capsys, lost, monkeypatch):
     monkeypatch.setattr(rollout, "LANES", rollout.GROUP)
     lines = (finished / PLAYS).read_text().splitlines(keepends=True)
     (finished / PLAYS).write_text("".join(line for k, line in enumerate(lines) if k != lost))
@@ -143,9 +143,9 @@ def test_wrong_arguments_are_one_line(capsys, tmp_path):
     assert "does not exist" in error_of(capsys, "--fast", "--out", str(tmp_path / "run"), "--report", missing)
 
 
-def test_the_list_names_every_table_and_figure(capsys):
+def test_list_prints_all_tables_and_figures(capsys):
     assert run(["--list"]) == 0
     listed = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert listed == list(PIECES)
+    assert listed == list(TABLES_AND_FIGURES)
     tables = "kitti bal synthetic subproblems zero-net state-size reversed rewards schedule small"
     assert listed == [*tables.split(), "lambda", "profiles", "convergence"]

@@ -1,4 +1,4 @@
-"""The Zero-net: its gradient through the LM step against differences, its inputs, its file, its training."""
+"""The Zero-net: its gradient against finite differences, its input, its file, its training."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def next_cost(episode, action: float) -> float:
 
 @pytest.mark.parametrize("scene", [0, 3, 7])
 @pytest.mark.parametrize("action", [-0.4, 0.1, 0.7])
-def test_the_slope_of_the_next_cost_is_that_of_differences(scene, action):
+def test_the_derivative_of_the_next_cost_is_that_by_finite_differences(scene, action):
     episode = _iterate(start(scene), jnp.asarray(0.5))[0]
     change, slope, after, step = _slope(episode, jnp.asarray(action))
     h = 1e-4
@@ -65,8 +65,8 @@ def test_the_slope_of_the_next_cost_is_that_of_differences(scene, action):
     assert float(step.damping) == pytest.approx(10 ** (-2 + 4 * action))
 
 
-def test_the_gradient_in_a_weight_is_slope_times_that_of_the_action():
-    net = zero_net.fresh(SMALL, AGENT, jax.random.key(0))
+def test_the_gradient_of_a_weight_follows_the_chain_rule():
+    net = zero_net.initial_network(SMALL, AGENT, jax.random.key(0))
     episode = start(2)
 
     def moved(by: float) -> ZeroNet:
@@ -80,7 +80,7 @@ def test_the_gradient_in_a_weight_is_slope_times_that_of_the_action():
     assert slope * float(jax.grad(action)(0.0)) == pytest.approx(expected, rel=2e-2)
 
 
-def test_the_network_sees_errors_actions_and_rewards_of_the_last_steps():
+def test_the_input_is_errors_actions_and_rewards_of_the_last_steps():
     episode = start(1)
     first = episode.memory
     one = _iterate(episode, jnp.asarray(0.25))[0]
@@ -95,12 +95,12 @@ def test_the_network_sees_errors_actions_and_rewards_of_the_last_steps():
 
 
 def test_three_layers_of_1280_have_the_papers_count_of_parameters():
-    net = zero_net.fresh(ZeroNetConfig(), AgentConfig(history=5), jax.random.key(0))
+    net = zero_net.initial_network(ZeroNetConfig(), AgentConfig(history=5), jax.random.key(0))
     assert zero_net.parameters(net) == 15 * 1280 + 1280 + 2 * (1280 * 1280 + 1280) + 1280 + 1
 
 
-def test_a_network_comes_back_from_its_file(tmp_path):
-    net = zero_net.fresh(SMALL, AGENT, jax.random.key(3))
+def test_a_network_is_read_as_it_was_written(tmp_path):
+    net = zero_net.initial_network(SMALL, AGENT, jax.random.key(3))
     zero_net.save(tmp_path / "net.npz", net)
     again = zero_net.restore(tmp_path / "net.npz", AGENT)
     assert [p.name for p in tmp_path.iterdir()] == ["net.npz"]
@@ -110,8 +110,8 @@ def test_a_network_comes_back_from_its_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_training_takes_a_lambda_that_is_far_too_large_down():
-    net = zero_net.fresh(SMALL, AGENT, jax.random.key(1))
+def test_training_decreases_a_lambda_that_is_far_too_large():
+    net = zero_net.initial_network(SMALL, AGENT, jax.random.key(1))
     *hidden, last = net.layers
     timid = ZeroNet((*hidden, Layer(last.kernel, last.bias + 1.5)), AGENT)
     layers, means = zero_net._train(SMALL, game(), timid, jax.random.key(2))

@@ -1,7 +1,7 @@
-"""Ceres as a peer: COLMAP's cost is BAL's, its steps are ours, and what drives it is a policy like any other.
+"""Ceres as another solver: its costs are those of BAL, and its steps and iterations under a policy are jaxba's.
 
-Ours means `rotation="manifold"`: Ceres turns a quaternion by twice its tangent vector, from the left. The factor of two
-is a scaling of variables, which diagonal damping does not see.
+jaxba is compared with `rotation="manifold"`: Ceres rotates a quaternion by twice its tangent vector, from the left. The
+factor of two is a scaling of variables, to which diagonal damping is invariant.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ import jax
 import numpy as np
 import pytest
 import support
-from support import DATA, needs_data, same_bits
+from support import DATA, needs_data, same_bits, solve
 
 from jaxba import (
     BundleProblem,
     Classic,
+    DampingPolicy,
     ProblemError,
     Schedule,
     StepOptions,
@@ -27,7 +28,6 @@ from jaxba import (
     Tolerances,
     make_policy,
     read_problem,
-    solve,
 )
 from jaxba.bench import report
 from jaxba.bench.records import read_records
@@ -41,10 +41,10 @@ pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]
 pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
 from jaxba.peers.ceres import Run, solve_by_ceres, solver_options
-from jaxba.peers.colmap import AnySide, backend, pyceres, reprojection
+from jaxba.peers.colmap import TwoSidedReprojection, backend, pyceres, reprojection
 from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.peers.driven import drive_ceres
-from jaxba.peers.model import observed, step_facts
+from jaxba.peers.model import observations_of, step_metrics
 
 pytestmark = pytest.mark.extra
 
@@ -54,12 +54,12 @@ SOME = Schedule(values=(1e-3, 1e-2, 1e-1, 1.0))
 
 LADYBUG = "bal/problem-49-7776-pre"
 IN_FRONT = ("bal/problem-21-11315-pre", "bal-converted/sba-54-5207-pre", "bal-converted/kittistereo00s-77-15638-pre")
-"""Real problems without a point behind a camera. Of the fifteen only Ladybug-49 has some."""
+"""Real problems without a point behind a camera."""
 SMALL = tuple(
     f"bal-converted/{name}"
     for name in ("balbianello-5-544-pre", "colmap-yding-7-699-post", "sba-7-465-pre", "sba-9-559-pre")
 )
-"""More of them, quickly solved."""
+"""Small real problems without a point behind a camera."""
 
 
 def real(name: str) -> BundleProblem:
@@ -67,9 +67,20 @@ def real(name: str) -> BundleProblem:
 
 
 def scattered(seed: int, far: float = 3) -> BundleProblem:
-    """`tiny` with its points thrown some units; three are a third of the way to the cameras."""
+    """`tiny` with Gaussian noise of standard deviation `far` on its points, which are at a depth of some nine."""
     problem = support.tiny()
     return problem.replace(points=problem.points + far * np.random.default_rng(seed).normal(size=problem.points.shape))
+
+
+def built(name: str) -> tuple[DampingPolicy, StepOptions]:
+    """The policy and the step of a solver's name."""
+    policy, options = parse_solver(name).build()
+    return policy, options.step_options(policy)
+
+
+def on_the_manifold(options: StepOptions) -> StepOptions:
+    """The same step in the coordinates that Ceres' rotations have."""
+    return replace(options, coordinates=replace(options.coordinates, rotation="manifold"))
 
 
 # The problem
@@ -104,7 +115,7 @@ def blocks(colmap: ColmapProblem, observation: int) -> tuple:
 def test_the_python_cost_function_is_colmap_s_in_front_of_the_camera():
     colmap = ColmapProblem(support.tiny())
     for k in range(0, 200, 7):
-        theirs, mine = reprojection(colmap.pixels[k]), AnySide(colmap.pixels[k])
+        theirs, mine = reprojection(colmap.pixels[k]), TwoSidedReprojection(colmap.pixels[k])
         residual, jacobians = theirs.evaluate(*blocks(colmap, k))
         found = np.full(2, np.nan), [np.full(2 * size, np.nan) for size in (3, 7, 5)]
         assert mine.Evaluate(blocks(colmap, k), *found)
@@ -126,7 +137,7 @@ def quaternion_tangent(q: np.ndarray) -> np.ndarray:
 
 
 def test_colmap_itself_takes_a_point_behind_its_camera_as_no_error():
-    """Why `AnySide` exists; if this changes, it can go."""
+    """Why `TwoSidedReprojection` exists; if this changes, it can go."""
     colmap = ColmapProblem(support.odd())
     behind = np.flatnonzero(colmap.in_python)
     assert behind.size
@@ -171,8 +182,8 @@ print("done")
 """
 
 
-def test_what_ceres_points_to_lives_as_long_as_the_adapter_and_nothing_is_freed_twice():
-    """In a process of its own, since its end is part of the test."""
+def test_memory_that_ceres_points_to_lives_as_long_as_the_problem_and_is_freed_once():
+    """Runs in its own process, since the process must exit cleanly."""
     done = subprocess.run([sys.executable, "-c", ALONE], capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr
 
@@ -182,7 +193,7 @@ def test_what_ceres_points_to_lives_as_long_as_the_adapter_and_nothing_is_freed_
 
 @pytest.mark.parametrize("mode", ["dense", "sparse"])
 @pytest.mark.parametrize("make", [support.tiny, support.odd])
-def test_costs_are_ours_under_the_same_lambdas(mode, make):
+def test_costs_are_those_of_jaxba_under_the_same_lambdas(mode, make):
     found = drive_ceres(make(), mode, SOME, max_iterations=12, tolerances=NEVER)
     ours = solve(make(), SOME, MANIFOLD, max_iterations=12, tolerances=NEVER)
     assert found.iterations == ours.iterations == 12
@@ -202,7 +213,7 @@ def test_in_the_coordinates_of_the_file_the_costs_differ():
     assert np.abs(found.history.cost / ours.history.cost - 1).max() > 1e-6
 
 
-def test_the_cost_counts_on_where_points_pass_behind_their_camera(caplog):
+def test_points_that_move_behind_their_camera_still_count(caplog):
     problem = scattered(8)
     assert (geometry.depths(problem) > 0).all()
     with caplog.at_level(logging.INFO, logger="jaxba.peers"):
@@ -226,7 +237,7 @@ def test_ceres_alone_counts_them_too_and_does_not_record_a_step_twice(seed, capl
 
 
 @pytest.mark.parametrize("damping", [1e-4, 1.0])
-def test_facts_that_ceres_does_not_report_are_those_of_our_step(damping):
+def test_metrics_that_ceres_does_not_report_are_those_of_the_step_of_jaxba(damping):
     problem = support.tiny()
     layout, state = support.start(problem, MANIFOLD)
     _, step = support.step(layout, state, damping, MANIFOLD)
@@ -234,19 +245,19 @@ def test_facts_that_ceres_does_not_report_are_those_of_our_step(damping):
     before = colmap.parameters()
     after = drive_ceres(problem, "dense", Schedule(values=(damping,)), max_iterations=1)
     there = ColmapProblem(after.problem).parameters()
-    facts = step_facts(observed(problem, colmap.pixels), before, there)
-    np.testing.assert_allclose(facts.predicted, step.predicted, rtol=1e-8)
-    np.testing.assert_allclose(facts.damping_share, step.damping_share, rtol=1e-6)
-    np.testing.assert_allclose(facts.step_norm, step.step_norm, rtol=1e-7)
-    np.testing.assert_allclose(facts.parameter_norm, step.parameter_norm, rtol=1e-12)
-    np.testing.assert_allclose(facts.cost, geometry.cost(after.problem), rtol=1e-12)
-    assert not facts.behind.any()
+    metrics = step_metrics(observations_of(problem, colmap.pixels), before, there)
+    np.testing.assert_allclose(metrics.predicted, step.predicted, rtol=1e-8)
+    np.testing.assert_allclose(metrics.damping_share, step.damping_share, rtol=1e-6)
+    np.testing.assert_allclose(metrics.step_norm, step.step_norm, rtol=1e-7)
+    np.testing.assert_allclose(metrics.parameter_norm, step.parameter_norm, rtol=1e-12)
+    np.testing.assert_allclose(metrics.cost, geometry.cost(after.problem), rtol=1e-12)
+    assert not metrics.behind.any()
 
 
 # Driven
 
 
-def test_a_rejected_step_leaves_every_bit():
+def test_a_rejected_step_changes_no_bit():
     stubborn = Schedule(values=(1e-4,), min_gain=2.0)
     found = drive_ceres(support.tiny(), "dense", stubborn)
     assert (found.iterations, found.accepted, found.termination) == (1, 0, Termination.STALLED)
@@ -262,7 +273,7 @@ def test_a_rejected_step_leaves_every_bit():
 
 
 @pytest.mark.parametrize("name", ["learned-driver", "ceres", "classic"])
-def test_a_policy_does_with_ceres_what_it_does_with_our_step(name):
+def test_a_policy_does_the_same_with_the_steps_of_ceres_and_of_jaxba(name):
     policy = make_policy(name)
     found = drive_ceres(support.tiny(), "dense", policy)
     ours = solve(support.tiny(), policy, MANIFOLD)
@@ -289,7 +300,7 @@ def test_nothing_is_compiled_once_the_clock_runs(name, monkeypatch):
         monkeypatch.setattr(Run, "start", lambda run: (before.append(clock.seconds), start(run)))
         solver = parse_solver(f"pyceres:dense+{name}")
         policy, options = solver.build()
-        drive_ceres(support.tiny(), "dense", policy, embedded=options if solver.embeds else None)
+        drive_ceres(support.tiny(), "dense", policy, embedded=options.step_options(policy) if solver.embeds else None)
         assert clock.seconds == before[0] > 0
 
 
@@ -302,15 +313,10 @@ def test_every_lambda_is_possible(damping):
 
 @pytest.mark.parametrize("name", ["learned", "ceres+embedded", "classic+refine2"])
 @pytest.mark.parametrize("make", [support.tiny, lambda: scattered(7)])
-def test_with_embedded_iterations_ceres_does_what_our_step_does(name, make):
-    policy, options = parse_solver(f"pyceres:dense+{name}").build()
+def test_with_embedded_iterations_ceres_and_jaxba_do_the_same(name, make):
+    policy, options = built(f"pyceres:dense+{name}")
     found = drive_ceres(make(), "dense", policy, embedded=options, max_iterations=12)
-    ours = solve(
-        make(),
-        policy,
-        replace(options, coordinates=replace(options.coordinates, rotation="manifold")),
-        max_iterations=12,
-    )
+    ours = solve(make(), policy, on_the_manifold(options), max_iterations=12)
     assert (found.iterations, found.termination) == (ours.iterations, ours.termination)
     np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
     np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-3)
@@ -318,8 +324,8 @@ def test_with_embedded_iterations_ceres_does_what_our_step_does(name, make):
     np.testing.assert_allclose(found.final_cost, geometry.cost(found.problem), rtol=1e-12)
 
 
-def test_ceres_makes_the_same_step_when_it_is_not_to_judge_it():
-    """With nothing embedded, steps as long as Ceres makes them."""
+def test_ceres_makes_the_same_step_when_jaxba_decides_on_acceptance():
+    """Without embedded iterations, and with steps as long as Ceres makes them."""
     bare = StepOptions(coordinates=Coordinates(rotation="manifold"))
     found, plain = (drive_ceres(support.tiny(), "dense", SOME, max_iterations=6, embedded=it) for it in (bare, None))
     np.testing.assert_allclose(found.history.cost, plain.history.cost, rtol=1e-10)
@@ -328,23 +334,23 @@ def test_ceres_makes_the_same_step_when_it_is_not_to_judge_it():
     np.testing.assert_allclose(found.history.step_norm, plain.history.step_norm, rtol=1e-6)
 
 
-def test_a_step_that_ceres_would_refuse_is_judged_and_then_leaves_every_bit():
+def test_a_rejected_step_with_embedded_iterations_changes_no_bit():
     bold, problem = Schedule(values=(1e-9,)), scattered(4, far=5)
     plain, bare = (drive_ceres(problem, "dense", bold, max_iterations=1, embedded=it) for it in (None, StepOptions()))
     for refused in (plain, bare):
         assert refused.history.candidate_cost[0] > 1e3 * refused.initial_cost
         assert not refused.history.accepted[0]
         assert same_bits(refused.problem, problem)
-    # shorter trials and points mend it
-    around = StepOptions(refinement=Refinement(points=5, starts="rays", trials=4))
-    mended = drive_ceres(problem, "dense", bold, max_iterations=1, embedded=around)
-    assert mended.history.accepted[0]
-    assert mended.final_cost < 1e-2 * mended.initial_cost
+    # shorter trial steps and point iterations make it acceptable
+    embedded = StepOptions(refinement=Refinement(points=5, starts="rays", trials=4))
+    repaired = drive_ceres(problem, "dense", bold, max_iterations=1, embedded=embedded)
+    assert repaired.history.accepted[0]
+    assert repaired.final_cost < 1e-2 * repaired.initial_cost
 
 
 @pytest.mark.parametrize("mode", ["sparse", "iterative"])
-def test_other_modes_embed_as_well_and_tell_what_conjugate_gradients_took(mode):
-    policy, options = parse_solver(f"pyceres:{mode}+learned").build()
+def test_other_modes_take_embedded_iterations_and_report_conjugate_gradients(mode):
+    policy, options = built(f"pyceres:{mode}+learned")
     terms = []
     note = lambda record: terms.append(float(record.step.forcing))
     found = drive_ceres(support.tiny(), mode, policy, embedded=options, callback=note)
@@ -354,8 +360,8 @@ def test_other_modes_embed_as_well_and_tell_what_conjugate_gradients_took(mode):
     np.testing.assert_allclose(found.final_cost, solve_by_ceres(support.tiny(), "dense").final_cost, rtol=1e-4)
 
 
-def test_driven_by_its_own_rule_ceres_does_what_it_does_alone():
-    """The same algorithm in pieces; alone it stops before the last step, which it counts here as not taken."""
+def test_a_policy_with_the_rule_of_ceres_does_what_ceres_does_alone():
+    """The same algorithm in separate calls; alone Ceres stops before the last step, which counts as rejected."""
     alone = solve_by_ceres(support.tiny(), "dense")
     found = drive_ceres(support.tiny(), "dense", make_policy("ceres"))
     assert (alone.termination, alone.history.accepted[-1]) == (Termination.COST, False)
@@ -423,7 +429,7 @@ def test_what_is_returned_is_consistent(run):
 
 
 @pytest.mark.parametrize("run", [alone, driven])
-def test_points_behind_their_camera_are_said_in_one_line(run, caplog):
+def test_points_behind_their_camera_are_logged_in_one_line(run, caplog):
     run(support.odd(), max_iterations=1)
     assert [r.getMessage() for r in caplog.records] == [
         "1 observations of points behind their camera: Python evaluates them for Ceres"
@@ -485,19 +491,19 @@ def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys
 @needs_data
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*IN_FRONT[:2], LADYBUG])
-def test_real_problems_end_as_with_our_step_where_iterations_are_embedded(name):
-    policy, options = parse_solver("pyceres:dense+learned").build()
+def test_real_problems_end_as_with_the_steps_of_jaxba_where_iterations_are_embedded(name):
+    policy, options = built("pyceres:dense+learned")
     found = drive_ceres(real(name), "dense", policy, embedded=options)
-    ours = solve(real(name), policy, replace(options, coordinates=replace(options.coordinates, rotation="manifold")))
+    ours = solve(real(name), policy, on_the_manifold(options))
     assert found.termination.converged
-    assert abs(found.iterations - ours.iterations) <= 1  # the network turns rounding into differences of lambda
+    assert abs(found.iterations - ours.iterations) <= 1  # the network amplifies rounding errors
     np.testing.assert_allclose(found.final_cost, ours.final_cost, rtol=1e-5)
 
 
 @needs_data
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*IN_FRONT, *SMALL])
-def test_real_costs_are_ours_at_the_start_and_under_the_same_lambdas(name):
+def test_real_costs_are_those_of_jaxba_at_the_start_and_under_the_same_lambdas(name):
     problem = real(name)
     colmap = ColmapProblem(problem)
     assert not colmap.in_python.any()
@@ -512,7 +518,7 @@ def test_real_costs_are_ours_at_the_start_and_under_the_same_lambdas(name):
 @needs_data
 @pytest.mark.slow
 def test_with_points_behind_cameras_ceres_ends_on_ladybug_where_bal_s_cost_says():
-    """13344.318: C++ Ceres 2.1 on BAL's own cost (test_golden.py), in other coordinates."""
+    """13344.318 is the final cost of C++ Ceres 2.1 with BAL's cost function, in other coordinates (test_golden.py)."""
     found = solve_by_ceres(real(LADYBUG), "dense")
     np.testing.assert_allclose(found.initial_cost, 850912.460681, rtol=1e-11)
     np.testing.assert_allclose(found.final_cost, 13344.3183, rtol=1e-6)
@@ -522,10 +528,10 @@ def test_with_points_behind_cameras_ceres_ends_on_ladybug_where_bal_s_cost_says(
 @needs_data
 @pytest.mark.slow
 @pytest.mark.parametrize("name", IN_FRONT)
-def test_real_costs_of_ceres_alone_are_ours_under_its_lambdas(name):
-    """Twelve iterations. In the next one four observations of kittistereo00s are behind a camera (left out, Ceres ended
-    at 60470): their points passed through infinity and hang on the clamp of the diagonal, which acts after the column
-    scaling of the first Jacobian in Ceres, and before any in jaxba. That costs 1.2e-6 there.
+def test_real_costs_of_ceres_alone_are_those_of_jaxba_under_its_lambdas(name):
+    """Only twelve iterations are compared. In the next one, four observations of kittistereo00s are behind a camera:
+    their points passed through infinity and depend on the lower limit of the diagonal. Ceres applies the limit after
+    its column scaling, jaxba without one, which makes a relative difference of 1.2e-6 in the cost.
     """
     problem = real(name)
     found = solve_by_ceres(problem, "dense", max_iterations=12)
@@ -538,13 +544,13 @@ def test_real_costs_of_ceres_alone_are_ours_under_its_lambdas(name):
 
 @needs_data
 @pytest.mark.slow
-def test_the_learned_policy_drives_ladybug_as_with_our_step_also_where_points_pass_behind():
+def test_the_learned_policy_does_the_same_with_ceres_on_ladybug_where_points_move_behind_cameras():
     policy = make_policy("learned-driver")
     found = drive_ceres(real(LADYBUG), "dense", policy, max_iterations=12)
     ours = solve(real(LADYBUG), policy, MANIFOLD, max_iterations=12)
     np.testing.assert_array_equal(found.history.accepted, ours.history.accepted)
     np.testing.assert_allclose(found.history.damping, ours.history.damping, rtol=1e-2)
-    # the network turns differences of rounding into ones of lambda, so costs are compared under the same lambdas
+    # the network amplifies rounding errors to differences of lambda, so costs are compared under the same lambdas
     same = Schedule(values=tuple(float(x) for x in found.history.damping))
     again = solve(real(LADYBUG), same, MANIFOLD, max_iterations=12, tolerances=NEVER)
     np.testing.assert_array_equal(found.history.accepted, again.history.accepted)

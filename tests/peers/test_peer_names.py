@@ -1,4 +1,4 @@
-"""Names of peers, and what is said where their library is missing; needs no library."""
+"""Solver names of other libraries, and the error where the library is not installed; needs no library."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from jaxba.solver.names import PEERS, SolverName, SolverNameError, parse_solver
         ("pyceres:iterative+classic:0.03", SolverName("classic:0.03", peer="pyceres:iterative"), None),
     ],
 )
-def test_peers_have_the_names_of_the_contract(text, name, shortest):
+def test_solver_names_of_other_libraries_are_parsed_and_printed(text, name, shortest):
     assert parse_solver(text) == name
     assert str(name) == (shortest or text)
     assert parse_solver(str(name)) == name
@@ -70,7 +70,7 @@ def test_without_embedded_iterations_a_policy_for_lambda_alone_drives_a_peer():
     policy, options = parse_solver("pyceres:dense+learned+refine0").build()
     assert isinstance(policy, LearnedPolicy)
     assert (policy.config.refine_points, policy.config.trials, policy.config.camera_rounds) == (0, 1, 0)
-    assert options == StepOptions()
+    assert options.step_options(policy) == StepOptions()
 
 
 def test_a_learned_policy_brings_its_embedded_iterations_to_a_peer():

@@ -24,7 +24,7 @@ from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement
         ({"camera_rounds": -1}, "camera_rounds must be at least 0"),
         ({"trials": 0}, "trials must be at least 1"),
         ({"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
-        ({"intrinsics": "fixed", "linear_solver": "implicit"}, "fixed intrinsics need the explicit solver"),
+        ({"intrinsics": "fixed", "linear_solver": "implicit"}, "intrinsics 'fixed' need the explicit solver"),
         ({"cg_max_iterations": 0}, "cg_max_iterations must be at least 1"),
         ({"cg_forcing": float("nan")}, "cg_forcing must not be negative, is nan"),
         ({"cg_tolerance": -1.0}, "cg_tolerance must not be negative, is -1"),

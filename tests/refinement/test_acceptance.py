@@ -11,6 +11,17 @@ import pytest
 import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxba.refinement.trial import (
+    FORESEEN,
+    FREE,
+    GOOD_GAIN,
+    HOPELESS,
+    NEGLIGIBLE,
+    ROUNDS_OF_OTHERS,
+    SHORTER,
+    WITHIN_REACH,
+    best_trial,
+)
 from scipy.optimize import least_squares
 from support import same_bits, solve, start, step
 
@@ -26,17 +37,6 @@ from jaxba.problem.options import Coordinates, Refinement
 from jaxba.refinement import trial
 from jaxba.refinement.cameras import DAMPINGS, refine_cameras
 from jaxba.refinement.subproblems import Whole
-from jaxba.refinement.trial import (
-    FORESEEN,
-    FREE,
-    GOOD_GAIN,
-    HOPELESS,
-    NEGLIGIBLE,
-    ROUNDS_OF_OTHERS,
-    SHORTER,
-    WITHIN_REACH,
-    best_trial,
-)
 
 pytestmark = pytest.mark.step
 

@@ -48,6 +48,9 @@ def test_a_name_reads_back_as_itself(name):
         ("stba:16+ceres+refine2@float32", SolverName("ceres", 2, "float32", "stba:16"), None),
         ("deeplm+learned", SolverName("learned", None, method="deeplm"), None),
         ("ddlm+learned+refine0", SolverName("learned", 0, method="ddlm"), None),
+        ("bold", SolverName("bold", None), None),
+        ("bold+embedded", SolverName("bold", None), "bold"),
+        ("stba+bold+refine0@float32", SolverName("bold", 0, "float32", "stba"), None),
         ("poba+constant:1e-4", SolverName("constant:1e-4", method="poba"), None),
     ],
 )

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from jaxba.bench.tables import number
-from jaxba.paper import claims, places
-from jaxba.paper.markdown import Section, counted, disagreements, share, table
-from jaxba.paper.pieces import base
-from jaxba.paper.pieces.base import Piece
-from jaxba.paper.workshop import Workshop, named
+from jaxba.paper import claims, real_problems
+from jaxba.paper.markdown import Section, disagreements, format_iterations, percentage, table
+from jaxba.paper.runner import Runner, method_named
+from jaxba.paper.tables_and_figures import common
+from jaxba.paper.tables_and_figures.common import TableOrFigure
 
 PAPER = {
     "Trafalgar": (65.1, 10.2, 5.6),
@@ -26,27 +26,29 @@ LABELS = ("Ceres-CG", "DeepLM", "DeepLM + ours", "ours, explicit")
 
 WHY = (
     "Ceres-CG is Ceres' rule with our matrix-free conjugate gradients, not the C++ program; times are those of this "
-    "machine; "
-    "the paper's are of whole families, ours of the files at hand and of parts of them."
+    "machine; the paper's are of whole families, ours of the files on this machine and of sub-problems of them."
 )
 
 
-def _work(shop: Workshop) -> None:
-    for found in places.families(shop.config.real):
-        shop.solve(found.all, [named(name) for name in METHODS])
+def _run(runner: Runner) -> None:
+    for found in real_problems.families(runner.config.real):
+        runner.solve(found.all, [method_named(name) for name in METHODS])
 
 
-def _section(shop: Workshop) -> Section:
-    methods = [named(name) for name in METHODS]
+def _section(runner: Runner) -> Section:
+    methods = [method_named(name) for name in METHODS]
     body, found, cells = [], [], []
-    for family in places.families(shop.config.real):
-        rows = [shop.row_on(family.all, method) for method in methods]
+    for family in real_problems.families(runner.config.real):
+        rows = [runner.row_on(family.all, method) for method in methods]
         paper = PAPER.get(family.family, (math.nan,) * 3)
         if family.reason or not any(row.solves for row in rows):
-            cells.append([family.family, family.reason or base.NOT_YET, *[number(x) for x in paper], *["-"] * 4])
+            cells.append([family.family, family.reason or common.NOT_YET, *[number(x) for x in paper], *["-"] * 4])
             continue
-        counts = [f"{number(row.seconds)} s, {counted(row.iterations)} its, {share(row.success)}" for row in rows]
-        sizes = base.problems(rows[0].solves)
+        counts = [
+            f"{number(row.seconds)} s, {format_iterations(row.iterations)} its, {percentage(row.success)}"
+            for row in rows
+        ]
+        sizes = common.problems(rows[0].solves)
         cells.append([family.family, sizes, *[number(x) for x in paper], *counts])
         cg, deep, driven, _ = rows
         if math.isfinite(paper[0]):
@@ -62,13 +64,12 @@ def _section(shop: Workshop) -> Section:
             )
     header = ["family", "here", *(f"paper: {label}, s" for label in LABELS[:3]), *LABELS]
     body.append(
-        "Seconds: set-up and iterations of a whole solve to convergence or 100 iterations, without compilation; "
-        "means over the "
-        "family's problems here. Ours in lambda alone."
+        "Seconds: set-up and iterations of a solve to convergence or 100 iterations, without compilation; means over "
+        "the family's problems on this machine. Our policy chooses lambda only."
     )
     body.append(table(header, cells, 2) if cells else "The configuration names no family.")
     body.append(disagreements(found, WHY))
     return Section("BAL's families against Ceres with conjugate gradients", tuple(body), tuple(found))
 
 
-PIECE = Piece("subproblems", "Table: BAL's families against Ceres-CG", _work, _section)
+ENTRY = TableOrFigure("subproblems", "Table: BAL's families against Ceres-CG", _run, _section)

@@ -1,4 +1,4 @@
-"""The training curve: held-out iterations against updates, with the hand-written rules as lines across."""
+"""The training curve: held-out iterations over updates, with the baselines as horizontal lines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from jaxba.bench.plots import COLOURS, LINES, MARKERS
 from jaxba.training.log import Row
 
-SHOWN = {"score": "mean iterations", "p90": "90th percentile of the iterations", "failures": "share of failures (%)"}
+SHOWN = {"score": "mean iterations", "p90": "90th percentile of the iterations", "failures": "failures (%)"}
 """Panels: fields of a held-out score and their labels."""
 
 
@@ -19,7 +19,7 @@ def plot_curve(rows: Sequence[Row], rules: Mapping[str, Mapping[str, float]], to
 
     Args:
         rows: of the log; those without an evaluation are left out.
-        rules: fields of a score (`score` is the mean) by name of the rule.
+        rules: fields of a score (`score` is the mean) by name of the baseline.
         tolerance: of success, for the labels.
     """
     figure = Figure(figsize=(12.0, 4.4), layout="constrained")
@@ -28,9 +28,9 @@ def plot_curve(rows: Sequence[Row], rules: Mapping[str, Mapping[str, float]], to
     handles = []
     for k, seed in enumerate(seeds):
         style = {"color": COLOURS[(1 + k) % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "markersize": 3.5}
-        mine = [row for row in rows if row["seed"] == seed and row.get("held_out/score") is not None]
+        own_rows = [row for row in rows if row["seed"] == seed and row.get("held_out/score") is not None]
         for axes, field in zip(panels, SHOWN, strict=True):
-            points = [(row["updates"], row.get(f"held_out/{field}")) for row in mine]
+            points = [(row["updates"], row.get(f"held_out/{field}")) for row in own_rows]
             points = [(x, _shown(field, y)) for x, y in points if y is not None]
             axes.plot([x for x, _ in points], [y for _, y in points], zorder=3, linewidth=1.6, **style)
         handles.append(Line2D([], [], linewidth=1.6, label=f"learned, agent {seed + 1}", **style))

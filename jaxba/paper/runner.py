@@ -1,4 +1,5 @@
-"""Does what a table or figure needs and is not yet on the disk, and hands out rows of what is."""
+"""Runs the solves and trainings of the tables and figures, keeps their results on disk, and makes table rows of
+them."""
 
 from __future__ import annotations
 
@@ -35,34 +36,35 @@ from jaxba.solver.solve import solve
 LIMIT = profile.ITERATION_LIMIT
 
 TEST = "test"
-"""Name of the tables' own scenes in records."""
+"""Name of the scenes of the tables in records."""
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row's solver: a policy, perhaps of several training runs, and the step that it drives."""
+    """The solver of a table row: a policy, perhaps with several training runs, and the options of the step."""
 
     name: str
-    """In records."""
+    """Name in records."""
 
     build: Callable[[int], tuple[DampingPolicy, SolveOptions]]
-    """Policy and options of a training run; rules ignore the number. Called only where something is to be run."""
+    """Gives policy and options of a training run, by its number; rules ignore the number. This may train the policy, so
+    it is called only if something has to be run."""
 
     seeds: int = 0
-    """Training runs; 0 for a rule."""
+    """Number of training runs; 0 for a rule."""
 
     @property
     def numbers(self) -> range:
-        """Of the training runs; one for a rule."""
+        """Numbers of the training runs; only 0 for a rule."""
         return range(max(1, self.seeds))
 
     def label(self, seed: int) -> str:
-        """The solver's name in records of solves."""
+        """Name of the solver in records of solves."""
         return f"{self.name}#{seed}" if self.seeds else self.name
 
 
-def named(name: str) -> Method:
-    """A solver by the name that `jaxba-bench` uses, perhaps with `/linear solver` behind it."""
+def method_named(name: str) -> Method:
+    """The method with a solver name of `jaxba-bench`, which `/LINEAR_SOLVER` may follow."""
     solver, slash, linear = name.partition("/")
     parsed = parse_solver(solver)
 
@@ -73,34 +75,34 @@ def named(name: str) -> Method:
     return Method(name, build, 0)
 
 
-class Workshop:
-    """A reproduction run: its settings, its folder and what it has."""
+class Runner:
+    """A reproduction run in a folder. Nothing is run whose result is in the folder."""
 
-    def __init__(self, config: PaperConfig, folder: Path, say: Callable[[str], None] = lambda _: None) -> None:
-        """Opens the folder.
+    def __init__(self, config: PaperConfig, folder: Path, report: Callable[[str], None] = lambda _: None) -> None:
+        """Reads the results that the folder has.
 
         Args:
-            config: of the run.
-            folder: holds all that is kept; must exist.
-            say: told in words what begins.
+            config: configuration of the run.
+            folder: folder of all results; must exist.
+            report: called with a line of text when something starts.
 
         Raises:
-            ProblemError: a record is damaged.
+            ProblemError: a file of results is damaged.
         """
-        self.config, self.folder, self.say = config, folder, say
+        self.config, self.folder, self.report = config, folder, report
         self.store = Store(folder)
         self.done = 0
-        """Solves, plays and trainings that this process had to do."""
+        """Number of solves, plays and trainings that this process has done."""
         self._test: Bank | None = None
         self._read: tuple[Source, BundleProblem] | None = None
 
     # Policies
 
     def agent(self, agent: Agent, method: str = "lm") -> Method:
-        """A trained agent, all of its training runs."""
+        """The method with a trained agent; the agent is trained when the method is first built."""
 
         def build(seed: int) -> tuple[DampingPolicy, SolveOptions]:
-            policy, fresh = agents.trained(self.config, agent, seed, self.folder, self.say)
+            policy, fresh = agents.trained(self.config, agent, seed, self.folder, self.report)
             self.done += fresh
             return policy, SolveOptions(method=method)
 
@@ -108,7 +110,7 @@ class Workshop:
         return Method(name, build, self.config.agents.seeds)
 
     def zero_net(self) -> Method:
-        """The non-holistic network, as many training runs as of an agent."""
+        """The method with the Zero-net, with as many training runs as an agent."""
         return Method("zero-net", self._zero_net, self.config.agents.seeds)
 
     def _zero_net(self, seed: int) -> tuple[DampingPolicy, SolveOptions]:
@@ -117,9 +119,9 @@ class Workshop:
         if path.is_file():
             net = zero_net.restore(path, agent)
         else:
-            self.say(f"zero-net {seed + 1}: training")
+            self.report(f"zero-net {seed + 1}: training")
             settings = agents.train_config(self.config, agents.OURS, 0)
-            train_on = agents.scenes(self.config, self.folder, self.say)[0]
+            train_on = agents.scenes(self.config, self.folder, self.report)[0]
             game = agents.game(self.config, agents.OURS, settings, train_on)
             key = jax.random.fold_in(jax.random.key(self.config.seed), 2000 + seed)
             net, _ = zero_net.train(self.config.zero_net, game, agent, key)
@@ -132,13 +134,13 @@ class Workshop:
     # Work
 
     def test_scenes(self) -> Bank:
-        """The tables' own scenes, made when first needed."""
+        """The scenes of the tables, generated when first needed."""
         if self._test is None:
-            self._test = agents.scenes(self.config, self.folder, self.say)[1]
+            self._test = agents.scenes(self.config, self.folder, self.report)[1]
         return self._test
 
     def play(self, method: Method) -> None:
-        """Plays a method on the tables' own scenes, where that has not been done."""
+        """Solves the scenes of the tables with a method, unless the folder has the result."""
         for seed in method.numbers:
             if self.store.play(TEST, method.name, seed):
                 continue
@@ -147,7 +149,7 @@ class Workshop:
             settings = agents.train_config(self.config, agents.OURS, 0)
             options = replace(options, intrinsics=settings.bank.intrinsics).step_options(policy)
             bank = self.test_scenes()
-            self.say(f"{method.label(seed)} on {len(bank.initial_cost)} scenes")
+            self.report(f"{method.label(seed)} on {len(bank.initial_cost)} scenes")
             started = time.perf_counter()
             found = play(settings.bank.classes[0], bank, policy, options, LIMIT)
             best = np.asarray(bank.best_cost)
@@ -168,13 +170,14 @@ class Workshop:
             self.done += 1
 
     def solve(self, sources: Iterable[Source], methods: Sequence[Method], limit: int = LIMIT, repeats: int = 0) -> None:
-        """Solves problems by methods, where that has not been done; a problem that cannot be read is told and skipped.
+        """Solves problems with methods, except for those whose results the folder has. A problem that cannot be read is
+        reported and skipped.
 
         Args:
             sources: problems.
-            methods: solvers.
-            limit: linear solves at most.
-            repeats: of each; those of the configuration if 0.
+            methods: methods.
+            limit: limit of linear solves.
+            repeats: repeats of each solve; as in the configuration if 0.
         """
         for source in sources:
             for method in methods:
@@ -184,14 +187,14 @@ class Workshop:
                             try:
                                 self._solve(source, method, seed, repeat, limit)
                             except ProblemError as error:
-                                self.say(f"{source.name}: left out: {error}")
+                                self.report(f"{source.name}: left out: {error}")
 
     def _solve(self, source: Source, method: Method, seed: int, repeat: int, limit: int) -> None:
         policy, options = method.build(seed)
         if self._read is None or self._read[0] != source:
             self._read = source, source.read()
         problem = self._read[1]
-        self.say(f"{source.name} by {method.label(seed)}")
+        self.report(f"{source.name} by {method.label(seed)}")
         steps: list[IterationRecord] = []
         solution = solve(
             problem,
@@ -206,12 +209,12 @@ class Workshop:
     # Rows
 
     def row_on_scenes(self, method: Method) -> Row:
-        """What is known of a method on the tables' own scenes."""
+        """The row of a method on the scenes of the tables, from the results so far."""
         plays = [self.store.play(TEST, method.name, seed) for seed in method.numbers]
         return rows.row(method.name, {p.seed: rows.of_play(p) for p in plays if p is not None}, method.seeds > 0)
 
     def row_on(self, sources: Iterable[Source], method: Method) -> Row:
-        """What is known of a method on real problems."""
+        """The row of a method on real problems, from the results so far."""
         names = [source.name for source in sources]
         best = profile.best_cost(self.store.solves)
         found = {}
@@ -222,16 +225,16 @@ class Workshop:
         return rows.row(method.name, found, method.seeds > 0)
 
     def records_on(self, sources: Iterable[Source], methods: Iterable[Method], seed: int = 0) -> list[Record]:
-        """Solves under the methods' own names, those of one training run."""
+        """Records of solves with one training run of each method, with `Method.name` as the solver."""
         labels = {method.label(seed): method.name for method in methods}
         found = self.store.solves_of([source.name for source in sources], list(labels))
         return [replace(record, solver=labels[record.solver]) for record in found]
 
     def first_dampings(self, method: Method) -> list[tuple[float, ...]]:
-        """First lambdas of a method on every scene, of its first training run."""
+        """First lambdas on every scene of the tables, of the method's first training run."""
         known = self.store.play(TEST, method.name, 0)
         return [] if known is None else list(known.first)
 
-    def scenes_known(self) -> int:
-        """How many scenes the plays in the store are on."""
+    def number_of_scenes(self) -> int:
+        """Number of scenes of the tables, from the results so far."""
         return max((len(p.iterations) for p in self.store.plays if p.scenes == TEST), default=0)

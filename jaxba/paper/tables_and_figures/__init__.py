@@ -1,6 +1,6 @@
-"""One module per table or figure of the paper, in its order."""
+"""The tables and figures of the paper, one module each."""
 
-from jaxba.paper.pieces import (
+from jaxba.paper.tables_and_figures import (
     bal,
     constant_schedule,
     convergence,
@@ -15,10 +15,10 @@ from jaxba.paper.pieces import (
     synthetic,
     zero,
 )
-from jaxba.paper.pieces.base import Piece
+from jaxba.paper.tables_and_figures.common import TableOrFigure
 
-PIECES: dict[str, Piece] = {
-    module.PIECE.name: module.PIECE
+TABLES_AND_FIGURES: dict[str, TableOrFigure] = {
+    module.ENTRY.name: module.ENTRY
     for module in (
         kitti,
         bal,
@@ -37,4 +37,4 @@ PIECES: dict[str, Piece] = {
 }
 """Tables and figures by name, in the order of the paper."""
 
-__all__ = ["PIECES", "Piece"]
+__all__ = ["TABLES_AND_FIGURES", "TableOrFigure"]

@@ -9,9 +9,9 @@ from jaxba.bench.tables import number
 from jaxba.damping import DampingPolicy
 from jaxba.paper import agents, claims
 from jaxba.paper.markdown import Line, Section, disagreements, lines_table
-from jaxba.paper.pieces import base
-from jaxba.paper.pieces.base import Piece
-from jaxba.paper.workshop import Method, Workshop, named
+from jaxba.paper.runner import Method, Runner, method_named
+from jaxba.paper.tables_and_figures import common
+from jaxba.paper.tables_and_figures.common import TableOrFigure
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.scenes import SceneConfig, random_scene
 from jaxba.solver.options import SolveOptions
@@ -20,37 +20,36 @@ PAPER_SIZE = 5
 """Cameras and points of the paper's small problem."""
 
 WHY = (
-    "our scenes and their starts are random ones of our own; the paper gives none; a solve here runs step by step "
-    "from Python, "
-    "and a compiled one has less overhead; our agents are small beside the paper's on its GPU."
+    "our scenes and their starts are our own random ones, since the paper gives none; a solve here calls Python after "
+    "each iteration, and a compiled one has less overhead; our agents are smaller than the paper's, which ran on a GPU."
 )
 
 
 @dataclass(frozen=True)
 class SmallScene(Source):
-    """As many cameras as points, all of which they see."""
+    """A random scene with as many points as cameras, in which every camera observes every point."""
 
     size: int = PAPER_SIZE
-    """Cameras, and points."""
+    """Number of cameras and of points."""
 
     seed: int = 0
-    """Of the scene."""
+    """Seed of the scene."""
 
     def read(self) -> BundleProblem:
-        """Makes it; focal lengths are known, so that poses and points are what is unknown."""
+        """Generates the scene. Its start has the true focal lengths."""
         n = self.size
         config = SceneConfig(n, n, n * n, trajectory="orbit", min_depth=4.0, max_depth=16.0, start_focal=0.0)
         return random_scene(config, self.seed)
 
 
-def _sources(shop: Workshop, size: int) -> list[SmallScene]:
-    config = shop.config
+def _sources(runner: Runner, size: int) -> list[SmallScene]:
+    config = runner.config
     seeds = range(config.seed, config.seed + config.small_scenes)
     return [SmallScene(f"small-{size}-{seed}", "small", f"{size} x {size}", size, seed) for seed in seeds]
 
 
 def _known_lens(method: Method) -> Method:
-    """The same with focal lengths and distortions held."""
+    """The same method with constant focal lengths and distortions."""
 
     def build(seed: int) -> tuple[DampingPolicy, SolveOptions]:
         policy, options = method.build(seed)
@@ -59,35 +58,34 @@ def _known_lens(method: Method) -> Method:
     return replace(method, build=build)
 
 
-def _methods(shop: Workshop, size: int) -> list[tuple[str, Method, float | None]]:
+def _methods(runner: Runner, size: int) -> list[tuple[str, Method, float | None]]:
     paper = size == PAPER_SIZE
     return [
-        ("classic", _known_lens(named("classic")), 5.0 if paper else None),
-        ("Ceres' rule", _known_lens(named("ceres")), None),
-        ("ours: agent of this run", _known_lens(shop.agent(agents.OURS)), 4.0 if paper else None),
-        ("ours: shipped policy, lambda alone", _known_lens(named("learned-driver")), 4.0 if paper else None),
+        ("classic", _known_lens(method_named("classic")), 5.0 if paper else None),
+        ("Ceres' rule", _known_lens(method_named("ceres")), None),
+        ("ours: agent of this run", _known_lens(runner.agent(agents.OURS)), 4.0 if paper else None),
+        ("ours: shipped policy, lambda alone", _known_lens(method_named("learned-driver")), 4.0 if paper else None),
     ]
 
 
-def _work(shop: Workshop) -> None:
-    for size in shop.config.small:
-        shop.solve(_sources(shop, size), [method for _, method, _ in _methods(shop, size)], repeats=1)
+def _run(runner: Runner) -> None:
+    for size in runner.config.small:
+        runner.solve(_sources(runner, size), [method for _, method, _ in _methods(runner, size)], repeats=1)
 
 
-def _section(shop: Workshop) -> Section:
+def _section(runner: Runner) -> Section:
     body = [
-        "Poses and points are unknown, the lens is known: with the nine unknowns of a BAL camera five cameras and "
-        "five points "
-        "would be underdetermined (50 equations for 53 unknowns beside the gauge)."
+        "Poses and points are unknown, the lens is known: with the nine unknowns of a BAL camera, five cameras and "
+        "five points would be underdetermined (50 equations for 53 unknowns, without the gauge)."
     ]
     found = []
-    for size in shop.config.small:
-        sources = _sources(shop, size)
-        lines = [Line(label, shop.row_on(sources, method), paper) for label, method, paper in _methods(shop, size)]
+    for size in runner.config.small:
+        sources = _sources(runner, size)
+        lines = [Line(label, runner.row_on(sources, method), paper) for label, method, paper in _methods(runner, size)]
         rows = {line.row.method: line.row for line in lines}
         classic, ours = rows["classic"], rows[agents.OURS.name]
         if not any(line.row.solves for line in lines):
-            body.append(f"**{size} x {size}**: {base.NOT_YET}")
+            body.append(f"**{size} x {size}**: {common.NOT_YET}")
             continue
         body.append(f"**{size} cameras, {size} points**, {len(sources)} scenes:")
         body.append(lines_table(lines, classic, rows["ceres"], with_time=True))
@@ -109,4 +107,4 @@ def _section(shop: Workshop) -> Section:
     return Section("Small problems", tuple(body), tuple(found))
 
 
-PIECE = Piece("small", "Table: the limit of small problems, 5 x 5", _work, _section)
+ENTRY = TableOrFigure("small", "Table: the limit of small problems, 5 x 5", _run, _section)

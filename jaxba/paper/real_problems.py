@@ -1,4 +1,4 @@
-"""Which real problems a run finds, and in words which it does not."""
+"""Real problems of the configuration: those that are on this machine, and the reasons for those that are not."""
 
 from __future__ import annotations
 
@@ -11,52 +11,52 @@ from pathlib import Path
 from jaxba.bench.sources import Source
 from jaxba.datasets.bal.paths import resolve
 from jaxba.paper.config import FamilyConfig, RealConfig
-from jaxba.paper.subproblem import Cut
+from jaxba.paper.subproblem import SubProblem
 from jaxba.problem.bundle_problem import ProblemError
 
 DATA_VARIABLE = "JAXBA_DATA"
-"""Environment variable: folder of real problems."""
+"""Environment variable with the folder of real problems."""
 
 NOT_SET = f"not run: {DATA_VARIABLE} is not set"
 
-_ENDING = re.compile(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$")
+_SUFFIXES = re.compile(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$")
 
 
 @dataclass(frozen=True)
-class Found:
-    """The real problems of one family."""
+class FamilyProblems:
+    """The real problems of one family that are on this machine."""
 
     family: str
-    """Its name."""
+    """Name of the family."""
 
     whole: tuple[Source, ...]
-    """Files."""
+    """Complete problems."""
 
-    cuts: tuple[Cut, ...]
-    """Sub-problems of them."""
+    sub_problems: tuple[SubProblem, ...]
+    """Sub-problems of the files."""
 
     missing: tuple[str, ...]
-    """What was named and is not here, as it was named."""
+    """Entries of the configuration for which no file exists."""
 
     reason: str = ""
-    """Why nothing was found; empty where something was."""
+    """Why there are no problems; empty if there are some."""
 
     @property
     def all(self) -> tuple[Source, ...]:
-        """Files, then sub-problems."""
-        return (*self.whole, *self.cuts)
+        """Complete problems, then sub-problems."""
+        return (*self.whole, *self.sub_problems)
 
 
-def find(config: FamilyConfig) -> Found:
-    """Looks for the files of a family; never fails."""
+def find(config: FamilyConfig) -> FamilyProblems:
+    """Looks for the files of a family. Missing files are not an error."""
     found, missing = [], []
     for entry in config.files:
         paths = _paths(entry)
         found += [Source(_label(path), config.name, path) for path in paths]
         if not paths:
             missing.append(entry)
-    cuts = tuple(
-        Cut(f"{source.name}-first{count}", config.name, source.location, cameras=count)
+    sub_problems = tuple(
+        SubProblem(f"{source.name}-first{count}", config.name, source.location, cameras=count)
         for source in found
         for count in config.cameras
     )
@@ -64,27 +64,27 @@ def find(config: FamilyConfig) -> Found:
     if not found:
         uses_variable = any(DATA_VARIABLE in entry for entry in config.files)
         reason = NOT_SET if uses_variable and not os.environ.get(DATA_VARIABLE) else "not run: no file of it is here"
-    return Found(config.name, tuple(found) if config.whole else (), cuts, tuple(missing), reason)
+    return FamilyProblems(config.name, tuple(found) if config.whole else (), sub_problems, tuple(missing), reason)
 
 
-def families(config: RealConfig) -> list[Found]:
-    """The families of BAL."""
+def families(config: RealConfig) -> list[FamilyProblems]:
+    """The problems of each BAL family."""
     return [find(family) for family in config.bal]
 
 
 def bal(config: RealConfig) -> tuple[Source, ...]:
-    """The problems of BAL at hand; parts of them where none enters whole."""
+    """The complete BAL problems on this machine, or their sub-problems if the configuration has no complete ones."""
     found = families(config)
-    return tuple(source for family in found for source in family.whole) or bal_and_parts(config)
+    return tuple(source for family in found for source in family.whole) or bal_and_sub_problems(config)
 
 
-def bal_and_parts(config: RealConfig) -> tuple[Source, ...]:
-    """The problems of BAL at hand and the parts that were cut from them."""
+def bal_and_sub_problems(config: RealConfig) -> tuple[Source, ...]:
+    """The complete BAL problems on this machine and their sub-problems."""
     return tuple(source for family in families(config) for source in family.all)
 
 
-def why_no_bal(config: RealConfig) -> str:
-    """The reason why there is no problem of BAL; empty where there is one."""
+def reason_without_bal(config: RealConfig) -> str:
+    """Why there are no BAL problems; empty if there are some."""
     reasons = [found.reason for found in families(config)]
     if not reasons:
         return "not run: the configuration names no problem of BAL"
@@ -103,4 +103,4 @@ def _paths(entry: str) -> list[str]:
 
 
 def _label(path: str) -> str:
-    return _ENDING.sub("", Path(path).name)
+    return _SUFFIXES.sub("", Path(path).name)

@@ -1,0 +1,166 @@
+"""Applies jaxba's embedded iterations and acceptance test to steps that Ceres computes. Needs the extra `ceres`.
+
+Ceres itself accepts every step: its problem has an additional residual (`AcceptAnyStep`) that no parameter changes,
+large before a step and zero after it. jaxba then refines the step and accepts or rejects it as one of its own, and
+Ceres continues from the result.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from jaxba.linear.schur import jacobian_product
+from jaxba.linear.step import Step
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.step import Proposal, initial_state, try_step
+from jaxba.model.linearize import linearize
+from jaxba.peers.ceres import Run, step_of
+from jaxba.peers.colmap import pyceres
+from jaxba.peers.model import half_rotation
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.geometry import COLMAP_FLIP as FLIP
+from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.solver.prepare import write_back
+from jaxba.structure.layout import Layout, layout_for
+
+FORCED_DECREASE = 1e200
+"""Decrease of the cost by `AcceptAnyStep`, pixels squared: larger than the cost of any useful candidate."""
+
+
+class AcceptAnyStep(pyceres.CostFunction):
+    """A residual that makes Ceres accept any step: large at the first evaluation after `reset`, zero afterwards.
+
+    Its Jacobian is zero, so that it does not enter the linear system. It has two residuals and depends on one point,
+    as an observation does, since Ceres has code specialised for these sizes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.set_num_residuals(2)
+        self.set_parameter_block_sizes([3])
+        self.reset()
+
+    def reset(self) -> None:
+        """Must be called before each call of Ceres."""
+        self.value = float(np.sqrt(FORCED_DECREASE))
+
+    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+        """Writes the residuals and the zero Jacobian; called by Ceres."""
+        residuals[:] = self.value, self.value
+        self.value = 0.0
+        if jacobians is not None and jacobians[0] is not None:
+            jacobians[0][:] = 0.0
+        return True
+
+
+class ReportedByCeres(NamedTuple):
+    """The numbers of a step that only Ceres knows."""
+
+    gradient_max: Any  # largest gradient entry before the step
+    cg_iterations: Any  # 0 for a direct linear solver
+    forcing: Any  # forcing term of conjugate gradients, 0 for a direct linear solver
+
+    @classmethod
+    def empty(cls) -> ReportedByCeres:
+        """Zeros of the right types, for compilation."""
+        return cls(np.float64(0), np.int32(0), np.float64(0))
+
+    @classmethod
+    def from_summaries(cls, summaries: list[Any], mode: str) -> ReportedByCeres:
+        """From Ceres' summaries of the start and of the iteration."""
+        step = step_of(summaries[1], summaries[0], np.nan, np.nan, mode)
+        return cls(np.float64(step.gradient_max), np.int32(step.cg_iterations), np.float64(step.forcing))
+
+
+class StepAcceptance:
+    """Refines the steps of a `Run`, and accepts or rejects them. Adds an `AcceptAnyStep` to the run's Ceres problem."""
+
+    def __init__(self, run: Run, options: StepOptions, min_gain: float) -> None:
+        """Builds jaxba's layout and state of the problem.
+
+        Args:
+            run: the solve; its parameters are the start.
+            options: embedded iterations; options of the linear solver are ignored.
+            min_gain: gain ratio that an accepted step exceeds.
+        """
+        # Ceres solves the linear system, so that the layout needs nothing for it and no past steps are kept
+        self.options = replace(
+            options,
+            linear_solver="implicit",
+            method=None,
+            conjugate_gradients=ConjugateGradients(preconditioner="jacobi"),
+            coordinates=replace(options.coordinates, rotation="manifold"),
+        )
+        self.run, self.min_gain = run, np.float64(min_gain)
+        problem = run.colmap.start
+        self.layout = jax.device_put(layout_for(problem, self.options))
+        self.state = initial_state(self.layout, problem, self.options)
+        self.accept_any = AcceptAnyStep()
+        run.colmap.add_point_cost(self.accept_any, int(problem.point_index[0]))
+
+    def evaluate(self, before: Any, damping: float, reported: ReportedByCeres) -> tuple[LMState, StepInfo]:
+        """The next state after the step from the parameters `before` to Ceres' current ones, and the step's record.
+
+        Args:
+            before: parameters before the step, as `ColmapProblem.parameters` returns them.
+            damping: lambda of the step.
+            reported: Ceres' numbers of the step.
+        """
+        after = self.run.colmap.parameters()
+        return _evaluate(
+            self.layout, self.state, before, after, np.float64(damping), reported, self.min_gain, options=self.options
+        )
+
+    def apply(self, before: Any, damping: float, reported: ReportedByCeres) -> StepInfo:
+        """As `evaluate`, and moves Ceres' problem to the next state, or back to `before` after a rejection."""
+        self.state, step = jax.block_until_ready(self.evaluate(before, damping, reported))
+        if not step.accepted:
+            self.run.colmap.restore(before)
+            return step
+        self.run.colmap.set_parameters_of(self.bundle())
+        if (behind := self.run.newly_behind()).any():
+            self.run.count_behind(behind)
+        return step
+
+    def bundle(self) -> BundleProblem:
+        """The problem at the current state."""
+        return write_back(self.run.colmap.start, self.layout, self.state, self.options)
+
+
+@functools.partial(jax.jit, static_argnames="options")
+def _evaluate(
+    layout: Layout,
+    state: LMState,
+    before: Any,
+    after: Any,
+    damping: Float[Array, ""],
+    reported: ReportedByCeres,
+    min_gain: Float[Array, ""],
+    options: StepOptions,
+) -> tuple[LMState, StepInfo]:
+    """jaxba's acceptance test of a step between two sets of COLMAP's parameters.
+
+    `before` and `after` are `(poses [c, 7], lenses [c, 5], points [p, 3])`.
+    """
+    flip = jnp.asarray(FLIP)[:, None]
+    rotation = 2 * half_rotation(before[0][:, :4].T, after[0][:, :4].T)
+    lens = (after[1] - before[1]).T
+    cameras = jnp.concatenate(
+        [flip * rotation, flip * (after[0][:, 4:] - before[0][:, 4:]).T, lens[jnp.array([0, 3, 4])]]
+    )
+    order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
+    points = (after[2] - before[2]).at[order].get(mode="fill", fill_value=0).T
+    linear = linearize(layout, state.cameras, state.points, options.loss)
+    residual, change = jnp.stack(linear.residual), jnp.stack(jacobian_product(layout, linear, cameras.T, points))
+    slope = -jnp.sum(residual * change)
+    damped = slope - jnp.sum(change * change)
+    proposal = Proposal(Step(cameras, points, slope, damped, *reported), linear.reference)
+    return try_step(layout, state, damping, proposal, options, min_gain)

@@ -1,0 +1,107 @@
+"""A constant action: the guard without a network, and the policy `bold`."""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from agent_steps import ACCEPTED, REJECTED, after, info
+from support import same_bits
+from test_learned import random_policy
+
+from jaxba import SolveOptions, like, make_policy, perturb, random_scene, solve
+from jaxba.damping import registry
+from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.features import begin
+from jaxba.damping.guard import damping_of
+from jaxba.damping.learned import ConstantAction, LearnedPolicy, boldest
+from jaxba.solver.names import parse_solver
+
+
+def boldest_network(config: AgentConfig) -> LearnedPolicy:
+    """No weights, and biases of which the hyperbolic tangent is -1 in float32."""
+    zero = [layer._replace(kernel=0 * layer.kernel, bias=0 * layer.bias) for layer in random_policy(0, config).layers]
+    return LearnedPolicy((*zero[:-1], zero[-1]._replace(bias=zero[-1].bias - np.float32(50))), config)
+
+
+@functools.cache
+def hard_scene():
+    """Starts so far from the solution that steps are shortened and rejected."""
+    return perturb(random_scene(like("paper"), 3), 0, point_sigma=0.5)
+
+
+@pytest.mark.parametrize("embedded", [True, False])
+def test_bold_is_a_network_that_always_asks_for_the_smallest_lambda(embedded):
+    policy, options = parse_solver("bold" if embedded else "bold+refine0").build()
+    found = solve(hard_scene(), policy, options)
+    expected = solve(hard_scene(), boldest_network(policy.config), options)
+    assert found.iterations == expected.iterations > 3
+    assert same_bits(found.history.damping, expected.history.damping)
+    assert same_bits((found.problem.cameras, found.problem.points), (expected.problem.cameras, expected.problem.points))
+    # the two programs may sum a cost, which chooses nothing here, in another order
+    np.testing.assert_allclose(found.history.cost, expected.history.cost, rtol=1e-14)
+
+
+def test_bolds_lambda_is_the_smallest_of_all_that_the_guard_allows():
+    policy = make_policy("bold")
+    config, wishes = policy.config, jnp.linspace(-1, 1, 9, dtype=jnp.float32)
+    state, damping = policy.init(info())
+    for accepted in (ACCEPTED, REJECTED, ACCEPTED, ACCEPTED, ACCEPTED, REJECTED, REJECTED, ACCEPTED):
+        allowed = [float(damping_of(config, state.guard, wish)) for wish in wishes]
+        assert float(damping) == min(allowed)
+        state = after(config, state, accepted, float(jnp.log10(damping)))
+        damping = damping_of(config, state.guard, policy.act(jnp.zeros(1))[0])
+
+
+def test_bold_falls_by_the_descent_to_the_lowest_and_rises_after_a_rejection():
+    policy = make_policy("bold")
+    state = begin(policy.config, info())
+    found = []
+    for accepted in (ACCEPTED,) * 4 + (REJECTED, ACCEPTED):
+        found.append(float(jnp.log10(damping_of(policy.config, state.guard, policy.act(jnp.zeros(1))[0]))))
+        state = after(policy.config, state, accepted, found[-1])
+    np.testing.assert_allclose(found, [-5, -6.5, -8, -9, -9, -8.5], atol=1e-6)
+
+
+def test_an_action_between_the_bounds_is_played_as_it_is():
+    config = AgentConfig(guard="off", low=-10.0, high=2.0)
+    found = solve(hard_scene(), ConstantAction((0.25,), config), SolveOptions(max_iterations=5))
+    np.testing.assert_allclose(np.log10(found.history.damping), -2.5, rtol=1e-6)
+
+
+def test_the_boldest_action_has_the_least_effort():
+    config = AgentConfig(effort="points+forcing")
+    assert boldest(config).action == (-1.0, -1.0, -1.0)
+    state, _ = boldest(config).init(info())
+    assert int(state.effort.point_iterations) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "like_name"),
+    [
+        ("bold", "learned"),
+        ("bold+refine0", "learned+refine0"),
+        ("bold+refine2", "learned+refine2"),
+        ("stba+bold", "stba+learned"),
+        ("pyceres:dense+bold", "pyceres:dense+learned"),
+        ("pyceres:dense+bold+refine0", "pyceres:dense+learned+refine0"),
+    ],
+)
+def test_bold_has_the_guard_and_the_step_of_the_learned_policy(name, like_name):
+    policy, options = parse_solver(name).build()
+    learned, same = parse_solver(like_name).build()
+    assert isinstance(policy, ConstantAction)
+    assert policy.config == learned.config
+    assert options == same
+
+
+def test_bold_is_written_by_hand():
+    assert not any(registry.is_learned(name) for name in ("bold", "bold-plain", "bold-driver"))
+
+
+def test_without_options_a_solve_takes_the_step_of_the_policy():
+    policy, options = parse_solver("bold").build()
+    assert SolveOptions().step_options(policy) == options.step_options(policy)
+    assert solve(hard_scene(), "bold").iterations == solve(hard_scene(), policy, options).iterations

@@ -1,0 +1,102 @@
+"""Which way imports point: a room of the package knows the rooms below it, and nothing of those above.
+
+Imports inside of functions and those for type checkers count as well.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import jaxba
+
+ORDER = (
+    *("typing", "runtime", "problem", "structure", "model", "linear", "refinement", "lm", "methods", "damping"),
+    *("solver", "io", "scenes", "datasets", "jaxba", "game", "training", "peers", "bench", "paper", "cli"),
+)
+"""Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
+
+NO_MORE_THAN = {
+    "runtime": {"typing"},
+    "io": {"typing", "runtime", "problem"},
+    "scenes": {"typing", "runtime", "problem"},
+    "datasets": {"typing", "runtime", "problem", "io"},
+}
+"""Rooms that know less than all that stand before them."""
+
+ENTRANCES = {"methods": "jaxba.methods.registry"}
+"""Rooms that others reach through one module."""
+
+PACKAGE = Path(jaxba.__file__).parent
+SOURCES = {
+    ".".join(("jaxba", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(".__init__"): path.read_text()
+    for path in PACKAGE.rglob("*.py")
+}
+"""Source text of every module by its name."""
+
+
+def imports(source: str) -> Iterator[str]:
+    """Modules of jaxba that a source text imports."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [name.name for name in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            within = [f"{node.module}.{name.name}" for name in node.names]
+            names = [name if name in SOURCES else str(node.module) for name in within]
+        else:
+            continue
+        yield from (name for name in names if name.partition(".")[0] == "jaxba")
+
+
+def room_of(module: str) -> str:
+    """Room in which a module stands."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else module
+
+
+def turned_arrows(room: str, sources: dict[str, str]) -> list[str]:
+    """Imports that modules of a room should not have, as `module: import`."""
+    known = NO_MORE_THAN.get(room, set(ORDER[: ORDER.index(room)]))
+    return [
+        f"{module}: {name}"
+        for module, source in sources.items()
+        if room_of(module) == room
+        for name in imports(source)
+        if room_of(name) != room and (room_of(name) not in known or name != ENTRANCES.get(room_of(name), name))
+    ]
+
+
+@pytest.mark.parametrize("room", ORDER)
+def test_a_room_knows_nothing_of_those_above(room):
+    assert turned_arrows(room, SOURCES) == []
+
+
+def test_every_room_has_its_place_in_the_order():
+    assert {room_of(module) for module in SOURCES} == set(ORDER)
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "found"),
+    [
+        ("jaxba.linear.schur", "from jaxba.lm.step import lm_step", "jaxba.lm.step"),
+        ("jaxba.lm.step", "def f():\n    import jaxba.methods.registry", "jaxba.methods.registry"),
+        ("jaxba.solver.solve", "from jaxba.methods import stba", "jaxba.methods.stba"),
+        ("jaxba.game.env", "if TYPE_CHECKING:\n    from jaxba import bench", "jaxba.bench"),
+        ("jaxba.io.bal", "from jaxba.structure import layout", "jaxba.structure.layout"),
+        ("jaxba.damping.rules", "import jaxba", "jaxba"),
+    ],
+)
+def test_a_turned_arrow_is_found(module, source, found):
+    assert turned_arrows(room_of(module), {module: source}) == [f"{module}: {found}"]
+
+
+def test_modules_do_not_import_each_other_in_circles():
+    try:
+        TopologicalSorter({module: set(imports(source)) for module, source in SOURCES.items()}).prepare()
+    except CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
