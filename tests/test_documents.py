@@ -81,7 +81,6 @@ def workplace(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=name_of)
 def test_the_code_of_a_page_runs_from_top_to_bottom(page, workplace):
     names: dict[str, object] = {"__name__": "__main__"}
@@ -154,3 +153,9 @@ def test_the_documents_are_short():
 def test_every_public_name_stands_on_a_page_of_the_reference():
     text = "".join(page.read_text(encoding="utf-8") for page in (DOCS / "reference/api").glob("*.md"))
     assert set(re.findall(r"^::: jaxba\.(\w+)$", text, re.MULTILINE)) == set(jaxba.__all__)
+
+
+def test_documents_that_the_code_names_are_in_the_repository():
+    places = [*ROOT.glob("jaxba/**/*.py"), *ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("configs/**/*.yaml")]
+    named = {(name_of(place), path) for place in places for path in re.findall(r"docs/[\w/-]+\.md", place.read_text())}
+    assert not [(place, path) for place, path in sorted(named) if not (ROOT / path).exists()]
