@@ -31,17 +31,6 @@ from jaxba.refinement.cameras import DAMPINGS, refine_cameras
 from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.pattern_move import FORESEEN, FREE
 from jaxba.refinement.subproblems import Whole
-from jaxba.refinement.trial import (
-    FORESEEN,
-    FREE,
-    GOOD_GAIN,
-    HOPELESS,
-    NEGLIGIBLE,
-    ROUNDS_OF_OTHERS,
-    SHORTER,
-    WITHIN_REACH,
-    best_trial,
-)
 
 pytestmark = pytest.mark.step
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -69,6 +70,15 @@ def test_two_problems_of_equal_shape_are_solved_at_once():
         assert int(carries.iteration[k]) == solution.iterations
         np.testing.assert_allclose(carries.state.cost[k], solution.final_cost, rtol=1e-9)
         check_same(prepared[k].problem_at(jax.tree.map(lambda leaf, k=k: leaf[k], carries.state)), solution)
+
+
+def test_the_compiled_loop_is_traced_once_for_all_numbers_of_a_policy_and_of_the_stop_rules():
+    static = ("options", "max_iterations")
+    loop = jax.jit(chex.assert_max_traces(solve_loop.__wrapped__, n=1), static_argnames=static)
+    for seed, first, ftol in ((0, 1e-4, 1e-6), (1, 1e-2, 1e-3)):
+        prepared = prepare(support.paper(seed), OPTIONS, policy=f"ceres:{first}")
+        tolerances = jax.tree.map(jnp.asarray, OPTIONS.tolerances._replace(ftol=ftol))
+        loop(prepared.layout, prepared.state, prepared.policy, tolerances, prepared.options, OPTIONS.max_iterations)
 
 
 @pytest.mark.parametrize("make", [support.tiny, support.odd, support.whitened, lambda: support.paper(0)])
