@@ -45,7 +45,7 @@ class RotationCoordinates(NamedTuple):
         to_front = lambda m: jnp.moveaxis(m, -1, 0)
         return cls(to_front(camera.left_jacobian(cameras[:3])), to_front(camera.left_jacobian_inverse(cameras[:3])))
 
-    def given(self, step: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
+    def from_manifold(self, step: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
         """A step on the manifold in the coordinates."""
         turned = jnp.einsum("cij,cj->ci", self.inverse, step[:, :3])
         return jnp.concatenate([turned, step[:, 3:]], axis=1)

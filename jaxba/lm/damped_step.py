@@ -1,7 +1,20 @@
-"""One damped step: eliminate the points, solve for the cameras, carry back to the points.
+"""One damped step of Levenberg-Marquardt, by the Schur complement.
 
-The step solves `(H + D) d = -g`. Elimination: linear/schur.py; solvers of the reduced camera system:
-linear/reduced_system.py.
+With residuals `r` and Jacobian `J` (whitened and weighted by the robust loss, model/linearize.py), the linear model of
+the cost is
+
+    m(d) = |r + J d|^2 / 2 = f + g.d + d.H d / 2,    g = J^T r,    H = J^T J,
+
+and the damped step d solves `(H + D) d = -g`, where D is `lambda diag(H)` or `lambda I`. Split into cameras and points:
+
+    [ B + D_c     E     ] [ d_c ]     [ g_c ]
+    [   E^T     C + D_p ] [ d_p ] = - [ g_p ]
+
+    1. S   = B + D_c - E (C + D_p)^-1 E^T            linear/schur.py: eliminate the points
+    2. d_c = S^-1 (-g_c + E (C + D_p)^-1 g_p)        linear/reduced_system.py, or a method of jaxba.methods
+    3. d_p = -(C + D_p)^-1 (g_p + E^T d_c)           linear/schur.py: back-substitution
+
+Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", sections 4 and 6.
 """
 
 from __future__ import annotations
@@ -45,21 +58,21 @@ def solve_step(
     effort: Effort | None = None,
     previous: Float[Array, "steps 9 cameras"] | None = None,
 ) -> Step:
-    """One damped step.
+    """Solves `(H + D) d = -g` for cameras and points.
 
     Args:
-        layout: slots; must hold pairs unless the options never form the reduced system.
-        linear: Jacobians and residuals at the current parameters.
-        cameras: current cameras, for the rotation coordinates.
-        points: current points, for the directions of the coarse system.
+        layout: the problem's observations; must list pairs if the options form the reduced camera system.
+        linear: residuals and Jacobians at the current parameters.
+        cameras: current cameras; they define the rotation coordinates.
+        points: current points; they define the coarse space of the two-level preconditioner.
         damping: lambda, dimensionless for diagonal scaling.
-        options: solver, scaling, coordinates.
-        iteration: its number, where the step depends on it (random clusters).
-        effort: forcing term of conjugate gradients, where it is not that of the options.
-        previous: last changes of the cameras, if the step is to be the best one together with them.
+        options: linear solver or method, scaling and coordinates.
+        iteration: number of the iteration; selects the random clusters of methods that use them.
+        effort: overrides the forcing term of conjugate gradients.
+        previous: last changes of the cameras, if the step is to be optimal in the span that includes them.
 
     Returns:
-        The step; not finite where the factorisation failed, which the caller treats as a rejection.
+        The step. It is non-finite if a factorisation failed; the caller rejects such a step.
     """
     truncated = options.truncated
     forcing = options.conjugate_gradients.forcing if truncated is None else truncated.forcing
@@ -72,46 +85,50 @@ def solve_step(
         frames = camera.frames(cameras)
         anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
         solved = solve_reduced(layout, linear, eliminated, reduced, anchor, options, forcing)
-        found = MethodStep(solved[0], None, solved[1], residual_orthogonal=True)
+        solution = MethodStep(solved[0], None, solved[1], residual_orthogonal=True)
     else:
         system = DampedSystem(layout, linear, eliminated, reduced, damping)
         method = cast(StepMethod, options.method)
-        found = method.solve(system, options, forcing, iteration, cameras, previous)
-    step = jnp.where(layout.camera_seen[:, None], found.cameras, jnp.zeros_like(found.cameras))
-    point_step = found.points
+        solution = method.solve(system, options, forcing, iteration, cameras, previous)
+    manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
+    point_step = solution.points
     if point_step is None:
-        point_step = jnp.stack(back_substitute(layout, linear, eliminated, step))
-    camera_step = coordinates.given(step)
-    slope, damped = _slope_and_damping(eliminated, reduced, step, camera_step, point_step)
-    if not found.residual_orthogonal:
-        damped = slope - sum(jnp.sum(m * m) for m in jacobian_product(layout, linear, step, point_step))
+        point_step = jnp.stack(back_substitute(layout, linear, eliminated, manifold_step))
+    camera_step = coordinates.from_manifold(manifold_step)
+    slope, damped = _slope_and_damping(eliminated, reduced, manifold_step, camera_step, point_step)
+    if not solution.residual_orthogonal:
+        # d.e is not zero: `-g.d - d.H d` takes the place of d.D d, with d.H d = |J d|^2
+        damped = slope - sum(jnp.sum(m * m) for m in jacobian_product(layout, linear, manifold_step, point_step))
     return Step(
         components_first(camera_step),
         point_step,
         slope,
         damped,
         largest_gradient(eliminated, reduced, coordinates),
-        found.iterations,
+        solution.iterations,
         jnp.asarray(0.0 if truncated is None else forcing, cameras.dtype),
     )
 
 
 def _slope_and_damping(
-    points: PointSystem, system: CameraSystem, step: Array, camera_step: Array, moves: Array
+    points: PointSystem, system: CameraSystem, manifold_step: Array, camera_step: Array, point_step: Array
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """`-g.d` and `d.D d`, from which the linear model's decrease follows as a sum that does not cancel.
+    """`-g.d` and `d.D d`, whose sum gives the decrease of the linear model without cancellation.
 
-    For steps that solve the system. The decrease is `-(g.d + d.H d / 2)`. `(H + D) d = -g - rest` turns it into
-    `(d.D d - g.d - d.rest) / 2`. The rest is zero for a factored system, and orthogonal to the step for conjugate
-    gradients started at zero, as for the best step of a span. Both kept terms are positive.
+    With `(H + D) d = -g - e`, where e is the residual of the linear solve, the decrease is
+
+        m(0) - m(d) = -g.d - d.H d / 2 = (d.D d - g.d + d.e) / 2.
+
+    `d.e` is zero for a factorisation, for conjugate gradients started at zero, and for the best step of a subspace. The
+    two terms that are left are positive.
     """
-    slope = jnp.sum(system.gradient * step) + jnp.sum(jnp.stack(points.gradient) * moves)
-    damped = jnp.sum(system.damping * camera_step**2) + jnp.sum(jnp.stack(points.damping) * moves**2)
+    slope = jnp.sum(system.gradient * manifold_step) + jnp.sum(jnp.stack(points.gradient) * point_step)
+    damped = jnp.sum(system.damping * camera_step**2) + jnp.sum(jnp.stack(points.damping) * point_step**2)
     return -slope, damped
 
 
 def largest_diagonal(layout: Layout, linear: Linearization) -> Float[Array, ""]:
-    """Largest diagonal entry of the undamped Hessian, the unit of g2o's first lambda."""
+    """Largest diagonal entry of the undamped `H = J^T J`. Source: the unit of g2o's initial lambda."""
     square = lambda rows: [a * a + b * b for a, b in zip(*rows, strict=True)]
     by_camera = tree_sum(as_rows(square(linear.camera_jacobian)), layout.camera_levels)
     by_point = jnp.stack(point_sums(layout, square(linear.point_jacobian)))

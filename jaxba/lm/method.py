@@ -1,6 +1,7 @@
-"""What a method must do that takes the place of the plain step: the interface that `lm_step` calls.
+"""The interface of methods that replace the plain Levenberg-Marquardt step (STBA, DeepLM, PoBA).
 
-`jaxba.methods.registry` holds those there are. A method is a frozen dataclass, so that it can stand in `StepOptions`.
+`lm_step` calls either `StepMethod.solve` or `RoundMethod.round`. `jaxba.methods.registry` lists the implementations. A
+method is a frozen dataclass, so that it can be a field of the static `StepOptions`.
 """
 
 from __future__ import annotations
@@ -23,37 +24,39 @@ class DampedSystem(NamedTuple):
     linear: Linearization
     points: PointSystem
     cameras: CameraSystem
-    damping: Float[Array, ""]
+    damping: Float[Array, ""]  # lambda
 
 
 class MethodStep(NamedTuple):
-    """What a method proposes."""
+    """The step that a method proposes."""
 
-    cameras: Float[Array, "cameras 9"]  # on the manifold
-    points: Float[Array, "3 points"] | None  # None: they follow from the cameras by back-substitution
-    iterations: Int[Array, ""]  # of what it iterates
-    residual_orthogonal: bool  # whether the residual of the system that is left is orthogonal to the step
+    cameras: Float[Array, "cameras 9"]  # manifold coordinates
+    points: Float[Array, "3 points"] | None  # None: computed from the cameras by back-substitution
+    iterations: Int[Array, ""]  # inner iterations, e.g. of conjugate gradients
+    residual_orthogonal: bool  # whether the residual of the damped system is orthogonal to the step
 
 
 class Round(NamedTuple):
-    """What a round of several solves did."""
+    """Result of one round of a method that solves several subproblems, each with its own accept decision."""
 
     cameras: Float[Array, "9 cameras"]
     points: Float[Array, "3 points"]
-    cost: Float[Array, ""]  # pixels squared
-    predicted: Float[Array, ""]  # decrease that linear models promised: of accepted trials, and of whole refused steps
-    gain: Float[Array, ""]  # what clusters that were accepted gained, over that
+    cost: Float[Array, ""]  # pixels^2
+    predicted: Float[Array, ""]  # predicted decrease, summed over accepted candidates and full rejected steps, pixels^2
+    gain: Float[Array, ""]  # actual decrease of the accepted clusters over `predicted`
     slope: Float[Array, ""]  # -g.d
     curvature: Float[Array, ""]  # d.H d
-    gradient_max: Float[Array, ""]  # before the round
-    share: Float[Array, ""]  # of their steps that clusters took, weighted by what each promised at full length
-    repairs: Int[Array, ""]  # camera rounds, further trials and pattern moves of the cluster that took most
+    gradient_max: Float[Array, ""]  # largest absolute gradient entry before the round
+    share: Float[
+        Array, ""
+    ]  # mean step fraction of the clusters, weighted by the predicted decrease of their full steps
+    repairs: Int[Array, ""]  # see `StepInfo.repairs`: the largest of all clusters
     accepted: Bool[Array, ""]
 
 
 @runtime_checkable
 class StepMethod(MethodTraits, Protocol):
-    """A method that solves the linear system in another way."""
+    """A method that solves the damped linear system in its own way."""
 
     def solve(
         self,
@@ -64,22 +67,22 @@ class StepMethod(MethodTraits, Protocol):
         parameters: Float[Array, "9 cameras"],
         previous: Float[Array, "steps 9 cameras"] | None,
     ) -> MethodStep:
-        """The camera step, and that of the points where it is made with it.
+        """The camera step, and the point step if the method computes it too.
 
         Args:
-            system: to be solved.
-            options: of the step.
-            forcing: of truncated conjugate gradients, where the method has them.
+            system: the damped system.
+            options: static options of the step.
+            forcing: forcing term of truncated conjugate gradients, if the method uses them.
             iteration: number of the iteration, from 0.
-            parameters: present cameras.
-            previous: last changes of the cameras, where they take part in the step.
+            parameters: current cameras.
+            previous: last changes of the cameras, newest first; None unless they are part of the search space.
         """
         ...
 
 
 @runtime_checkable
 class RoundMethod(MethodTraits, Protocol):
-    """A method whose iteration is a round of several solves, parts of which are accepted each by itself."""
+    """A method whose iteration is a round of several solves, each with its own accept decision."""
 
     def round(
         self,
@@ -92,5 +95,16 @@ class RoundMethod(MethodTraits, Protocol):
         options: StepOptions,
         min_gain: float | Float[Array, ""],
     ) -> Round:
-        """One round from the present parameters and their cost."""
+        """One round from the current parameters.
+
+        Args:
+            layout: the problem's observations.
+            cameras: current cameras.
+            points: current points.
+            cost: their cost, pixels^2.
+            damping: lambda.
+            iteration: number of the iteration, from 0.
+            options: static options of the step.
+            min_gain: a subproblem's step is accepted if its cost falls and its gain ratio exceeds this.
+        """
         ...

@@ -1,8 +1,17 @@
-"""The Levenberg-Marquardt step: the one piece that solver, game and benchmark share.
+"""One iteration of Levenberg-Marquardt for a given lambda.
 
-`lm_step` is pure: `propose`, a linear solve, and `try_step`, which looks along the step for a candidate to accept. It
-compiles once per problem shape and `StepOptions`, runs under `vmap`, and never branches in Python on a value: a failed
-factorisation or an overflow is a candidate with a non-finite cost, and that is a rejected step.
+From the parameters x with cost f(x):
+
+    propose    (H + D) d = -g                       one linear solve, lm/damped_step.py
+    try_step   rho = (f(x) - f(x + d)) / (m(0) - m(d))
+               x <- x + d  if  f(x + d) < f(x)  and  rho > min_gain,  else x stays
+
+where m is the linear model and rho the gain ratio. With the options of `Refinement`, `try_step` also improves x + d
+without another linear solve (refinement/candidates.py). A damping policy chooses lambda between iterations.
+
+`lm_step` is a pure function: it compiles once per problem shape and `StepOptions` and runs under `vmap`. It never
+branches in Python on a computed value: a failed factorisation or an overflow gives a candidate with a non-finite cost,
+which is rejected like any other bad step.
 """
 
 from __future__ import annotations
@@ -29,24 +38,24 @@ from jaxba.typing import AnyArray
 
 
 class Proposal(NamedTuple):
-    """What the linear model proposes, and what candidates are compared with."""
+    """The solution of the damped system, and the costs before the step."""
 
     step: Step
     reference: Reference
 
 
 def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
-    """The problem's parameters in layout order.
+    """The problem's parameters in layout order, with their cost.
 
     Args:
         layout: made from the same problem.
         problem: start of the optimisation.
-        options: only the loss matters, for the cost.
-        dtype: floating point type of the solve; the problem's own when None.
+        options: the loss, and the number of previous steps to keep.
+        dtype: floating point type of the solve; that of the problem's arrays if None.
     """
     cameras = components_first(jnp.asarray(problem.cameras, dtype))
     order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
-    # padding points name an index out of range; they rest at the origin
+    # padding points have an index out of range and are placed at the origin
     points = components_first(jnp.asarray(problem.points, dtype).at[order].get(mode="fill", fill_value=0))
     return state_at(cameras, points, cost(layout, cameras, points, options.loss), options)
 
@@ -54,7 +63,7 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
 def state_at(
     cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], cost: Float[Array, ""], options: StepOptions
 ) -> LMState:
-    """The state before the first iteration: where everything is, its cost, and no previous steps."""
+    """The state before the first iteration, with zeros for the previous steps."""
     if not options.kept_steps:
         return LMState(cameras, points, cost)
     return LMState(cameras, points, cost, jnp.zeros((options.kept_steps, *cameras.shape), cameras.dtype))
@@ -69,22 +78,22 @@ def lm_step(
     iteration: int | Int[Array, ""] = 0,
     effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
-    """One iteration: one linear solve with one lambda, accepted or rejected.
+    """One iteration: one linear solve with the given lambda, accepted or rejected.
 
     Args:
         layout: the problem's observations.
-        state: current parameters.
-        damping: lambda; see `StepOptions.scaling`.
-        options: static.
+        state: current parameters and cost.
+        damping: lambda; `Coordinates.scaling` says what it multiplies.
+        options: static options of the step.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
-        iteration: number of iterations done before, for methods that draw new clusters in each.
-        effort: what the step may cost, instead of what the options say; has no effect in domain decomposition.
+        iteration: number of the iteration, from 0; methods with random clusters use other ones in each.
+        effort: overrides the point iterations and the forcing term of the options; ignored by the method `ddlm`.
 
     Returns:
-        The next state (the same one after a rejection) and a record of what happened.
+        The next state (unchanged after a rejection) and the record of the iteration.
 
     Raises:
-        ValueError: the layout has lenses, and the solver is not the explicit one.
+        ValueError: cameras share intrinsics, or some are fixed, and the linear solver is not the explicit one.
     """
     if not options.single_solve:
         return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, iteration)
@@ -100,7 +109,7 @@ def propose(
     iteration: int | Int[Array, ""] = 0,
     effort: Effort | None = None,
 ) -> Proposal:
-    """The first part of `lm_step`: the linear model and its damped solution. Arguments are those of `lm_step`."""
+    """First part of `lm_step`: linearise and solve the damped system. Arguments as for `lm_step`."""
     _check_lenses(layout, options)
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
@@ -120,23 +129,23 @@ def try_step(
     min_gain: float | Float[Array, ""] = 0.0,
     effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
-    """The second part of `lm_step`: candidates along a step, and whether one is accepted."""
+    """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
     damping = jnp.asarray(damping, state.cost.dtype)
     step = proposal.step
-    found = best_candidate(Whole(layout), *state[:3], proposal.reference, step, options, min_gain, effort)
-    moved = [found.share * step.cameras, found.points - state.points]
+    candidate = best_candidate(Whole(layout), *state[:3], proposal.reference, step, options, min_gain, effort)
+    tried_step = [candidate.share * step.cameras, candidate.points - state.points]
     return _advance(
         state,
-        found,
-        moved,
+        candidate,
+        tried_step,
         damping,
         layout.camera_seen,
         gradient_max=step.gradient_max,
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
-        share=found.share,
+        share=candidate.share,
         damping_share=jnp.clip(step.damped / step.slope, 0, 1),
-        repairs=found.repairs,
+        repairs=candidate.repairs,
     )
 
 
@@ -153,54 +162,59 @@ def _round(
     min_gain: float | Float[Array, ""],
     iteration: int | Int[Array, ""],
 ) -> tuple[LMState, StepInfo]:
-    """A round of several solves in the place of a step: parts of it are accepted, each by itself."""
+    """One round of a `RoundMethod`, which makes its own accept decisions."""
     _check_lenses(layout, options)
     method = cast(RoundMethod, options.method)
-    found = method.round(layout, *state[:3], damping, iteration, options, min_gain)
+    result = method.round(layout, *state[:3], damping, iteration, options, min_gain)
     return _advance(
         state,
-        found,
-        [found.cameras - state.cameras, found.points - state.points],
+        result,
+        [result.cameras - state.cameras, result.points - state.points],
         damping,
         layout.camera_seen,
-        gradient_max=found.gradient_max,
+        gradient_max=result.gradient_max,
         cg_iterations=jnp.zeros((), jnp.int32),
         forcing=jnp.zeros_like(state.cost),
-        share=found.share,
-        damping_share=jnp.clip(1 - found.curvature / found.slope, 0, 1),
-        repairs=found.repairs,
+        share=result.share,
+        damping_share=jnp.clip(1 - result.curvature / result.slope, 0, 1),
+        repairs=result.repairs,
     )
 
 
 def _advance(
     state: LMState,
-    found: Candidate | Round,
-    moved: list[Array],
+    candidate: Candidate | Round,
+    tried_step: list[Array],
     damping: Float[Array, ""],
-    seen: Bool[AnyArray, " cameras"],
+    camera_seen: Bool[AnyArray, " cameras"],
     **fields: Array,
 ) -> tuple[LMState, StepInfo]:
-    """The state after a candidate was accepted or not, and the record of it.
+    """The state after the accept decision, and the record of the iteration.
 
-    `moved` is the step that was tried, `seen` are the cameras that take part; `fields` are those of
-    `StepInfo` that are not set here.
+    Args:
+        state: before the iteration.
+        candidate: proposed parameters, with the decision.
+        tried_step: change of cameras and points that was evaluated, for its norm.
+        damping: lambda.
+        camera_seen: cameras with observations; only these count in the parameter norm.
+        fields: the fields of `StepInfo` that are not set here.
     """
-    choose = lambda new, old: jnp.where(found.accepted, new, old)
+    choose = lambda new, old: jnp.where(candidate.accepted, new, old)
     previous = state.previous_steps
     if previous is not None:
-        latest = found.cameras - state.cameras
+        latest = candidate.cameras - state.cameras
         previous = choose(jnp.concatenate([latest[None], previous[:-1]]), previous)
-    cameras, points, lower = (choose(*pair) for pair in zip(found[:3], state[:3], strict=True))
-    after = LMState(cameras, points, lower, previous)
+    cameras, points, new_cost = (choose(*pair) for pair in zip(candidate[:3], state[:3], strict=True))
+    after = LMState(cameras, points, new_cost, previous)
     return after, StepInfo(
         cost=after.cost,
         previous_cost=state.cost,
-        candidate_cost=found.cost,
-        predicted=found.predicted,
-        gain_ratio=found.gain,
-        accepted=found.accepted,
+        candidate_cost=candidate.cost,
+        predicted=candidate.predicted,
+        gain_ratio=candidate.gain,
+        accepted=candidate.accepted,
         damping=damping,
-        step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in moved)),
-        parameter_norm=jnp.sqrt(jnp.sum(jnp.where(seen, state.cameras, 0) ** 2) + jnp.sum(state.points**2)),
+        step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in tried_step)),
+        parameter_norm=jnp.sqrt(jnp.sum(jnp.where(camera_seen, state.cameras, 0) ** 2) + jnp.sum(state.points**2)),
         **fields,
     )

@@ -1,4 +1,10 @@
-"""When a solve ends, and why."""
+"""Stopping rules: when a solve ends, and why.
+
+Three convergence tests on accepted steps, as in Ceres (relative decrease of the cost, relative step length, largest
+gradient entry), and one on rejected steps whose predicted decrease is below the rounding error of the cost. A strongly
+damped step is short whatever the distance to the minimum, so the first two ask in addition that damping is not what
+made it short.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +18,19 @@ from jaxtyping import Bool, Float, Int
 from jaxba.lm.records import StepInfo
 
 DAMPING_LIMIT = 1e32
-"""A step rejected with this lambda ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
+"""A step rejected with a lambda of this size ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
 
-HIDDEN_DECREASE = 100.0
-"""A small decrease ends a solve only if, without damping, it would be estimated at no more than this times as large. A
-step that lambda made short says nothing about how far the minimum is."""
+MAX_UNDAMPED_RATIO = 100.0
+"""A small decrease, or a short step, counts as convergence only if the same without damping is estimated at no more
+than this many times as large. Chosen, not fitted."""
 
-
-SHARE_ROUNDING = 64.0
-"""Rounding units within which a share of damping is one: under a lambda of 1e30 it came out as one or just below."""
+FRACTION_ROUNDING = 64.0
+"""Machine epsilons within which a damping fraction counts as one: with lambda = 1e30 it was computed as 1 or just
+below."""
 
 COST_ROUNDING = 8.0
-"""Rounding units of a cost within which the promise of a refused step tells nothing: 1e-6 in float32, where costs of
-real problems have errors of that size (docs/performance.md), 2e-15 in float64."""
+"""Rounding error of a cost in machine epsilons, relative to the cost: 1e-6 in float32, which was measured on real
+problems, and 2e-15 in float64."""
 
 
 class Termination(enum.IntEnum):
@@ -57,7 +63,7 @@ _REASONS = {
     Termination.COST: "relative decrease of an accepted step within ftol",
     Termination.STEP: "accepted step within xtol",
     Termination.GRADIENT: "gradient within gtol",
-    Termination.ROUNDING: "promised decrease of a refused step within the rounding of the cost",
+    Termination.ROUNDING: "predicted decrease of a rejected step within the rounding of the cost",
     Termination.MAX_ITERATIONS: "iteration limit",
     Termination.STALLED: "a rejected step would be repeated unchanged",
     Termination.STOPPED: "stopped by the caller",
@@ -67,68 +73,76 @@ _REASONS = {
 
 
 class Tolerances(NamedTuple):
-    """Convergence tests (design, section 2), and a cost that is good enough.
+    """Tolerances of the convergence tests, and a target cost. The defaults are those of Ceres.
 
-    The first two are for accepted steps. A refused one ends a solve where nothing can be told any more
-    (`lost_in_rounding`).
+    `ftol` and `xtol` apply to accepted steps. Rejected steps end a solve by `lost_in_rounding`.
     """
 
     ftol: float = 1e-6
-    """`|f - f'| <= ftol f`, by a step that is not short for its damping (`converged_in_cost`)."""
+    """An accepted step with `f - f_new <= ftol f` that damping did not make short (`converged_in_cost`)."""
 
     xtol: float = 1e-8
-    """`|step| <= xtol (|x| + xtol)`."""
+    """An accepted step with `|d| <= xtol (|x| + xtol)` that damping did not make short."""
 
     gtol: float = 1e-10
-    """Largest gradient entry."""
+    """Largest absolute gradient entry."""
 
     target: float = 0.0
-    """Cost in pixels squared at which a solve may end, converged or not; 0 switches it off."""
+    """Cost in pixels^2 at or below which a solve ends, converged or not; 0 switches it off."""
 
 
 def converged_in_cost(step: StepInfo, ftol: Any) -> Bool[Array, ""]:
-    """An accepted step lowered the cost by at most `ftol f`, and not because damping made it short.
+    """Whether an accepted step lowered the cost by at most `ftol f`, and not because damping made it short.
 
-    Let s be the share of the step's curvature `d.(H + D) d` that is damping's. In a direction of curvature h,
-    `s = lambda / (h + lambda)`, and the undamped model would promise `1 / (1 - s^2)` times the decrease. That may not
-    exceed `HIDDEN_DECREASE` times the tolerance.
+    Let `s = d.D d / d.(H + D) d` be the damping fraction. Along a direction of curvature h it is
+    `s = lambda / (h + lambda)`, and the undamped model predicts `1 / (1 - s^2)` times the decrease.
+    This estimate may be at most `MAX_UNDAMPED_RATIO` times the tolerance.
     """
-    return step.accepted & _is_little(step.previous_cost - step.cost, step, ftol)
+    return step.accepted & _is_negligible(step.previous_cost - step.cost, step, ftol)
 
 
 def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
-    """A step was refused that promised less than what its cost is rounded by, and not because damping made it short.
+    """Whether a step was rejected whose predicted decrease is below the rounding error of the cost.
 
-    Whether such a step is any good cannot be seen, and the next ones, damped more, promise less still. In float64 that
-    is beyond all useful tolerances; in float32 it comes before `ftol` is met, which then needs a step accepted by luck.
+    Such a rejection says nothing about the step, and the next steps, damped more, predict even less. In float64 this is
+    far below useful tolerances. In float32 it happens before `ftol` is met, which would then need a step that is
+    accepted by luck.
     """
     rounding = COST_ROUNDING * float(jnp.finfo(step.cost.dtype).eps)
-    told = (step.predicted > 0) & jnp.isfinite(step.step_norm)  # peers do not tell what they refused (peers/driven.py)
-    return ~step.accepted & told & _is_little(step.predicted, step, rounding)
+    known = (step.predicted > 0) & jnp.isfinite(step.step_norm)  # peers do not report rejected steps (peers/driven.py)
+    return ~step.accepted & known & _is_negligible(step.predicted, step, rounding)
 
 
-def _is_little(decrease: Float[Array, ""], step: StepInfo, tolerance: Any) -> Bool[Array, ""]:
-    """Whether a decrease is within a tolerance relative to the cost, also as it would be without damping."""
-    hidden = decrease > HIDDEN_DECREASE * _undamped(step) * (1 + step.damping_share) * tolerance * step.previous_cost
-    whole = ~(step.share < 1)  # a step that had to be shortened says nothing either
-    return (decrease <= tolerance * step.previous_cost) & ~hidden & whole
+def _is_negligible(decrease: Float[Array, ""], step: StepInfo, tolerance: Any) -> Bool[Array, ""]:
+    """Whether a decrease is within a tolerance relative to the cost, for the damped step and without damping."""
+    undamped_bound = MAX_UNDAMPED_RATIO * _undamped_fraction(step) * (1 + step.damping_share)
+    damping_limited = decrease > undamped_bound * tolerance * step.previous_cost
+    full_step = ~(step.share < 1)  # a backtracked step is short for another reason
+    return (decrease <= tolerance * step.previous_cost) & ~damping_limited & full_step
 
 
-def _undamped(step: StepInfo) -> Float[Array, ""]:
-    """What damping leaves of the step's curvature, as a share; none where it would be told by the last digits alone."""
-    left = 1 - step.damping_share
-    return jnp.where(left <= SHARE_ROUNDING * float(jnp.finfo(step.cost.dtype).eps), jnp.zeros_like(left), left)
+def _undamped_fraction(step: StepInfo) -> Float[Array, ""]:
+    """`1 - s` for the damping fraction s; zero where only rounding is left of it."""
+    rest = 1 - step.damping_share
+    return jnp.where(rest <= FRACTION_ROUNDING * float(jnp.finfo(step.cost.dtype).eps), jnp.zeros_like(rest), rest)
 
 
 def termination_of(
     step: StepInfo, stuck: Bool[Array, ""], iteration: Int[Array, ""], tolerances: Tolerances, max_iterations: Any
 ) -> Int[Array, ""]:
-    """First stop rule that applies. Only an accepted step, a zero gradient, or a promise that drowns in rounding ends a
-    solve as converged."""
+    """The first stopping rule that applies to a step, as the integer of a `Termination`.
+
+    Args:
+        step: record of the iteration.
+        stuck: whether a rejected step would be repeated unchanged.
+        iteration: iterations so far, this one included.
+        tolerances: convergence tests.
+        max_iterations: limit of iterations.
+    """
     by_cost = converged_in_cost(step, tolerances.ftol)
     bound = tolerances.xtol * (step.parameter_norm + tolerances.xtol)
-    hidden = step.step_norm > HIDDEN_DECREASE * _undamped(step) * bound
-    by_step = step.accepted & (step.step_norm <= bound) & ~hidden & ~(step.share < 1)
+    damping_limited = step.step_norm > MAX_UNDAMPED_RATIO * _undamped_fraction(step) * bound
+    by_step = step.accepted & (step.step_norm <= bound) & ~damping_limited & ~(step.share < 1)
     by_gradient = step.gradient_max <= tolerances.gtol
     limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
     stalled = ~step.accepted & stuck

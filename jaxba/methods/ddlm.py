@@ -179,7 +179,12 @@ def _cluster_steps(
     gradient_max = largest_gradient(eliminated, system, coordinates)
     none = jnp.zeros((), jnp.int32), jnp.zeros_like(gradient_max)
     return Step(
-        components_first(coordinates.given(moves)), point_moves, slopes, slopes - curvatures, gradient_max, *none
+        components_first(coordinates.from_manifold(moves)),
+        point_moves,
+        slopes,
+        slopes - curvatures,
+        gradient_max,
+        *none,
     )
 
 
