@@ -1,9 +1,11 @@
 """Cholesky factorisation of a banded reduced camera system, tile by tile.
 
-A window of as many tiles as the band is wide slides down the diagonal. Its first tile is factored, the tiles below are
-solved for, their outer product is subtracted from the rest of the window, and the next row of tiles enters. One loop
-body, whatever the length of the sequence. Source: Golub and Van Loan, "Matrix Computations", section 4.3 (band
-Cholesky), with the blocked right-looking update of LAPACK's pbtrf.
+A window of as many tiles as the band is wide slides down the diagonal. Each step factors its first tile, solves for the
+tiles below, subtracts their outer product from the rest of the window, and moves on by one row of tiles. The compiled
+program has one loop body, whatever the length of the sequence.
+
+Source: Golub and Van Loan, "Matrix Computations", section 4.3 (band Cholesky), with the blocked right-looking update of
+LAPACK's pbtrf.
 """
 
 from __future__ import annotations
@@ -20,31 +22,31 @@ from jaxba.structure.segment_sums import take_rows
 
 
 def band_rows(band: Band, blocks: Float[Array, "blocks 9 9"]) -> Float[Array, "tiles rows columns"]:
-    """The tiles of every row up to the diagonal one, which is last; unit diagonal in the padding."""
+    """The tiles of every row of tiles; the diagonal one is last. Padding gets a unit diagonal."""
     tiles, m, columns = band.blocks.shape
     rows = take_rows(blocks.reshape(-1, 81), band.blocks).reshape(tiles, m, columns, 9, 9)
     rows = rows.transpose(0, 1, 3, 2, 4).reshape(tiles, 9 * m, 9 * columns)
-    padding = jnp.repeat(band.camera == band.place.shape[0], 9, axis=1).astype(rows.dtype)
+    padding = jnp.repeat(band.camera == band.rank.shape[0], 9, axis=1).astype(rows.dtype)
     unit = padding[:, :, None] * jnp.eye(9 * m, dtype=rows.dtype)
     return rows.at[:, :, -9 * m :].add(unit)
 
 
 class BandFactor(NamedTuple):
-    """A Cholesky factor by tiles."""
+    """Cholesky factor L of a band matrix, in tiles."""
 
     band: Band
     inverses: Float[Array, "tiles size size"]  # of the diagonal tiles
-    below: Float[Array, "tiles rest size"]  # what stands below them within the band
+    below: Float[Array, "tiles rest size"]  # the rows of L below each diagonal tile, within the band
 
     def solve(self, right: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
         """Solves `L L^T x = b`."""
         tiles, rest, size = self.below.shape
         zero = jnp.zeros((1, 9), right.dtype)
-        sides = take_rows(jnp.concatenate([right, zero]), self.band.camera).reshape(tiles, size)
+        rights = take_rows(jnp.concatenate([right, zero]), self.band.camera).reshape(tiles, size)
 
         def forward(before: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-            side, inverse, below = row
-            half = jnp.matmul(inverse, side - before[:size], precision="highest")
+            right_tile, inverse, below = row
+            half = jnp.matmul(inverse, right_tile - before[:size], precision="highest")
             after = jnp.concatenate([before, jnp.zeros(size, right.dtype)])[size:]
             return after + jnp.matmul(below, half, precision="highest"), half
 
@@ -55,27 +57,27 @@ class BandFactor(NamedTuple):
             return jnp.concatenate([x, after])[:rest], x
 
         nothing = jnp.zeros(rest, right.dtype)
-        # before its turn a tile has no more than `rest` rows to subtract from; with no tile below there is none
+        # contributions of earlier tiles to the next `rest` rows; none for a block-diagonal matrix
         padded = nothing if rest else jnp.zeros(size, right.dtype)
-        _, halves = lax.scan(forward if rest else _alone, padded, (sides, self.inverses, self.below))
+        _, halves = lax.scan(forward if rest else _diagonal_forward, padded, (rights, self.inverses, self.below))
         _, x = lax.scan(backward, nothing, (halves, self.inverses, self.below), reverse=True)
-        return take_rows(x.reshape(-1, 9), self.band.place)
+        return take_rows(x.reshape(-1, 9), self.band.rank)
 
 
-def _alone(nothing: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    side, inverse, _ = row
-    return nothing, jnp.matmul(inverse, side, precision="highest")
+def _diagonal_forward(nothing: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    right_tile, inverse, _ = row
+    return nothing, jnp.matmul(inverse, right_tile, precision="highest")
 
 
 def band_factor(band: Band, blocks: Float[Array, "blocks 9 9"]) -> BandFactor:
-    """Factors S; not finite where it is not positive definite."""
+    """Cholesky factor of S; non-finite if S is not positive definite."""
     rows = band_rows(band, blocks)
     _, size, columns = rows.shape
-    held, rest = columns // size, columns - size  # tiles in the window, rows below its first tile
+    window_tiles, rest = columns // size, columns - size  # tiles in the window, rows below its first tile
     window = jnp.zeros((columns, columns), rows.dtype)
-    for k in range(held):  # row k of the window ends on the diagonal
+    for k in range(window_tiles):  # row k of the window ends on the diagonal
         window = window.at[k * size : (k + 1) * size, : (k + 1) * size].set(rows[k, :, columns - (k + 1) * size :])
-    entering = jnp.concatenate([rows[held:], jnp.zeros((held, size, columns), rows.dtype)])
+    entering = jnp.concatenate([rows[window_tiles:], jnp.zeros((window_tiles, size, columns), rows.dtype)])
     unit = jnp.eye(size, dtype=rows.dtype)
 
     def eliminate(window: Array, new: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -93,5 +95,5 @@ def band_factor(band: Band, blocks: Float[Array, "blocks 9 9"]) -> BandFactor:
 def band_factor_and_solve(
     band: Band, blocks: Float[Array, "blocks 9 9"], right: Float[Array, "cameras 9"]
 ) -> Float[Array, "cameras 9"]:
-    """Solves `S x = b`; not finite where S is not positive definite."""
+    """Solves `S x = b`; non-finite if S is not positive definite."""
     return band_factor(band, blocks).solve(right)

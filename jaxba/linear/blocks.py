@@ -1,4 +1,7 @@
-"""Sums of products over pairs, as blocks of a symmetric matrix."""
+"""Blocks of a symmetric matrix as sums of products over pairs of observations.
+
+A block of the reduced camera system is a sum over the points that two cameras both see: `S_jk -= sum_i Y_ij Y_ik^T`.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,9 @@ def pair_products(
     """`sum Y_left Y_right^T` for every block of the lower triangle; the last block is zero.
 
     Args:
-        pairs: which rows multiply into which block.
-        rows: `Y` of every slot, its three columns one after the other, each of length `width`.
-        width: unknowns of a block's side.
+        pairs: which rows are multiplied into which block.
+        rows: `Y^T` [3, width] of every observation, flattened.
+        width: number of rows and columns of a block.
     """
 
     def batch(parts: tuple[Array, Array, Array]) -> Array:
@@ -27,13 +30,17 @@ def pair_products(
         products = compute_unfused(outer_sum, left, right, index=sums)
         return compute_unfused(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums)
 
-    # one batch after the other, so that what is gathered and its products stay in cache
+    # batch by batch, so that the gathered rows and their products stay in the cache
     partial = lax.map(batch, (pairs.left, pairs.right, pairs.sums)).reshape(-1, width * width)
     return compute_unfused(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums)
 
 
 def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks square"], width: int) -> Float[Array, "n n"]:
-    """The matrix made of the blocks; only its lower triangle is filled."""
+    """The blocks assembled into one matrix, of which only the lower triangle is filled.
+
+    Raises:
+        ValueError: the layout was built without a table of blocks.
+    """
     if pairs.table is None:
         raise ValueError("this layout has no table of blocks: build it with factor=True to factor the system")
     side = pairs.table.shape[0]

@@ -1,4 +1,4 @@
-"""Symmetric positive definite 3 x 3 systems, one per column, written out entry by entry."""
+"""Cholesky factorisation of many 3 x 3 systems, one per column, entry by entry."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from jax import Array
 from jaxtyping import Float
 
 PIVOT_FLOOR = 16.0
-"""A pivot below this many rounding units of its diagonal entry is lifted to that: a point whose rays are
-parallel then keeps a finite step, which the acceptance test judges, instead of spoiling the whole one."""
+"""Smallest pivot, in machine epsilons times its diagonal entry. A point with parallel rays has a singular block; with
+this floor its step stays finite, and one such point does not make the whole step fail."""
 
 
 class Cholesky3(NamedTuple):

@@ -1,8 +1,7 @@
 """Preconditioned conjugate gradients with Ceres' stopping rule and an iteration count.
 
-`jax.scipy.sparse.linalg.cg` computes the same iterates (a test holds the two together) but reports no
-count and stops on the residual norm only. Bundle adjustment wants to stop on the quadratic model instead,
-since late iterations of an inexact step buy nothing.
+`jax.scipy.sparse.linalg.cg` computes the same iterates, but returns no count and stops on the residual norm only. An
+inexact Newton step should stop on the quadratic model instead: late iterations hardly lower it.
 """
 
 from __future__ import annotations
@@ -40,16 +39,16 @@ def conjugate_gradients(
         apply: `A`.
         right: `b`, any shape.
         precondition: `M^-1`, symmetric positive definite.
-        forcing: stop when `i (Q_i - Q_(i-1)) / Q_i < forcing`, `Q_i = -x.(b + r)`. Source: Ceres
-            conjugate_gradients_solver, after Nash and Sofer 1990. Zero switches the test off.
+        forcing: stop when `i (Q_i - Q_(i-1)) / Q_i < forcing`, where `Q_i = x.A x - 2 b.x = -x.(b + r)` in iteration
+            i. Source: Ceres conjugate_gradients_solver, after Nash and Sofer 1990. Zero switches the test off.
         tolerance: stop when `|r| <= tolerance |b|`.
         max_iterations: upper bound.
 
     Returns:
-        The iterate and the number of iterations. Negative curvature ends the iteration with the iterate so
-        far; a non-finite number makes the result non-finite, which the caller rejects.
+        The iterate and the number of iterations. Negative curvature stops with the last iterate. A non-finite number
+        makes the result non-finite, and the caller rejects the step.
     """
-    enough = tolerance * tolerance * jnp.sum(right * right)
+    bound = tolerance * tolerance * jnp.sum(right * right)
 
     def body(c: _Carry) -> _Carry:
         image = apply(c.direction)
@@ -60,13 +59,13 @@ def conjugate_gradients(
         residual = c.residual - step * image
         model = -jnp.sum(x * (right + residual))
         count = c.count + 1
-        settled = (forcing > 0) & (count * (model - c.model) / model < forcing)
-        finished = settled | (jnp.sum(residual * residual) <= enough) | (count >= max_iterations)
+        converged = (forcing > 0) & (count * (model - c.model) / model < forcing)
+        finished = converged | (jnp.sum(residual * residual) <= bound) | (count >= max_iterations)
         scaled = precondition(residual)
         product = jnp.sum(residual * scaled)
         direction = scaled + product / c.product * c.direction
         done = _Carry(x, residual, direction, product, model, count, valid & ~finished)
-        # negative curvature keeps the iterate; a curvature that is no number must not look like a good one
+        # negative curvature keeps the iterate; a non-finite curvature makes it nan
         rest = c._replace(x=jnp.where(jnp.isfinite(curvature), c.x, jnp.nan), running=valid)
         return _Carry(*(jnp.where(valid, new, old) for new, old in zip(done, rest, strict=True)))
 
@@ -75,5 +74,5 @@ def conjugate_gradients(
     zero = jnp.zeros_like(right)
     start = _Carry(zero, right, scaled, product, jnp.zeros_like(product), jnp.zeros((), jnp.int32), product > 0)
     end = lax.while_loop(lambda c: c.running, body, start)
-    # a non-finite preconditioner or right-hand side must not look like a zero step
+    # with a non-finite preconditioner or right-hand side the loop does not start: return nan, not a zero step
     return jnp.where(jnp.isfinite(product), end.x, jnp.full_like(right, jnp.nan)), end.count

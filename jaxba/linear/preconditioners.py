@@ -1,6 +1,10 @@
-"""Preconditioners of the reduced camera system.
+"""Preconditioners of conjugate gradients on the reduced camera system S.
 
-Source: Agarwal et al. 2010 (block diagonals); two levels: two_level.py.
+- `jacobi`: the camera blocks `B + D_c`.
+- `schur-jacobi`: the block diagonal of S.
+- `two-level`: the block diagonal of S plus a coarse correction (two_level.py).
+
+Source: Agarwal et al. 2010, "Bundle Adjustment in the Large" (the first two).
 """
 
 from __future__ import annotations
@@ -32,16 +36,16 @@ def preconditioner(
     blocks: Float[Array, "blocks 9 9"] | None,
     name: Preconditioner,
 ) -> Operator:
-    """The preconditioner of this name, as a function of the residual.
+    """`M^-1` as a function of the residual.
 
     Args:
-        layout: slots; grouped cameras for two levels.
-        linear: Jacobians.
-        points: eliminated.
+        layout: the problem's observations, with camera clusters for `two-level`.
+        linear: residuals and Jacobians.
+        points: the eliminated points.
         system: damped camera blocks.
-        anchor: where cameras and points are, for two levels.
-        blocks: the reduced camera system where it has been formed.
-        name: see `ConjugateGradients`.
+        anchor: current poses and points, for `two-level`.
+        blocks: the blocks of S, if they have been formed.
+        name: which one.
     """
     if name == "jacobi":
         return block_inverse(system.blocks)
@@ -59,10 +63,11 @@ def preconditioner(
 def diagonal_blocks(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "cameras 9 9"]:
-    """The diagonal blocks of S, `D_c + sum J_c^T (I - Q Q^T) J_c`, from rows `F^T J_c` with `F F^T = I - Q Q^T`.
+    """The diagonal blocks of S, `D_c + sum J_c^T (I - Q Q^T) J_c`.
 
-    Two rows an observation, and a sum that cannot lose its sign. A camera that sees a point twice adds a product across
-    the two observations, which is left out: this is a preconditioner.
+    With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T J_c`, two an
+    observation, which stays positive semi-definite under rounding. If a camera sees a point twice, the product of the
+    two observations is missing, which is harmless in a preconditioner.
     """
     over, under = points.projected
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -78,7 +83,7 @@ def diagonal_blocks(
 
 
 def block_inverse(blocks: Float[Array, "cameras 9 9"]) -> Callable[[Array], Array]:
-    """Applies the inverses of positive definite blocks, formed once by Cholesky."""
+    """The product with the inverses of positive definite blocks, which are formed once by Cholesky."""
     factor = jnp.linalg.cholesky(blocks, symmetrize_input=False)
     eye = jnp.broadcast_to(jnp.eye(blocks.shape[-1], dtype=blocks.dtype), blocks.shape)
     root = solve_triangular(factor, eye, lower=True)

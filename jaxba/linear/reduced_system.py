@@ -1,8 +1,8 @@
 """Solvers of the reduced camera system `S x = b`.
 
-- `explicit`: S formed from chunked products over co-visible pairs, factored: dense, or as a band where it is one.
-- `sparse`: S formed in blocks, conjugate gradients on the blocks.
-- `implicit`: conjugate gradients with two passes over the observations a product; S is never formed.
+- `explicit`: form S and factor it by Cholesky, as a band if it is one, else dense.
+- `sparse`: form the non-zero blocks of S, then conjugate gradients with them.
+- `implicit`: conjugate gradients without forming S; a product takes two passes over the observations.
 
 Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
 """
@@ -34,11 +34,11 @@ from jaxba.structure.layout import Layout, PairLayout
 from jaxba.structure.segment_sums import take_rows, tree_sum
 from jaxba.typing import AnyArray
 
-SINGLE_LIFT = 64.0
-"""Rounding units added to the scaled diagonal of a system formed in float32, which may have lost its sign."""
+FLOAT32_SHIFT = 64.0
+"""Machine epsilons added to the unit diagonal of a scaled float32 system, which rounding may have made indefinite."""
 
-REPAIR_FORCING = 1e-3
-"""Forcing term of the full-precision iteration around a float32 factorisation: two or three products."""
+CORRECTION_FORCING = 1e-3
+"""Forcing term of the float64 conjugate gradients around a float32 factorisation; they take two or three products."""
 
 T = TypeVar("T")
 
@@ -52,46 +52,50 @@ def solve_reduced(
     options: StepOptions,
     forcing: float | Float[Array, ""],
 ) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
-    """Solves for the camera step, in manifold coordinates, with the solver that the options name.
+    """Solves `S x = b` for the camera step, in manifold coordinates, with the solver that the options name.
 
-    Conjugate gradients, where they are all of the solver, end by `forcing`.
+    Args:
+        layout: the problem's observations.
+        linear: residuals and Jacobians.
+        points: the eliminated points.
+        system: B + D_c and b.
+        anchor: current poses and points, for the two-level preconditioner.
+        options: linear solver and precision.
+        forcing: forcing term of conjugate gradients for the solvers `sparse` and `implicit`.
 
     Returns:
-        The step, and the number of iterations (0 after a factorisation). Not finite where
-        a factorisation failed.
+        The step and the number of iterations (0 for a factorisation). The step is non-finite if a factorisation failed.
     """
     product = lambda x: apply_reduced(layout, linear, points, system, x)
     explicit, grid = options.linear_solver == "explicit", layout.grid
     if system.ties is not None:
-        formed = _dense(layout, linear, points, system)
+        formed = _dense_matrix(layout, linear, points, system)
         return solve_tied(system.ties, formed, system.right), _no_iterations()
-    # a small capacitance matrix is not worth rounding to float32
+    # the system of a scene with few points is small: float32 would save nothing
     if explicit and grid is not None and (not options.mixed_precision or has_few_points(*grid.shape)):
         return solve_dense(grid, linear, points, system), _no_iterations()
     if not options.mixed_precision:
         if explicit:
             return factor_blocks(layout, reduced_blocks(layout, linear, points, system), system.right), _no_iterations()
-        return _iterate_reduced(layout, linear, points, system, anchor, options, forcing)
-    rough_linear, rough_points, rough_system, rough_anchor = to_single((linear, points, system, anchor))
+        return _solve_iteratively(layout, linear, points, system, anchor, options, forcing)
+    linear32, points32, system32, anchor32 = to_single((linear, points, system, anchor))
     if explicit:
         if grid is None:
-            solve = factored(layout, reduced_blocks(layout, rough_linear, rough_points, rough_system))
+            solve = factored(layout, reduced_blocks(layout, linear32, points32, system32))
         else:
-            solve = factored_dense(dense_system(grid, rough_linear, rough_points, rough_system))
+            solve = factored_dense(dense_system(grid, linear32, points32, system32))
         precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
-        return _iterate(product, precondition, system, options, REPAIR_FORCING)
-    step, iterations = _iterate_reduced(
-        layout, rough_linear, rough_points, rough_system, rough_anchor, options, forcing
-    )
+        return _conjugate_gradients(product, precondition, system, options, CORRECTION_FORCING)
+    step, iterations = _solve_iteratively(layout, linear32, points32, system32, anchor32, options, forcing)
     return step.astype(system.right.dtype), iterations
 
 
 def to_single(tree: T) -> T:
-    """The same numbers in float32; truth values stay what they are."""
+    """All floating point arrays in float32; booleans are unchanged."""
     return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(jnp.float32), tree)
 
 
-def _iterate_reduced(
+def _solve_iteratively(
     layout: Layout,
     linear: Linearization,
     points: PointSystem,
@@ -108,7 +112,7 @@ def _iterate_reduced(
     precondition = preconditioner(
         layout, linear, points, system, anchor, blocks, options.conjugate_gradients.preconditioner
     )
-    return _iterate(apply, precondition, system, options, forcing)
+    return _conjugate_gradients(apply, precondition, system, options, forcing)
 
 
 def _no_iterations() -> Int[Array, ""]:
@@ -118,7 +122,7 @@ def _no_iterations() -> Int[Array, ""]:
 def reduced_blocks(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "blocks 9 9"]:
-    """The blocks of the reduced camera system's lower triangle, in the order of `PairLayout`; the last is zero."""
+    """The blocks of the lower triangle of S, in the order of `PairLayout`; the last one is zero."""
     pairs = _pairs(layout)
     products = pair_products(pairs, coupling_by_camera(layout, points, system), 9)
 
@@ -132,7 +136,7 @@ def reduced_blocks(
 def solve_dense(
     grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "cameras 9"]:
-    """Solves the reduced camera system of a dense scene, by way of the smaller one of two matrices."""
+    """Solves `S x = b` where most cameras see most points: by S itself, or by Woodbury's identity for few points."""
     if has_few_points(*grid.shape):
         return capacitance_solve(dense_coupling(grid, linear, points), system)
     matrix = dense_system(grid, linear, points, system)
@@ -142,7 +146,7 @@ def solve_dense(
 def dense_coupling(
     grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem
 ) -> Float[Array, "unknowns columns"]:
-    """W, which couples cameras and points: a row per camera unknown, a column per coordinate of each point."""
+    """`W = E L^-T`, so that `S = B + D_c - W W^T`: one row per camera unknown, one column per coordinate of a point."""
     count, cameras = grid.shape
     rows = take_rows(coupling_rows(linear, points), grid).reshape(count, cameras, 3, 9)
     return rows.transpose(1, 3, 0, 2).reshape(9 * cameras, 3 * count)
@@ -151,7 +155,7 @@ def dense_coupling(
 def dense_system(
     grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "unknowns unknowns"]:
-    """The reduced camera system as one product `diag(B) - W W^T`."""
+    """`S = B + D_c - W W^T` as one dense matrix product."""
     cameras = grid.shape[1]
     wide = dense_coupling(grid, linear, points)
     product = jnp.matmul(wide, wide.T, precision="highest")
@@ -159,8 +163,10 @@ def dense_system(
     return own.reshape(9 * cameras, 9 * cameras) - product
 
 
-def _dense(layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem) -> Float[Array, "n n"]:
-    """The reduced camera system as one matrix; only its lower triangle is filled."""
+def _dense_matrix(
+    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
+) -> Float[Array, "n n"]:
+    """S as one matrix; only its lower triangle is filled."""
     if layout.grid is not None:
         return dense_system(layout.grid, linear, points, system)
     return dense_blocks(_pairs(layout), reduced_blocks(layout, linear, points, system).reshape(-1, 81), 9)
@@ -169,7 +175,7 @@ def _dense(layout: Layout, linear: Linearization, points: PointSystem, system: C
 def factor_blocks(
     layout: Layout, blocks: Float[Array, "blocks 9 9"], right: Float[Array, "cameras 9"]
 ) -> Float[Array, "cameras 9"]:
-    """Solves by a Cholesky factorisation, of a band where the layout has found one."""
+    """Solves `S x = b` by a Cholesky factorisation: of a band if the layout has one, else dense."""
     band = _pairs(layout).band
     if band is not None:
         return band_factor_and_solve(band, blocks, right)
@@ -179,24 +185,24 @@ def factor_blocks(
 
 
 def factored_dense(matrix: Float[Array, "n n"]) -> Callable[[Array], Array]:
-    """As `factored`, of a dense matrix."""
+    """As `factored`, for a dense matrix."""
     scale = lax.rsqrt(jnp.diagonal(matrix))
-    lift = SINGLE_LIFT * float(jnp.finfo(matrix.dtype).eps)
-    panels = factor_panels(matrix * scale[:, None] * scale + lift * jnp.eye(matrix.shape[0], dtype=matrix.dtype))
+    shift = FLOAT32_SHIFT * float(jnp.finfo(matrix.dtype).eps)
+    panels = factor_panels(matrix * scale[:, None] * scale + shift * jnp.eye(matrix.shape[0], dtype=matrix.dtype))
     return lambda r: (scale * panels.solve(scale * r.reshape(-1))).reshape(r.shape)
 
 
 def factored(layout: Layout, blocks: Float[Array, "blocks 9 9"]) -> Callable[[Array], Array]:
-    """The inverse of a system known to rounding only, for a preconditioner: its scaled diagonal is lifted a little."""
+    """`S^-1` in float32, for a preconditioner. The diagonal is scaled to one and shifted, so that the factor exists."""
     pairs = _pairs(layout)
     if pairs.band is None:
         return factored_dense(dense_blocks(pairs, blocks.reshape(-1, 81), 9))
     diagonal = jnp.diagonal(take_rows(blocks, pairs.diagonal), axis1=1, axis2=2)  # [cameras, 9]
     scale = lax.rsqrt(diagonal)
-    lift = SINGLE_LIFT * float(jnp.finfo(blocks.dtype).eps)
+    shift = FLOAT32_SHIFT * float(jnp.finfo(blocks.dtype).eps)
     scaled = blocks * take_rows(scale, pairs.block_row)[:, :, None] * take_rows(scale, pairs.block_column)[:, None, :]
     own = (pairs.block_camera < layout.num_cameras).astype(blocks.dtype)
-    scaled = scaled + lift * own[:, None, None] * jnp.eye(9, dtype=blocks.dtype)
+    scaled = scaled + shift * own[:, None, None] * jnp.eye(9, dtype=blocks.dtype)
     band = band_factor(pairs.band, scaled)
     return lambda r: scale * band.solve(scale * r)
 
@@ -204,7 +210,7 @@ def factored(layout: Layout, blocks: Float[Array, "blocks 9 9"]) -> Callable[[Ar
 def apply_blocks(
     layout: Layout, blocks: Float[Array, "blocks 9 9"], x: Float[Array, "cameras 9"]
 ) -> Float[Array, "cameras 9"]:
-    """`S x` with S in blocks: each one is read once and serves its own place and its mirror image."""
+    """`S x` with S in blocks of the lower triangle; each block is read once, for itself and for its transpose."""
     pairs = _pairs(layout)
     rows = jnp.einsum("nab,nb->na", blocks, take_rows(x, pairs.block_column))
     columns = jnp.einsum("nab,na->nb", blocks, take_rows(x, pairs.block_row))
@@ -217,7 +223,7 @@ def _pairs(layout: Layout) -> PairLayout:
     return layout.pairs
 
 
-def _iterate(
+def _conjugate_gradients(
     apply: Callable[[Array], Array],
     precondition: Callable[[Array], Array],
     system: CameraSystem,

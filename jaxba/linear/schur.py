@@ -1,12 +1,25 @@
-"""Points eliminated from the damped normal equations; what is left for the cameras.
+"""The Schur complement: points eliminated from the damped normal equations.
 
-With `H = [[B, E], [E^T, C]]` and damping `D`, points are eliminated through `C + D_p = L L^T`: with `Q = J_p L^-T` per
-observation and `Y = J_c^T Q`, the reduced camera system is `S = B + D_c - sum Y Y^T`, its right-hand side
-`-J_c^T (r - Q h)`, `h = L^-1 g_p`. Writing the right-hand side with the projected residual `r - Q h` keeps it free
-of cancellation.
+With the damped Hessian in blocks of cameras and points, `[[B + D_c, E], [E^T, C + D_p]]`, eliminating the points gives
+the reduced camera system
 
-Rotations are perturbed on the manifold here. `RotationCoordinates` says in which coordinates damping is diagonal.
-Source: Triggs et al. 2000, section 6; Agarwal et al. 2010, section 3.
+    S d_c = b,    S = B + D_c - E (C + D_p)^-1 E^T,    b = -g_c + E (C + D_p)^-1 g_p,
+
+and the points follow by back-substitution, `d_p = -(C + D_p)^-1 (g_p + E^T d_c)`.
+
+C is block-diagonal, so everything is computed from 3 x 3 factors `C + D_p = L L^T`, one a point. Per observation, with
+Jacobians `J_c` [2, 9] and `J_p` [2, 3]:
+
+    Q = J_p L^-T,   Y = J_c^T Q,   h = L^-1 g_p
+    S = B + D_c - sum Y Y^T,   b = -sum J_c^T (r - Q h),   d_p = -L^-T (h + sum Y^T d_c)
+
+The projected residual `r - Q h` in b avoids the cancellation between its two terms.
+
+Rotations are perturbed on the manifold, `R <- exp(d) R`; damping is diagonal in the coordinates of the options
+(`RotationCoordinates`).
+
+Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 6; Agarwal et al. 2010, "Bundle Adjustment
+in the Large", section 3.
 """
 
 from __future__ import annotations
@@ -31,14 +44,14 @@ from jaxba.structure.shared_intrinsics import LensTies
 
 
 class RotationCoordinates(NamedTuple):
-    """Maps between manifold rotation steps and the coordinates in which damping is diagonal."""
+    """Maps rotation steps between the manifold and the coordinates in which damping is diagonal, to first order."""
 
-    forward: Float[Array, "cameras 3 3"]  # coordinates -> manifold
+    forward: Float[Array, "cameras 3 3"]  # options' coordinates -> manifold
     inverse: Float[Array, "cameras 3 3"]
 
     @classmethod
     def of(cls, cameras: Float[Array, "9 cameras"], options: StepOptions) -> RotationCoordinates:
-        """Angle-axis coordinates need the left Jacobian; the manifold's own need nothing."""
+        """The left Jacobian of SO(3) for angle-axis coordinates, the identity for manifold coordinates."""
         if options.coordinates.rotation == "manifold":
             one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
             return cls(one, one)
@@ -46,43 +59,50 @@ class RotationCoordinates(NamedTuple):
         return cls(to_front(camera.left_jacobian(cameras[:3])), to_front(camera.left_jacobian_inverse(cameras[:3])))
 
     def from_manifold(self, step: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
-        """A step on the manifold in the coordinates."""
-        turned = jnp.einsum("cij,cj->ci", self.inverse, step[:, :3])
-        return jnp.concatenate([turned, step[:, 3:]], axis=1)
+        """A manifold step in the options' coordinates."""
+        rotation = jnp.einsum("cij,cj->ci", self.inverse, step[:, :3])
+        return jnp.concatenate([rotation, step[:, 3:]], axis=1)
 
 
 class PointSystem(NamedTuple):
-    """The eliminated points."""
+    """The factored point blocks `C + D_p = L L^T` and what follows from them."""
 
-    factor: Cholesky3
+    factor: Cholesky3  # L, of (points,)
     gradient: list[Array]  # g_p, [3] of (points,)
     damping: list[Array]  # D_p, [3] of (points,)
-    solved: list[Array]  # h = L^-1 g_p
+    solved: list[Array]  # h = L^-1 g_p, [3] of (points,)
     projected: list[list[Array]]  # Q, [2][3] of (slots,)
 
 
 class CameraSystem(NamedTuple):
-    """What is left for the cameras, except the sum of Y Y^T."""
+    """The reduced camera system without the sum of `Y Y^T`, which each solver forms or applies in its own way."""
 
     blocks: Float[Array, "cameras 9 9"]  # B + D_c, manifold coordinates
     only_damping: Float[Array, "cameras 9 9"]  # D_c, manifold coordinates
     gradient: Float[Array, "cameras 9"]  # g_c, manifold coordinates
-    right: Float[Array, "cameras 9"]  # right-hand side of the reduced system
+    right: Float[Array, "cameras 9"]  # b, right-hand side of the reduced system
     damping: Float[Array, "cameras 9"]  # D_c, diagonal in the options' coordinates
-    # J_c, r and r - Q h in the order of the cameras, two rows an observation
+    # [J_c, r, r - Q h], two rows an observation, sorted by camera (structure/layout.py)
     rows: Float[Array, "chunks terms 11"] | None = None
-    ties: LensTies | None = None  # where cameras share a lens: the damping of its numbers is in equal parts theirs
+    ties: LensTies | None = None  # shared intrinsics: each camera holds an equal part of their damping
 
 
 def eliminate_points(
     layout: Layout, linear: Linearization, damping: Float[Array, "*points"], options: StepOptions
 ) -> PointSystem:
-    """Forms, damps and factors the 3 x 3 block of every point; one lambda for all, or one each."""
+    """Forms, damps and factors the 3 x 3 block of every point.
+
+    Args:
+        layout: the problem's observations.
+        linear: residuals and Jacobians.
+        damping: lambda, one for all points or one each.
+        options: scaling of the damping.
+    """
     sums = point_sums(layout, normal_entries(linear.point_jacobian, linear.residual))
     matrix, gradient = [sums[k] for k in range(6)], [sums[k] for k in range(6, 9)]
     diagonal = [damping_diagonal(matrix[k], damping, options) for k in (0, 2, 5)]
-    for place, extra in zip((0, 2, 5), diagonal, strict=True):
-        matrix[place] = matrix[place] + extra
+    for entry, extra in zip((0, 2, 5), diagonal, strict=True):
+        matrix[entry] = matrix[entry] + extra
     factor = cholesky3(matrix)
     solved = factor.forward(gradient)
     at_slot = take(jnp.stack(factor), layout.slot_point)
@@ -102,7 +122,19 @@ def camera_system(
     damping: Float[Array, "*cameras_1"],
     options: StepOptions,
 ) -> CameraSystem:
-    """Sums `[J_c, r, r - Q h]^T [J_c, r, r - Q h]` per camera: block, gradient and right-hand side at once."""
+    """B + D_c, g_c and b of every camera.
+
+    `J_c^T [J_c, r, r - Q h]`, summed over a camera's observations, holds B, g_c and -b in its columns: one pass over
+    the observations for all three.
+
+    Args:
+        layout: the problem's observations.
+        linear: residuals and Jacobians.
+        points: the eliminated points.
+        coordinates: in which the damping is diagonal.
+        damping: lambda, one for all cameras or one each, shape (cameras, 1).
+        options: scaling of the damping, and its factor for cameras.
+    """
     solved = take(jnp.stack(points.solved), layout.slot_point)
     rows = []
     for k in range(2):
@@ -122,18 +154,18 @@ def camera_system(
     if ties is not None:
         whole = damping_diagonal(ties.total(diagonal[:, 6:]), factor, options)
         extra = extra.at[:, 6:].set(ties.spread(whole / jnp.maximum(ties.counts(), 1)[:, None]))
-    # a camera that nobody uses gets a unit block and so a zero step
+    # a camera without observations gets a unit block, and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
-    turned = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
+    on_manifold = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
     added = extra[:, :, None] * jnp.eye(9, dtype=extra.dtype)
-    added = added.at[:, :3, :3].set(turned)
+    added = added.at[:, :3, :3].set(on_manifold)
     return CameraSystem(blocks + added, added, gradient, right, extra, gathered, ties)
 
 
 def back_substitute(
     layout: Layout, linear: Linearization, points: PointSystem, step: Float[Array, "cameras 9"]
 ) -> list[Array]:
-    """Point steps `-L^-T (h + sum Y^T step)`, three vectors over points."""
+    """Point step `-L^-T (h + sum Y^T d_c)` of a camera step on the manifold, [3] of (points,)."""
     inner = project_to_points(layout, linear, points, step)
     return [-x for x in points.factor.backward([h + w for h, w in zip(points.solved, inner, strict=True)])]
 
@@ -141,7 +173,7 @@ def back_substitute(
 def apply_reduced(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, x: Float[Array, "cameras 9"]
 ) -> Float[Array, "cameras 9"]:
-    """`S x` without forming S: two passes over the observations."""
+    """`S x = (B + D_c) x - sum Y (Y^T x)` without forming S, in two passes over the observations."""
     inner = project_to_points(layout, linear, points, x)
     at_slot = take(jnp.stack(inner), layout.slot_point)
 
@@ -153,8 +185,8 @@ def apply_reduced(
     return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(rows, layout.camera_levels)
 
 
-def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "places 27"]:
-    """`Y = J_c^T Q` in the order of the cameras, the point's index slow and the camera's fast."""
+def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "sorted 27"]:
+    """`Y^T` [3, 9] of every observation, flattened, sorted by camera (structure/layout.py)."""
     assert system.rows is not None
     over, under = points.projected
     projected = take_rows(as_rows([*over, *under]), layout.camera_levels[0].reshape(-1)).reshape(-1, 2, 3)
@@ -162,7 +194,7 @@ def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem
 
 
 def coupling_rows(linear: Linearization, points: PointSystem) -> Float[Array, "slots 27"]:
-    """`Y = J_c^T Q` of every slot, the point's index slow and the camera's fast."""
+    """`Y^T` [3, 9] of every slot, flattened."""
     first, second = linear.camera_jacobian
     over, under = points.projected
     columns = [first[a] * over[i] + second[a] * under[i] for i in range(3) for a in range(9)]
@@ -172,7 +204,7 @@ def coupling_rows(linear: Linearization, points: PointSystem) -> Float[Array, "s
 def project_to_points(
     layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras 9"]
 ) -> list[Array]:
-    """`sum Y^T x` over each point's slots."""
+    """`sum Y^T x` over each point's observations, [3] of (points,)."""
     at_slot = take(components_first(x), layout.slot_camera)
 
     def inner(at_slot: Array, projected: list[list[Array]], jacobian: list[list[Array]]) -> list[Array]:
@@ -185,7 +217,7 @@ def project_to_points(
 def jacobian_product(
     layout: Layout, linear: Linearization, cameras: Float[Array, "cameras 9"], points: Float[Array, "3 points"]
 ) -> list[Array]:
-    """`J d` of every slot, two vectors, pixels."""
+    """`J d` of every slot for a step on the manifold, [2] of (slots,), pixels."""
     by_camera, by_point = take_each(components_first(cameras), layout.slot_camera), take_each(points, layout.slot_point)
     rows = zip(linear.camera_jacobian, linear.point_jacobian, strict=True)
     dot = lambda a, b: functools.reduce(operator.add, [x * y for x, y in zip(a, b, strict=True)])
@@ -193,15 +225,19 @@ def jacobian_product(
 
 
 def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates) -> Float[Array, ""]:
-    """Largest entry of the gradient, in the options' coordinates."""
-    turned = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
+    """Largest absolute entry of the gradient, in the options' coordinates."""
+    rotation = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
     lens = system.gradient[:, 6:] if system.ties is None else system.ties.total(system.gradient[:, 6:])
-    parts = turned, system.gradient[:, 3:6], lens, jnp.stack(points.gradient)
+    parts = rotation, system.gradient[:, 3:6], lens, jnp.stack(points.gradient)
     return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts])
 
 
 def damping_diagonal(diagonal: Array, damping: Float[Array, "..."], options: StepOptions) -> Array:
-    """The diagonal matrix that damping adds to one with the given diagonal."""
+    """Diagonal of D for a Hessian with the given diagonal.
+
+    `lambda I` for identity scaling, else `lambda diag(H)` with the diagonal clamped to
+    [`DIAGONAL_MINIMUM`, `DIAGONAL_MAXIMUM`] as in Ceres.
+    """
     if options.coordinates.scaling == "identity":
         return jnp.full_like(diagonal, 1) * damping
     high = min(DIAGONAL_MAXIMUM, float(jnp.finfo(diagonal.dtype).max) / 4)

@@ -1,4 +1,11 @@
-"""The reduced camera system where cameras share lenses: rows and columns of a lens added up, then factored."""
+"""The reduced camera system of cameras that share intrinsics.
+
+With the matrix T that copies each lens's parameters y to all of its cameras, `d_c = T y` and the system becomes
+
+    T^T S T y = T^T b:
+
+the rows and columns of S that belong to one lens are summed (structure/shared_intrinsics.py).
+"""
 
 from __future__ import annotations
 
@@ -18,23 +25,23 @@ def solve_tied(
 
     Args:
         ties: T.
-        matrix: S, of which the lower triangle is read.
+        matrix: S; only its lower triangle is read.
         right: b.
 
     Returns:
-        T y; not finite where the tied matrix is not positive definite.
+        T y; non-finite if `T^T S T` is not positive definite.
     """
     cameras, lenses = ties.members.shape
     lower = jnp.tril(matrix)
-    whole = (lower + jnp.tril(matrix, -1).T).reshape(cameras, 9, cameras, 9)
-    poses = whole[:, :POSE_SIZE, :, :POSE_SIZE].reshape(POSE_SIZE * cameras, -1)
+    full = (lower + jnp.tril(matrix, -1).T).reshape(cameras, 9, cameras, 9)
+    pose_pose = full[:, :POSE_SIZE, :, :POSE_SIZE].reshape(POSE_SIZE * cameras, -1)
     own = ties.members.astype(matrix.dtype)
-    columns = jnp.einsum("cadk,dl->calk", whole[..., POSE_SIZE:], own, precision="highest")  # [c, 9, lens, 3]
-    both = columns[:, :POSE_SIZE].reshape(-1, LENS_SIZE * lenses)
-    alone = jnp.einsum("cl,cjmk->ljmk", own, columns[:, POSE_SIZE:], precision="highest")
-    unused = jnp.repeat(ties.counts() == 0, LENS_SIZE).astype(matrix.dtype)  # such a lens gets a zero step
-    alone = alone.reshape(LENS_SIZE * lenses, -1) + jnp.diag(unused)
-    tied = jnp.block([[poses, both], [both.T, alone]])
+    columns = jnp.einsum("cadk,dl->calk", full[..., POSE_SIZE:], own, precision="highest")  # [c, 9, lens, 3]
+    pose_lens = columns[:, :POSE_SIZE].reshape(-1, LENS_SIZE * lenses)
+    lens_lens = jnp.einsum("cl,cjmk->ljmk", own, columns[:, POSE_SIZE:], precision="highest")
+    unused = jnp.repeat(ties.counts() == 0, LENS_SIZE).astype(matrix.dtype)  # its step is zero
+    lens_lens = lens_lens.reshape(LENS_SIZE * lenses, -1) + jnp.diag(unused)
+    tied = jnp.block([[pose_pose, pose_lens], [pose_lens.T, lens_lens]])
     step = factor_and_solve(tied, jnp.concatenate([right[:, :POSE_SIZE].ravel(), ties.total(right[:, 6:]).ravel()]))
     pose, lens = step[: POSE_SIZE * cameras], step[POSE_SIZE * cameras :]
     return jnp.concatenate([pose.reshape(cameras, POSE_SIZE), ties.spread(lens.reshape(lenses, LENS_SIZE))], axis=1)

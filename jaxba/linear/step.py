@@ -1,4 +1,4 @@
-"""A damped step, what the linear model says about it, and what an iteration may cost."""
+"""The records of a damped step: the step with its linear model, and the limits on its cost in time."""
 
 from __future__ import annotations
 
@@ -9,24 +9,28 @@ from jaxtyping import Float, Int
 
 
 class Step(NamedTuple):
-    """A step and what the linear model says about it."""
+    """A damped step d and the terms of its linear model (lm/damped_step.py)."""
 
     cameras: Float[Array, "9 cameras"]  # in the coordinates of the options
     points: Float[Array, "3 points"]
-    # of the whole, or of every subproblem that is accepted by itself (refinement/subproblems.py):
-    slope: Float[Array, "*parts"]  # -g.d = d.(H + D) d, pixels^2
-    damped: Float[Array, "*parts"]  # d.D d, pixels^2; of a step that solves no system, what -g.d exceeds d.H d by
-    gradient_max: Float[Array, ""]  # largest entry of the gradient before the step
+    # for the whole problem, or one entry per subproblem that is accepted on its own (refinement/subproblems.py):
+    slope: Float[Array, "*parts"]  # -g.d, which is d.(H + D) d if the step solves the damped system; pixels^2
+    damped: Float[Array, "*parts"]  # -g.d - d.H d, which is d.D d if the step solves the damped system; pixels^2
+    gradient_max: Float[Array, ""]  # largest absolute gradient entry before the step
     cg_iterations: Int[Array, ""]  # 0 when the system was factored
-    forcing: Float[Array, ""]  # term by which they ended, 0 where that is not by one
+    forcing: Float[Array, ""]  # forcing term that stopped them; 0 for an exact solve
 
-    def predicted(self, share: Float[Array, "*parts"]) -> Float[Array, "*parts"]:
-        """Decrease of the cost that the linear model predicts for a fraction of the step, pixels^2."""
-        return share * (0.5 * share * self.damped + (1 - 0.5 * share) * self.slope)
+    def predicted(self, fraction: Float[Array, "*parts"]) -> Float[Array, "*parts"]:
+        """Decrease of the cost that the linear model predicts for `fraction * d`, pixels^2.
+
+        `m(0) - m(a d) = -a g.d - a^2 d.H d / 2`, written with `slope` and `damped`, which are not negative, so that
+        nothing cancels.
+        """
+        return fraction * (0.5 * fraction * self.damped + (1 - 0.5 * fraction) * self.slope)
 
 
 class Effort(NamedTuple):
-    """What an iteration may cost, for policies that decide it anew every time. Traced: changing it compiles nothing."""
+    """Limits of one iteration, for policies that choose them anew each time. Traced, so a change compiles nothing."""
 
-    point_iterations: Int[Array, ""]  # instead of Refinement.points where there are any, 0 to that
-    forcing: Float[Array, ""] | None  # instead of ConjugateGradients.forcing; None: that stays
+    point_iterations: Int[Array, ""]  # replaces Refinement.points, which is its maximum
+    forcing: Float[Array, ""] | None  # replaces ConjugateGradients.forcing; None: no change

@@ -1,12 +1,13 @@
-"""A two-level preconditioner whose coarse space is the motion of whole clusters of cameras.
+"""A two-level preconditioner whose coarse space is the rigid motion of clusters of cameras.
 
-What makes conjugate gradients slow on a long sequence are its smooth, nearly free deformations: neighbouring cameras
-move as one, points with them, and hardly any residual changes. Such motions are spanned by one similarity (rotation,
-translation, scale) for each cluster of cameras, to which a common change of focal length and distortion is added. With
-their ten columns per cluster in P, the preconditioner is `M^-1 = D^-1 + P (P^T S P)^-1 P^T`, D the block diagonal of S.
+    M^-1 = D^-1 + P (P^T S P)^-1 P^T,    D = the block diagonal of S.
 
-A similarity moves cameras and points together without changing a residual, so that `J_c P = -J_p [a x X, b, s X]`:
-the columns of S P come from the point Jacobians, no camera is differentiated anew.
+Conjugate gradients are slow on long sequences because of smooth deformations with small eigenvalues: neighbouring
+cameras and their points move together, and residuals hardly change. P spans such motions with ten columns per cluster:
+a similarity (rotation a, translation b, scale s) and a common change of f, k1 and k2.
+
+A similarity of cameras and points together changes no residual, so that `J_c P = -J_p [a x X, b, s X]`: the columns of
+`S P` follow from the point Jacobians.
 
 Source: additive two-level Schwarz with a Nicolaides coarse space (Toselli and Widlund 2005, section 3); Jian, Balcan
 and Dellaert 2011 and Kushal and Agarwal 2012 precondition the same system with subgraphs and clusters instead.
@@ -34,16 +35,16 @@ MODES = 10
 """Seven of a similarity, then focal length, k1 and k2."""
 
 SHIFT = 64.0
-"""Rounding units per coarse unknown added to the scaled diagonal: a cluster of one camera has nine unknowns only."""
-
+"""Machine epsilons per coarse unknown added to the unit diagonal of the scaled coarse system, which is singular where a
+cluster has one camera: ten columns for nine unknowns."""
 
 COARSE_PANEL = 256
-"""Columns of a panel of the coarse system's factor: with 1280 unknowns a step took as long as with panels of 128,
-within 2%, and a second less to compile."""
+"""Columns of a panel of the coarse factorisation. Measured with 1280 unknowns: steps as fast as with panels of 128,
+within 2%, and a second less of compilation."""
 
 
 class Anchor(NamedTuple):
-    """Where the cameras and points are, for the directions of the modes."""
+    """Current poses and points, at which the columns of P are computed."""
 
     rotation: Float[Array, "3 3 cameras"]
     translation: Float[Array, "3 cameras"]
@@ -51,17 +52,17 @@ class Anchor(NamedTuple):
 
 
 def camera_modes(layout: Layout, anchor: Anchor) -> Float[Array, "cameras 9 10"]:
-    """P: how each camera follows a motion of its cluster, in manifold coordinates; zero for unseen cameras.
+    """P: the step of each camera for a motion of its cluster, in manifold coordinates; zero for unseen cameras.
 
-    The world moves by `X <- exp(a) X + b`, then grows by `1 + s`; a camera that follows turns by `-R a` and shifts by
-    `-R b + s t`.
+    For the similarity `X <- (1 + s) (exp(a) X + b)` of the world, the camera step that keeps all projections is
+    `-R a` for the rotation and `-R b + s t` for the translation.
     """
-    turned = -jnp.moveaxis(anchor.rotation, -1, 0)
-    count = turned.shape[0]
-    zero = lambda *shape: jnp.zeros((count, *shape), turned.dtype)
-    rotation = jnp.concatenate([turned, zero(3, 7)], axis=2)
-    translation = jnp.concatenate([zero(3, 3), turned, anchor.translation.T[:, :, None], zero(3, 3)], axis=2)
-    lens = jnp.broadcast_to(jnp.eye(3, MODES, 7, dtype=turned.dtype), (count, 3, MODES))
+    minus_rotation = -jnp.moveaxis(anchor.rotation, -1, 0)
+    count = minus_rotation.shape[0]
+    zeros = lambda *shape: jnp.zeros((count, *shape), minus_rotation.dtype)
+    rotation = jnp.concatenate([minus_rotation, zeros(3, 7)], axis=2)
+    translation = jnp.concatenate([zeros(3, 3), minus_rotation, anchor.translation.T[:, :, None], zeros(3, 3)], axis=2)
+    lens = jnp.broadcast_to(jnp.eye(3, MODES, 7, dtype=minus_rotation.dtype), (count, 3, MODES))
     modes = jnp.concatenate([rotation, translation, lens], axis=1)
     return jnp.where(layout.camera_seen[:, None, None], modes, jnp.zeros_like(modes))
 
@@ -69,7 +70,7 @@ def camera_modes(layout: Layout, anchor: Anchor) -> Float[Array, "cameras 9 10"]
 def coarse_preconditioner(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, anchor: Anchor
 ) -> Callable[[Array], Array]:
-    """`P (P^T S P)^-1 P^T`; zero where the coarse system is not positive definite."""
+    """The product with `P (P^T S P)^-1 P^T`; zero if the coarse system is not positive definite."""
     clusters = _clusters(layout)
     modes = camera_modes(layout, anchor)
     matrix = coarse_system(layout, linear, points, system, anchor, modes)
@@ -79,13 +80,13 @@ def coarse_preconditioner(
     shift = jnp.where(diagonal > 0, SHIFT * unknowns * float(jnp.finfo(matrix.dtype).eps), 1.0)
     scaled = matrix * scale[:, None] * scale + jnp.diag(shift)
     panels = factor_panels(scaled, COARSE_PANEL)
-    found = jnp.isfinite(panels.inverses[-1]).all()  # what fails in one panel spoils all later ones
+    valid = jnp.isfinite(panels.inverses[-1]).all()  # a failed panel makes all later ones non-finite
 
     def apply(r: Array) -> Array:
         inner = cluster_sum(clusters, jnp.einsum("cam,ca->cm", modes, r))
-        moved = scale * panels.solve(scale * inner.reshape(-1))
-        moved = jnp.where(found, moved, jnp.zeros_like(moved)).reshape(-1, MODES)
-        return jnp.einsum("cam,cm->ca", modes, take_rows(moved, clusters.label))
+        coarse = scale * panels.solve(scale * inner.reshape(-1))
+        coarse = jnp.where(valid, coarse, jnp.zeros_like(coarse)).reshape(-1, MODES)
+        return jnp.einsum("cam,cm->ca", modes, take_rows(coarse, clusters.label))
 
     return apply
 
@@ -98,7 +99,7 @@ def coarse_system(
     anchor: Anchor,
     modes: Float[Array, "cameras 9 10"],
 ) -> Float[Array, "unknowns unknowns"]:
-    """The lower triangle of `P^T S P`, by clusters: `P^T B P` less the products of what clusters share by points."""
+    """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of clusters."""
     clusters = _clusters(layout)
     shared = pair_products(clusters.pairs, _shared_rows(layout, linear, points, anchor.points), MODES)
     own = jnp.einsum("cam,cab,cbn->cmn", modes, system.blocks, modes).reshape(-1, MODES * MODES)
@@ -109,7 +110,7 @@ def coarse_system(
 
 
 def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Float[Array, "clusters k"]:
-    """Sums the rows of each cluster's cameras."""
+    """The sum of the rows of each cluster's cameras."""
     padded = jnp.concatenate([rows, jnp.zeros((1, rows.shape[1]), rows.dtype)])
     return jnp.sum(take_rows(padded, clusters.members), axis=1)
 
@@ -117,9 +118,9 @@ def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Flo
 def _shared_rows(
     layout: Layout, linear: Linearization, points: PointSystem, positions: Float[Array, "3 points"]
 ) -> Float[Array, "coarse 30"]:
-    """`(J_c P)^T Q` summed over each cluster's view of each point, the point's index slow and the mode's fast.
+    """`(J_c P)^T Q`, transposed and flattened, summed over the observations of each point by each cluster.
 
-    All slots of one view share the point, so that only `J_p^T Q` and the lens columns are summed over slots.
+    These observations have the point X in common, so that only `J_p^T Q` and the columns of f, k1 and k2 are summed.
     """
     clusters = _clusters(layout)
     over, under = points.projected

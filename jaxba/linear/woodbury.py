@@ -1,13 +1,13 @@
-"""The reduced camera system of a scene with few points, solved by way of a matrix of the size of its points.
+"""The reduced camera system of a scene with few points, by Woodbury's identity.
 
-`S = B - W W^T` has a row per camera unknown, W a column per coordinate of each point. Where there are fewer columns
-than rows, S need not be formed: with `B = L L^T` block by block and `Z = L^-1 W`,
+`S = B - W W^T` has a row per camera unknown, and W has a column per coordinate of each point. With fewer columns than
+rows it is cheaper not to form S. With `B = L L^T` (block-diagonal) and `Z = L^-1 W`,
 
-    S^-1 b = L^-T (h + Z (I - Z^T Z)^-1 Z^T h),  h = L^-1 b,
+    S^-1 b = L^-T (h + Z (I - Z^T Z)^-1 Z^T h),    h = L^-1 b,
 
-so that only the capacitance matrix `I - Z^T Z` is factored. It has the eigenvalues of `L^-1 S L^-T` other than one, and
-is positive definite exactly where S is. In effect cameras are eliminated and not points: these are the steps of a
-Cholesky factorisation of `[[B, W], [W^T, I]]` from the top left, and as stable.
+so that only the capacitance matrix `I - Z^T Z` is factored. It is positive definite exactly if S is: its eigenvalues
+are those of `L^-1 S L^-T` other than one. In effect cameras are eliminated instead of points: the operations are those
+of a Cholesky factorisation of `[[B, W], [W^T, I]]`, and as stable.
 
 Source: Golub and Van Loan, "Matrix Computations", section 2.1.4 (Sherman-Morrison-Woodbury formula).
 """
@@ -27,16 +27,16 @@ def capacitance_solve(wide: Float[Array, "unknowns columns"], system: CameraSyst
     """Solves `(B - W W^T) x = b`.
 
     Args:
-        wide: W; rows are cameras' unknowns, camera by camera.
-        system: B and b.
+        wide: W; its rows are sorted by camera.
+        system: B, damping included, and b.
 
     Returns:
-        The camera step; not finite where the system is not positive definite.
+        The camera step; non-finite if S is not positive definite.
     """
     factor = jnp.linalg.cholesky(system.blocks, symmetrize_input=False)
     unit = jnp.broadcast_to(jnp.eye(9, dtype=factor.dtype), factor.shape)
     inverse = solve_triangular(factor, unit, lower=True)  # [cameras, 9, 9]
-    # products and not fused sums: XLA would make W anew for every row
+    # matmul instead of a fused sum: XLA would recompute W for every row of the result
     scaled = jnp.matmul(inverse, wide.reshape(len(inverse), 9, -1), precision="highest").reshape(wide.shape)
     half = jnp.matmul(inverse, system.right[:, :, None], precision="highest").reshape(-1)
     capacitance = jnp.eye(wide.shape[1], dtype=wide.dtype) - jnp.matmul(scaled.T, scaled, precision="highest")

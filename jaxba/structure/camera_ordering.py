@@ -1,7 +1,7 @@
-"""Orders of the cameras that gather the reduced camera system around its diagonal.
+"""Orderings of the cameras that make the reduced camera system a band matrix.
 
-A sequence of frames sees every point for a short while, so that in the right order of the cameras the system is a
-narrow band, and so is its Cholesky factor: `n b^2` operations instead of `n^3 / 3`.
+In an image sequence every point is seen for a few frames only. In the right order of the cameras the reduced camera
+system is then a narrow band of width b, and so is its Cholesky factor: `n b^2` operations instead of `n^3 / 3`.
 """
 
 from __future__ import annotations
@@ -15,44 +15,45 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from jaxba.typing import AnyArray, register_pytree
 
-MAX_BAND_SHARE = 1 / 3
-"""A band of `b` of `n` cameras is factored as one if `b / n` is below this. The two factorisations run at the same
-speed an operation (47 GFLOP/s on two cores), so that they break even at 1 / sqrt(6) = 0.41."""
+MAX_BAND_FRACTION = 1 / 3
+"""Largest `b / n` for which a system of n cameras is factored as a band of b. Both factorisations were measured at
+47 GFLOP/s on two cores, so that they break even at 1 / sqrt(6) = 0.41; the rest is overhead."""
 
 MIN_BAND_CAMERAS = 64
-"""Smaller systems are factored dense, in one or two milliseconds."""
+"""Smaller systems are factored dense, which takes one or two milliseconds."""
 
 TILE_CAMERAS = 11
-"""Cameras factored at once. From 4 to 11 the time was the same, larger tiles waste operations on the band's edge."""
+"""Cameras per tile. Measured: the same time from 4 to 11; larger tiles waste operations at the edge of the band."""
 
 
 @register_pytree
 @dataclass(frozen=True)
 class Band:
-    """The reduced camera system cut into tiles of `m` cameras, of which a row holds `span` up to the diagonal."""
+    """The reduced camera system in tiles of `m` cameras; a row of tiles ends with the one on the diagonal."""
 
     blocks: Int[AnyArray, "tiles m columns"]
-    """Block number of (camera of the tile row, camera of the row's tiles); the zero block elsewhere."""
+    """Index of the block of (camera of the tile row, camera of the row's tiles); the zero block where there is none."""
 
     camera: Int[AnyArray, "tiles m"]
-    """Camera at each place; the number of cameras in the padding."""
+    """Camera at each position of the ordering; the number of cameras in the padding."""
 
-    place: Int[AnyArray, " cameras"]
-    """Place of each camera, counted through all tiles."""
+    rank: Int[AnyArray, " cameras"]
+    """Position of each camera in the ordering, counted through all tiles."""
 
 
 def camera_order(
     rows: Int[np.ndarray, " blocks"], columns: Int[np.ndarray, " blocks"], cameras: int
 ) -> tuple[Int[np.ndarray, " cameras"], int]:
-    """The better of the given order and reverse Cuthill-McKee's.
+    """The given or the reverse Cuthill-McKee ordering, whichever has the smaller bandwidth.
 
     Args:
-        rows: camera of each block's rows.
+        rows: camera of the rows of each non-zero block.
         columns: camera of its columns; one triangle is enough.
         cameras: number of cameras.
 
     Returns:
-        The rank of each camera, and the largest distance in rank of two cameras that share a point.
+        The rank (position) of each camera, and the bandwidth: the largest difference in rank of two cameras that see a
+        point in common.
 
     Source: Cuthill and McKee 1969; reversed by George 1971.
     """
@@ -66,28 +67,28 @@ def camera_order(
 
 
 def is_banded(cameras: int, width: int) -> bool:
-    """Whether a band factorisation is worth its overhead."""
-    return cameras >= MIN_BAND_CAMERAS and width < MAX_BAND_SHARE * cameras
+    """Whether a system of bandwidth `width` is factored as a band."""
+    return cameras >= MIN_BAND_CAMERAS and width < MAX_BAND_FRACTION * cameras
 
 
 def band_of(
-    names: Int[np.ndarray, " blocks"], rank: Int[np.ndarray, " cameras"], width: int, tile: int = TILE_CAMERAS
+    keys: Int[np.ndarray, " blocks"], rank: Int[np.ndarray, " cameras"], width: int, tile: int = TILE_CAMERAS
 ) -> Band:
-    """Places blocks in tiles.
+    """Arranges the blocks of a band matrix in tiles.
 
     Args:
-        names: `row * cameras + column` in ranks, sorted, lower triangle; the position is the block's number.
-        rank: of each camera.
-        width: largest `row - column`.
-        tile: cameras a tile.
+        keys: `row * cameras + column` of each block in ranks, sorted, lower triangle.
+        rank: position of each camera.
+        width: bandwidth, the largest `row - column`.
+        tile: cameras per tile.
     """
     cameras = len(rank)
     tiles = -(-cameras // tile)
     before = min(-(-width // tile), tiles - 1)  # tiles left of the diagonal one
-    blocks = np.full((tiles, tile, (before + 1) * tile), len(names), np.int32)
-    row, column = np.divmod(names, cameras)
+    blocks = np.full((tiles, tile, (before + 1) * tile), len(keys), np.int32)
+    row, column = np.divmod(keys, cameras)
     at = row // tile
-    blocks[at, row % tile, column - (at - before) * tile] = np.arange(len(names))
+    blocks[at, row % tile, column - (at - before) * tile] = np.arange(len(keys))
     camera = np.full(tiles * tile, cameras, np.int32)
     camera[rank] = np.arange(cameras)
     return Band(blocks, camera.reshape(tiles, tile), rank.astype(np.int32))
