@@ -122,7 +122,7 @@ def decomposed_round(
     good, whole = found.accepted, step.predicted(jnp.ones_like(before))
     possible = jnp.isfinite(whole)
     sum_of = lambda values: jnp.sum(jnp.where(possible, values, 0))
-    shared = jnp.asarray(partition.separator)
+    shared = jnp.asarray(partition.is_shared)
     cameras = jnp.where(parts.of_cameras(good), found.cameras, cameras)
     points = jnp.where(parts.of_points(good) & ~shared, found.points, points)
     predicted = sum_of(jnp.where(good, found.predicted, whole))
@@ -161,7 +161,7 @@ def _cluster_steps(
     layout, partition = parts.layout, parts.partition
     coordinates, of_camera = RotationCoordinates.of(cameras, options), parts.of_cameras(dampings)
     eliminated = eliminate_points(layout, linear, parts.of_points(dampings), options)
-    free = take(jnp.where(partition.separator, 0, 1).astype(cameras.dtype), layout.slot_point)
+    free = take(jnp.where(partition.is_shared, 0, 1).astype(cameras.dtype), layout.slot_point)
     projected = [[free * entry for entry in row] for row in eliminated.projected]
     eliminated = eliminated._replace(projected=projected)
     system = camera_system(layout, linear, eliminated, coordinates, of_camera[:, None], options)
@@ -171,7 +171,7 @@ def _cluster_steps(
     solved = jnp.all(finite, axis=1)
     moves = jnp.where(layout.camera_seen[:, None] & parts.of_cameras(solved)[:, None], moves, 0)
     point_moves = jnp.stack(back_substitute(layout, linear, eliminated, moves))
-    point_moves = jnp.where(partition.separator | ~parts.of_points(solved), 0, point_moves)
+    point_moves = jnp.where(partition.is_shared | ~parts.of_points(solved), 0, point_moves)
     moved = jacobian_product(layout, linear, moves, point_moves)
     slopes = parts.sums(-(linear.residual[0] * moved[0] + linear.residual[1] * moved[1]))
     slopes = jnp.where(solved, slopes, jnp.nan)
@@ -200,14 +200,14 @@ def _separators(
         (inverse_depth,) = view_terms(layout, frames, points, lambda views: [views.projected().inverse_depth])
         previous = PreviousPoints.of(layout, points, inverse_depth)
         refined, costs = refine_points(layout, frames, points, options.loss, options.refinement.points, previous)
-        costs = jnp.where(partition.separator, costs, before)
-        return jnp.where(partition.separator, refined, points), total(costs)
+        costs = jnp.where(partition.is_shared, costs, before)
+        return jnp.where(partition.is_shared, refined, points), total(costs)
     matrix = entries[:6]
     for place in (0, 2, 5):
         matrix[place] = matrix[place] + damping_diagonal(matrix[place], damping, options)
     factor = cholesky3(matrix)
     step = jnp.stack(factor.backward(factor.forward(entries[6:])))
-    trial = points - jnp.where(partition.separator, step, 0)
+    trial = points - jnp.where(partition.is_shared, step, 0)
     costs = one_pass(trial, terms)[9]
     better = costs < before
     return jnp.where(better, trial, points), total(jnp.where(better, costs, before))

@@ -131,9 +131,9 @@ def eliminate_copies(
     gradient = jnp.where(damping >= CORRECTED_FROM, agreed, gradient)
     factor = cholesky3(matrix)
     solved = jnp.stack(factor.forward(list(gradient)))
-    at_slot = Cholesky3(*take(jnp.stack(factor), partition.copy))
+    at_slot = Cholesky3(*take(jnp.stack(factor), partition.slot_replica))
     projected = [at_slot.forward(row) for row in linear.point_jacobian]
-    return SplitSystem(projected, take_each(solved, partition.copy))
+    return SplitSystem(projected, take_each(solved, partition.slot_replica))
 
 
 def agreed_gradient(
@@ -147,7 +147,7 @@ def agreed_gradient(
     """
     count = tree_sum(jnp.asarray(layout.slot_mask, gradient.dtype)[:, None], partition.levels)[:, 0]
     share = jnp.where(count > 0, 1 / jnp.maximum(count, 1), 0)
-    per_slot = take(jnp.concatenate([gradient, diagonal]) * share, partition.copy) * layout.slot_mask
+    per_slot = take(jnp.concatenate([gradient, diagonal]) * share, partition.slot_replica) * layout.slot_mask
     by_slot = take(point_sum(layout, per_slot), layout.slot_point) * layout.slot_mask
     # back to copies, of which every slot knows the same: their mean
     ours = tree_sum(by_slot.T, partition.levels).T * share

@@ -132,7 +132,7 @@ class Clusters(NamedTuple):
         """See `Subproblems`."""
         if options.refinement.points:
             points, _ = _refined(self.layout, cameras, points, previous, options, search)
-            points = jnp.where(self.partition.separator, previous.points, points)
+            points = jnp.where(self.partition.is_shared, previous.points, points)
         return points, observation_costs(self.layout, cameras, points, options.loss)
 
     def sums(self, terms: Float[Array, " slots"]) -> Float[Array, " clusters"]:

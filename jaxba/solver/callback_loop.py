@@ -33,7 +33,7 @@ from jaxba.runtime.compilation import (
     program,
 )
 from jaxba.solver.loop import Carry, History, advance, begin, history_of, problem_info
-from jaxba.structure.layout import Layout, turns_of
+from jaxba.structure.layout import Layout, num_partitions
 
 
 class IterationRecord(NamedTuple):
@@ -84,7 +84,7 @@ class _Loop(NamedTuple):
             self.policy,
             self.tolerances,
             limit,
-            jnp.asarray(turns_of(self.layout)),
+            jnp.asarray(num_partitions(self.layout)),
         )
         carry, facts = call(program(_advance_and_tell, level="quick"), *own)
         return carry._replace(state=state), step, facts

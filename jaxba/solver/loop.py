@@ -17,7 +17,7 @@ from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, with_free_lenses
 from jaxba.problem.options import StepOptions
-from jaxba.structure.layout import Layout, turns_of
+from jaxba.structure.layout import Layout, num_partitions
 from jaxba.structure.segment_sums import point_sum
 from jaxba.typing import AnyArray
 
@@ -82,7 +82,7 @@ def after_step(
 ) -> tuple[Any, Float[Array, ""], Int[Array, ""]]:
     """The policy's answer to a step, and the stop rules: its next state, the next lambda, a `Termination`.
 
-    `turns` is `layout.turns_of`: with several, the next step is another one though nothing has changed.
+    `turns` is `layout.num_partitions`: with several, the next step is another one though nothing has changed.
     """
     after, damping = policy.propose(policy_state, step)
     # the same state and lambda after a rejection: the policy would ask for the same step for ever
@@ -160,6 +160,6 @@ def solve_loop(
         carry, history = loop
         state, step = step_of(carry)
         history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, history_of(step))
-        return advance(carry, state, step, policy, tolerances, most, turns_of(layout)), history
+        return advance(carry, state, step, policy, tolerances, most, num_partitions(layout)), history
 
     return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))

@@ -1,9 +1,9 @@
-"""The two conventions of arrays, and the only functions that lead from one to the other.
+"""The two axis orders of arrays, and the functions that convert between them.
 
-State, camera model and everything that runs over observations keep the components first: cameras are `[9, cameras]`,
-points `[3, points]`, so that every component is one contiguous vector. Linear algebra keeps the items first: steps,
-gradients and right-hand sides of the reduced camera system are `[cameras, 9]`, blocks `[cameras, 9, 9]`, and so are the
-arrays of a `BundleProblem`.
+The state, the camera model and all arrays over observations are components-first: cameras are `[9, cameras]`, points
+`[3, points]`, so that every component is a contiguous vector. Linear algebra is items-first: steps, gradients and
+right-hand sides of the reduced camera system are `[cameras, 9]`, its blocks `[cameras, 9, 9]`. The arrays of a
+`BundleProblem` are items-first, too.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ AnArray = TypeVar("AnArray", np.ndarray, Array)
 
 
 def components_first(items: AnArray) -> AnArray:
-    """`[items, components]` as `[components, items]`."""
+    """`[items, components]` to `[components, items]`."""
     return items.T
 
 
 def items_first(components: AnArray) -> AnArray:
-    """`[components, items]` as `[items, components]`."""
+    """`[components, items]` to `[items, components]`."""
     return components.T

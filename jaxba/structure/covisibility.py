@@ -1,7 +1,8 @@
-"""Which pairs of observations multiply into which block of the reduced camera system.
+"""Co-visibility: the pairs of observations of one point that form each block of the reduced camera system.
 
-Observations are named by their place in the order of the cameras (structure/layout.py): a block reads two short
-stretches of memory then, where its observations would be scattered over all slots.
+A pair of observations of one point by cameras j and k adds a product to block (j, k). Observations are referred to by
+their camera-sorted index (structure/layout.py): a block then reads two short ranges of memory, while its slots are
+scattered.
 """
 
 from __future__ import annotations
@@ -18,61 +19,62 @@ from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, sorted_b
 from jaxba.typing import AnyArray, register_pytree
 
 PAIR_CHUNKS = (4, 8)
-"""Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
+"""Candidate chunk widths: pairs of one block that are multiplied and summed together."""
 
 PAIR_BATCH = 2048
-"""Most chunks multiplied at once: bounds the gathered operands to 7 MB and the products to 1.3 MB, which stay in
+"""Most chunks per batch. It bounds the gathered operands to 7 MB and the products to 1.3 MB, so that they stay in the
 cache."""
 
-MOST_COUNTED = 1 << 18
-"""Numbers of blocks, empty ones included, up to which pairs are counted for each: the counts stay in the cache."""
+MAX_COUNTED_BLOCKS = 1 << 18
+"""Largest number of possible blocks, cameras squared, for which pairs are sorted by counting: the counts fit the
+cache."""
 
 PAIR_ITEM_COST = 1.5
-"""Cost of one partial 9 x 9 block, in pairs; decides between few long and many short chunks."""
+"""Cost of one partial 9 x 9 block in units of a pair, measured; it decides the chunk width."""
 
 
 @register_pytree
 @dataclass(frozen=True)
 class PairLayout:
-    """Which observations multiply into which block of the reduced camera system (lower triangle)."""
+    """The pairs of observations of each block of the reduced camera system, lower triangle."""
 
     left: Int[AnyArray, "batches chunks width"]
-    """Place of the view by the block row's camera."""
+    """Camera-sorted index of the observation by the camera of the block's rows."""
 
     right: Int[AnyArray, "batches chunks width"]
-    """Place of the view of the same point by the block column's camera."""
+    """Camera-sorted index of the observation of the same point by the camera of the block's columns."""
 
     sums: Int[AnyArray, "batches partial width_of_sums"]
-    """Chunks of the batch that are summed at once: those of one block. The last one of a batch is all padding."""
+    """Chunks of a batch that belong to one block and are summed together. The last row of a batch is padding."""
 
     levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Tree from the partial sums of all batches to blocks; the last block is always zero."""
+    """Summation tree from the partial sums of all batches to blocks; the last block is always zero."""
 
     block_camera: Int[AnyArray, " blocks"]
-    """Camera of a block on the diagonal; the number of cameras for the others."""
+    """Camera of each diagonal block; the number of cameras for other blocks."""
 
     block_row: Int[AnyArray, " blocks"]
-    """Camera of a block's rows."""
+    """Camera of the rows of each block."""
 
     block_column: Int[AnyArray, " blocks"]
-    """Camera of a block's columns."""
+    """Camera of the columns of each block."""
 
     product_levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Tree to cameras from the products of blocks with their columns, then of mirrored blocks with their rows."""
+    """Summation tree to cameras of `S x`: from the products of blocks, followed by those of transposed blocks."""
 
     diagonal: Int[AnyArray, " cameras"]
-    """Number of each camera's block on the diagonal."""
+    """Index of the diagonal block of each camera."""
 
     table: Int[AnyArray, "cameras cameras"] | None
-    """Block number of (row, column) in the lower triangle, the zero block elsewhere; for a dense factorisation."""
+    """Index of the block of (row, column) in the lower triangle, else of the zero block; for a dense factorisation."""
 
     band: Band | None
-    """Where a band is factored instead."""
+    """For a band factorisation instead; None if the system is not factored as a band."""
 
 
 def pair_layout(
     camera: np.ndarray,
-    place: np.ndarray,
+    row_index: np.ndarray,
     tracks: np.ndarray,
     start: np.ndarray,
     cameras: int,
@@ -82,23 +84,24 @@ def pair_layout(
     banded: bool = True,
     capacity: Capacity | None = None,
 ) -> PairLayout:
-    """Lists all pairs of observations of one point, sorted by the block they add to.
+    """Lists all pairs of observations of one point, sorted by the block that they add to.
 
     Args:
-        camera: of each observation; those of one point stand together.
-        place: of each observation among the rows that are to be multiplied.
-        tracks: observations of each point.
-        start: number of each point's first observation.
+        camera: camera of each observation; observations are sorted by point.
+        row_index: row of each observation among those that are multiplied (its camera-sorted index).
+        tracks: number of observations of each point.
+        start: position of the first observation of each point.
         cameras: number of cameras.
-        empty: a place whose row is zero.
+        empty: index of a row of zeros.
         factor: whether the system will be factored.
         banded: whether it may be factored as a band, where that is cheaper.
-        capacity: makes all shapes follow from it: every block of the lower triangle is there, and no band.
+        capacity: fixed sizes from which all shapes follow: every block of the lower triangle is listed, and no band is
+            used.
     """
-    camera, place = camera.astype(np.int32), place.astype(np.int32)
+    camera, row_index = camera.astype(np.int32), row_index.astype(np.int32)
     left, right = _pairs_of_tracks(tracks, start)
     rows, columns = camera[left], camera[right]
-    # a camera that sees a point twice: both orders add to the same diagonal block
+    # if a camera sees a point twice, both orders of the pair add to the same diagonal block
     twice = np.flatnonzero(rows == columns)
     twice = twice[left[twice] != right[twice]]
     if twice.size:
@@ -106,12 +109,12 @@ def pair_layout(
         rows, columns = np.concatenate([rows, columns[twice]]), np.concatenate([columns, rows[twice]])
     rank, reach = np.arange(cameras), cameras
     if capacity is None and factor and banded and cameras >= MIN_BAND_CAMERAS:
-        there = np.zeros((cameras, cameras), bool)
-        there[rows, columns] = True
-        row, column = np.nonzero(there)
+        covisible = np.zeros((cameras, cameras), bool)
+        covisible[rows, columns] = True
+        row, column = np.nonzero(covisible)
         rank, reach = camera_order(row, column, cameras)
     banded = banded and is_banded(cameras, reach)
-    if banded:  # from here on cameras go by their rank, and the lower triangle is that of the ranks
+    if banded:  # from here on rows and columns are ranks of cameras, and the lower triangle is that of the ranks
         ranks = rank.astype(np.int32)
         rows, columns = ranks[rows], ranks[columns]
         swap = rows < columns
@@ -119,42 +122,42 @@ def pair_layout(
         rows, columns = np.maximum(rows, columns), np.minimum(rows, columns)
     else:
         rank = np.arange(cameras)
-    blocks = _Blocks.of(rows, columns, cameras)
+    blocks = _BlockList.of(rows, columns, cameras)
     if capacity is not None:
         blocks = blocks.with_all(cameras)
-    names, counts, order = blocks
+    keys, counts, order = blocks
     diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
     room = None if capacity is None else room_for(counts, capacity.pairs, capacity.points)
-    number_of = lambda w: int((-(-counts // w)).sum()) if room is None else chunks_at_most(room.items, len(names), w)
+    number_of = lambda w: int((-(-counts // w)).sum()) if room is None else chunks_at_most(room.items, len(keys), w)
     width = min(PAIR_CHUNKS, key=lambda w: number_of(w) * (w + PAIR_ITEM_COST))
     width = max(1, min(width, int(counts.max()) if room is None else room.most))
     chunks = -(-counts // width)
-    # where each pair goes, in the order of the blocks: those of a block stand together, and begin a row
+    # position of each pair in the chunks: pairs of one block are contiguous, and a block starts a new chunk
     shift = width * (np.cumsum(chunks) - chunks) - (np.cumsum(counts) - counts)
     position = np.repeat(shift.astype(np.int32), counts) + np.arange(len(left), dtype=np.int32)
-    most = int(chunks.sum()) if room is None else number_of(width)  # chunks for which there is room
+    most = int(chunks.sum()) if room is None else number_of(width)  # largest number of chunks
     batches = max(1, -(-most // (PAIR_BATCH - 1)))
-    batch = max(1, -(-most // batches))  # chunks of a batch; one more is all padding
+    batch = max(1, -(-most // batches))  # chunks of a batch, without the one that is padding
     position += position // (width * batch) * width
     padded = []
     for side in (left, right):
         array = np.full(batches * (batch + 1) * width, empty, np.int32)
-        array[position] = place[side[order]]
+        array[position] = row_index[side[order]]
         padded.append(array.reshape(batches, batch + 1, width))
     sums, levels = _batch_sums(chunks, batches, batch, None if room is None else -(-room.most // width))
     table = None
     if factor and not banded:
-        table = np.full(cameras * cameras, len(names), np.int32)
-        table[names] = np.arange(len(names))
+        table = np.full(cameras * cameras, len(keys), np.int32)
+        table[keys] = np.arange(len(keys))
         table = table.reshape(cameras, cameras)
     by_rank = np.argsort(rank)
-    on_diagonal = np.searchsorted(names, diagonal)[rank]
-    block_camera = np.full(len(names) + 1, cameras, np.int32)
+    on_diagonal = np.searchsorted(keys, diagonal)[rank]
+    block_camera = np.full(len(keys) + 1, cameras, np.int32)
     block_camera[on_diagonal] = np.arange(cameras)
-    block_row, block_column = (np.append(by_rank[part], 0).astype(np.int32) for part in np.divmod(names, cameras))
+    block_row, block_column = (np.append(by_rank[part], 0).astype(np.int32) for part in np.divmod(keys, cameras))
     mirrored = np.flatnonzero(block_row[:-1] != block_column[:-1])
     targets = np.concatenate([block_row[:-1], block_column[mirrored]])
-    items = np.concatenate([np.arange(len(names)), len(names) + 1 + mirrored])
+    items = np.concatenate([np.arange(len(keys)), len(keys) + 1 + mirrored])
     by_target = np.argsort(targets, kind="stable")
     return PairLayout(
         left=padded[0],
@@ -164,17 +167,17 @@ def pair_layout(
         block_camera=block_camera,
         block_row=block_row,
         block_column=block_column,
-        product_levels=sum_tree(items[by_target], np.bincount(targets, minlength=cameras), len(names), TREE_WIDTH),
+        product_levels=sum_tree(items[by_target], np.bincount(targets, minlength=cameras), len(keys), TREE_WIDTH),
         diagonal=on_diagonal.astype(np.int32),
         table=table,
-        band=band_of(names, rank, reach) if banded else None,
+        band=band_of(keys, rank, reach) if banded else None,
     )
 
 
 def _pairs_of_tracks(
     tracks: Int[np.ndarray, " points"], start: Int[np.ndarray, " starts"]
 ) -> tuple[Int[np.ndarray, " pairs"], Int[np.ndarray, " pairs"]]:
-    """All pairs of observations of one point, the later or same one first; points of equal track length together."""
+    """All pairs of observations of one point, the later (or same) one first; points are grouped by track length."""
     lengths = np.bincount(tracks)
     total = int(lengths @ (np.arange(len(lengths)) * np.arange(1, len(lengths) + 1) // 2))
     left, right = np.empty(total, np.int32), np.empty(total, np.int32)
@@ -194,77 +197,77 @@ def _pairs_of_tracks(
 def _batch_sums(
     chunks: Int[np.ndarray, " blocks"], batches: int, batch: int, most: int | None
 ) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...]]:
-    """What is summed within each batch, and the tree from there to the blocks and one more that is empty.
+    """Partial sums within each batch, and the summation tree from these to the blocks and one more that is empty.
 
     Args:
-        chunks: of each block, one block after the other.
+        chunks: number of chunks of each block; those of one block are contiguous.
         batches: number of batches.
-        batch: chunks of each.
-        most: chunks of a block at most, where all shapes are to follow from that and the numbers above; else None.
+        batch: number of chunks of a batch.
+        most: largest number of chunks of a block, if all shapes shall follow from that and from the numbers above.
     """
     block = np.repeat(np.arange(len(chunks)), chunks)
-    home, place = np.divmod(np.arange(len(block)), batch)
-    run = (np.diff(block, prepend=-1) != 0) | (place == 0)  # chunks of one block within one batch begin here
-    within = _since(run)
-    begins = within % TREE_WIDTH == 0
-    owner, target = home[begins], block[begins]  # of each partial sum
-    counts = np.bincount(owner, minlength=batches)
+    own_batch, position = np.divmod(np.arange(len(block)), batch)
+    is_start = (np.diff(block, prepend=-1) != 0) | (position == 0)  # first chunk of a block within a batch
+    within = _since(is_start)
+    starts_sum = within % TREE_WIDTH == 0
+    sum_batch, target = own_batch[starts_sum], block[starts_sum]  # batch and block of each partial sum
+    counts = np.bincount(sum_batch, minlength=batches)
     partial = int(counts.max()) if most is None else chunks_at_most(batch, len(chunks), TREE_WIDTH)
-    number = _since(np.diff(owner, prepend=-1) != 0)
+    number = _since(np.diff(sum_batch, prepend=-1) != 0)
     sums = np.full((batches, partial + 1, TREE_WIDTH), batch, np.int32)
-    sums[home, number[np.cumsum(begins) - 1], within % TREE_WIDTH] = place
+    sums[own_batch, number[np.cumsum(starts_sum) - 1], within % TREE_WIDTH] = position
     room = None
     if most is not None:
-        touched = min(batches, (most - 1) // batch + 2)  # batches among which the chunks of one block can be
+        touched = min(batches, (most - 1) // batch + 2)  # most batches over which the chunks of one block are spread
         room = Room(batches * partial, chunks_at_most(most, touched, TREE_WIDTH))
     counts = np.bincount(target, minlength=len(chunks) + 1)
-    return sums, sum_tree(owner * (partial + 1) + number, counts, batches * (partial + 1) - 1, TREE_WIDTH, room)
+    return sums, sum_tree(sum_batch * (partial + 1) + number, counts, batches * (partial + 1) - 1, TREE_WIDTH, room)
 
 
 def _since(marks: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """How many places each one is past the last mark; the first is marked."""
+    """Distance of each position from the last mark before it; the first position is marked."""
     first = np.flatnonzero(marks)
     return np.arange(len(marks)) - np.repeat(first, np.diff(first, append=len(marks)))
 
 
-class _Blocks(NamedTuple):
-    """Which blocks of the lower triangle there are, and which pairs add to them."""
+class _BlockList(NamedTuple):
+    """The non-zero blocks of the lower triangle, and the pairs that add to them."""
 
-    names: Int[np.ndarray, " blocks"]
-    """`row * cameras + column`, sorted; all on the diagonal are there."""
+    keys: Int[np.ndarray, " blocks"]
+    """`row * cameras + column` of each block, sorted; all diagonal blocks are listed."""
 
     counts: Int[np.ndarray, " blocks"]
-    """Pairs of each."""
+    """Number of pairs of each block."""
 
     order: Int[np.ndarray, " pairs"]
-    """Pairs in the order of their blocks, and as they were given within one."""
+    """Pairs sorted by block; the sort is stable."""
 
     @classmethod
-    def of(cls, rows: Int[np.ndarray, " pairs"], columns: Int[np.ndarray, " pairs"], cameras: int) -> _Blocks:
-        """Sorts pairs by the block of each."""
+    def of(cls, rows: Int[np.ndarray, " pairs"], columns: Int[np.ndarray, " pairs"], cameras: int) -> _BlockList:
+        """Sorts pairs by their blocks."""
         diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
-        if cameras**2 <= MOST_COUNTED:
-            keys = rows * np.int32(cameras) + columns
-            counts = np.bincount(keys, minlength=cameras**2)
+        if cameras**2 <= MAX_COUNTED_BLOCKS:
+            pair_keys = rows * np.int32(cameras) + columns
+            counts = np.bincount(pair_keys, minlength=cameras**2)
             listed = counts > 0
             listed[diagonal] = True
-            names = np.flatnonzero(listed)
-            return cls(names, counts[names], sorted_by(keys, cameras**2))
+            keys = np.flatnonzero(listed)
+            return cls(keys, counts[keys], sorted_by(pair_keys, cameras**2))
         # by column, then by row
         order = sorted_by(columns, cameras)
         order = order[sorted_by(rows[order], cameras)]
-        names = rows[order].astype(np.int64) * cameras + columns[order]
-        first = np.flatnonzero(np.diff(names, prepend=-1))
-        counts = np.diff(first, append=len(names))
-        return cls(names[first], counts, order).with_these(diagonal)
+        keys = rows[order].astype(np.int64) * cameras + columns[order]
+        first = np.flatnonzero(np.diff(keys, prepend=-1))
+        counts = np.diff(first, append=len(keys))
+        return cls(keys[first], counts, order).with_these(diagonal)
 
-    def with_these(self, wanted: Int[np.ndarray, " more"]) -> _Blocks:
-        """The same with further blocks, to which no pair adds."""
-        names = np.union1d(self.names, wanted)
-        counts = np.zeros(len(names), np.int64)
-        counts[np.searchsorted(names, self.names)] = self.counts
-        return self._replace(names=names, counts=counts)
+    def with_these(self, wanted: Int[np.ndarray, " more"]) -> _BlockList:
+        """The same list with further blocks, which have no pairs."""
+        keys = np.union1d(self.keys, wanted)
+        counts = np.zeros(len(keys), np.int64)
+        counts[np.searchsorted(keys, self.keys)] = self.counts
+        return self._replace(keys=keys, counts=counts)
 
-    def with_all(self, cameras: int) -> _Blocks:
-        """The same with every block of the lower triangle."""
+    def with_all(self, cameras: int) -> _BlockList:
+        """The same list with every block of the lower triangle."""
         return self.with_these(np.ravel_multi_index(np.tril_indices(cameras), (cameras, cameras)))

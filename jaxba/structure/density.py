@@ -1,57 +1,58 @@
-"""Whether the reduced camera system is better made of one dense product than of chosen pairs of observations."""
+"""When the reduced camera system is formed by one dense matrix product instead of from pairs of observations.
+
+Two cases: nearly every camera sees nearly every point, or there are few points (calibration boards, hand-set markers),
+where Woodbury's identity replaces the system by one of the size of the points (linear/woodbury.py).
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-DENSE_SHARE = 0.1
-"""Pairs per point and pair of cameras from which on a dense product forms the system: it runs 17 times as fast an
-operation as the products of chosen pairs, and doubles each of them."""
+MIN_DENSITY = 0.1
+"""Fraction of non-zero products from which a dense matrix product is cheaper. Measured: it is 17 times as fast per
+operation as products of listed pairs, and computes each of them twice."""
 
 DENSE_UNKNOWNS = 512
-"""Larger systems are formed from pairs, but where points are few: the dense operand takes 72 bytes a point and unknown.
-It is the most columns of a capacitance matrix besides, which LAPACK factors in a millisecond."""
+"""Largest system that is formed by a dense product; the operand takes 72 bytes per point and camera unknown. Also the
+largest capacitance matrix of Woodbury's identity, which LAPACK factors in a millisecond."""
 
-LARGEST_SHARE = 2 / 3
-"""Coordinates of points over unknowns of cameras up to which the capacitance matrix is the cheaper one: of 10 or 40
-cameras alone the time of both was equal near 0.7, in batches of 256 scenes near 0.85."""
+MAX_POINT_RATIO = 2 / 3
+"""Point coordinates over camera unknowns up to which Woodbury's identity is used. Measured break-even: 0.7 for single
+problems of 10 and 40 cameras, 0.85 for batches of 256 scenes."""
 
 
 def has_few_points(points: int, cameras: int) -> bool:
-    """Whether the points, padding included, are few enough beside the cameras for `capacitance_solve`."""
-    return 3 * points <= LARGEST_SHARE * 9 * cameras
+    """Whether points, including padding, are few enough relative to cameras for Woodbury's identity to be cheaper."""
+    return 3 * points <= MAX_POINT_RATIO * 9 * cameras
 
 
 def has_small_capacitance(columns: int, cameras: int) -> bool:
-    """Whether, moreover, they are so few that their matrix is the whole cost, whoever sees them."""
+    """Whether, in addition, the capacitance matrix is so small that it pays however few observations there are."""
     return 3 * columns <= DENSE_UNKNOWNS and has_few_points(columns, cameras)
 
 
 def has_dense_shape(tracks: np.ndarray, cameras: int, columns: int) -> bool:
-    """`is_dense`, as far as lengths of tracks tell it: if no camera sees a point twice.
+    """`is_dense` from track lengths alone, for a problem in which no camera sees a point twice.
 
     Args:
-        tracks: observations of each point.
+        tracks: number of observations of each point.
         cameras: number of cameras.
-        columns: points in layout order, padding included.
+        columns: number of points in layout order, including padding.
     """
     pairs = float(np.sum(tracks * (tracks + 1.0)) / 2)
-    dense = 9 * cameras <= DENSE_UNKNOWNS and pairs > DENSE_SHARE * np.count_nonzero(tracks) * cameras**2
+    dense = 9 * cameras <= DENSE_UNKNOWNS and pairs > MIN_DENSITY * np.count_nonzero(tracks) * cameras**2
     return bool(dense or has_small_capacitance(columns, cameras))
 
 
 def is_dense(camera: np.ndarray, point: np.ndarray, tracks: np.ndarray, cameras: int, columns: int) -> bool:
-    """Whether one dense product is cheaper than chosen pairs.
-
-    So it is where nearly every camera sees nearly every point; and where there are few points in all, such as the
-    corners of a calibration board or hand-set markers, whoever sees them.
+    """Whether one dense product is cheaper than listed pairs. Impossible if a camera sees a point twice.
 
     Args:
-        camera: of each observation, sorted by point, then by camera.
-        point: of each observation.
-        tracks: observations of each point.
+        camera: camera of each observation; observations are sorted by point, then by camera.
+        point: point of each observation.
+        tracks: number of observations of each point.
         cameras: number of cameras.
-        columns: points in layout order, padding included.
+        columns: number of points in layout order, including padding.
     """
     if not has_dense_shape(tracks, cameras, columns):
         return False

@@ -1,13 +1,20 @@
-"""Static index arrays that turn a problem's sparse sums into dense ones.
+"""The layout of a problem: index arrays that turn its sparse sums into dense ones.
 
-A *slot* holds one observation. Points are put in buckets by track length, in tiles of `n`; a tile of points with
-up to `t` observations owns `t x n` slots, so the sum over a point's observations is a dense sum over
-`t`. Sums over a camera, or over a block of the reduced camera system, are trees: rows are gathered in
-chunks of fixed width that belong to one target, summed densely, and the partial sums again, until one row
-a target is left. Nothing is ever scattered. Padding points at a slot without observation, whose values are
-exactly zero. Where sizes are padded (structure/padding.py) there are no buckets, and sums over points are trees too.
+An *observation slot*, slot for short, is a position in the arrays over observations; it holds one observation or is
+empty. Points with similar numbers of observations form a bucket; in a bucket, `n` points with up to `t` observations
+each own a tile of `t x n` slots, so that the sum over the observations of a point is a dense sum over `t`
+(structure/track_buckets.py).
 
-Everything is made once per problem on the host with vectorised NumPy.
+Sums over a camera, or over a block of the reduced camera system, are *summation trees* (structure/sum_trees.py): rows
+are gathered in chunks of fixed width that belong to one target and summed densely, then the partial sums in the same
+way, until there is one row per target. There are no scatter operations. Padding of the index arrays refers to an empty
+slot, whose values are exactly zero.
+
+The rows of the first level of the camera tree list the slots sorted by camera. The position of a slot in this list is
+its *camera-sorted index*.
+
+With a fixed capacity (structure/padding.py) there are no buckets, and sums over points are summation trees as well.
+Everything is computed once per problem, on the host, with vectorised NumPy.
 """
 
 from __future__ import annotations
@@ -31,17 +38,19 @@ from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 from jaxba.typing import AnyArray, register_pytree
 
 CAMERA_CHUNK = 8
-"""Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
+"""Observations per chunk of a camera. Their products are unrolled, so this number decides the size of the program."""
 
 
 @register_pytree
 @dataclass(frozen=True)
 class Layout:
-    """A problem's observations in slot order, and how to sum them."""
+    """A problem's observations in slot order, with the index arrays of their sums. Its points are in *layout order*."""
 
     slot_camera: Int[AnyArray, " slots"]
+    """Camera of each slot."""
+
     slot_point: Int[AnyArray, " slots"]
-    """Column of the point in layout order."""
+    """Point of each slot, in layout order."""
 
     slot_mask: Bool[AnyArray, " slots"]
     """Whether the slot holds an observation."""
@@ -53,50 +62,50 @@ class Layout:
     """`Sigma^(-1/2)` of each observation."""
 
     bucket_points: tuple[Int[AnyArray, " _"], ...]
-    """Problem index of the points of each bucket; padding repeats an index out of range."""
+    """Index in the problem of the points of each bucket; padding points have an index out of range."""
 
     point_levels: tuple[Int[AnyArray, "_ _"], ...] | None
-    """Tree from slots to points where sizes are padded (structure/padding.py); buckets are summed as they stand."""
+    """Summation tree from slots to points of a layout with fixed capacity; None for buckets."""
 
     camera_levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Tree from slots to cameras. The rows of its first level, one after the other, are the *order of the cameras*; an
-    empty slot is among them."""
+    """Summation tree from slots to cameras. The flattened first level sorts the slots by camera and contains an empty
+    one."""
 
     camera_seen: Bool[AnyArray, " cameras"]
-    """Cameras with at least one observation; the others never move."""
+    """Cameras with at least one observation; the others are not optimised."""
 
     pairs: PairLayout | None
-    """None where the reduced camera system is never formed."""
+    """Pairs of observations that form the reduced camera system; None if it is not formed from them."""
 
     grid: Int[AnyArray, "points cameras"] | None
-    """Slot of each point's view by each camera, an empty one elsewhere: where the reduced camera system is one product
-    of dense matrices."""
+    """Slot of the observation of each point by each camera, an empty slot if there is none. Only where the reduced
+    camera system is formed as one dense matrix product."""
 
     clusters: ClusterLayout | None
-    """None where nothing asks for a coarse system."""
+    """Clusters of the two-level preconditioner; None if it is not used."""
 
     partitions: Partition | None
-    """Random clusterings, one behind the other; None where no method asks for them."""
+    """Random partitions of the cameras, along a leading axis; None if no method uses them."""
 
     lenses: LensTies | None
-    """None where every camera has a lens of its own, all of it free."""
+    """Shared and fixed intrinsics; None if every camera has its own intrinsics and optimises all of them."""
 
     buckets: tuple[Bucket, ...] = field(metadata={"static": True})
-    """Empty where sizes are padded."""
+    """Shape of each bucket; empty for a layout with fixed capacity."""
 
     @property
     def num_slots(self) -> int:
-        """Slots, empty ones included."""
+        """Number of slots, including empty ones."""
         return self.slot_camera.shape[-1]
 
     @property
     def num_points(self) -> int:
-        """Points in layout order, padding included."""
+        """Number of points in layout order, including padding."""
         return sum(members.shape[-1] for members in self.bucket_points)
 
     @property
     def num_cameras(self) -> int:
-        """Cameras, observed or not."""
+        """Number of cameras, observed or not."""
         return self.camera_seen.shape[-1]
 
 
@@ -112,29 +121,29 @@ def build_layout(
     lenses: bool = True,
     observations: ObservationOrder | None = None,
 ) -> Layout:
-    """Sorts a problem's observations into slots.
+    """Assigns a problem's observations to slots and builds the index arrays of their sums.
 
     Args:
         problem: a checked problem; host arrays.
-        pairs: whether to list the pairs that form the explicit reduced camera system. Their number is
-            the sum of t (t + 1) / 2 over track lengths t.
+        pairs: whether to list the pairs of observations that form the reduced camera system. Their number is the sum
+            of `t (t + 1) / 2` over track lengths t.
         factor: whether that system will be factored, which takes a table of its blocks, dense or banded.
-        clusters: whether to group cameras for the two-level preconditioner.
-        grid: whether a factored system may be formed as one dense product, where nearly all cameras see nearly all
-            points; pairs are not listed then.
-        partitions: cameras of a cluster at most, to draw random partitions of the cameras; needs pairs.
-        capacity: pads all sizes, for a system that is factored: no clusters, no partitions. Where the system is a band,
-            it is factored dense all the same.
-        lenses: whether the problem's lenses count; not where intrinsics are fixed.
-        observations: of the problem, where they are sorted already.
+        clusters: whether to cluster cameras for the two-level preconditioner.
+        grid: whether a factored system may be formed as one dense matrix product instead of from pairs, where that is
+            cheaper (structure/density.py).
+        partitions: largest number of cameras in a cluster, to draw random partitions of the cameras; needs pairs.
+        capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it is a band.
+        lenses: whether the problem's lenses matter; they do not if all intrinsics are fixed.
+        observations: the sorted observations of the problem, if they are known already.
 
     Returns:
-        A pytree of NumPy arrays; shapes depend on the problem only through sizes and track lengths. Those of a padded
-        layout follow from the capacity and whether there is whitening, whether the system is one dense product
-        (`is_dense`) and whether a camera sees points twice so often that a tree needs more levels (`room_for`).
+        A pytree of NumPy arrays. Without a capacity, its shapes follow from the sizes and track lengths of the problem.
+        With one they follow from the capacity, from whether there is whitening, from whether the system is one dense
+        product (`is_dense`), and from whether cameras see points twice so often that a tree needs more levels
+        (`room_for`).
 
     Raises:
-        ValueError: parts that do not go together, or a problem larger than the capacity.
+        ValueError: arguments that exclude each other, or a problem larger than the capacity.
     """
     if capacity is not None and (clusters or partitions is not None or not factor):
         raise ValueError("only layouts for a factored system are padded: no clusters, no partitions, factor=True")
@@ -170,13 +179,13 @@ def build_layout(
     listed = None
     ties = lens_ties(problem.lenses, seen > 0) if lenses and problem.lenses is not None else None
     if pairs and table is None:
-        banded = ties is None or not ties.shared  # a shared lens couples cameras that have no point in common
+        banded = ties is None or not ties.shared  # a shared lens couples cameras without common points
         ordered = camera_levels[0].ravel()
-        place = np.zeros(slots, np.int32)
-        place[ordered] = np.arange(len(ordered))
-        spare = int(place[empty])
+        sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot
+        sorted_index[ordered] = np.arange(len(ordered))
+        spare = int(sorted_index[empty])
         listed = pair_layout(
-            camera, place[slot], tracks, start, cameras, spare, factor=factor, banded=banded, capacity=capacity
+            camera, sorted_index[slot], tracks, start, cameras, spare, factor=factor, banded=banded, capacity=capacity
         )
     drawn = None
     if partitions is not None:
@@ -210,7 +219,7 @@ def layout_for(
     capacity: Capacity | None = None,
     observations: ObservationOrder | None = None,
 ) -> Layout:
-    """The layout that a step with these options needs, and nothing more; padded where there is a capacity."""
+    """The layout with exactly the parts that a step with these options needs. Arguments as for `build_layout`."""
     return build_layout(
         problem,
         pairs=options.forms_reduced_system,
@@ -223,13 +232,17 @@ def layout_for(
     )
 
 
-def turns_of(layout: Layout) -> int:
-    """Different steps that one state and lambda lead to: as many as there are partitions, which take turns."""
+def num_partitions(layout: Layout) -> int:
+    """Number of partitions that iterations cycle through, and so of different steps from one state and lambda."""
     return 1 if layout.partitions is None else layout.partitions.label.shape[0]
 
 
 def partition_of(layout: Layout) -> Partition:
-    """The partitions of a layout that has them."""
+    """The partitions of a layout.
+
+    Raises:
+        ValueError: it was built without them.
+    """
     if layout.partitions is None:
         raise ValueError("this layout has no partitions: build it with partitions=, the cameras of a cluster at most")
     return layout.partitions

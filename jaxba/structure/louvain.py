@@ -1,12 +1,13 @@
-"""Random clusterings of the camera graph, a new one every iteration.
+"""Random clusterings of the camera graph, by a randomised Louvain method.
 
-Cameras are nodes, and the weight of an edge is the share of points that both cameras see among those that either sees.
-A clustering grows as in Louvain's method, but a node picks the community it joins at random, the better ones more
-likely, and edges that the clustering before cut are likely to be kept this time.
+Cameras are nodes. The weight of an edge is the number of points that both cameras see over the number that either sees.
+As in Louvain's method, nodes join the community of a neighbour pass by pass, but each chooses at random, with a softmax
+over the gains in modularity. Edges that the previous clustering cut are contracted first, so that they are likely to be
+inside a cluster this time.
 
 Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", section 3.3, and
-the authors' code. Here all nodes choose at once and then move one after the other, so that choosing is a few array
-operations; the original lets each node see the moves before its own.
+the authors' code. Here all nodes of a pass choose before any of them moves, so that choosing takes a few array
+operations; in the original each node sees the moves before its own.
 """
 
 from __future__ import annotations
@@ -20,18 +21,18 @@ from scipy.sparse import csr_matrix
 from jaxba.structure.camera_clusters import shared_points
 
 TEMPERATURE = 10.0
-"""Inverse temperature of the choice; larger is greedier. Source: the authors' code."""
+"""Inverse temperature of the softmax; larger is greedier. Source: the authors' code."""
 
 MAX_PASSES = 30
-"""Passes of one clustering; each halves the number of communities or nearly so, and 5 to 8 are usual."""
+"""Most passes of one clustering. Each about halves the number of communities; 5 to 8 are usual."""
 
 
 def camera_graph(
     camera: Int[np.ndarray, " observations"], point: Int[np.ndarray, " observations"], cameras: int, points: int
 ) -> csr_matrix:
-    """Weights `|P_i and P_j| / |P_i or P_j|` of the pairs of cameras that share points, [cameras, cameras].
+    """Edge weights `|P_i and P_j| / |P_i or P_j|` for the sets P_i of points that camera i sees, [cameras, cameras].
 
-    Of a large problem a sample of the points is counted (`clusters.shared_points`).
+    For a large problem they are estimated from a sample of the points (`camera_clusters.shared_points`).
     """
     shared, seen = shared_points(camera, point, cameras, points)
     edges = shared.tocoo()
@@ -40,14 +41,14 @@ def camera_graph(
 
 
 def clusterings(graph: csr_matrix, largest: int, rng: np.random.Generator) -> Iterator[Int[np.ndarray, " cameras"]]:
-    """Clusterings without end: labels from 0 for every camera.
+    """An endless sequence of clusterings: the cluster of every camera, numbered from 0.
 
     Args:
-        graph: symmetric weights without a diagonal.
-        largest: cameras of a cluster at most.
-        rng: decides all of them.
+        graph: symmetric edge weights without a diagonal.
+        largest: largest number of cameras in a cluster.
+        rng: random generator.
     """
-    label = cluster(graph, largest, None, None)  # Louvain's own, greedy
+    label = cluster(graph, largest, None, None)  # the greedy Louvain method
     while True:
         label = cluster(graph, largest, label, rng)
         yield label
@@ -59,13 +60,13 @@ def cluster(
     previous: Int[np.ndarray, " cameras"] | None,
     rng: np.random.Generator | None,
 ) -> Int[np.ndarray, " cameras"]:
-    """One clustering.
+    """One clustering: the cluster of every camera, numbered from 0.
 
     Args:
-        graph: symmetric weights without a diagonal.
-        largest: cameras of a cluster at most.
-        previous: the clustering before, whose cut edges are joined first; None for no such preference.
-        rng: for a random choice; None for the best one.
+        graph: symmetric edge weights without a diagonal.
+        largest: largest number of cameras in a cluster.
+        previous: the previous clustering, whose cut edges are contracted first; None: no such preference.
+        rng: random generator; None for greedy choices.
     """
     nodes, edges = len(graph.indptr) - 1, graph.nnz / 2
     degree = np.asarray(graph.sum(axis=1)).ravel()
@@ -79,14 +80,14 @@ def cluster(
         if np.array_equal(into, np.arange(len(into))):
             break
         label, weight, degree, size = _collapse(into, label, weight, degree, size)
-    # cameras that share points with nobody need no cluster each
+    # cameras without edges are put together into as few clusters as possible
     alone = np.diff(graph.indptr) == 0
     label = np.where(alone, nodes + np.cumsum(alone) // max(largest, 1), label)
     return np.unique(label, return_inverse=True)[1]
 
 
 def _matching(graph: csr_matrix, label: np.ndarray) -> np.ndarray:
-    """Pairs of cameras whose edge was cut, the heaviest edges first, each camera once."""
+    """Greedy matching of the edges cut by a clustering, heaviest first: the node that every node is merged into."""
     edges = graph.tocoo()
     cut = np.flatnonzero((edges.row < edges.col) & (label[edges.row] != label[edges.col]))
     cut = cut[np.argsort(-np.asarray(edges.data, float)[cut], kind="stable")]
@@ -108,15 +109,15 @@ def _pass(
     largest: int,
     rng: np.random.Generator | None,
 ) -> np.ndarray:
-    """The community that every node joins, by the number of the node it started from.
+    """One pass: the community that every node joins, as the index of the node that founded it.
 
-    The gain in modularity decides: the weight towards a neighbour less what the degrees alone would let expect.
+    Nodes choose by the gain in modularity: the weight of the edge minus its expectation from the degrees.
     """
     nodes = len(size)
     row, column = np.repeat(np.arange(nodes), np.diff(weight.indptr)), weight.indices
     gain = sharpness * (weight.data - degree[column] * degree[row] / total)
     stay = np.zeros(nodes)
-    if rng is not None:  # the largest of Gumbel-perturbed logits is a draw from their softmax
+    if rng is not None:  # Gumbel-max trick: the argmax is a sample of the softmax
         gain, stay = gain + rng.gumbel(size=len(gain)), rng.gumbel(size=nodes)
     gain[size[row] + size[column] > largest] = -np.inf
     choosing = np.flatnonzero(np.diff(weight.indptr) > 0)
@@ -129,7 +130,7 @@ def _pass(
     into, members, joined = list(range(nodes)), size.tolist(), [False] * nodes
     sizes = size.tolist()
     for node, target in zip(choosing[moving].tolist(), column[first][moving].tolist(), strict=True):
-        # a node that others have joined stays, and nobody joins where the node itself has left
+        # a node that others have joined stays, and a node that has left its community cannot be joined
         if joined[node] or into[target] != target or members[target] + sizes[node] > largest:
             continue
         into[node], joined[target] = target, True
@@ -140,7 +141,7 @@ def _pass(
 def _collapse(
     into: np.ndarray, label: np.ndarray, weight: csr_matrix, degree: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, csr_matrix, np.ndarray, np.ndarray]:
-    """Makes every community one node."""
+    """Contracts every community to one node."""
     kept, new = np.unique(into, return_inverse=True)
     merge = csr_matrix((np.ones(len(into)), (np.arange(len(into)), new)), shape=(len(into), len(kept)))
     edges = (merge.T @ weight @ merge).tocoo()

@@ -1,4 +1,4 @@
-"""Observations sorted by point, then by camera: made once for a solve, for its cost model, padding and layout."""
+"""Observations sorted by point, then by camera. Computed once per solve, for cost model, padding and layout."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from jaxba.structure.sum_trees import sorted_by
 
 @dataclass(frozen=True)
 class ObservationOrder:
-    """The observations of a problem by point, those of a point by camera."""
+    """The observations of a problem, sorted by point, then by camera."""
 
     order: Int[np.ndarray, " observations"]
-    """Problem index of each sorted observation."""
+    """Index in the problem of each sorted observation."""
 
     camera: Int[np.ndarray, " observations"]
     """Camera of each sorted observation."""
@@ -26,10 +26,10 @@ class ObservationOrder:
     """Point of each sorted observation."""
 
     tracks: Int[np.ndarray, " points"]
-    """Observations of each point."""
+    """Number of observations of each point."""
 
     num_cameras: int
-    """Cameras, observed or not."""
+    """Number of cameras, observed or not."""
 
     @classmethod
     def of(cls, problem: BundleProblem) -> ObservationOrder:
@@ -42,18 +42,18 @@ class ObservationOrder:
 
     @cached_property
     def start(self) -> Int[np.ndarray, " points_and_one"]:
-        """Sorted observation at which each point begins; the last entry is their number."""
+        """Position of the first observation of each point; the last entry is the number of observations."""
         return np.concatenate([[0], np.cumsum(self.tracks)])
 
     @cached_property
     def num_pairs(self) -> int:
-        """Pairs of observations of one point; an observation pairs with itself."""
+        """Number of unordered pairs of observations of one point, an observation with itself included."""
         tracks = self.tracks.astype(np.int64)
         return int(np.sum(tracks * (tracks + 1) // 2))
 
     @cached_property
     def num_repeated_pairs(self) -> int:
-        """Pairs of different observations of one point by one camera."""
+        """Number of pairs of different observations of one point by one camera."""
         new = np.ones(len(self.order), bool)
         new[1:] = (np.diff(self.point) != 0) | (np.diff(self.camera) != 0)
         times = np.diff(np.append(np.flatnonzero(new), len(new)))
@@ -61,5 +61,5 @@ class ObservationOrder:
 
     @cached_property
     def num_observed_points(self) -> int:
-        """Points with at least one observation."""
+        """Number of points with at least one observation."""
         return int(np.count_nonzero(self.tracks))

@@ -1,13 +1,13 @@
-"""Sizes rounded up to a grid, so that similar problems share one compiled program.
+"""Array sizes rounded up to a coarse grid, so that similar problems share one compiled program.
 
-A program fits one set of array shapes. Without padding those follow from the data (buckets by track length, trees,
-pairs), so that every problem compiles its own, in seconds, where solving it may take a fraction of one. Padded shapes
-follow from a `Capacity` alone, four numbers on a coarse grid. Padding holds no observations: it adds exact zeros to
-sums, and its cameras and points never move.
+A compiled program fits one set of array shapes. Without padding these follow from the data (buckets by track length,
+summation trees, pairs), so that every problem compiles its own program, which takes seconds where the solve may take a
+fraction of one. With padding all shapes follow from a `Capacity`, four numbers on a coarse grid. Padding contains no
+observations: it adds exact zeros to sums, and its cameras and points never change.
 
-Up to half of the slots are waste, which makes an iteration up to twice as long or a little more. That is a good bargain
-while a solve is quicker than a compilation, so larger problems are left as they are (`capacity_of`). Few points lose
-more: with their padding they are too many for a matrix of their own size (`structure/density.py`).
+Up to half of the slots are padding, which makes an iteration up to about twice as long. That pays while a solve is
+faster than a compilation, so larger problems are not padded (`capacity_of`). A problem with few points loses more: with
+padding it has too many of them for Woodbury's identity (structure/density.py).
 """
 
 from __future__ import annotations
@@ -22,44 +22,44 @@ from jaxba.problem.options import LinearSolverChoice, StepOptions
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import Room
 
-LEAST_CAMERAS = 8
+MIN_CAMERAS = 8
 """Smallest number of cameras."""
 
-LEAST_OBSERVATIONS = 1024
-"""Smallest number of slots: a step takes 0.4 us each (Ladybug-49), so that rounding these up costs no time."""
+MIN_OBSERVATIONS = 1024
+"""Smallest number of slots. Measured on Ladybug-49: a step takes 0.4 us per slot, so that this many cost no time."""
 
-LEAST_TRACK = 2
-"""There is room for a point in so many slots at least. Windows of real sequences have 3 to 5 observations a point, but
-so points nearly always follow from observations, and a padding point costs little."""
+SLOTS_PER_POINT = 2
+"""Slots per point in the capacity. Windows of real sequences have 3 to 5 observations per point; with room for more
+points, their capacity nearly always follows from that of the observations, and a padding point costs little."""
 
-LEAST_PAIRS = 4
-"""Pairs per slot for which there is room anyway: 20 cameras of kitti00vo have 3.4 per observation."""
+PAIRS_PER_SLOT = 4
+"""Pairs per slot in the capacity: windows of 20 cameras of the KITTI sequence kitti00vo have 3.4 per observation."""
 
 MAX_CAMERAS = 128
-"""More cameras are not padded: a dense system of 1350 unknowns takes 11 ms to factor, and long sequences are
+"""Most cameras of a padded problem: a dense system of 1350 unknowns takes 11 ms to factor, and long sequences are
 better factored as bands."""
 
 MAX_OBSERVATIONS = 1 << 17
-"""More slots are not padded: a step takes 0.4 us each (Ladybug-49), so that twenty take a second."""
+"""Most slots of a padded problem. Measured on Ladybug-49: a step takes 0.4 us per slot, twenty steps take a second."""
 
 MAX_PAIRS = 1 << 20
-"""More pairs are not padded: a step took 0.1 us each, so that twenty took two seconds."""
+"""Most pairs of a padded problem. Measured: a step takes 0.1 us per pair, twenty steps take two seconds."""
 
 
 @dataclass(frozen=True)
 class Capacity:
-    """What a padded layout has room for. Equal capacities mean equal shapes."""
+    """Sizes of a padded layout. Equal capacities give equal shapes."""
 
     cameras: int
     points: int
     observations: int
-    """Slots; one more than there can be observations, since one is always empty."""
+    """Number of slots, one more than the largest number of observations, since one slot is always empty."""
 
     pairs: int
-    """Pairs of observations of one point, each with itself included."""
+    """Number of pairs of observations of one point, an observation with itself included."""
 
     def holds(self, problem: BundleProblem) -> bool:
-        """Whether there is room for the problem; its pairs are not counted."""
+        """Whether the problem fits; its pairs are not counted."""
         counts = problem.num_cameras, problem.num_points, problem.num_observations + 1
         return all(n <= most for n, most in zip(counts, (self.cameras, self.points, self.observations), strict=True))
 
@@ -68,45 +68,50 @@ class Capacity:
 
 
 def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = None) -> Capacity | None:
-    """The grid cell of a problem.
+    """The capacity of a problem: its sizes rounded up to the grid.
 
-    Cameras are rounded up to 8, 12, 16, 24, ..., observations to a power of two. Points and pairs mostly follow from
-    that; where they do not, they are rounded up to powers of two themselves. Free numbers cut a sequence into more
-    cells: 20 windows of 20 cameras of kitti00vo fall into 2 of them, with free points and pairs into 5.
+    Cameras are rounded up to 8, 12, 16, 24, ..., observations to a power of two. Points and pairs get a fixed multiple
+    of the slots or, if that is not enough, the next power of two. Rounding each on its own gives more programs:
+    measured on 20 windows of 20 cameras of kitti00vo, 5 different capacities instead of 2.
+
+    Args:
+        problem: the problem to pad.
+        observations: its sorted observations, if they are known already.
 
     Returns:
-        None for problems with lenses (problem/intrinsics.py), or with more than `MAX_CAMERAS`, `MAX_OBSERVATIONS`
-        (points count too) or `MAX_PAIRS`.
+        The capacity; None for problems with lenses (problem/intrinsics.py), with more than `MAX_CAMERAS` or
+        `MAX_PAIRS`, or with more observations or points than `MAX_OBSERVATIONS`.
     """
     if problem.lenses is not None or problem.num_cameras > MAX_CAMERAS:
         return None
     if max(problem.num_points, problem.num_observations + 1) > MAX_OBSERVATIONS:
         return None
     observations = observations or ObservationOrder.of(problem)
-    # of a camera that sees a point twice both orders are listed (covisibility.py)
+    # if a camera sees a point twice, the pair is listed in both orders (covisibility.py)
     pairs = observations.num_pairs + observations.num_repeated_pairs
     if pairs > MAX_PAIRS:
         return None
-    cameras = max(LEAST_CAMERAS, _power(problem.num_cameras))
-    between = max(LEAST_CAMERAS, cameras * 3 // 4)
-    slots = max(LEAST_OBSERVATIONS, _power(problem.num_observations + 1))
+    cameras = max(MIN_CAMERAS, _power(problem.num_cameras))
+    between = max(MIN_CAMERAS, cameras * 3 // 4)
+    slots = max(MIN_OBSERVATIONS, _power(problem.num_observations + 1))
     return Capacity(
         cameras=between if problem.num_cameras <= between else cameras,
-        points=max(slots // LEAST_TRACK, _power(problem.num_points)),
+        points=max(slots // SLOTS_PER_POINT, _power(problem.num_points)),
         observations=slots,
-        pairs=max(slots * LEAST_PAIRS, _power(pairs)),
+        pairs=max(slots * PAIRS_PER_SLOT, _power(pairs)),
     )
 
 
 def room_for(counts: Int[np.ndarray, " targets"], items: int, expected: int) -> Room:
-    """Room of a tree whose targets have at most as many items as there are cameras, or points, to give them.
+    """Room of a summation tree in a layout with fixed capacity.
 
-    More come where a camera sees a point twice. Such a tree is made for the worst, with one or two levels more.
+    A target has at most `expected` items unless a camera sees a point twice. If some target has more, the tree gets
+    room for all items in one target, which takes one or two more levels.
 
     Args:
-        counts: items of each target.
-        items: capacity for all of them.
-        expected: most items of a target where no camera sees a point twice.
+        counts: number of items of each target.
+        items: capacity for the items of all targets.
+        expected: largest number of items of a target if no camera sees a point twice.
     """
     return Room(items, min(items, expected) if counts.max(initial=0) <= expected else items)
 
@@ -114,18 +119,18 @@ def room_for(counts: Int[np.ndarray, " targets"], items: int, expected: int) -> 
 def with_padded_solver(
     capacity: Capacity | None, options: StepOptions, asked: LinearSolverChoice
 ) -> tuple[Capacity | None, LinearSolverChoice]:
-    """Padding is for the explicit solver alone, and wherever there is a choice it takes that.
+    """Restricts padding to the explicit solver, which `auto` then means.
 
-    `auto` chooses by counts of the very problem, so that neighbours in one cell might get different programs. Up to the
-    largest capacity the explicit solver is never slow.
+    The choice of `auto` depends on the exact sizes of a problem, so that problems of one capacity might get different
+    programs. Up to the largest capacity the explicit solver is never slow.
 
     Args:
-        capacity: of the problem, None where it is not padded.
-        options: of the step, with its method.
-        asked: the linear solver that was asked for.
+        capacity: of the problem; None if it is not padded.
+        options: options of the step, with its method.
+        asked: the requested linear solver.
 
     Returns:
-        The capacity, None where another solver was asked for, and the linear solver to ask for.
+        The capacity (None if another solver or a method is requested) and the linear solver to use.
     """
     if options.method is not None or asked not in ("auto", "explicit"):
         return None, asked
@@ -133,7 +138,7 @@ def with_padded_solver(
 
 
 def padded_parameters(problem: BundleProblem, capacity: Capacity) -> BundleProblem:
-    """The problem's cameras and points, then zeros up to the capacity; without observations, which the layout has."""
+    """The problem's cameras and points, padded with zeros to the capacity, without observations."""
     cameras, points = np.zeros((capacity.cameras, CAMERA_SIZE)), np.zeros((capacity.points, POINT_SIZE))
     cameras[: problem.num_cameras], points[: problem.num_points] = problem.cameras, problem.points
     nothing = np.zeros(0, np.int32)

@@ -1,10 +1,10 @@
-"""Cameras in clusters, points in pieces: the index arrays of methods that solve one cluster at a time.
+"""Random partitions of the cameras into clusters, for methods that solve one cluster at a time (STBA, DeepLM).
 
-A *partition* is one clustering of the cameras. What it does to the observations is listed once per problem for a number
-of partitions, and iteration `t` takes number `t` modulo that number. So a random clustering costs nothing while
-iterating, and the whole solve stays one compiled program.
+A fixed number of partitions is drawn once per problem, with their index arrays, and iteration t uses number t modulo
+that number. Random clusters then cost nothing during the iterations, and the solve is one compiled program.
 
-A point whose observers lie in several clusters is a *separator*; its observations from one cluster are a *copy*.
+A point that is seen from several clusters is a *shared point*. STBA splits it into *point replicas*, one per cluster,
+each with the observations of that cluster.
 """
 
 from __future__ import annotations
@@ -25,41 +25,41 @@ from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
 from jaxba.typing import AnyArray, register_pytree
 
 PARTITIONS = 16
-"""Different partitions of a problem, used in turn."""
+"""Number of partitions of a problem, used cyclically."""
 
 SEED = 0
-"""Decides the clusterings: the same problem gets the same ones."""
+"""Seed of the clusterings; the same problem always gets the same ones."""
 
 
 @register_pytree
 @dataclass(frozen=True)
 class Partition:
-    """One clustering, or several of them along a leading axis."""
+    """One partition of the cameras, or several along a leading axis."""
 
     label: Int[AnyArray, "*t cameras"]
     """Cluster of each camera."""
 
     members: Int[AnyArray, "*t clusters size"]
-    """Cameras of each cluster in order; the number of cameras in the padding."""
+    """Cameras of each cluster, in order; padded with the number of cameras."""
 
     blocks: Int[AnyArray, "*t clusters size size"]
-    """Number in `PairLayout` of the block of two members, lower triangle; the zero block elsewhere, and one past it on
-    the diagonal of the padding."""
+    """Index in `PairLayout` of the block of two members, lower triangle; else that of the zero block, and one past it
+    on the diagonal of the padding."""
 
-    copy: Int[AnyArray, "*t slots"]
-    """Copy that a slot belongs to; empty slots belong to the last copy, which is nobody's."""
+    slot_replica: Int[AnyArray, "*t slots"]
+    """Point replica of each slot; empty slots belong to the last replica, which has no observations."""
 
     levels: tuple[Int[AnyArray, "*t _ _"], ...]
-    """Tree from slots to copies."""
+    """Summation tree from slots to point replicas."""
 
-    separator: Bool[AnyArray, "*t points"]
+    is_shared: Bool[AnyArray, "*t points"]
     """Whether a point, in layout order, is seen from several clusters."""
 
-    def at(self, turn: int | Int[Array, ""]) -> Partition:
+    def at(self, iteration: int | Int[Array, ""]) -> Partition:
         """The partition of an iteration, counted from 0."""
         count = self.label.shape[0]
-        arrays = self if isinstance(turn, int) else jax.tree.map(jnp.asarray, self)
-        return jax.tree.map(lambda x: x[turn % count], arrays)
+        arrays = self if isinstance(iteration, int) else jax.tree.map(jnp.asarray, self)
+        return jax.tree.map(lambda x: x[iteration % count], arrays)
 
 
 def partition_layout(
@@ -77,16 +77,16 @@ def partition_layout(
     """Draws partitions of a problem.
 
     Args:
-        camera: of each observation, sorted by point, then by camera.
-        point: of each observation.
-        slot: of each observation.
+        camera: camera of each observation; observations are sorted by point, then by camera.
+        point: point of each observation.
+        slot: slot of each observation.
         cameras: number of cameras.
         points: number of points.
-        slot_point: column of the point of each slot.
-        empty: a slot that holds no observation.
-        pairs: of the same problem, not banded.
-        largest: cameras of a cluster at most.
-        count: partitions to draw; one where all cameras fit in a cluster.
+        slot_point: point of each slot, in layout order.
+        empty: an empty slot.
+        pairs: pairs of the same problem, not banded.
+        largest: largest number of cameras in a cluster.
+        count: number of partitions; only one is drawn if all cameras fit in one cluster.
     """
     graph = camera_graph(camera, point, cameras, points)
     if cameras <= largest:
@@ -96,52 +96,53 @@ def partition_layout(
         labels = np.stack(list(itertools.islice(drawn, count)))
     clusters = int(labels.max()) + 1
     sizes = np.stack([np.bincount(label, minlength=clusters) for label in labels])
-    copies = [_copies(label[camera], point, clusters) for label in labels]
-    most = max(len(counts) for _, counts in copies) + 1
-    trees, of_slot, separator = [], [], []
-    for which, counts in copies:
+    replicas = [_point_replicas(label[camera], point, clusters) for label in labels]
+    most = max(len(counts) for _, counts in replicas) + 1
+    trees, slot_replica, is_shared = [], [], []
+    for which, counts in replicas:
         counts = np.append(counts, np.zeros(most - len(counts), int))
         order = np.argsort(which, kind="stable")
         trees.append(sum_tree(slot[order], counts, empty, TREE_WIDTH))
-        of_slot.append(np.full(len(slot_point), most - 1, np.int32))
-        of_slot[-1][slot] = which
+        slot_replica.append(np.full(len(slot_point), most - 1, np.int32))
+        slot_replica[-1][slot] = which
         first = np.unique(which, return_index=True)[1]
-        pieces = np.bincount(slot_point[slot[first]], minlength=int(slot_point.max()) + 1)
-        separator.append(pieces > 1)
+        replicas_of_point = np.bincount(slot_point[slot[first]], minlength=int(slot_point.max()) + 1)
+        is_shared.append(replicas_of_point > 1)
     tables = [cluster_members(label, clusters, int(sizes.max())) for label in labels]
     return Partition(
         label=labels.astype(np.int32),
         members=np.stack(tables),
         blocks=np.stack([_blocks(table, label, pairs) for table, label in zip(tables, labels, strict=True)]),
-        copy=np.stack(of_slot),
+        slot_replica=np.stack(slot_replica),
         levels=_stack(trees, empty),
-        separator=np.stack(separator),
+        is_shared=np.stack(is_shared),
     )
 
 
-def _copies(label: np.ndarray, point: np.ndarray, clusters: int) -> tuple[np.ndarray, np.ndarray]:
-    """The copy of each observation, numbered by point and cluster, and the observations of each copy."""
+def _point_replicas(label: np.ndarray, point: np.ndarray, clusters: int) -> tuple[np.ndarray, np.ndarray]:
+    """The replica of each observation, numbered by point and cluster, and the number of observations of each."""
     _, which, counts = np.unique(point.astype(np.int64) * clusters + label, return_inverse=True, return_counts=True)
     return which, counts
 
 
 def _blocks(members: np.ndarray, label: np.ndarray, pairs: PairLayout) -> np.ndarray:
+    """The array `Partition.blocks` of one clustering."""
     clusters, size = members.shape
     row, column = np.asarray(pairs.block_row)[:-1], np.asarray(pairs.block_column)[:-1]
     zero = len(row)
-    place = np.zeros(len(label), int)
+    position = np.zeros(len(label), int)
     cluster, rank = np.nonzero(members < len(label))
-    place[members[cluster, rank]] = rank
+    position[members[cluster, rank]] = rank
     inside = np.flatnonzero(label[row] == label[column])
     table = np.full((clusters, size, size), zero, np.int32)
-    table[label[row[inside]], place[row[inside]], place[column[inside]]] = inside
+    table[label[row[inside]], position[row[inside]], position[column[inside]]] = inside
     cluster, rank = np.nonzero(members == len(label))
     table[cluster, rank, rank] = zero + 1
     return table
 
 
 def _stack(trees: list[tuple[np.ndarray, ...]], empty: int) -> tuple[np.ndarray, ...]:
-    """Trees of equal shapes: missing levels hand their rows on, missing rows and columns are empty."""
+    """Stacks summation trees, padded to equal shapes: missing levels are identities, missing rows and columns empty."""
     depth = max(len(tree) for tree in trees)
     levels = []
     for number in range(depth):
@@ -158,5 +159,5 @@ def _stack(trees: list[tuple[np.ndarray, ...]], empty: int) -> tuple[np.ndarray,
 
 
 def _level(tree: tuple[np.ndarray, ...], number: int) -> np.ndarray:
-    """A level of a tree; past its end the one that changes nothing."""
+    """A level of a tree; past the last level an identity."""
     return tree[number] if number < len(tree) else np.arange(len(tree[-1]), dtype=np.int32)[:, None]

@@ -1,8 +1,12 @@
-"""Lenses that several cameras share: the step in which they move alike.
+"""Shared intrinsics: index arrays for cameras that have a lens, and so f, k1 and k2, in common.
 
-With T the matrix that gives every camera the numbers of its lens, tied unknowns y stand for the step T y, and the
-damped system `(H + D) d = -g` becomes `T^T (H + D) T y = -T^T g`. Points are eliminated as ever, since T leaves them
-alone: the reduced camera system of all cameras is formed, then rows and columns of a lens are added up.
+Let T be the matrix that copies the parameters y of the lenses (and the poses) to the cameras, `d = T y`. The damped
+system `(H + D) d = -g` becomes
+
+    T^T (H + D) T y = -T^T g.
+
+T leaves points alone, so they are eliminated as usual; then the rows and columns of the reduced camera system that
+belong to one lens are summed (linear/shared_intrinsics_solve.py).
 """
 
 from __future__ import annotations
@@ -18,45 +22,45 @@ from jaxba.problem.intrinsics import Lenses
 from jaxba.typing import AnyArray, register_pytree
 
 POSE_SIZE = 6
-"""Unknowns of a camera that are its own: rotation and translation. Those of the lens follow."""
+"""Pose parameters of a camera: rotation and translation. The intrinsics f, k1 and k2 follow."""
 
 
 @register_pytree
 @dataclass(frozen=True)
 class LensTies:
-    """What a layout knows of lenses."""
+    """The matrix T of shared intrinsics, and the intrinsics that are optimised."""
 
     lens: Int[AnyArray, " cameras"]
     """Lens of each camera."""
 
     members: Bool[AnyArray, "cameras lenses"]
-    """Whether an observed camera has a lens; no columns where no lens is shared."""
+    """Whether a camera is observed and has this lens; no columns if no lens is shared."""
 
     free: Bool[AnyArray, "3 cameras"]
     """Which of f, k1 and k2 of a camera are optimised."""
 
     shared: bool = field(metadata={"static": True})
-    """Whether two cameras have the same lens; without it nothing is tied, and some numbers may stay all the same."""
+    """Whether two cameras have the same lens. If not, T is the identity, but some intrinsics may still be fixed."""
 
     def total(self, values: Float[Array, "cameras 3"]) -> Float[Array, "lenses 3"]:
-        """Sums over the observed cameras of each lens: `T^T` of the lenses' unknowns."""
+        """Sums over the observed cameras of each lens: the product with `T^T`."""
         return jnp.matmul(self.members.T.astype(values.dtype), values, precision="highest")
 
     def counts(self) -> Int[Array, " lenses"]:
-        """Observed cameras of each lens."""
+        """Number of observed cameras of each lens."""
         return jnp.sum(self.members, axis=0, dtype=jnp.int32)
 
     def spread(self, values: Float[Array, "lenses 3"]) -> Float[Array, "cameras 3"]:
-        """A lens's numbers for each of its cameras: T."""
+        """The values of its lens for each camera: the product with T."""
         return values[self.lens]
 
 
 def lens_ties(lenses: Lenses, seen: Bool[np.ndarray, " cameras"]) -> LensTies:
-    """The lenses of a problem, for its layout.
+    """The shared intrinsics of a problem, for its layout.
 
     Args:
-        lenses: checked.
-        seen: cameras with at least one observation.
+        lenses: checked lenses of the problem.
+        seen: whether each camera has an observation.
     """
     index = np.asarray(lenses.index)
     members = np.zeros((len(index), 0), bool)

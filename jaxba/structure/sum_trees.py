@@ -1,4 +1,8 @@
-"""Index arrays that turn a sum over many rows into a few dense ones."""
+"""Summation trees: index arrays that sum rows into targets by a few gathers and dense sums, without scatter.
+
+Level by level, rows of one target are summed in chunks of fixed width; the partial sums are the rows of the next level.
+The sums themselves are computed by `segment_sums.tree_sum`.
+"""
 
 from __future__ import annotations
 
@@ -9,37 +13,38 @@ from jaxtyping import Int
 from scipy.sparse import csr_matrix
 
 TREE_WIDTH = 8
-"""Partial sums added at once on the higher levels of a tree."""
+"""Width of the chunks on all levels but the first."""
 
 
 class Room(NamedTuple):
-    """What a tree has room for, so that its shape does not depend on what it sums."""
+    """Upper bounds from which the shapes of a tree follow, so that they do not depend on the data."""
 
     items: int
-    """Most items of all targets together."""
+    """Largest number of items of all targets together."""
 
     most: int
-    """Most items of one target."""
+    """Largest number of items of one target."""
 
 
 def sum_tree(
     items: np.ndarray, counts: np.ndarray, empty: int, width: int, room: Room | None = None
 ) -> tuple[np.ndarray, ...]:
-    """Index arrays that sum `items` into targets, `width` at a time, then `TREE_WIDTH` at a time.
+    """The summation tree of `items`, with chunks of `width` on the first level and of `TREE_WIDTH` on the others.
 
     Args:
-        items: row numbers, those of target 0 first, then those of target 1, ...
-        counts: number of items of each target; zero is allowed.
-        empty: a row that is known to be zero, for padding.
-        width: items summed at once on the first level.
-        room: makes the shapes follow from itself, the number of targets and the width alone.
+        items: row indices, those of target 0 first, then those of target 1, ...
+        counts: number of items of each target; may be zero.
+        empty: index of a row of zeros, for padding.
+        width: chunk width on the first level.
+        room: bounds from which the shapes follow, together with the number of targets and the width; None: the shapes
+            follow from the data.
 
     Returns:
-        Arrays [targets, width]; level l + 1 indexes the sums of level l. Every level but the last ends with
-        an all-padding row; the last has exactly one row a target, in order.
+        Index arrays [chunks, width], one per level; those of level l + 1 index the sums of level l. Every level but the
+        last ends with a row of padding; the last one has exactly one row per target, in order.
 
     Raises:
-        ValueError: there is no room for the items.
+        ValueError: the items exceed the room.
     """
     levels = []
     space, most = room or Room(len(items), int(counts.max(initial=1)))
@@ -64,14 +69,14 @@ def sum_tree(
 
 
 def sorted_by(keys: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " n"]:
-    """A stable `argsort` of numbers below `most`, in linear time: by counting, as a sparse matrix is transposed."""
+    """Stable `argsort` of integers below `most` in linear time: a counting sort, by transposing a sparse matrix."""
     ones = np.ones(len(keys), np.int8)
     rows = csr_matrix((ones, keys, np.arange(len(keys) + 1, dtype=np.int32)), shape=(len(keys), most))
     return rows.tocsc().indices
 
 
 def with_spare_row(levels: tuple[np.ndarray, ...], empty: int) -> tuple[np.ndarray, ...]:
-    """The same tree with a row that is all padding on its first level; only a tree of one level may be without."""
+    """The same tree, with a row of padding on its first level. Only a tree of one level may lack it."""
     level, *others = levels
     if others:
         return levels
@@ -80,10 +85,10 @@ def with_spare_row(levels: tuple[np.ndarray, ...], empty: int) -> tuple[np.ndarr
 
 
 def fitting_width(counts: np.ndarray) -> int:
-    """Items summed at once on the first level, so that least is read where most targets have few: padding counts."""
+    """The chunk width of the first level that reads the fewest rows, padding included."""
     return min(range(2, TREE_WIDTH + 1), key=lambda width: int((-(-counts // width)).sum()) * (width + 1))
 
 
 def chunks_at_most(items: int, targets: int, width: int) -> int:
-    """Most chunks of a width that items make, however they belong to targets: the sum of `ceil(count / width)`."""
+    """Upper bound on the number of chunks, `sum ceil(count / width)`, for any distribution of items over targets."""
     return min(items, (items + targets * (width - 1)) // width)
