@@ -1,11 +1,13 @@
-"""The BAL camera with analytic derivatives, on arrays whose components lead.
+"""The BAL camera model and its analytic derivatives.
 
-A vector field over n items is an array [3, n]: the observation index runs last, so that a CPU's vector
-unit and a GPU's coalesced reads both see neighbours. Rotations are handled once per camera; what
-happens per observation has no sine, no cosine and no branch.
+    P = R X + t,   p = -P.xy / P.z,   z = f (1 + k1 |p|^2 + k2 |p|^4) p
 
-Source of the model: Agarwal et al. 2010, "Bundle Adjustment in the Large". Derivatives on the rotation
-manifold: left perturbation `R <- exp(d) R`, Sola et al. 2018, "A micro Lie theory", eqs. 143-146.
+Arrays are components-first, [3, n], so that vector instructions of a CPU and coalesced reads of a GPU run over
+observations. Rotation matrices are computed once per camera; what is computed per observation has no sine, cosine or
+branch.
+
+Source of the model: Agarwal et al. 2010, "Bundle Adjustment in the Large". Derivatives by a rotation are those of the
+left perturbation `R <- exp(d) R`, Sola et al. 2018, "A micro Lie theory", eqs. 143-146.
 """
 
 from __future__ import annotations
@@ -20,11 +22,11 @@ from jaxba.runtime.fusion import fusion_barrier
 from jaxba.typing import AnyArray
 
 SMALL_ANGLE_SQUARED = 1e-6
-"""Below this squared angle (radians^2) the series of sin and cos is used; its error is under 1e-20."""
+"""Squared angle (radians^2) below which functions of the angle are Taylor series, with an error below 1e-20."""
 
 
 class Frames(NamedTuple):
-    """What an observation needs to know of its camera."""
+    """The camera of each observation: rotation matrix and the other parameters."""
 
     rotation: Float[Array, "3 3 ..."] | list[list[Array]]  # R, world to camera
     translation: Float[Array, "3 ..."] | list[Array]  # t, scene units
@@ -32,39 +34,39 @@ class Frames(NamedTuple):
     k1: Float[Array, "..."]
     k2: Float[Array, "..."]
 
-    def stored(self) -> Frames:
-        """The same, made once for all that read it; of arrays."""
+    def materialized(self) -> Frames:
+        """The same frames, computed once and stored: a fusion barrier keeps XLA from recomputing them in every use."""
         rotation, translation = jnp.asarray(self.rotation), jnp.asarray(self.translation)
         table = fusion_barrier(jnp.stack([*rotation.reshape(9, -1), *translation, self.focal, self.k1, self.k2]))
         return Frames(table[:9].reshape(rotation.shape), table[9:12], *table[12:])
 
     def at(self, index: Int[AnyArray, "..."]) -> Frames:
-        """The frames of the cameras in `index`, in lists: vectors that are not stored but looked up by who reads them.
+        """The frames of the cameras in `index`, as lists of vectors, whose gathers XLA fuses into their uses.
 
-        To be called on what is `stored`, lest a camera's sine be taken once an observation.
+        Call it on `materialized` frames, or the rotation matrices are computed once per observation.
         """
-        look = lambda row: row.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
-        rotation = [[look(entry) for entry in row] for row in self.rotation]
-        return Frames(rotation, [look(row) for row in self.translation], *map(look, self[2:]))
+        gather = lambda row: row.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        rotation = [[gather(entry) for entry in row] for row in self.rotation]
+        return Frames(rotation, [gather(row) for row in self.translation], *map(gather, self[2:]))
 
     def stacked(self) -> Frames:
-        """Lists made arrays, which are stored."""
+        """The same with arrays in place of lists."""
         rotation = jnp.stack([jnp.stack(list(row)) for row in self.rotation])
         return self._replace(rotation=rotation, translation=jnp.stack(list(self.translation)))
 
 
 class Projection(NamedTuple):
-    """A projected point with the intermediate values that derivatives share, vectors in lists or arrays of them."""
+    """A projected point, with the intermediate values that its derivatives need."""
 
     pixel: Float[Array, "2 ..."] | list[Array]  # f d p
     direction: Float[Array, "2 ..."] | list[Array]  # p = -P.xy / P.z
-    inverse_depth: Float[Array, "..."]  # 1 / P.z; zero where masked
+    inverse_depth: Float[Array, "..."]  # 1 / P.z; negative in front of the camera, zero where masked
     radius: Float[Array, "..."]  # |p|^2
     distortion: Float[Array, "..."]  # d = 1 + k1 |p|^2 + k2 |p|^4
     rotated: Float[Array, "3 ..."] | list[Array]  # R X
 
     def stacked(self) -> Projection:
-        """Lists made arrays, which are stored."""
+        """The same with arrays in place of lists."""
         stack = lambda rows: jnp.stack(list(rows))
         pixel, direction, rotated = stack(self.pixel), stack(self.direction), stack(self.rotated)
         return self._replace(pixel=pixel, direction=direction, rotated=rotated)
@@ -162,8 +164,8 @@ def project(
         mask: where false, the projection and everything derived from it is exactly zero.
 
     Returns:
-        Pixels (BAL axes) and shared terms, in lists. A point on the camera plane gives non-finite pixels; a point
-        behind the camera is projected like any other, as BAL does.
+        Pixels (BAL axes) and intermediate values, in lists. A point on the camera plane gives non-finite pixels; a
+        point behind the camera is projected like any other, as in BAL.
     """
     rotation = frame.rotation
     rotated = [row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in rotation]
@@ -179,17 +181,19 @@ def project(
 
 
 class Derivatives(NamedTuple):
-    """Derivative of the pixel by camera (rotation on the manifold, translation, f, k1, k2) and by point."""
+    """Derivatives of the pixel by the camera (rotation on the manifold, translation, f, k1, k2) and by the point."""
 
     camera: list[list[Array]]  # [2][9] of [n]
     point: list[list[Array]]  # [2][3] of [n]
 
 
 def derivatives(frame: Frames, projection: Projection) -> Derivatives:
-    """Analytic Jacobians of `project`, as lists of columns so that each is one fused expression.
+    """Analytic Jacobians of `project`, as lists of columns, each of which is one fused expression.
 
-    With `p` the direction, `d` the distortion and `e = d'(|p|^2)`: `dz/dp = f (d I + 2 e p p^T)` and
-    `dp/dP = -[I | p] / P.z`. The rotation part is `dz/dP (-[R X]x)`, the point part `dz/dP R`.
+    With the distortion `d = 1 + k1 |p|^2 + k2 |p|^4` and its derivative `e = k1 + 2 k2 |p|^2` by `|p|^2`:
+
+        dz/dp = f (d I + 2 e p p^T)      dp/dP = -[I | p] / P.z      dz/dt = dz/dP
+        dz/dw = -dz/dP [R X]x            dz/dX = dz/dP R             dz/d(f, k1, k2) = (d, f |p|^2, f |p|^4) p
     """
     u, v = projection.direction
     radius, distortion = projection.radius, projection.distortion
@@ -197,17 +201,21 @@ def derivatives(frame: Frames, projection: Projection) -> Derivatives:
     scale = -frame.focal * projection.inverse_depth
     cross = scale * slope * u * v
     radial = scale * (distortion + slope * radius)
-    outer = [
+    by_camera_point = [
         [scale * (distortion + slope * u * u), cross, radial * u],
         [cross, scale * (distortion + slope * v * v), radial * v],
     ]
     qx, qy, qz = projection.rotated
     rotation = frame.rotation
     camera, point = [], []
-    for row, direction in zip(outer, (u, v), strict=True):
+    for row, direction in zip(by_camera_point, (u, v), strict=True):
         a, b, c = row
-        turn = [qy * c - qz * b, qz * a - qx * c, qx * b - qy * a]
-        lens = [distortion * direction, frame.focal * radius * direction, frame.focal * radius * radius * direction]
-        camera.append([*turn, *row, *lens])
+        by_rotation = [qy * c - qz * b, qz * a - qx * c, qx * b - qy * a]
+        by_intrinsics = [
+            distortion * direction,
+            frame.focal * radius * direction,
+            frame.focal * radius * radius * direction,
+        ]
+        camera.append([*by_rotation, *row, *by_intrinsics])
         point.append([a * rotation[0][k] + b * rotation[1][k] + c * rotation[2][k] for k in range(3)])
     return Derivatives(camera, point)

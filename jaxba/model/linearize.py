@@ -1,4 +1,10 @@
-"""Residuals, cost and Jacobians of all observations, in slot order."""
+"""Residuals, cost and Jacobians of all observations, in slot order.
+
+    f = 1/2 sum_i rho(|r_i|^2),    r_i = Sigma_i^(-1/2) (predicted - observed)
+
+The robust loss enters the linear model as weights: residuals and Jacobians are scaled by `sqrt(rho'(|r_i|^2))`
+(problem/losses.py), so that `g = J^T r` is the gradient of f and `H = J^T J` its Gauss-Newton Hessian.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +25,16 @@ from jaxba.structure.segment_sums import take, total
 
 
 class Reference(NamedTuple):
-    """What a candidate is compared with, slot by slot."""
+    """Costs and depths before a step, with which a candidate is compared."""
 
-    costs: Array  # (slots,), pixels squared
+    costs: Array  # (slots,), pixels^2
     inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
 
 
 class Linearization(NamedTuple):
-    """Whitened, loss-weighted residuals and Jacobians; everything is zero in empty slots.
+    """Whitened and weighted residuals and Jacobians; everything is zero in empty slots.
 
-    Camera columns are: rotation on the manifold (left perturbation, radians), translation, f, k1, k2.
+    Columns of the camera Jacobian: rotation on the manifold (left perturbation, radians), translation, f, k1, k2.
     """
 
     residual: list[Array]  # [2] of (slots,), pixels
@@ -39,24 +45,24 @@ class Linearization(NamedTuple):
 
     @property
     def reference(self) -> Reference:
-        """What there is to know without derivatives."""
+        """The part of it that does not need derivatives."""
         return Reference(self.costs, self.inverse_depth)
 
 
 @traced_once()
 def slot_frames(layout: Layout, cameras: Float[Array, "9 cameras"]) -> camera.Frames:
-    """The camera of every slot, stored; rotation matrices are made once per camera."""
-    return camera.frames(cameras).stored().at(layout.slot_camera).stacked()
+    """The camera of every slot, materialised; rotation matrices are computed once per camera."""
+    return camera.frames(cameras).materialized().at(layout.slot_camera).stacked()
 
 
 def view_residuals(views: Views, projection: camera.Projection) -> list[Array]:
-    """The whitened residual `Sigma^(-1/2) (predicted - observed)`, pixels; zero where there is no observation."""
+    """The whitened residual `Sigma^(-1/2) (predicted - observed)`, pixels; zero in empty slots."""
     measured = [row.astype(projection.radius.dtype) for row in views.pixels]
     return _whiten(views, [predicted - pixel for predicted, pixel in zip(projection.pixel, measured, strict=True)])
 
 
 def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, "*slots"]:
-    """`rho(|r|^2) / 2` of every slot, pixels squared."""
+    """`rho(|r|^2) / 2` of every slot, pixels^2."""
     squared = residual[0] * residual[0] + residual[1] * residual[1]
     return 0.5 * (squared if loss.trivial else loss(squared)[0])
 
@@ -73,18 +79,20 @@ def observation_costs(
 def cost(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Float[Array, ""]:
-    """The objective `1/2 sum rho(|Sigma^(-1/2) r|^2)`, pixels squared (design, section 2)."""
-    # fused with their sum, the costs would go to a library, and slowly
+    """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2."""
+    # not fused with the sum: XLA would compile both to a slow library call
     return compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
 
 
 def point_terms(views: Views, loss: Loss) -> list[Array]:
-    """Of every observation the six lower entries of `J_p^T J_p` (row by row), the three of `J_p^T r`, its cost (pixels
-    squared), and the inverse depth."""
+    """Point normal equations of every observation, eleven vectors.
+
+    The six lower entries of `J_p^T J_p` row by row, the three of `J_p^T r`, the cost (pixels^2) and the inverse depth.
+    """
     projection = views.projected()
     residual = view_residuals(views, projection)
     by_point = _whiten_columns(views, camera.derivatives(views.frames, projection).point)
-    rows = views.kept([*by_point[0], *by_point[1], *residual])
+    rows = views.materialized([*by_point[0], *by_point[1], *residual])
     residual = rows[6:]
     entries = normal_entries([rows[:3], rows[3:6]], residual)
     if not loss.trivial:
@@ -94,7 +102,7 @@ def point_terms(views: Views, loss: Loss) -> list[Array]:
 
 
 def normal_entries(by_point: list[list[Array]], residual: list[Array]) -> list[Array]:
-    """Products of point columns with each other and with the residual, nine vectors."""
+    """The six lower entries of `J_p^T J_p`, row by row, and the three of `J_p^T r`."""
     first, second = by_point
     matrix = [first[i] * first[j] + second[i] * second[j] for i in range(3) for j in range(i + 1)]
     return matrix + [first[i] * residual[0] + second[i] * residual[1] for i in range(3)]
@@ -104,7 +112,7 @@ def normal_entries(by_point: list[list[Array]], residual: list[Array]) -> list[A
 def linearize(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Linearization:
-    """Analytic Jacobians at the given parameters."""
+    """Residuals and analytic Jacobians at the given parameters, whitened and weighted by the robust loss."""
 
     def terms(views: Views) -> list[Array]:
         projection = views.projected()
@@ -126,14 +134,13 @@ def linearize(
 def with_free_lenses(
     layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False
 ) -> Linearization:
-    """The same where no residual depends on what of f, k1 and k2 stays: its part of the damped system is the clamped
-    damping alone, its gradient zero, and so is its step.
+    """Sets the Jacobian columns of fixed intrinsics to zero. Their gradient, and so their step, is then zero, too.
 
     Args:
-        layout: knows the lenses.
-        linear: all derivatives.
-        intrinsics: `fixed` holds all lenses.
-        alone: whether every camera moves by itself, so that shared lenses must stay.
+        layout: knows which intrinsics of each lens are free.
+        linear: with all derivatives.
+        intrinsics: `fixed` fixes all intrinsics.
+        alone: whether cameras are optimised one by one, so that shared intrinsics must be fixed.
     """
     lenses = layout.lenses
     zero = jnp.zeros_like(linear.residual[0])
@@ -142,8 +149,8 @@ def with_free_lenses(
     if lenses is None:
         return linear
     free = take(jnp.asarray(lenses.free), layout.slot_camera)
-    kept = lambda row: [jnp.where(free[k], column, zero) for k, column in enumerate(row[6:])]
-    return linear._replace(camera_jacobian=[[*row[:6], *kept(row)] for row in linear.camera_jacobian])
+    masked = lambda row: [jnp.where(free[k], column, zero) for k, column in enumerate(row[6:])]
+    return linear._replace(camera_jacobian=[[*row[:6], *masked(row)] for row in linear.camera_jacobian])
 
 
 def _whiten(slots: Layout | Views, pair: list[Array]) -> list[Array]:

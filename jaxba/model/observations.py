@@ -1,4 +1,7 @@
-"""Observations with what they need to know, what follows from them, and sums of that over each point's."""
+"""Evaluation of functions of an observation, its camera and its point: per slot, and summed over each point.
+
+The functions are written once, for a `Views`; here they are evaluated in one fused loop over all slots.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ from jaxba.typing import AnyArray
 
 
 class Views(NamedTuple):
-    """Slots with their cameras and points, of any common shape."""
+    """Observation slots with their cameras and points, of any common shape."""
 
     frames: camera.Frames
     points: Float[Array, "3 ..."]
@@ -26,30 +29,36 @@ class Views(NamedTuple):
     whitening: Float[AnyArray, "2 2 ..."] | None
 
     def projected(self) -> camera.Projection:
-        """Where the points are seen; in haste stored, since every vector that needs it has a loop of its own then."""
+        """The projections of the points.
+
+        Materialised under fast compilation, where each vector computed from them has a loop of its own.
+        """
         projection = camera.project(self.frames, self.points, self.mask)
         return projection.stacked() if fast_compilation.value else projection
 
-    def kept(self, rows: list[Array]) -> list[Array]:
-        """The same vectors, which several others need; in haste stored."""
+    def materialized(self, rows: list[Array]) -> list[Array]:
+        """The same vectors, for several uses: computed once and stored under fast compilation, else unchanged."""
         return list(fusion_barrier(jnp.stack(rows))) if fast_compilation.value else rows
 
 
 Terms = Callable[..., list[Array]]
-"""Makes vectors from `Views` and from what else there is to know of the same slots."""
+"""A function of `Views` and of further vectors over the same slots; it returns a list of vectors."""
 
 
 def view_terms(
     layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"], terms: Terms, *slots: Array
 ) -> list[Float[Array, " slots"]]:
-    """Vectors over slots that follow from an observation, its camera and its point, made together.
+    """Evaluates a function of an observation, its camera and its point for every slot, in one loop.
 
     Args:
-        layout: slots.
-        frames: of every slot, stored (`linearize.slot_frames`).
-        points: of the problem.
-        terms: what they are.
-        slots: what else they follow from.
+        layout: the problem's observations.
+        frames: camera of every slot, materialised (`linearize.slot_frames`).
+        points: current points.
+        terms: the function.
+        slots: its further arguments, vectors over slots.
+
+    Returns:
+        A vector over slots for each term.
     """
     at_slots = jnp.stack(take_each(points, layout.slot_point))
     return compute_in_one_loop(
@@ -58,14 +67,14 @@ def view_terms(
 
 
 def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Float[Array, " points"]]]:
-    """What sums over each point's observations terms that follow from an observation, its camera and its point.
+    """`view_terms` summed over the observations of each point, as a function of the points.
 
     Args:
-        layout: slots.
-        frames: of every slot, stored.
+        layout: the problem's observations.
+        frames: camera of every slot, materialised.
 
     Returns:
-        A function of points, `Terms`, and any vectors over slots; its result is a vector over points for each term.
+        A function of points, `Terms` and further vectors over slots, which returns a vector over points for each term.
     """
 
     def one_pass(points: Float[Array, "3 points"], terms: Terms, *slots: Array) -> list[Float[Array, " points"]]:
