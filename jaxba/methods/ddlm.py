@@ -1,15 +1,17 @@
-"""Stochastic domain decomposition (DeepLM's, "ddlm"): clusters of cameras optimised beside each other.
+"""Stochastic domain decomposition of DeepLM (`ddlm`): clusters of cameras optimised independently.
 
-One round: points that several clusters see stand still, so that clusters share neither a variable nor a residual. Each
-takes a damped step of its own cameras and of the points that it alone sees, with the embedded iterations, camera rounds
-and trials of any other step (`jaxba/refinement`), and keeps it only if its own cost falls. Then cameras stand still
-and every separator takes a damped step of its own, or embedded iterations, kept under the same condition. The cost of
-the whole can only fall. The next round draws other clusters.
+Each round draws a partition of the cameras into clusters (structure/random_partitions.py):
 
-Lambda is one number a round, for clusters and shared points.
+1. Points that several clusters see are held fixed, so that clusters have no variable and no residual in common. Each
+   cluster takes a damped step of its cameras and of the points that it alone sees, with the refinements of any other
+   step (`jaxba/refinement`), and accepts it only if its own cost falls.
+2. Cameras are held fixed, and every shared point takes a damped step, or embedded point iterations, under the same
+   condition.
 
-Source: Huang et al. 2021, "DeepLM", section 4. The authors' code holds the pieces but not the schedule of rounds, which
-is ours.
+The total cost never rises. Lambda is the same for all clusters and shared points of a round.
+
+Source: Huang et al. 2021, "DeepLM: Large-scale Nonlinear Least Squares on Deep Learning Frameworks using Stochastic
+Domain Decomposition", section 4. The authors' code has the parts, but no schedule of rounds; the one here is our own.
 """
 
 from __future__ import annotations
@@ -45,8 +47,8 @@ from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import take, total
 
-LEAST_SHARE = 1 / 64
-"""Share of a round in which no cluster was accepted, not zero because policies look at its logarithm."""
+MIN_STEP_FRACTION = 1 / 64
+"""Step fraction of a round in which no cluster was accepted; positive because policies use its logarithm."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +56,11 @@ class DomainDecomposition:
     """The method `ddlm`."""
 
     cluster_cameras: int = 100
-    """Cameras of a cluster at most. Source: as for `stba`."""
+    """Largest number of cameras in a cluster. Source: as for `stba`."""
 
     name: str = field(default="ddlm", init=False)
     description: str = field(
-        default="DeepLM's stochastic domain decomposition: clusters optimised beside each other, then shared points",
+        default="DeepLM's stochastic domain decomposition: clusters optimised independently, then shared points",
         init=False,
     )
     rule: str = field(default="ceres", init=False)
@@ -100,16 +102,16 @@ def decomposed_round(
     options: StepOptions,
     min_gain: float | Float[Array, ""],
 ) -> Round:
-    """One round of one partition.
+    """One round with a given partition.
 
     Args:
-        layout: slots, with pairs.
-        cameras: present cameras.
-        points: present points.
-        cost: their cost, pixels squared.
+        layout: the problem's observations, with pairs.
+        cameras: current cameras.
+        points: current points.
+        cost: their cost, pixels^2.
         damping: lambda.
-        partition: of this round.
-        options: what is embedded in the steps of the clusters, and what shared points do after them.
+        partition: the partition of this round.
+        options: refinement of the clusters' steps and of shared points.
         min_gain: a cluster's step is accepted if its cost falls and its gain ratio exceeds this.
     """
     parts = Clusters.of(layout, partition)
@@ -119,31 +121,31 @@ def decomposed_round(
     step = _cluster_steps(parts, linear, cameras, dampings, options)
     before = parts.sums(linear.costs)
     found = best_candidate(parts, cameras, points, before, linear.reference, step, options, min_gain)
-    good, whole = found.accepted, step.predicted(jnp.ones_like(before))
-    possible = jnp.isfinite(whole)
-    sum_of = lambda values: jnp.sum(jnp.where(possible, values, 0))
+    accepted, full_step = found.accepted, step.predicted(jnp.ones_like(before))
+    solved = jnp.isfinite(full_step)  # clusters whose factorisation did not fail
+    sum_of = lambda values: jnp.sum(jnp.where(solved, values, 0))
     shared = jnp.asarray(partition.is_shared)
-    cameras = jnp.where(parts.of_cameras(good), found.cameras, cameras)
-    points = jnp.where(parts.of_points(good) & ~shared, found.points, points)
-    predicted = sum_of(jnp.where(good, found.predicted, whole))
-    gained = sum_of(jnp.where(good, found.gain * found.predicted, 0))
-    offered = jnp.sum(jnp.where(possible, whole, jnp.inf))
-    taken = sum_of(jnp.where(good, found.share * whole, 0))
-    moved, after = _separators(layout, cameras, points, damping, partition, options)
-    # points alone may lower the cost a little where every cluster was refused, which is no sign of convergence
-    share = jnp.where(offered - taken > NEGLIGIBLE * cost, taken / offered, 1)
+    cameras = jnp.where(parts.of_cameras(accepted), found.cameras, cameras)
+    points = jnp.where(parts.of_points(accepted) & ~shared, found.points, points)
+    predicted = sum_of(jnp.where(accepted, found.predicted, full_step))
+    decrease = sum_of(jnp.where(accepted, found.gain * found.predicted, 0))
+    offered = jnp.sum(jnp.where(solved, full_step, jnp.inf))
+    taken = sum_of(jnp.where(accepted, found.share * full_step, 0))
+    new_points, new_cost = _step_shared_points(layout, cameras, points, damping, partition, options)
+    # if every cluster was rejected, shared points alone may lower the cost a little, which is no sign of convergence
+    fraction = jnp.where(offered - taken > NEGLIGIBLE * cost, taken / offered, 1)
     return Round(
         cameras,
-        moved,
-        jnp.minimum(after, cost),
+        new_points,
+        jnp.minimum(new_cost, cost),
         predicted,
-        jnp.where(predicted > 0, gained / predicted, 0),  # no cluster's matrix could be factored
+        jnp.where(predicted > 0, decrease / predicted, 0),  # zero if every factorisation failed
         sum_of(step.slope),
         sum_of(step.slope - step.damped),
         step.gradient_max,
-        jnp.clip(share, LEAST_SHARE, 1),
+        jnp.clip(fraction, MIN_STEP_FRACTION, 1),
         jnp.max(found.repairs),
-        after < cost,
+        new_cost < cost,
     )
 
 
@@ -154,9 +156,9 @@ def _cluster_steps(
     dampings: Float[Array, " clusters"],
     options: StepOptions,
 ) -> Step:
-    """Steps of all clusters, separators standing still; the gradient is that of the whole problem.
+    """Steps of all clusters with shared points held fixed; `gradient_max` is that of the whole problem.
 
-    A cluster whose factorisation failed stands still, and its slope is nan.
+    The step of a cluster whose factorisation failed is zero, and its slope is nan.
     """
     layout, partition = parts.layout, parts.partition
     coordinates, of_camera = RotationCoordinates.of(cameras, options), parts.of_cameras(dampings)
@@ -165,22 +167,22 @@ def _cluster_steps(
     projected = [[free * entry for entry in row] for row in eliminated.projected]
     eliminated = eliminated._replace(projected=projected)
     system = camera_system(layout, linear, eliminated, coordinates, of_camera[:, None], options)
-    moves = solve_clusters(layout, linear, eliminated, system, system.right, partition)
-    # what is no number would spread: empty slots belong to some camera, and padding reads them
-    finite = jnp.all(jnp.isfinite(moves), axis=1).at[partition.members].get(mode="fill", fill_value=True)
+    camera_step = solve_clusters(layout, linear, eliminated, system, system.right, partition)
+    # set failed clusters to zero: padding reads empty slots, which belong to some camera, and would spread a nan
+    finite = jnp.all(jnp.isfinite(camera_step), axis=1).at[partition.members].get(mode="fill", fill_value=True)
     solved = jnp.all(finite, axis=1)
-    moves = jnp.where(layout.camera_seen[:, None] & parts.of_cameras(solved)[:, None], moves, 0)
-    point_moves = jnp.stack(back_substitute(layout, linear, eliminated, moves))
-    point_moves = jnp.where(partition.is_shared | ~parts.of_points(solved), 0, point_moves)
-    moved = jacobian_product(layout, linear, moves, point_moves)
-    slopes = parts.sums(-(linear.residual[0] * moved[0] + linear.residual[1] * moved[1]))
+    camera_step = jnp.where(layout.camera_seen[:, None] & parts.of_cameras(solved)[:, None], camera_step, 0)
+    point_step = jnp.stack(back_substitute(layout, linear, eliminated, camera_step))
+    point_step = jnp.where(partition.is_shared | ~parts.of_points(solved), 0, point_step)
+    product = jacobian_product(layout, linear, camera_step, point_step)
+    slopes = parts.sums(-(linear.residual[0] * product[0] + linear.residual[1] * product[1]))
     slopes = jnp.where(solved, slopes, jnp.nan)
-    curvatures = parts.sums(moved[0] * moved[0] + moved[1] * moved[1])
+    curvatures = parts.sums(product[0] * product[0] + product[1] * product[1])
     gradient_max = largest_gradient(eliminated, system, coordinates)
     none = jnp.zeros((), jnp.int32), jnp.zeros_like(gradient_max)
     return Step(
-        components_first(coordinates.from_manifold(moves)),
-        point_moves,
+        components_first(coordinates.from_manifold(camera_step)),
+        point_step,
         slopes,
         slopes - curvatures,
         gradient_max,
@@ -188,10 +190,14 @@ def _cluster_steps(
     )
 
 
-def _separators(
+def _step_shared_points(
     layout: Layout, cameras: Array, points: Array, damping: Array, partition: Partition, options: StepOptions
 ) -> tuple[Float[Array, "3 points"], Float[Array, ""]]:
-    """Every separator after its embedded iterations, or a damped step where there are none; the cost after that."""
+    """Optimises shared points with cameras held fixed: embedded iterations, or a damped step if there are none.
+
+    Returns:
+        All points, and the total cost (pixels^2). A point changes only if its own cost falls.
+    """
     frames = slot_frames(layout, cameras)
     one_pass = point_passes(layout, frames)
     terms = lambda views: point_terms(views, options.loss)[:10]
@@ -203,8 +209,8 @@ def _separators(
         costs = jnp.where(partition.is_shared, costs, before)
         return jnp.where(partition.is_shared, refined, points), total(costs)
     matrix = entries[:6]
-    for place in (0, 2, 5):
-        matrix[place] = matrix[place] + damping_diagonal(matrix[place], damping, options)
+    for entry in (0, 2, 5):
+        matrix[entry] = matrix[entry] + damping_diagonal(matrix[entry], damping, options)
     factor = cholesky3(matrix)
     step = jnp.stack(factor.backward(factor.forward(entries[6:])))
     trial = points - jnp.where(partition.is_shared, step, 0)

@@ -1,12 +1,12 @@
-"""Conjugate gradients on the whole normal equations `(H + D) d = -g`, no variable eliminated (global DeepLM).
+"""DeepLM's global solver (`deeplm`): conjugate gradients on the normal equations `(H + D) d = -g`, without elimination.
 
 Cameras and points are solved for together, preconditioned by their 9 x 9 and 3 x 3 diagonal blocks. A product takes two
-passes over the observations and no block of the reduced camera system is ever formed, so memory grows with the
-observations alone.
+passes over the observations. No block of the reduced camera system is formed, so that memory is linear in the number of
+observations.
 
 Source: Huang et al. 2021, "DeepLM: Large-scale Nonlinear Least Squares on Deep Learning Frameworks using Stochastic
-Domain Decomposition", and the authors' code. There, columns are divided by `1 + |J_j|` before damping, which only
-moves the clamp of the diagonal: ours is Ceres'. The recomputation of the residual every ten iterations is left out.
+Domain Decomposition", and the authors' code. Two differences: the authors divide the columns of J by `1 + |J_j|` before
+damping, where we clamp the diagonal as Ceres does; and they recompute the residual every ten iterations.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class GlobalConjugateGradients:
     conjugate_gradients: ConjugateGradients = field(
         default_factory=lambda: ConjugateGradients(forcing=1e-3, max_iterations=150)
     )
-    """Their stopping rule; the preconditioner is that of the method. Source: 1e-3 and 150, the authors' code."""
+    """Stopping rule; the preconditioner field is ignored. Source of 1e-3 and 150: the authors' code."""
 
     name: str = field(default="deeplm", init=False)
     description: str = field(
@@ -64,7 +64,8 @@ class GlobalConjugateGradients:
         rule = self.conjugate_gradients
         step, points, iterations = solve_normal(*system[:4], rule, forcing)
         if previous is not None:
-            step, points = best_in_span(system, step, parameters, previous), None  # the points then follow the cameras
+            # no point step: it follows by back-substitution
+            step, points = best_in_span(system, step, parameters, previous), None
         return MethodStep(step, points, iterations, True)
 
 
@@ -76,35 +77,35 @@ def solve_normal(
     rule: ConjugateGradients,
     forcing: float | Float[Array, ""],
 ) -> tuple[Float[Array, "cameras 9"], Float[Array, "3 points"], Int[Array, ""]]:
-    """Solves for cameras (manifold coordinates) and points at once.
+    """Solves `(H + D) d = -g` for cameras and points together.
 
     Args:
-        layout: slots.
-        linear: Jacobians and residuals.
+        layout: the problem's observations.
+        linear: residuals and Jacobians.
         points: factored diagonal blocks and damping of the points.
         system: damped diagonal blocks of the cameras.
-        rule: tolerance and limit of conjugate gradients ...
-        forcing: ... and its forcing term.
+        rule: tolerance and iteration limit of conjugate gradients.
+        forcing: forcing term of conjugate gradients.
 
     Returns:
-        The two parts of the step and the number of iterations.
+        The camera step (manifold coordinates), the point step, and the number of iterations.
     """
     cameras = system.gradient.shape[0]
     join = lambda c, p: jnp.concatenate([c.reshape(-1), p.reshape(-1)])
-    part = lambda x: (x[: 9 * cameras].reshape(cameras, 9), x[9 * cameras :].reshape(3, -1))
+    split = lambda x: (x[: 9 * cameras].reshape(cameras, 9), x[9 * cameras :].reshape(3, -1))
     point_damping = jnp.stack(points.damping)
     inverse = block_inverse(system.blocks)
 
     def apply(x: Array) -> Array:
-        c, p = part(x)
-        moved = jacobian_product(layout, linear, c, p)
-        pull = lambda first, second: [a * moved[0] + b * moved[1] for a, b in zip(first, second, strict=True)]
-        back = tree_sum(as_rows(pull(*linear.camera_jacobian)), layout.camera_levels)
-        back = back + jnp.einsum("cab,cb->ca", system.only_damping, c)
-        return join(back, jnp.stack(point_sums(layout, pull(*linear.point_jacobian))) + point_damping * p)
+        c, p = split(x)
+        product = jacobian_product(layout, linear, c, p)
+        transposed = lambda first, second: [a * product[0] + b * product[1] for a, b in zip(first, second, strict=True)]
+        by_camera = tree_sum(as_rows(transposed(*linear.camera_jacobian)), layout.camera_levels)
+        by_camera = by_camera + jnp.einsum("cab,cb->ca", system.only_damping, c)
+        return join(by_camera, jnp.stack(point_sums(layout, transposed(*linear.point_jacobian))) + point_damping * p)
 
     def precondition(x: Array) -> Array:
-        c, p = part(x)
+        c, p = split(x)
         return join(inverse(c), jnp.stack(points.factor.backward(points.factor.forward(list(p)))))
 
     right = -join(system.gradient, jnp.stack(points.gradient))
@@ -116,4 +117,4 @@ def solve_normal(
         tolerance=rule.tolerance,
         max_iterations=rule.max_iterations,
     )
-    return *part(found), iterations
+    return *split(found), iterations

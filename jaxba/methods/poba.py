@@ -1,7 +1,12 @@
 """Power bundle adjustment (PoBA): a power series for the inverse of the reduced camera system.
 
-With `S = B - W`, `S^-1 b = sum_i (B^-1 W)^i B^-1 b`: products with S, the inverses of its 9 x 9 blocks, and no inner
-products. Source: Weber et al. 2023, "Power Bundle Adjustment for Large-Scale 3D Reconstruction".
+With `S = B - W`, where B are the damped camera blocks,
+
+    S^-1 b = sum_i (B^-1 W)^i B^-1 b.
+
+A term takes a product with S and one with the inverses of the 9 x 9 blocks, but no inner products.
+
+Source: Weber et al. 2023, "Power Bundle Adjustment for Large-Scale 3D Reconstruction".
 """
 
 from __future__ import annotations
@@ -25,7 +30,7 @@ class PowerSeries:
     """The method `poba`."""
 
     order: int = 20
-    """Terms of the series. Source: Weber et al. 2023, section 5."""
+    """Order of the series: the highest power. Source: Weber et al. 2023, section 5."""
 
     name: str = field(default="poba", init=False)
     description: str = field(
@@ -70,7 +75,15 @@ def series(
     right: Float[Array, "cameras 9"],
     order: int,
 ) -> Float[Array, "cameras 9"]:
-    """First `order + 1` terms of `sum_i (B^-1 W)^i B^-1 b`, a symmetric map of b."""
+    """The first `order + 1` terms of `sum_i (B^-1 W)^i B^-1 b`, a symmetric linear map of b.
+
+    Args:
+        apply: product with S.
+        system: damped camera blocks B.
+        inverse: product with B^-1.
+        right: b.
+        order: highest power.
+    """
 
     def body(_: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         total, term = carry

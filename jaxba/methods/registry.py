@@ -1,7 +1,7 @@
-"""Methods by name: ways to make a step, or something in its place, each of which any damping policy can drive.
+"""The optimisation methods by name. Every method works with every damping policy.
 
 Plain Levenberg-Marquardt is `lm`. The others implement `StepMethod` or `RoundMethod` of `jaxba.lm.method`, so that
-solver, benchmark and game run all of them through one `lm_step`.
+solver, benchmark and game run all of them through `lm_step`.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ from jaxba.problem.options import StepOptions
 MethodName = Literal["lm", "stba", "deeplm", "ddlm", "poba"]
 
 DEFAULT_METHOD: MethodName = "lm"
-"""Understood where none is named."""
+"""The method of a solver name without one."""
 
 
 class UnknownMethodError(ValueError):
-    """A name that is no method. The message is one line for a person."""
+    """A name is not that of a method. The message is one line for the user."""
 
 
 @runtime_checkable
 class Method(Protocol):
-    """One way to make a step."""
+    """An optimisation method: it decides how the step of an iteration is computed."""
 
     @property
     def name(self) -> str:
-        """In commands, tables and files."""
+        """Name in commands, tables and files."""
         ...
 
     @property
     def description(self) -> str:
-        """One line."""
+        """One line for the user."""
         ...
 
     @property
     def rule(self) -> str:
-        """The damping policy that the method was published with."""
+        """Name of the damping rule that the method was published with."""
         ...
 
     def options(self, base: StepOptions) -> StepOptions:
-        """The options of a step of this method; what it does not decide is that of `base`."""
+        """Step options for this method, which keep everything of `base` that the method does not decide."""
         ...
 
 
@@ -69,7 +69,7 @@ _CLUSTERED: dict[str, Callable[[int], Method]] = {
     "stba": lambda size: StochasticClusters(cluster_cameras=size),
     "ddlm": lambda size: DomainDecomposition(cluster_cameras=size),
 }
-"""Methods whose clusters can be given a size."""
+"""Methods with clusters, by the largest number of cameras in a cluster."""
 
 METHODS: dict[str, Method] = {
     method.name: method
@@ -91,10 +91,10 @@ def make_method(name: str) -> Method:
     """The method called `name`.
 
     Args:
-        name: a key of `METHODS`; those that cluster cameras take the size of a cluster, as in `stba:16`.
+        name: a key of `METHODS`; methods with clusters of cameras accept their largest size, as in `stba:16`.
 
     Raises:
-        UnknownMethodError: no such method, or a size that makes no sense.
+        UnknownMethodError: no such method, or an invalid size.
     """
     base, colon, size = name.partition(":")
     if base not in METHODS:

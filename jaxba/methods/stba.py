@@ -1,14 +1,17 @@
-"""Stochastic bundle adjustment (STBA): a step from a system that falls apart into clusters of cameras.
+"""Stochastic bundle adjustment (STBA): a step from a system that decomposes into clusters of cameras.
 
-A point that several clusters see is split into a copy per cluster, and for this step nothing holds the copies together.
-The reduced camera system is then block-diagonal, a small dense system per cluster. What the split lost is repaired by a
-few Richardson steps on the true reduced camera system, and the points follow the cameras unsplit.
+Each iteration draws a partition of the cameras into clusters (structure/random_partitions.py):
 
-Lambda damps cameras (times `camera_damping`), points and copies. Large ones make the copies of a point disagree about a
-steepest-descent step; `agreed_gradient` mends that.
+1. A point that several clusters see is split into independent point replicas, one per cluster. The reduced camera
+   system of the split problem is block-diagonal, one small dense system per cluster.
+2. A few Richardson iterations on the true reduced camera system correct the camera step.
+3. The points follow by back-substitution, unsplit.
+
+Lambda damps cameras (times `camera_damping`), points and replicas. With a large lambda the step is nearly a
+steepest-descent step, in which the replicas of a point differ; `consensus_gradient` makes them agree.
 
 Source: Zhou et al. 2020, "Stochastic Bundle Adjustment for Efficient and Scalable 3D Reconstruction", sections 3 and 4,
-and the authors' code. Clusters: structure/random_partitions.py.
+and the authors' code.
 """
 
 from __future__ import annotations
@@ -34,15 +37,16 @@ from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import as_rows, point_sum, take, take_each, take_rows, tree_sum
 
-CORRECTED_FROM = 1.0
-"""Lambda from which on the copies of a point are made to agree. Source: the authors' code (radius at most 1)."""
+MIN_CONSENSUS_DAMPING = 1.0
+"""Smallest lambda for which the gradients of replicas are made to agree. Source: the authors' code (radius at most
+1)."""
 
 
 class SplitSystem(NamedTuple):
-    """The eliminated copies."""
+    """The eliminated point replicas (linear/schur.py)."""
 
-    projected: list[list[Array]]  # J_p L^-T of each slot's copy, [2][3] of (slots,)
-    solved: list[Array]  # L^-1 g of each slot's copy, [3] of (slots,)
+    projected: list[list[Array]]  # Q = J_p L^-T of each slot's replica, [2][3] of (slots,)
+    solved: list[Array]  # h = L^-1 g of each slot's replica, [3] of (slots,)
 
 
 @dataclass(frozen=True)
@@ -50,14 +54,14 @@ class StochasticClusters:
     """The method `stba`."""
 
     cluster_cameras: int = 100
-    """Cameras of a cluster at most. Source: the authors' code."""
+    """Largest number of cameras in a cluster. Source: the authors' code."""
 
     repairs: int = 4
-    """Richardson steps on the true system after the clusters' solution. Source: the authors' code."""
+    """Richardson iterations on the true system after the clusters' solution. Source: the authors' code."""
 
     name: str = field(default="stba", init=False)
     description: str = field(
-        default="stochastic bundle adjustment: random clusters of cameras solved apart, then four repairs",
+        default="stochastic bundle adjustment: random clusters of cameras, then four Richardson iterations",
         init=False,
     )
     rule: str = field(default="stba", init=False)
@@ -102,33 +106,33 @@ def clustered_step(
     """The camera step of one STBA iteration, in manifold coordinates.
 
     Args:
-        layout: slots, with pairs.
-        linear: Jacobians and residuals.
-        points: the true points, eliminated.
-        system: the true camera system, damped.
+        layout: the problem's observations, with pairs.
+        linear: residuals and Jacobians.
+        points: the unsplit points, eliminated.
+        system: the reduced camera system of the unsplit problem.
         damping: lambda.
-        partition: of this iteration.
+        partition: the partition of this iteration.
         options: scaling of the damping.
-        repairs: Richardson steps.
+        repairs: number of Richardson iterations.
     """
-    split = eliminate_copies(layout, linear, damping, partition, options)
-    right = split_right(layout, linear, system, split)
+    split = eliminate_replicas(layout, linear, damping, partition, options)
+    right = split_right_hand_side(layout, linear, system, split)
     step = solve_clusters(layout, linear, points._replace(projected=split.projected), system, right, partition)
-    return repair(layout, linear, points, system, step, repairs)
+    return richardson(layout, linear, points, system, step, repairs)
 
 
-def eliminate_copies(
+def eliminate_replicas(
     layout: Layout, linear: Linearization, damping: Float[Array, ""], partition: Partition, options: StepOptions
 ) -> SplitSystem:
-    """As `eliminate.eliminate_points`, for copies."""
+    """As `schur.eliminate_points`, for point replicas."""
     rows = jnp.stack(normal_entries(linear.point_jacobian, linear.residual))
     sums = tree_sum(rows.T, partition.levels).T
     matrix, gradient = [sums[k] for k in range(6)], sums[6:]
-    for place in (0, 2, 5):
-        matrix[place] = matrix[place] + damping_diagonal(matrix[place], damping, options)
-    diagonal = jnp.stack([matrix[place] for place in (0, 2, 5)])
-    agreed = agreed_gradient(layout, partition, diagonal, gradient)
-    gradient = jnp.where(damping >= CORRECTED_FROM, agreed, gradient)
+    for entry in (0, 2, 5):
+        matrix[entry] = matrix[entry] + damping_diagonal(matrix[entry], damping, options)
+    diagonal = jnp.stack([matrix[entry] for entry in (0, 2, 5)])
+    consensus = consensus_gradient(layout, partition, diagonal, gradient)
+    gradient = jnp.where(damping >= MIN_CONSENSUS_DAMPING, consensus, gradient)
     factor = cholesky3(matrix)
     solved = jnp.stack(factor.forward(list(gradient)))
     at_slot = Cholesky3(*take(jnp.stack(factor), partition.slot_replica))
@@ -136,29 +140,37 @@ def eliminate_copies(
     return SplitSystem(projected, take_each(solved, partition.slot_replica))
 
 
-def agreed_gradient(
-    layout: Layout, partition: Partition, diagonal: Float[Array, "3 copies"], gradient: Float[Array, "3 copies"]
-) -> Float[Array, "3 copies"]:
-    """Gradients `D_k (sum_j g_j) / (sum_j D_j)`: the copies of a point then agree about the step `-D_k^-1 g_k`.
+def consensus_gradient(
+    layout: Layout, partition: Partition, diagonal: Float[Array, "3 replicas"], gradient: Float[Array, "3 replicas"]
+) -> Float[Array, "3 replicas"]:
+    """Gradients of replicas for which all replicas of a point take the same step `-D_k^-1 g_k`.
 
-    The nearest gradients, in the metric of `D^-1`, for which they do; the closed form of the published projection
-    `g - H^T (H D^-1 H^T)^-1 H D^-1 g`, where `H` takes differences to the first copy. Sums over the copies of a point
-    run over its slots, each copy shared out among its own.
+        g_k <- D_k (sum_j g_j) / (sum_j D_j)
+
+    These are the nearest such gradients in the metric of `D^-1`: the closed form of the published projection
+    `g - H^T (H D^-1 H^T)^-1 H D^-1 g`, where H takes differences to the first replica.
+
+    Args:
+        layout: the problem's observations.
+        partition: the partition of this iteration.
+        diagonal: D, diagonal of the damped block of each replica.
+        gradient: g of each replica.
     """
+    # Sums over the replicas of a point run over its slots, with weights that sum to one for each replica.
     count = tree_sum(jnp.asarray(layout.slot_mask, gradient.dtype)[:, None], partition.levels)[:, 0]
-    share = jnp.where(count > 0, 1 / jnp.maximum(count, 1), 0)
-    per_slot = take(jnp.concatenate([gradient, diagonal]) * share, partition.slot_replica) * layout.slot_mask
+    weight = jnp.where(count > 0, 1 / jnp.maximum(count, 1), 0)
+    per_slot = take(jnp.concatenate([gradient, diagonal]) * weight, partition.slot_replica) * layout.slot_mask
     by_slot = take(point_sum(layout, per_slot), layout.slot_point) * layout.slot_mask
-    # back to copies, of which every slot knows the same: their mean
-    ours = tree_sum(by_slot.T, partition.levels).T * share
-    whole = ours[3:]
-    return jnp.where(whole > 0, diagonal * ours[:3] / jnp.where(whole > 0, whole, 1), gradient)
+    # back to replicas: all slots of a replica have the same value, so take their mean
+    sums = tree_sum(by_slot.T, partition.levels).T * weight
+    diagonal_sum = sums[3:]
+    return jnp.where(diagonal_sum > 0, diagonal * sums[:3] / jnp.where(diagonal_sum > 0, diagonal_sum, 1), gradient)
 
 
-def split_right(
+def split_right_hand_side(
     layout: Layout, linear: Linearization, system: CameraSystem, split: SplitSystem
 ) -> Float[Array, "cameras 9"]:
-    """Right-hand side of the split system, `-J_c^T (r - Q h)`."""
+    """Right-hand side of the split system, `-sum J_c^T (r - Q h)`."""
     inner = [sum(split.projected[k][i] * split.solved[i] for i in range(3)) for k in range(2)]
     first, second = linear.camera_jacobian
     rows = as_rows([first[a] * inner[0] + second[a] * inner[1] for a in range(9)])
@@ -176,26 +188,33 @@ def solve_clusters(
     """Solves the block-diagonal system, one dense factorisation per cluster.
 
     Args:
-        points: whose `projected` couples the cameras of one cluster; nothing else of it is used.
+        layout: the problem's observations, with pairs.
+        linear: residuals and Jacobians.
+        points: only `projected` is used; it couples the cameras of a cluster.
+        system: damped camera blocks.
         right: right-hand side.
+        partition: the clusters.
+
+    Returns:
+        The camera step, in manifold coordinates; non-finite for a cluster whose factorisation failed.
     """
     matrices = cluster_matrices(layout, linear, points, system, partition)
     padded = jnp.concatenate([right, jnp.zeros((1, 9), right.dtype)])
     rights = take_rows(padded, partition.members).reshape(partition.members.shape[0], -1)
-    # large ones one after the other on a CPU, where each factorisation uses all cores by itself
+    # large systems are solved one by one on a CPU, where each factorisation uses all cores
     if jax.default_backend() == "cpu" and rights.shape[1] >= MIN_UNKNOWNS:
-        found = lax.map(lambda pair: factor_and_solve(*pair), (matrices, rights))
+        steps = lax.map(lambda pair: factor_and_solve(*pair), (matrices, rights))
     else:
-        found = jax.vmap(factor_and_solve)(matrices, rights)
-    found = found.reshape(*partition.members.shape, 9)
-    # cameras and places in clusters name each other; padding writes where nobody reads
-    return jnp.zeros_like(padded).at[partition.members].set(found)[:-1]
+        steps = jax.vmap(factor_and_solve)(matrices, rights)
+    steps = steps.reshape(*partition.members.shape, 9)
+    # every camera is in one cluster; padding writes to the extra last row
+    return jnp.zeros_like(padded).at[partition.members].set(steps)[:-1]
 
 
 def cluster_matrices(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, partition: Partition
 ) -> Float[Array, "clusters n n"]:
-    """The diagonal blocks of the split system; only their lower triangles are filled."""
+    """The diagonal block of each cluster in the split system; only its lower triangle is filled."""
     blocks = reduced_blocks(layout, linear, points, system)
     blocks = jnp.concatenate([blocks, jnp.eye(9, dtype=blocks.dtype)[None]])
     clusters, size = partition.members.shape
@@ -203,11 +222,13 @@ def cluster_matrices(
     return table.transpose(0, 1, 3, 2, 4).reshape(clusters, 9 * size, 9 * size)
 
 
-def repair(
+def richardson(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, step: Array, rounds: int
 ) -> Float[Array, "cameras 9"]:
-    """Richardson steps `x + B^-1 (b - S x)` on the true system: the error shrinks by the spectral radius of
-    `B^-1 E C^-1 E^T`, which is below one."""
+    """Richardson iterations `x <- x + B^-1 (b - S x)` on the true reduced camera system.
+
+    They converge: each multiplies the error by `B^-1 E C^-1 E^T` (damped B and C), whose spectral radius is below one.
+    """
     inverse = block_inverse(computed_after(step, system.blocks))
-    again = lambda _, x: x + inverse(system.right - apply_reduced(layout, linear, points, system, x))
-    return lax.fori_loop(0, rounds, again, step)
+    iteration = lambda _, x: x + inverse(system.right - apply_reduced(layout, linear, points, system, x))
+    return lax.fori_loop(0, rounds, iteration, step)

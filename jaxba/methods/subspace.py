@@ -1,15 +1,14 @@
-"""Sequential subspace optimisation: an inexact step, made the best one in the span of it and of earlier steps.
+"""Sequential subspace optimisation: the best step in the span of an inexact step and of previous camera steps.
 
-A power series, repaired clusters and truncated conjugate gradients leave a part of the damped system unsolved, and the
-next iteration begins anew with the same operator, which leaves the same part again: iterations of a fixed linear
-scheme, whose error shrinks by a constant factor. So the step is taken as the minimum of the damped linear model over
-the span of what the solver found and of the last accepted camera steps. On one and the same system, with a fixed
-symmetric solver and one earlier step, that is the preconditioned method of conjugate gradients, continued from one
-iteration to the next; the earlier steps make good what the solver leaves out again and again.
+Inexact solvers (a power series, clusters with Richardson iterations, truncated conjugate gradients) leave a part of the
+damped system unsolved. The next iteration starts anew with nearly the same operator and leaves the same part again, as
+in a stationary iteration, whose error falls by a constant factor. So the step is replaced by the minimum of the damped
+linear model over the span of the inexact step and the last accepted camera steps. For a constant system, a fixed
+symmetric solver and one previous step this is the preconditioned conjugate gradient method, continued over iterations.
 
-It takes one product with the reduced camera system for each of the steps, the new one included, and as the residual
-that is left is orthogonal to the step, promised decreases need no further pass. An exact solver gains nothing: its step
-is the minimum over all steps already.
+The cost is one product with the reduced camera system per vector of the span. The residual of the result is orthogonal
+to the step, so that the predicted decrease needs no further pass over the observations. An exact solver gains nothing:
+its step minimises over all steps.
 
 Source: Narkiss and Zibulevsky 2005, "Sequential subspace optimization method for large-scale unconstrained problems";
 Knyazev 2001 for conjugate gradients as the optimum in a plane.
@@ -29,7 +28,7 @@ from jaxba.lm.method import DampedSystem
 from jaxba.model import camera
 
 RIDGE = 64.0
-"""Rounding units added to the scaled Gram matrix, whose steps may be nearly parallel."""
+"""Machine epsilons added to the unit diagonal of the scaled Gram matrix, whose vectors may be nearly parallel."""
 
 
 def best_in_span(
@@ -38,13 +37,16 @@ def best_in_span(
     parameters: Float[Array, "9 cameras"],
     previous: Float[Array, "steps 9 cameras"],
 ) -> Float[Array, "cameras 9"]:
-    """The minimum of the damped linear model over the span of a camera step and of earlier changes of the cameras.
+    """The minimum of the damped linear model over the span of a camera step and of previous changes of the cameras.
 
     Args:
         system: the damped system, points eliminated.
-        step: what a solver found, on the manifold.
-        parameters: present cameras.
-        previous: last changes of the cameras' parameters, newest first; zeros stand for none.
+        step: the inexact step, in manifold coordinates.
+        parameters: current cameras.
+        previous: last changes of the camera parameters, newest first; zeros where there are none yet.
+
+    Returns:
+        A camera step in manifold coordinates.
     """
     product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
     return with_previous(product, system.cameras.right, step, on_manifold(parameters, previous))
@@ -59,28 +61,28 @@ def with_previous(
     """The minimum of `x.S x / 2 - b.x` over the span of a step and the previous ones.
 
     Args:
-        product: `S x`, symmetric positive definite.
-        right: `b`.
-        step: what a solver found; where it is not finite, neither is the result.
-        previous: others; zeros stand for none.
+        product: product with S, symmetric positive definite.
+        right: b.
+        step: the inexact step; a non-finite one gives a non-finite result.
+        previous: previous steps; zeros where there are none yet.
     """
     basis = jnp.concatenate([step[None], previous])
     images = jnp.stack([product(each) for each in basis])
     gram = jnp.einsum("icn,jcn->ij", basis, images, precision="highest")
     slopes = jnp.einsum("icn,cn->i", basis, right, precision="highest")
-    size = jnp.sqrt(jnp.diagonal(gram))
-    live = ~(size == 0)  # a size that is no number stays in
-    unit = jnp.where(live, size, 1)
-    own = jnp.where(live, RIDGE * float(jnp.finfo(gram.dtype).eps), 1)
-    scaled = 0.5 * (gram + gram.T) / unit[:, None] / unit + jnp.diag(own)
-    weights = solve_positive(scaled[None], (slopes / unit)[None])[0] / unit
+    norm = jnp.sqrt(jnp.diagonal(gram))
+    nonzero = ~(norm == 0)  # true for nan, so that it reaches the result
+    scale = jnp.where(nonzero, norm, 1)
+    ridge = jnp.where(nonzero, RIDGE * float(jnp.finfo(gram.dtype).eps), 1)
+    scaled = 0.5 * (gram + gram.T) / scale[:, None] / scale + jnp.diag(ridge)
+    weights = solve_positive(scaled[None], (slopes / scale)[None])[0] / scale
     return jnp.einsum("i,icn->cn", weights, basis, precision="highest")
 
 
 def on_manifold(
     cameras: Float[Array, "9 cameras"], changes: Float[Array, "steps 9 cameras"]
 ) -> Float[Array, "steps cameras 9"]:
-    """Changes of the file's camera numbers, to first order as steps from where the cameras are now."""
-    turn = camera.left_jacobian(cameras[:3])
-    turned = jnp.einsum("ijc,sjc->sci", turn, changes[:, :3], precision="highest")
-    return jnp.concatenate([turned, jnp.moveaxis(changes[:, 3:], 1, 2)], axis=2)
+    """Changes of camera parameters (angle-axis rotations) as steps in manifold coordinates, to first order."""
+    jacobian = camera.left_jacobian(cameras[:3])
+    rotations = jnp.einsum("ijc,sjc->sci", jacobian, changes[:, :3], precision="highest")
+    return jnp.concatenate([rotations, jnp.moveaxis(changes[:, 3:], 1, 2)], axis=2)
