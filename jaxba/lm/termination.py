@@ -22,7 +22,7 @@ DAMPING_LIMIT = 1e32
 
 MAX_UNDAMPED_RATIO = 100.0
 """A small decrease, or a short step, counts as convergence only if the same without damping is estimated at no more
-than this many times as large. Chosen, not fitted."""
+than this many times as large."""
 
 FRACTION_ROUNDING = 64.0
 """Machine epsilons within which a damping fraction counts as one: with lambda = 1e30 it was computed as 1 or just

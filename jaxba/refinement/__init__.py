@@ -1,1 +1,1 @@
-"""Around a step: points and cameras re-optimised alone, backtracking, pattern moves, acceptance."""
+"""What follows the linear solve: accept decision, point and camera refinement, backtracking, pattern moves."""

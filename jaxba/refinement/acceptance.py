@@ -1,8 +1,14 @@
-"""Whether a candidate is accepted: its cost after embedded point iterations, against what the linear model predicted.
+"""The accept decision on a candidate, after its embedded point iterations.
 
-A candidate is accepted if its cost falls and its gain ratio, the actual over the predicted decrease, exceeds a bound.
-Where a problem falls into subproblems (`subproblems.py`), each is accepted or rejected by itself. Source of the gain
-ratio: Nielsen 1999, "Damping Parameter in Marquardt's Method"; of embedded point iterations: Jeong et al. 2012.
+With the cost f, the candidate x' and the decrease that the linear model predicts, a candidate is accepted if
+
+    f(x') < f(x)   and   rho = (f(x) - f(x')) / predicted > min_gain.
+
+If a problem decomposes into subproblems (subproblems.py), the decision is made for each of them separately, and the
+arrays below have an axis `parts`.
+
+Source of the gain ratio rho: Nielsen 1999, "Damping Parameter in Marquardt's Method"; of embedded point iterations:
+Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment".
 """
 
 from __future__ import annotations
@@ -21,47 +27,47 @@ from jaxba.refinement.points import PreviousPoints
 from jaxba.refinement.subproblems import PointSearch, Subproblems
 
 NEGLIGIBLE = 1e-6
-"""Predicted decrease relative to the cost that is not worth repairs or further trials. Source: Ceres
+"""Predicted decrease, relative to the cost, below which there are no camera rounds and no further trials. Source: Ceres
 function_tolerance."""
 
-ENOUGH = 1e-2
-"""Decrease by the points' own iterations, relative to what the step predicted, after which they need no further one in
-what is tried after the whole step. Where it held for that too, `ceres+refine3` took 34 iterations to 1e-3 on
-kitti00vo instead of 22."""
+POINT_DECREASE = 1e-2
+"""Candidates after the full step stop their point iterations once one lowers the cost by less than this fraction of the
+predicted decrease. Not the full step: with the same rule there, `ceres+refine3` took 34 instead of 22 iterations to a
+relative error of 1e-3 on kitti00vo."""
 
-LITTLE_LEFT = 1e-3
-"""Predicted decrease relative to the cost below which points are refined from both of their starts, which takes as
-long again. In every trial it brought no more."""
+NEAR_CONVERGENCE = 1e-3
+"""Predicted decrease, relative to the cost, below which points are refined from both of their starts, which doubles the
+time. Measured: in earlier iterations it brings nothing more."""
 
 
 class Candidate(NamedTuple):
-    """Parameters that might be accepted, one decision for every subproblem."""
+    """Proposed parameters, with the accept decision for every subproblem."""
 
     cameras: Float[Array, "9 cameras"]
     points: Float[Array, "3 points"]
-    cost: Float[Array, "*parts"]
-    predicted: Float[Array, "*parts"]  # decrease predicted by the linear model at this length
+    cost: Float[Array, "*parts"]  # pixels^2
+    predicted: Float[Array, "*parts"]  # decrease that the linear model predicts for this step fraction, pixels^2
     gain: Float[Array, "*parts"]  # actual over predicted decrease
     accepted: Bool[Array, "*parts"]
-    share: Float[Array, "*parts"]  # length relative to the whole step
-    repairs: Int[Array, "*parts"]  # camera rounds, further trials and pattern moves that it took
+    share: Float[Array, "*parts"]  # step fraction: length relative to the full step
+    repairs: Int[Array, "*parts"]  # camera rounds, trials and pattern moves after the first candidate
 
 
 class Comparison(NamedTuple):
-    """What candidates of one step are compared with."""
+    """The data of one step with which its candidates are evaluated."""
 
     parts: Subproblems
     cameras: Float[Array, "9 cameras"]  # before the step
-    points: Float[Array, "3 points"]
-    cost: Float[Array, "*parts"]  # there, pixels squared
-    terms: Float[Array, " terms"]  # the same in pieces, compared one by one: two sums would cancel in float32
+    points: Float[Array, "3 points"]  # before the step
+    cost: Float[Array, "*parts"]  # before the step, pixels^2
+    terms: Float[Array, " terms"]  # its terms: differences are summed, since the difference of sums cancels in float32
     previous: PreviousPoints
     step: Step
     options: StepOptions
     min_gain: float | Float[Array, ""]
     point_iterations: int | Int[Array, ""]
-    starts: Int[Array, ""]  # of points after the whole step, see `PointSearch`
-    matters: Bool[Array, "*parts"]  # whether the step predicts a decrease worth repairs and further trials
+    starts: Int[Array, ""]  # starts of points after the full step, see `PointSearch`
+    matters: Bool[Array, "*parts"]  # whether the predicted decrease is worth camera rounds and further trials
 
 
 def comparison(
@@ -75,7 +81,7 @@ def comparison(
     min_gain: float | Float[Array, ""],
     effort: Effort | None,
 ) -> Comparison:
-    """What the candidates of a step are compared with; arguments are those of `best_candidate`."""
+    """The `Comparison` of a step. Arguments as for `best_candidate`."""
     point_iterations = options.refinement.points
     if effort is not None:
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
@@ -91,7 +97,7 @@ def comparison(
         options=options,
         min_gain=min_gain,
         point_iterations=point_iterations,
-        starts=jnp.where(jnp.all(predicted <= LITTLE_LEFT * cost), 2, 1),
+        starts=jnp.where(jnp.all(predicted <= NEAR_CONVERGENCE * cost), 2, 1),
         matters=predicted > NEGLIGIBLE * cost,
     )
 
@@ -102,25 +108,25 @@ def assess(
     points: Float[Array, "3 points"],
     share: Float[Array, "*parts"],
     repairs: Int[Array, "*parts"],
-    whole: Bool[Array, ""] | None = None,
+    full_step: Bool[Array, ""] | None = None,
 ) -> Candidate:
-    """A candidate after its embedded point iterations, and whether it is accepted.
+    """Refines the points of a candidate and decides whether it is accepted.
 
     Args:
-        against: what it is compared with.
-        cameras: of the candidate.
-        points: where their iterations start.
-        share: its length relative to the whole step.
-        repairs: what it took so far.
-        whole: whether it is the whole step of some subproblem, after which points may also start from their rays; None
-            after a camera round, which finds points where their cameras left them.
+        against: data of the step.
+        cameras: cameras of the candidate.
+        points: points before their embedded iterations.
+        share: step fraction, which scales the predicted decrease.
+        repairs: camera rounds, trials and pattern moves so far.
+        full_step: whether this is the full step of some subproblem, after which points may also start from their rays;
+            None after a camera round, where they never do.
     """
     options, parts = against.options, against.parts
-    if whole is None:
-        whole = jnp.zeros((), bool)
+    if full_step is None:
+        full_step = jnp.zeros((), bool)
         options = replace(options, refinement=replace(options.refinement, starts="step"))
-    enough = jnp.where(whole, -jnp.inf, ENOUGH * jnp.sum(against.step.predicted(share)))
-    search = PointSearch(against.point_iterations, jnp.where(whole, against.starts, 0), enough)
+    min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * jnp.sum(against.step.predicted(share)))
+    search = PointSearch(against.point_iterations, jnp.where(full_step, against.starts, 0), min_decrease)
     points, terms = parts.refine(cameras, points, against.previous, options, search)
     cost, decrease, predicted = parts.sums(terms), parts.sums(against.terms - terms), against.step.predicted(share)
     gain = decrease / predicted
@@ -128,8 +134,8 @@ def assess(
     return Candidate(cameras, points, cost, predicted, gain, accepted & jnp.isfinite(cost), share, repairs)
 
 
-def chosen(parts: Subproblems, which: Bool[Array, "*parts"], new: Candidate, old: Candidate) -> Candidate:
-    """The new candidate of some subproblems, the old one of the others."""
+def select(parts: Subproblems, which: Bool[Array, "*parts"], new: Candidate, old: Candidate) -> Candidate:
+    """The new candidate for the subproblems in `which`, the old one for the others."""
     values = [jnp.where(which, *pair) for pair in zip(new[2:], old[2:], strict=True)]
     cameras = jnp.where(parts.of_cameras(which), new.cameras, old.cameras)
     return Candidate(cameras, jnp.where(parts.of_points(which), new.points, old.points), *values)

@@ -1,4 +1,4 @@
-"""Backtracking: a refused candidate is tried again at a quarter of the length."""
+"""Backtracking: a rejected step is tried again at a quarter of its length."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from jaxtyping import Bool, Float
 from jaxba.refinement.acceptance import Candidate, Comparison
 
 SHORTER = 0.25
-"""Factor on the length of a step that was refused. Measured with 4 trials on Ladybug-49 under lambda 1e-6."""
+"""Factor on the length of a rejected step. Measured with 4 trials on Ladybug-49 with a constant lambda of 1e-6."""
 
 
-def is_tried_again(against: Comparison, candidate: Candidate, length: Float[Array, "*parts"]) -> Bool[Array, "*parts"]:
-    """Whether a candidate was refused and a shorter one is left to try."""
+def should_backtrack(
+    against: Comparison, candidate: Candidate, length: Float[Array, "*parts"]
+) -> Bool[Array, "*parts"]:
+    """Whether a candidate of this length was rejected and a shorter one is left to try."""
     shortest = 1.5 * SHORTER ** (against.options.refinement.trials - 1)
     return ~candidate.accepted & (length > shortest) & against.matters

@@ -1,8 +1,8 @@
-"""Camera rounds: first every camera, then every point is re-optimised alone, a few times over.
+"""Camera rounds: every camera, then every point is re-optimised on its own, a few times in turn.
 
-Where a step did less than half of what the linear model predicted and is not hopeless, a step along a curved valley
-comes back to its floor. Source: resection and intersection (Chen, Chen, Wang 2019, "Bundle adjustment revisited"), here
-as a repair of second-order steps.
+They follow a candidate that achieved less than half of the predicted decrease but is not far off. A step along a curved
+valley leaves its floor; independent steps of cameras and points return to it. Source: resection-intersection (Chen,
+Chen and Wang 2019, "Bundle adjustment revisited"), used here to correct second-order steps.
 """
 
 from __future__ import annotations
@@ -11,57 +11,60 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
-from jaxba.refinement.acceptance import Candidate, Comparison, assess, chosen
+from jaxba.refinement.acceptance import Candidate, Comparison, assess, select
 from jaxba.refinement.cameras import refine_cameras
 
 GOOD_GAIN = 0.5
-"""Gain ratio from which on the linear model is trusted and cameras stay where it put them."""
+"""Gain ratio from which the linear model is trusted and there are no camera rounds."""
 
-HOPELESS = 1.5
-"""Candidates that cost more than this times the present cost get no camera rounds: wild points would pull the cameras
-after them. On Ladybug-49 under lambda 1e-6 a limit of 10 led into a minimum 19% above, 1.5 did not."""
+MAX_COST_RATIO = 1.5
+"""Largest cost of a candidate, relative to the cost before the step, for camera rounds: beyond it, outlying points
+would pull the cameras away. On Ladybug-49 with a constant lambda of 1e-6, a limit of 10 led to a minimum 19% above that
+reached with 1.5."""
 
-WITHIN_REACH = (-5.0, -0.5)
-"""Gain ratios after one camera round, and after more, from which on a further one may lead to acceptance. On six real
-problems it did in none of the 12 and 17 cases with less."""
+MIN_GAINS = (-5.0, -0.5)
+"""Smallest gain ratio after one camera round, and after more, for which there is another one. On six real problems none
+of the 12 and 17 candidates below was ever accepted."""
 
-ROUNDS_OF_OTHERS = 1
-"""Camera rounds of a shortened candidate, and of a pattern move. On 457 held-out scenes `learned` came within 1e-4 of
-the best in 6.40 iterations on average without any of a shortened one, 6.02 with one, 5.88 with three; on real problems
-three took a tenth more work than one."""
+ROUNDS_OF_LATER_CANDIDATES = 1
+"""Most camera rounds of a backtracked candidate or a pattern move. Measured on 457 held-out scenes with the policy
+`learned`: 6.40 iterations to within 1e-4 of the best cost with none for backtracked candidates, 6.02 with one, 5.88
+with three; on real problems three took a tenth more work than one."""
 
 
-def repaired(
+def with_camera_rounds(
     against: Comparison,
     candidate: Candidate,
     best: Candidate,
-    whole: Bool[Array, "*parts"],
-    going: Bool[Array, "*parts"],
+    full_step: Bool[Array, "*parts"],
+    active: Bool[Array, "*parts"],
 ) -> Candidate:
-    """A candidate after as many camera rounds as may lead to its acceptance.
+    """A candidate after camera rounds, as long as these may lead to its acceptance.
 
     Args:
-        against: what it is compared with.
-        candidate: to be repaired.
-        best: the best one so far, which a pattern move must undercut.
-        whole: whether it is the whole step, which may have all rounds.
-        going: subproblems that it is for.
+        against: data of the step.
+        candidate: the candidate to improve.
+        best: the best candidate so far; a pattern move must have a lower cost.
+        full_step: whether the candidate is the full step, which may have all rounds.
+        active: subproblems for which the candidate is evaluated.
     """
     most = against.options.refinement.camera_rounds
-    rounds = jnp.where(whole, most, min(ROUNDS_OF_OTHERS, most))
-    rounds = jnp.where(going, rounds, 0)
+    rounds = jnp.where(full_step, most, min(ROUNDS_OF_LATER_CANDIDATES, most))
+    rounds = jnp.where(active, rounds, 0)
 
     def one_round(carry: tuple[Candidate, Int[Array, "*parts"]]) -> tuple[Candidate, Int[Array, "*parts"]]:
         candidate, left = carry
-        moved = refine_cameras(against.parts.layout, candidate.cameras, candidate.points, against.options)
-        again = assess(against, moved, candidate.points, candidate.share, candidate.repairs + 1)
-        return chosen(against.parts, worth_it(carry), again, candidate), left - 1
+        cameras = refine_cameras(against.parts.layout, candidate.cameras, candidate.points, against.options)
+        improved = assess(against, cameras, candidate.points, candidate.share, candidate.repairs + 1)
+        return select(against.parts, should_continue(carry), improved, candidate), left - 1
 
-    def worth_it(carry: tuple[Candidate, Int[Array, "*parts"]]) -> Bool[Array, "*parts"]:
+    def should_continue(carry: tuple[Candidate, Int[Array, "*parts"]]) -> Bool[Array, "*parts"]:
         candidate, left = carry
-        lacks = jnp.where(best.accepted, candidate.cost >= best.cost, candidate.gain < GOOD_GAIN)
+        insufficient = jnp.where(best.accepted, candidate.cost >= best.cost, candidate.gain < GOOD_GAIN)
         done = rounds - left
-        within_reach = candidate.gain > jnp.select([done == 0, done == 1], [-jnp.inf, WITHIN_REACH[0]], WITHIN_REACH[1])
-        return (left > 0) & lacks & (candidate.cost < HOPELESS * against.cost) & within_reach & against.matters
+        promising = candidate.gain > jnp.select([done == 0, done == 1], [-jnp.inf, MIN_GAINS[0]], MIN_GAINS[1])
+        return (
+            (left > 0) & insufficient & (candidate.cost < MAX_COST_RATIO * against.cost) & promising & against.matters
+        )
 
-    return lax.while_loop(lambda carry: jnp.any(worth_it(carry)), one_round, (candidate, rounds))[0]
+    return lax.while_loop(lambda carry: jnp.any(should_continue(carry)), one_round, (candidate, rounds))[0]

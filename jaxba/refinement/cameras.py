@@ -1,4 +1,4 @@
-"""Embedded camera iterations: every camera re-optimised alone while the points stand still (resection)."""
+"""Resection: every camera is re-optimised on its own with the points held fixed."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
 DAMPINGS = (1e-6, 1e-2)
-"""Relative damping of a camera's step, and of a second one where the first did not help."""
+"""Relative damping of the first attempt at a camera's step, and of a second one if the first did not lower its cost."""
 
 
 def refine_cameras(
     layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], options: StepOptions
 ) -> Float[Array, "9 cameras"]:
-    """One damped Gauss-Newton step of every camera by itself, kept only where that camera's own cost falls.
+    """One damped Gauss-Newton step of every camera on its own, accepted if that camera's own cost falls.
 
     Args:
-        layout: slots.
-        cameras: where to start.
-        points: they stand still.
-        options: loss, and whether intrinsics stay.
+        layout: the problem's observations.
+        cameras: current cameras.
+        points: points, held fixed.
+        options: the loss, and whether intrinsics are fixed.
 
     Returns:
-        Cameras; the total cost is never larger than before.
+        New cameras; the total cost is never larger than before.
     """
     linear = linearize(layout, cameras, points, options.loss)
     linear = with_free_lenses(layout, linear, options.intrinsics, alone=True)
@@ -41,23 +41,23 @@ def refine_cameras(
     products = tree_sum(outer_sum(gathered[..., :9], gathered), tuple(levels))
     blocks, gradient = products[:, :, :9], products[:, :, 9]
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
-    # XLA would add up a camera's costs anew for every number that depends on them
+    # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
     own_cost = lambda costs: compute_unfused(each_sum, costs, index=layout.slot_camera)
     before = own_cost(linear.costs)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        best, done, turn = carry
-        damped = blocks + (dampings[turn] * diagonal)[:, :, None] * jnp.eye(9, dtype=blocks.dtype)
+        best, done, attempt_number = carry
+        damped = blocks + (dampings[attempt_number] * diagonal)[:, :, None] * jnp.eye(9, dtype=blocks.dtype)
         step = -components_first(solve_positive(damped, gradient))
-        # on the manifold, in which the Jacobian is written
-        moved = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
-        costs = observation_costs(layout, moved, points, options.loss)
-        upright = moved[6] * cameras[6] >= 0  # as in candidates.py
-        better = (own_cost(costs) < before) & ~done & upright
-        return jnp.where(better, moved, best), done | better, turn + 1
+        # the Jacobian, and so the step, is in manifold coordinates
+        trial = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
+        costs = observation_costs(layout, trial, points, options.loss)
+        same_sign = trial[6] * cameras[6] >= 0  # of the focal length, as in candidates.py
+        better = (own_cost(costs) < before) & ~done & same_sign
+        return jnp.where(better, trial, best), done | better, attempt_number + 1
 
-    # a loop and not two copies: half of it to compile
+    # a loop instead of unrolled attempts: half as much to compile
     dampings, unseen = jnp.asarray(DAMPINGS, cameras.dtype), ~jnp.asarray(layout.camera_seen)
     more = lambda carry: (carry[2] < len(DAMPINGS)) & ~jnp.all(carry[1])
     return lax.while_loop(more, attempt, (cameras, unseen, jnp.zeros((), jnp.int32)))[0]

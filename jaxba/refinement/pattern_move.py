@@ -1,7 +1,9 @@
-"""Pattern moves: an accepted step is repeated in its direction, twice as far each time, as long as that costs less.
+"""Pattern moves: an accepted step is repeated in its direction, each time twice as far, while the cost falls.
 
-An accepted candidate that the linear model did not foresee, or that damping held back, lies on the floor of a valley,
-and so does the start. Source: Hooke, Jeeves 1961, "Direct search solution of numerical and statistical problems".
+An accepted candidate that the linear model did not predict, or whose length damping limited, lies on the floor of a
+valley, as does the start: the direction between the two follows the valley.
+
+Source: Hooke and Jeeves 1961, "Direct search solution of numerical and statistical problems".
 """
 
 from __future__ import annotations
@@ -12,22 +14,26 @@ from jaxtyping import Bool, Float
 
 from jaxba.refinement.acceptance import Candidate, Comparison
 
-FORESEEN = 0.25
-"""Difference of the gain ratio from one up to which a step did what the linear model predicted."""
+GAIN_TOLERANCE = 0.25
+"""Difference of the gain ratio from one up to which the linear model predicted the step."""
 
-FREE = 0.1
-"""Share of damping in a step's curvature up to which damping did not hold it back. A step that did what was predicted
-and was free is Newton's, and there is nothing to be had beyond its end."""
+SMALL_DAMPING_FRACTION = 0.1
+"""Damping fraction `d.D d / d.(H + D) d` up to which damping did not limit the length of a step. If the linear model
+predicted such a step, it is a Gauss-Newton step, and nothing is gained beyond it."""
 
 
-def is_repeated(against: Comparison, first: Candidate) -> Bool[Array, "*parts"]:
+def should_repeat(against: Comparison, first: Candidate) -> Bool[Array, "*parts"]:
     """Whether the first accepted candidate is repeated in its direction."""
     step = against.step
-    foreseen = (jnp.abs(first.gain - 1) <= FORESEEN) & (first.repairs == 0) & (step.damped <= FREE * step.slope)
-    return against.matters & ~foreseen
+    predicted = (
+        (jnp.abs(first.gain - 1) <= GAIN_TOLERANCE)
+        & (first.repairs == 0)
+        & (step.damped <= SMALL_DAMPING_FRACTION * step.slope)
+    )
+    return against.matters & ~predicted
 
 
-def goes_further(
+def should_extend(
     against: Comparison, better: Bool[Array, "*parts"], length: Float[Array, "*parts"]
 ) -> Bool[Array, "*parts"]:
     """Whether a pattern move that was `better` is followed by one of twice the length."""

@@ -1,20 +1,20 @@
-"""Embedded point iterations: every point re-optimised alone while the cameras stand still.
+"""Embedded point iterations: every point is re-optimised on its own with the cameras held fixed.
 
-Given cameras, the cost splits into one small problem a point, so that each point may take damped
-Gauss-Newton steps of its own, kept only if its own cost falls. The total cost can only fall. Points that a
-bold camera step threw far away come back in one pass over the observations each.
+For fixed cameras the cost is a sum of independent problems with three unknowns, one per point. Every point takes damped
+Gauss-Newton steps of its own, accepted only if its own cost falls, so that the total cost never rises. An iteration
+takes one pass over the observations. Points that a long camera step threw off come back in this way.
 
-Projection does not see the difference between a point and its mirror image behind the camera, and a point far away
-comes to the other side by way of infinity. There it may fit for a while and never find back: kittistereo00s ended 1.8%
-above the best known cost with 61 such points. So a point that the step sent behind a camera starts again from where it
-was before the step (`PreviousPoints`).
+Two cases do not come back by themselves, since the cost does not see them:
 
-Nor does it see distance where rays are nearly parallel: one step may take a point a million times as far, where it
-feels nothing any more, or through infinity behind its cameras. So neither the step nor a point's own iterations take
-it more than `FARTHEST` times as far.
+- A point behind a camera projects like its mirror image in front of it, and a distant point gets there by way of
+  infinity. It may fit for a while and then be stuck: kittistereo00s ended 1.8% above the best known cost with 61 such
+  points. So a point that the step sent behind a camera starts again from its previous position (`PreviousPoints`).
+- With nearly parallel rays, one step may increase the distance of a point a million times, to where its gradient
+  vanishes, or send it through infinity behind its cameras. So neither the step nor the point's own iterations may
+  increase its distance more than `MAX_DISTANCE_RATIO` times.
 
-Source: "embedded point iterations", Jeong et al., "Pushing the Envelope of Modern Methods for Bundle
-Adjustment", PAMI 2012; Ceres calls the same idea inner iterations.
+Source: Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment" (embedded point iterations);
+Ceres calls the same idea inner iterations.
 """
 
 from __future__ import annotations
@@ -35,50 +35,49 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sum
 
 INITIAL_DAMPING = 1e-6
-"""Relative damping of a point's first step: plain Gauss-Newton but for parallel rays."""
+"""Relative damping of a point's first step: Gauss-Newton except for parallel rays."""
 
 REJECTED_DAMPING = 1e-2
-"""Damping after a point's first rejected step."""
+"""Smallest relative damping after a point's step was rejected."""
 
 DAMPING_FACTOR = 10.0
-"""Growth of a point's damping after a further rejection, and its decay after success."""
+"""Factor on a point's damping after a rejected step, and its inverse after an accepted one."""
 
+MAX_DISTANCE_RATIO = 100.0
+"""Largest growth of the distance of a point from its cameras by the step, and again by its own iterations. The distance
+is the harmonic mean of its depths, negative behind a camera; a point that starts behind its cameras has no limit.
+Chosen since the depths of a scene span two decades. With a ratio of 8 kitti00vo ended 3e-4 above the best known cost,
+with 100 it ended 2e-7 above."""
 
-FARTHEST = 100.0
-"""Distance that a point may have from its cameras after the step, and again after its own iterations, relative to where
-it was before. Distances are harmonic means over its cameras; those behind count as negative. What starts behind its
-cameras has no limit. The depths of a scene span two decades.
-8 stopped points that should go: kitti00vo ended 3e-4 above the best known cost, 2e-7 with 100."""
-
-LITTLE = 1e-2
-"""Share of the cost below which the decrease of a pass is small."""
+SMALL_DECREASE = 1e-2
+"""Largest decrease of an iteration, relative to the cost, after which the iterations may stop early."""
 
 
 class PreviousPoints(NamedTuple):
-    """Where points were before the step, and what was visible there."""
+    """Positions of points before the step, to which diverged points return."""
 
     points: Float[Array, "3 points"]
-    front: Bool[Array, " slots"]  # whether the point lay in front of the camera
-    nearness: Float[Array, " points"]  # see `gone`
+    front: Bool[Array, " slots"]  # whether the point was in front of the camera
+    inverse_depth_sum: Float[Array, " points"]  # over the cameras of a point, negative in front of them
 
     @classmethod
     def of(
         cls, layout: Layout, points: Float[Array, "3 points"], inverse_depth: Float[Array, " slots"]
     ) -> PreviousPoints:
-        """Where points are, with `Projection.inverse_depth` of every slot there."""
+        """From the positions of points and `Projection.inverse_depth` of every slot."""
         return cls(points, inverse_depth < 0, point_sum(layout, inverse_depth[None])[0])
 
 
 class _Carry(NamedTuple):
     points: Float[Array, "3 points"]  # best so far
     costs: Float[Array, " points"]
-    system: Float[Array, "9 points"]  # lower triangle of the block, then the gradient, there
+    system: Float[Array, "9 points"]  # lower triangle of `J_p^T J_p` and gradient at `points`
     damping: Float[Array, " points"]
-    trial: Float[Array, "3 points"]  # where to look next
-    nearness: Float[Array, " points"]  # of the start, see `gone`
-    late: Bool[Array, " points"]  # whether it was put back, and so is a pass behind the others
+    trial: Float[Array, "3 points"]  # next positions to evaluate
+    inverse_depth_sum: Float[Array, " points"]  # at the start
+    delayed: Bool[Array, " points"]  # whether the point was reset, and so is a pass behind the others
     passes: Int[Array, ""]
-    settled: Bool[Array, ""]  # whether the last pass brought too little for another one
+    converged: Bool[Array, ""]  # whether the last pass lowered the cost too little for another one
 
 
 def refine_points(
@@ -88,25 +87,25 @@ def refine_points(
     loss: Loss,
     iterations: int | Int[Array, ""],
     previous: PreviousPoints | None = None,
-    enough: float | Float[Array, ""] = -jnp.inf,
+    min_decrease: float | Float[Array, ""] = -jnp.inf,
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
-    """Improves every point by `iterations` steps of its own.
+    """Improves every point by up to `iterations` damped Gauss-Newton steps of its own.
 
     Args:
-        layout: slots.
-        frames: of every slot (`linearize.slot_frames`).
-        points: where to start.
+        layout: the problem's observations.
+        frames: camera of every slot (`linearize.slot_frames`).
+        points: start.
         loss: robust loss.
-        iterations: steps per point, none or more; each costs one pass over the observations, and so does the end, and
-            one more where points are put back.
-        previous: where points were before the step. A point that lies behind a camera in front of which it was, or
-            `FARTHEST` times as far from its cameras, is put back there first.
-        enough: ends after a step that lowered the cost by no more than this, all points together, nor by more than
-            `LITTLE` of what is left.
+        iterations: steps per point, zero or more. Each takes one pass over the observations; there is one more pass at
+            the end, and another one if points are reset.
+        previous: points before the step. A diverged point is reset to its previous position first: one that is behind
+            a camera and was in front of it, or more than `MAX_DISTANCE_RATIO` times as far away.
+        min_decrease: stop after an iteration that lowers the total cost by at most this (pixels^2) and by at most
+            `SMALL_DECREASE` of the cost that is left.
 
     Returns:
-        Points, and the cost of each point's observations there (pixels squared), never larger than where it
-        started, which is its previous place for a point that was put back.
+        Points, and the cost of the observations of each (pixels^2). It is never larger than at the start, which for
+        reset points is the previous position.
     """
     one_pass = point_passes(layout, frames)
     fronts = () if previous is None else (previous.front,)
@@ -127,27 +126,29 @@ def refine_points(
         return jnp.stack(compute_in_one_loop(moved, best.points, factor, best.system[6:]))
 
     def body(carry: _Carry) -> _Carry:
-        *system, costs, nearness = (found := one_pass(carry.trial, terms, *fronts))[:11]
-        diverged, late = jnp.zeros_like(carry.late), carry.late
+        *system, costs, inverse_depth_sum = (found := one_pass(carry.trial, terms, *fronts))[:11]
+        diverged, delayed = jnp.zeros_like(carry.delayed), carry.delayed
         if previous is not None:
-            diverged = (carry.passes == 0) & ((found[11] > 0) | gone(nearness, previous.nearness))
-            late = late | diverged
-        start = jnp.where(jnp.isinf(carry.costs), nearness, carry.nearness)
-        going_on = ~diverged & (late | (carry.passes <= iterations))
-        better = (costs < carry.costs) & ~gone(nearness, start) & going_on
+            diverged = (carry.passes == 0) & (
+                (found[11] > 0) | has_receded(inverse_depth_sum, previous.inverse_depth_sum)
+            )
+            delayed = delayed | diverged
+        start = jnp.where(jnp.isinf(carry.costs), inverse_depth_sum, carry.inverse_depth_sum)
+        active = ~diverged & (delayed | (carry.passes <= iterations))
+        accepted = (costs < carry.costs) & ~has_receded(inverse_depth_sum, start) & active
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
-        damping = jnp.where(better, carry.damping / DAMPING_FACTOR, grown)
-        least, lowered = jnp.where(better, costs, carry.costs), jnp.sum(jnp.where(better, carry.costs - costs, 0))
+        damping = jnp.where(accepted, carry.damping / DAMPING_FACTOR, grown)
+        least, lowered = jnp.where(accepted, costs, carry.costs), jnp.sum(jnp.where(accepted, carry.costs - costs, 0))
         best = _Carry(
-            points=jnp.where(better, carry.trial, carry.points),
+            points=jnp.where(accepted, carry.trial, carry.points),
             costs=least,
-            system=jnp.where(better, jnp.stack(system), carry.system),
+            system=jnp.where(accepted, jnp.stack(system), carry.system),
             damping=jnp.where(diverged, carry.damping, damping),
             trial=carry.trial,
-            nearness=start,
-            late=late,
+            inverse_depth_sum=start,
+            delayed=delayed,
             passes=carry.passes + 1,
-            settled=lowered <= jnp.minimum(enough, LITTLE * jnp.sum(least)),
+            converged=lowered <= jnp.minimum(min_decrease, SMALL_DECREASE * jnp.sum(least)),
         )
         best = best._replace(trial=propose(best))
         if previous is None:
@@ -157,20 +158,23 @@ def refine_points(
             trial=jnp.where(diverged, previous.points, best.trial),
         )
 
-    # the start is a trial better than nothing, and the end one like the others: the program has one copy of a pass
-    nothing = jnp.full_like(points[0], jnp.inf)
-    first = jnp.full_like(nothing, DAMPING_FACTOR * INITIAL_DAMPING)
-    none, zero = jnp.zeros(nothing.shape, bool), jnp.zeros_like(nothing)
-    system = jnp.zeros((9, *nothing.shape), points.dtype)
-    carry = _Carry(points, nothing, system, first, points, zero, none, jnp.zeros((), jnp.int32), jnp.zeros((), bool))
-    more = lambda c: (c.passes <= iterations + jnp.any(c.late)) & ~c.settled
+    # start and end are passes like the others, with infinite initial costs: the program contains a pass only once
+    infinite = jnp.full_like(points[0], jnp.inf)
+    damping = jnp.full_like(infinite, DAMPING_FACTOR * INITIAL_DAMPING)
+    not_delayed, zero = jnp.zeros(infinite.shape, bool), jnp.zeros_like(infinite)
+    system = jnp.zeros((9, *infinite.shape), points.dtype)
+    carry = _Carry(
+        points, infinite, system, damping, points, zero, not_delayed, jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    )
+    more = lambda c: (c.passes <= iterations + jnp.any(c.delayed)) & ~c.converged
     carry = lax.while_loop(more, body, carry)
     return carry.points, carry.costs
 
 
-def gone(nearness: Float[Array, " points"], before: Float[Array, " points"]) -> Bool[Array, " points"]:
-    """Whether points in front of their cameras are more than `FARTHEST` times as far away as before, or behind.
+def has_receded(inverse_depth_sum: Float[Array, " points"], before: Float[Array, " points"]) -> Bool[Array, " points"]:
+    """Whether points have moved behind their cameras or more than `MAX_DISTANCE_RATIO` times as far away.
 
-    Nearness is the sum of inverse depths over a point's cameras, negative in front of them. What was behind is free.
+    Both arguments are sums of inverse depths over a point's cameras, negative in front of them. A point that was behind
+    its cameras before has not receded, wherever it is.
     """
-    return (before < 0) & (FARTHEST * nearness > before)
+    return (before < 0) & (MAX_DISTANCE_RATIO * inverse_depth_sum > before)

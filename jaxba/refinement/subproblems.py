@@ -1,7 +1,7 @@
-"""What is judged by itself: the whole problem, or every cluster of a decomposition.
+"""Subproblems whose candidates are accepted separately: the whole problem, or the clusters of a partition.
 
-The cost of a part is the sum over its observations, and a candidate is accepted or refused part by part. Numbers of
-parts are arrays of one shape: none for the whole, one entry a cluster else.
+The cost of a subproblem is the sum over its observations, and its candidate is accepted or rejected on its own. Arrays
+with the dimension `*parts` are scalars for the whole problem and have one entry per cluster otherwise.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from jaxba.structure.segment_sums import point_sum, take, total, tree_sum
 
 
 class PointSearch(NamedTuple):
-    """How far embedded point iterations go."""
+    """Parameters of embedded point iterations for one candidate."""
 
     iterations: int | Int[Array, ""]
-    starts: Int[Array, ""]  # whether from rays, and from both places (`triangulate.refine_from_starts`)
-    enough: Float[Array, ""]  # decrease of an iteration that is the last one
+    starts: Int[Array, ""]  # where points start: 0, 1 or 2 (`midpoints.refine_from_starts`)
+    min_decrease: Float[Array, ""]  # stop after an iteration that lowers the cost by no more than this, pixels^2
 
 
 @runtime_checkable
 class Subproblems(Protocol):
-    """How a problem falls into parts."""
+    """Decomposition of a problem into parts that are accepted separately."""
 
     @property
     def layout(self) -> Layout:
@@ -39,7 +39,7 @@ class Subproblems(Protocol):
         ...
 
     def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " terms"]:
-        """The cost of every observation, in the pieces in which `refine` has it."""
+        """The cost as terms that correspond one to one to those of `refine`: of observations, or of points."""
         ...
 
     def refine(
@@ -50,24 +50,24 @@ class Subproblems(Protocol):
         options: StepOptions,
         search: PointSearch,
     ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
-        """The parts' own points after embedded iterations, if the options have any, and the cost in pieces."""
+        """The points after embedded iterations, if the options have any, and the terms of the cost there."""
         ...
 
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, "*parts"]:
-        """Sums pieces over every part."""
+        """Sums terms over every part."""
         ...
 
     def of_cameras(self, values: Array) -> Array:
-        """The number of each camera's part, as far as broadcasting does not say it."""
+        """The value of each camera's part, or a scalar that broadcasts."""
         ...
 
     def of_points(self, values: Array) -> Array:
-        """The number of each point's part; any for a point that several parts see."""
+        """The value of each point's part, or a scalar that broadcasts; arbitrary for shared points."""
         ...
 
 
 class Whole(NamedTuple):
-    """One part. Costs are compared point by point where points are refined, as `refine_points` returns them."""
+    """The whole problem as one part. The terms of its cost are those of points if points are refined, else of slots."""
 
     layout: Layout
 
@@ -102,19 +102,19 @@ class Whole(NamedTuple):
 
 
 class Clusters(NamedTuple):
-    """The clusters of a partition. Points that several of them see stand still."""
+    """The clusters of a partition. Shared points are held fixed. The terms of the cost are those of slots."""
 
     layout: Layout
     partition: Partition
     owner: Int[Array, " points"]
-    """The cluster that alone sees a point; any for a separator."""
+    """The only cluster that sees a point; arbitrary for shared points."""
 
     @staticmethod
     def of(layout: Layout, partition: Partition) -> Clusters:
-        """The parts of a partition."""
+        """The clusters of a partition as subproblems."""
         seen = jnp.asarray(layout.slot_mask).astype(jnp.float32)
         labels = take(jnp.asarray(partition.label), layout.slot_camera) * seen
-        sums = point_sum(layout, jnp.stack([labels, seen]))  # of equal whole numbers: the quotient is exact
+        sums = point_sum(layout, jnp.stack([labels, seen]))  # sums of equal integers: the quotient is exact
         return Clusters(layout, partition, (sums[0] / jnp.maximum(sums[1], 1)).astype(jnp.int32))
 
     def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " slots"]:
@@ -137,7 +137,9 @@ class Clusters(NamedTuple):
 
     def sums(self, terms: Float[Array, " slots"]) -> Float[Array, " clusters"]:
         """See `Subproblems`."""
-        own_terms = jnp.where(self.layout.slot_mask, terms, 0)  # empty slots belong to some camera of another cluster
+        own_terms = jnp.where(
+            self.layout.slot_mask, terms, 0
+        )  # empty slots have some camera, perhaps of another cluster
         per_camera = tree_sum(own_terms[:, None], self.layout.camera_levels)[:, 0]
         members = self.partition.members
         own = per_camera.at[members].get(mode="clip")
@@ -157,5 +159,5 @@ def _refined(
 ) -> tuple[Float[Array, "3 points"], Float[Array, " points"]]:
     frames = slot_frames(layout, cameras)
     if options.refinement.starts == "step":
-        return refine_points(layout, frames, points, options.loss, search.iterations, previous, search.enough)
+        return refine_points(layout, frames, points, options.loss, search.iterations, previous, search.min_decrease)
     return refine_from_starts(layout, frames, points, options.loss, search.iterations, previous, *search[1:])

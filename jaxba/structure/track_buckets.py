@@ -15,7 +15,7 @@ from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
 
 MAX_PADDING = 0.10
-"""Largest number of empty slots relative to observations, besides one point of padding. Chosen, not fitted."""
+"""Largest number of empty slots relative to observations, besides one point of padding."""
 
 TILE = 8
 """Points per tile of a large bucket, as many as the widest vector registers hold. A pass over the points reads one
