@@ -1,1 +1,1 @@
-"""The bundle adjustment problem: cameras, points, observations, losses and what may be changed before a solve."""
+"""The bundle adjustment problem: cameras, points, observations, losses, options and preprocessing."""

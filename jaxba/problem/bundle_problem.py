@@ -1,7 +1,7 @@
-"""The bundle adjustment problem: what is optimised, and the checks that it makes sense.
+"""The bundle adjustment problem: parameters, observations, and the checks that they are valid.
 
-Everything to the right of this module (layout, step, solver, game, benchmark) may assume that a
-`BundleProblem` made by `BundleProblem.create` is finite, non-empty and has indices in range.
+All other modules may assume that a `BundleProblem` made by `BundleProblem.create` is finite, has observations, and has
+indices in range.
 """
 
 from __future__ import annotations
@@ -23,16 +23,19 @@ POINT_SIZE = 3
 
 
 class ProblemError(ValueError):
-    """Input that is no valid bundle adjustment problem. The message is one line for a person."""
+    """The input is not a valid bundle adjustment problem. The message is one line for the user."""
 
 
 @register_pytree
 @dataclass(frozen=True)
 class BundleProblem:
-    """Cameras, points and the pixels at which they were seen (BAL convention).
+    """Cameras, points and observations, in the conventions of BAL.
 
-    A camera `[w, t, f, k1, k2]` maps a point `X` to `P = R(w) X + t`, `p = -P.xy / P.z`,
-    `z = f (1 + k1 |p|^2 + k2 |p|^4) p`. Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
+    A camera `[w, t, f, k1, k2]` maps a point X to the pixel z:
+
+        P = R(w) X + t,    p = -P.xy / P.z,    z = f (1 + k1 |p|^2 + k2 |p|^4) p
+
+    Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
     """
 
     cameras: Float[AnyArray, "cameras 9"]
@@ -51,10 +54,10 @@ class BundleProblem:
     """Point of each observation, int32."""
 
     whitening: Float[AnyArray, "observations 2 2"] | None = None
-    """`Sigma^(-1/2)` of each observation; None stands for the identity (pixels)."""
+    """`Sigma^(-1/2)` of each observation (1 / pixels); None: the identity."""
 
     lenses: Lenses | None = None
-    """Which cameras share a lens, and what of it stays; None: every camera has its own, all of it free (BAL)."""
+    """Shared and fixed intrinsics; None: every camera has its own, and all are optimised (BAL)."""
 
     @classmethod
     def create(
@@ -69,7 +72,7 @@ class BundleProblem:
         weight: Any = None,
         lenses: Lenses | None = None,
     ) -> BundleProblem:
-        """Checks the arrays and makes a problem of float64 / int32 NumPy arrays.
+        """Checks the arrays and returns a problem of float64 and int32 NumPy arrays.
 
         Args:
             cameras: shape (cameras, 9).
@@ -80,12 +83,13 @@ class BundleProblem:
             covariance: optional, shape (observations, 2, 2), pixels squared; symmetric and
                 positive definite. The cost then uses `|Sigma^(-1/2) r|^2`.
             weight: optional, shape (observations,), non-negative; multiplies the squared
-                residual, so it stands for the covariance `I / weight`. Excludes `covariance`.
+                residual, like the covariance `I / weight`. Excludes `covariance`.
             lenses: optional; which cameras share f, k1 and k2, and which of these are optimised.
 
         Raises:
             ProblemError: shapes differ, an index is out of range, a number is not finite, there
-                are no observations, a covariance is not positive definite, or cameras of one lens differ in it.
+                are no observations, a covariance is not positive definite, or cameras of one lens differ in f, k1 or
+                k2.
         """
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
@@ -126,11 +130,12 @@ class BundleProblem:
         return self.observations.shape[0]
 
     def replace(self, **changes: Any) -> BundleProblem:
-        """The same problem with some fields exchanged; nothing is checked again."""
+        """The same problem with some fields replaced, without new checks."""
         return replace(self, **changes)
 
 
 def _floats(name: str, values: Any, width: int) -> np.ndarray:
+    """A float64 array of shape (n, width), checked to be finite."""
     array = np.ascontiguousarray(np.asarray(values, dtype=np.float64))
     if array.ndim != 2 or array.shape[1] != width:
         raise ProblemError(f"{name} must have shape (n, {width}), not {array.shape}")
@@ -141,6 +146,7 @@ def _floats(name: str, values: Any, width: int) -> np.ndarray:
 
 
 def _indices(name: str, values: Any, bound: int) -> np.ndarray:
+    """An int32 vector, checked to be in [0, bound)."""
     array = np.asarray(values)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise ProblemError(f"{name} must be a vector of integers, not {array.dtype} of shape {array.shape}")
@@ -151,6 +157,7 @@ def _indices(name: str, values: Any, bound: int) -> np.ndarray:
 
 
 def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:
+    """`Sigma^(-1/2)` of each observation, shape (count, 2, 2), from covariances or weights."""
     if weight is not None:
         weight = np.asarray(weight, dtype=np.float64)
         if weight.shape != (count,) or not np.isfinite(weight).all() or (weight < 0).any():

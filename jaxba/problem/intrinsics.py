@@ -1,7 +1,8 @@
-"""Lenses: which cameras were taken with the same one, and which of its numbers are optimised.
+"""Shared and fixed intrinsics.
 
-In BAL every camera has a focal length and a distortion of its own. A COLMAP model says better: images of one camera
-share them, and its model of a lens may have no distortion at all, or one that is not ours to change.
+A *lens* is one set of intrinsics f, k1 and k2, which several cameras (images) can share. In BAL every camera has a lens
+of its own. In a COLMAP model all images of one physical camera share their intrinsics, and its camera model may have no
+distortion, or one that is not optimised.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Bool, Int
 from jaxba.typing import AnyArray, register_pytree
 
 LENS_SIZE = 3
-"""Numbers of a lens: f (pixels), k1, k2."""
+"""Parameters of a lens: f (pixels), k1, k2."""
 
 
 @register_pytree
@@ -23,7 +24,7 @@ class Lenses:
     """The lenses of a problem's cameras."""
 
     index: Int[AnyArray, " cameras"]
-    """Lens of each camera, int32. Cameras of one lens have equal f, k1 and k2, before and after a solve."""
+    """Lens of each camera, int32. Cameras with the same lens have equal f, k1 and k2, before and after a solve."""
 
     free: Bool[AnyArray, "lenses 3"]
     """Which of f, k1 and k2 of each lens are optimised."""
@@ -34,19 +35,20 @@ class Lenses:
         return len(np.unique(self.index)) < len(self.index)
 
     def of(self, cameras: Int[np.ndarray, " kept"]) -> Lenses:
-        """The lenses of some cameras; all lenses keep their numbers."""
+        """The same for a subset of the cameras; the numbering of the lenses is unchanged."""
         return replace(self, index=np.asarray(self.index)[cameras])
 
 
 def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
-    """The same as int32 and bool on the host.
+    """Checks lenses and returns them as int32 and bool NumPy arrays.
 
     Args:
-        lenses: of a problem.
+        lenses: lenses of a problem.
         cameras: its cameras, shape (cameras, 9).
 
     Raises:
-        ValueError: shapes differ, an index is out of range, or cameras of one lens differ in f, k1 or k2; in one line.
+        ValueError: shapes differ, an index is out of range, or cameras with the same lens differ in f, k1 or k2. The
+            message is one line.
     """
     index, free = np.asarray(lenses.index), np.asarray(lenses.free)
     if index.shape != (len(cameras),) or index.dtype.kind not in "iu":

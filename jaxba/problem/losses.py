@@ -1,10 +1,11 @@
-"""Robust losses with Ceres' definitions: `rho(s)` of the squared whitened residual norm `s`.
+"""Robust losses `rho(s)` of the squared whitened residual norm s, as defined by Ceres.
 
-The cost is `1/2 sum rho(s)`. A loss enters the normal equations as the weight `rho'(s)` (iteratively
-reweighted least squares): the second-derivative term of Triggs' correction is left out, which keeps
-every block positive semi-definite; the step is a descent direction either way.
+    f = 1/2 sum_i rho(|r_i|^2)
 
-Source: Ceres Solver, loss_function.h. `scale` is the residual size, in pixels, where the loss starts to bend.
+In the normal equations residual and Jacobian are weighted by `sqrt(rho'(s))` (iteratively reweighted least squares).
+The second-derivative term of Triggs' correction is left out, so that every block stays positive semi-definite.
+
+Source: Ceres Solver, loss_function.h; Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis".
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def _cauchy(s: Array) -> tuple[Array, Array]:
 def _tukey(s: Array) -> tuple[Array, Array]:
     rest = jnp.maximum(1 - s, 0)
     value = (1 - rest**3) / 3
-    return jnp.where(jnp.isfinite(s), value, s), rest**2  # what is no number is no outlier: it would spoil the step
+    return jnp.where(jnp.isfinite(s), value, s), rest**2  # nan and inf must not pass as outliers
 
 
 _SHAPES: dict[str, Callable[[Array], tuple[Array, Array]]] = {
@@ -52,23 +53,23 @@ _SHAPES: dict[str, Callable[[Array], tuple[Array, Array]]] = {
 }
 
 NAMES = tuple(_SHAPES)
-"""Known losses."""
+"""Names of the known losses."""
 
 
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Loss:
-    """A loss and its scale (pixels).
+    """A robust loss and its scale (pixels).
 
-    Your own loss is a function `rho(s)` in the place of a name, elementwise in JAX, with `rho(0) = 0` and a derivative
-    that is 1 at zero and nowhere negative; JAX differentiates it. Define it once: another function is another program.
+    Instead of a name you can give a function `rho(s)`, elementwise in JAX, with `rho(0) = 0`, derivative 1 at zero and
+    no negative derivative; JAX differentiates it. Define the function once: another function object compiles again.
     """
 
     name: str | Callable[[Array], Array] = "squared"
     """One of `squared`, `huber`, `soft_l1`, `cauchy`, `tukey`, or a function of `s / scale^2`."""
 
     scale: float = 1.0
-    """Residual size in pixels at which the loss bends; no effect for `squared`."""
+    """Residual norm in pixels at which the loss starts to flatten; no effect for `squared`."""
 
     def __post_init__(self) -> None:
         if not callable(self.name) and self.name not in _SHAPES:
@@ -78,11 +79,11 @@ class Loss:
 
     @property
     def trivial(self) -> bool:
-        """Whether the weight is one everywhere."""
+        """Whether this is the squared loss, with weight one everywhere."""
         return self.name == "squared"
 
     def __call__(self, squared: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """`rho(s)` and `rho'(s)` at squared residual norms, pixels squared."""
+        """`rho(s)` (pixels^2) and `rho'(s)` at squared residual norms s (pixels^2)."""
         area = self.scale * self.scale
         if callable(self.name):
             value, slope = jax.jvp(self.name, (squared / area,), (jnp.ones_like(squared),))

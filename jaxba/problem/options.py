@@ -1,4 +1,7 @@
-"""How a step is made: static, hashable, so that each distinct value is compiled once."""
+"""Options of an iteration: linear solver, refinement, coordinates and loss.
+
+All options are static and hashable: each distinct value compiles a program of its own.
+"""
 
 from __future__ import annotations
 
@@ -27,20 +30,21 @@ DIAGONAL_MAXIMUM = 1e32
 
 @dataclass(frozen=True)
 class ConjugateGradients:
-    """How conjugate gradients are preconditioned, and when they stop."""
+    """Preconditioner and stopping rule of conjugate gradients."""
 
     preconditioner: Preconditioner = "two-level"
-    """`schur-jacobi`: the block diagonal of the reduced camera system. `two-level`: the same and a coarse system for
-    the motion of clusters of cameras. `jacobi`: the camera blocks."""
+    """`schur-jacobi`: the block diagonal of the reduced camera system. `two-level`: the same, with a coarse correction
+    for the motion of clusters of cameras. `jacobi`: the camera blocks of the normal equations."""
 
     forcing: float = 0.1
-    """They stop when i (Q_i - Q_(i-1)) / Q_i falls below this. Source: Ceres' default."""
+    """Stop when `i (Q_i - Q_(i-1)) / Q_i` falls below this, for the quadratic model Q after iteration i. Source: Ceres'
+    default."""
 
     tolerance: float = 0.0
-    """... or when the residual is below this fraction of the right-hand side; 0 switches it off."""
+    """Stop when the residual is below this fraction of the right-hand side; 0 switches it off."""
 
     max_iterations: int = 500
-    """... or after this many iterations. Source: Ceres max_linear_solver_iterations."""
+    """Stop after this many iterations. Source: Ceres max_linear_solver_iterations."""
 
     def __post_init__(self) -> None:
         _check_known("preconditioner", self.preconditioner, Preconditioner)
@@ -52,29 +56,29 @@ class ConjugateGradients:
 
 @dataclass(frozen=True)
 class Refinement:
-    """What is done around a linear solve, without another one: `jaxba/refinement`. The default is a plain step."""
+    """Improvements of a step without another linear solve (`jaxba/refinement`). The default is none: plain LM."""
 
     points: int = 0
-    """Embedded point iterations after each camera step."""
+    """Number of embedded point iterations for each candidate; 0 for none."""
 
     starts: PointStarts = "step"
-    """Where embedded point iterations start: where the `step` took a point, or from the `rays` of its pixels, if that
-    is cheaper; near convergence from both."""
+    """Start of embedded point iterations: `step`: the position after the step; `rays`: the midpoint of the rays of its
+    pixels if the cost is lower there, and both near convergence."""
 
     trials: int = 1
-    """How often a step is tried before it is rejected, each time a quarter as long."""
+    """Number of backtracking trials before a step is rejected; each is a quarter as long as the one before."""
 
     camera_rounds: int = 0
-    """Rounds in which first every camera, then every point is re-optimised alone, where a step did much less than the
-    linear model promised; one at most for a shortened candidate."""
+    """Most rounds in which every camera, then every point is re-optimised on its own, after a step that achieved much
+    less than the predicted decrease; at most one for a backtracked candidate."""
 
     pattern_moves: int = 0
-    """How often at most an accepted step is repeated in its direction, each time twice as far, where the linear model
-    did not foresee what it did."""
+    """Most repetitions of an accepted step in its direction, each twice as far, if the linear model did not predict its
+    decrease or damping limited its length."""
 
     previous_steps: int = 0
-    """Camera steps of earlier iterations in whose span an inexact step is made the best one, by methods that have a use
-    for them (`MethodTraits.uses_previous_steps`)."""
+    """Number of previous camera steps that, with an inexact step, span the subspace in which the step is optimised; for
+    methods with `MethodTraits.uses_previous_steps`."""
 
     def __post_init__(self) -> None:
         for name, least in (
@@ -90,23 +94,23 @@ class Refinement:
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Coordinates of a step, and what lambda multiplies in them."""
+    """Coordinates of a step, and the damping matrix D in them."""
 
     scaling: Scaling = "diagonal"
-    """What lambda multiplies: `diagonal` the clamped diagonal of the Hessian (Ceres), `identity` the unit
-    matrix (the paper's equation)."""
+    """Damping matrix: `diagonal`: `lambda diag(H)` with a clamped diagonal (Ceres); `identity`: `lambda I` (the paper
+    on learned damping)."""
 
     camera_damping: float = 1.0
-    """Damping of the cameras relative to that of the points, a factor on lambda. 1 is Levenberg-Marquardt as published;
-    with small ones it is mostly the points that hold a step back."""
+    """Factor on lambda for cameras. 1 is Levenberg-Marquardt as published; with a small factor mostly points are
+    damped."""
 
     rotation: Rotation = "angle-axis"
-    """Coordinates of a rotation step: `angle-axis` adds to the three numbers of the file, as Ceres does with
-    BAL cameras; `manifold` multiplies by exp(step). They differ in what diagonal damping damps."""
+    """Coordinates of a rotation step: `angle-axis`: addition to the angle-axis vector, as Ceres does with BAL cameras;
+    `manifold`: `R <- exp(step) R`. Diagonal damping differs between them."""
 
     lens_step: LensStep = "file"
-    """Coordinates in which a step of the intrinsics is added: `file` adds to f, k1 and k2, as Ceres does with a BAL
-    camera; `pixels` to f and the distortion per pixel, which a zoom leaves alone. They agree to first order."""
+    """Coordinates in which a step of the intrinsics is added: `file`: f, k1 and k2, as Ceres does with BAL cameras;
+    `pixels`: f and the distortion per pixel, `k1 / f^2` and `k2 / f^4`. They agree to first order."""
 
     def __post_init__(self) -> None:
         for name, known in (("scaling", Scaling), ("rotation", Rotation), ("lens_step", LensStep)):
@@ -117,69 +121,68 @@ class Coordinates:
 
 @runtime_checkable
 class MethodTraits(Protocol):
-    """What the layout and the compilation must know of a method that replaces the plain step (`jaxba.methods`)."""
+    """Properties of a method that replaces the plain LM step (`jaxba.methods`), for layout and compilation."""
 
     @property
     def name(self) -> str:
-        """As in `jaxba.METHODS`."""
+        """Name in `jaxba.METHODS`."""
         ...
 
     @property
     def forms_reduced_system(self) -> bool:
-        """Whether the layout must list pairs of observations."""
+        """Whether it forms the reduced camera system, so that the layout must list pairs of observations."""
         ...
 
     @property
     def cluster_cameras(self) -> int | None:
-        """Most cameras of a random cluster; None for a method without clusters."""
+        """Largest number of cameras in a random cluster; None for a method without clusters."""
         ...
 
     @property
     def conjugate_gradients(self) -> ConjugateGradients | None:
-        """Its own, if it solves by truncated conjugate gradients."""
+        """Stopping rule if it solves by truncated conjugate gradients, else None."""
         ...
 
     @property
     def single_solve(self) -> bool:
-        """Whether a step is one linear solve and then one decision, not a round of several."""
+        """Whether an iteration is one linear solve with one accept decision, not a round of several."""
         ...
 
     @property
     def uses_previous_steps(self) -> bool:
-        """Whether earlier camera steps can take part in a step."""
+        """Whether it can use previous camera steps (`Refinement.previous_steps`)."""
         ...
 
 
 @dataclass(frozen=True)
 class StepOptions:
-    """Static options of `lm_step`. Each distinct value is compiled once."""
+    """Static options of `lm_step`. Each distinct value compiles a program of its own."""
 
     linear_solver: LinearSolver = "explicit"
-    """Of the reduced camera system. `explicit`: form it and factor it. `sparse`: form its blocks, conjugate gradients.
-    `implicit`: conjugate gradients without forming it. A method has its own."""
+    """Solver of the reduced camera system. `explicit`: form and factor it. `sparse`: form its blocks, then conjugate
+    gradients. `implicit`: conjugate gradients without forming it. Ignored by methods, which have their own."""
 
     method: MethodTraits | None = None
-    """What replaces the plain Levenberg-Marquardt step, an entry of `jaxba.METHODS`; None: nothing."""
+    """Method that replaces the plain Levenberg-Marquardt step, an entry of `jaxba.METHODS`; None: plain LM."""
 
     conjugate_gradients: ConjugateGradients = field(default_factory=ConjugateGradients)
-    """Of the solvers `sparse` and `implicit`."""
+    """Conjugate gradients of the solvers `sparse` and `implicit`."""
 
     refinement: Refinement = field(default_factory=Refinement)
-    """What is done around the linear solve."""
+    """Improvements of the step without another linear solve."""
 
     coordinates: Coordinates = field(default_factory=Coordinates)
-    """Of the step."""
+    """Coordinates of the step and of its damping."""
 
     intrinsics: Intrinsics = "free"
-    """Whether focal lengths and distortions are optimised, as in BAL, or stay: the paper optimises poses and points.
-    `fixed` needs the explicit solver."""
+    """Whether f, k1 and k2 are optimised, as in BAL, or `fixed`, which needs the explicit solver."""
 
     loss: Loss = field(default_factory=Loss)
     """Robust loss of the squared whitened residual."""
 
     mixed_precision: bool = False
-    """Whether the reduced camera system is float32 where all else is in the type of the parameters. A factorisation is
-    then the preconditioner of conjugate gradients in full precision, which make good what rounding lost."""
+    """Whether the reduced camera system is float32, with everything else in the type of the parameters. A factorisation
+    is then the preconditioner of a few conjugate gradient iterations in full precision."""
 
     def __post_init__(self) -> None:
         _check_known("linear_solver", self.linear_solver, LinearSolver)
@@ -189,46 +192,46 @@ class StepOptions:
 
     @property
     def solver_name(self) -> str:
-        """How the linear system is solved: the linear solver, or the method in its place."""
+        """Name of the linear solver, or of the method that replaces it."""
         return self.linear_solver if self.method is None else self.method.name
 
     @property
     def factors_reduced_system(self) -> bool:
-        """Whether the reduced camera system as a whole is factored."""
+        """Whether the whole reduced camera system is factored."""
         return self.method is None and self.linear_solver == "explicit"
 
     @property
     def forms_reduced_system(self) -> bool:
-        """Whether the layout must list pairs."""
+        """Whether blocks of the reduced camera system are formed, so that the layout must list pairs."""
         if self.method is not None:
             return self.method.forms_reduced_system
         return self.linear_solver in ("explicit", "sparse")
 
     @property
     def cluster_cameras(self) -> int | None:
-        """Most cameras of a random cluster; None where the layout draws none."""
+        """Largest number of cameras in a random cluster; None if the layout needs no random clusters."""
         return None if self.method is None else self.method.cluster_cameras
 
     @property
     def truncated(self) -> ConjugateGradients | None:
-        """Conjugate gradients that end by a forcing term (inexact Newton); None where a step is not made by them."""
+        """Conjugate gradients that stop by a forcing term (inexact Newton); None if the step does not use them."""
         if self.method is not None:
             return self.method.conjugate_gradients
         return None if self.linear_solver == "explicit" else self.conjugate_gradients
 
     @property
     def single_solve(self) -> bool:
-        """Whether a step is one linear solve and then one decision, not a round of several."""
+        """Whether an iteration is one linear solve with one accept decision, not a round of several."""
         return self.method is None or self.method.single_solve
 
     @property
     def kept_steps(self) -> int:
-        """How many earlier camera steps take part in a step."""
+        """Number of previous camera steps that are kept for the next step."""
         return self.refinement.previous_steps if self.method is not None and self.method.uses_previous_steps else 0
 
     @property
     def uses_camera_clusters(self) -> bool:
-        """Whether the layout must group cameras for the two-level preconditioner."""
+        """Whether the layout needs camera clusters, for the two-level preconditioner."""
         truncated = self.truncated if self.method is None else None
         return truncated is not None and truncated.preconditioner == "two-level"
 
@@ -239,10 +242,10 @@ def _check_known(name: str, value: str, kind: Any) -> None:
 
 
 def check_count(name: str, value: Any, least: int) -> None:
-    """Refuses what is no whole number, or one that programs cannot hold.
+    """Checks that an option is an integer in [least, `LARGEST_COUNT`].
 
     Raises:
-        ValueError: naming it.
+        ValueError: it is not; the message contains its name.
     """
     try:
         count = operator.index(value)

@@ -1,4 +1,4 @@
-"""Changes of a problem before it is solved: normalise, perturb, drop what no camera can see."""
+"""Preprocessing of a problem: normalise, shift, perturb, and drop invalid observations."""
 
 from __future__ import annotations
 
@@ -12,28 +12,32 @@ POBA_SIZE = 100.0
 """Size of a normalised scene. Source: Ceres `BALProblem::Normalize`, kept by rootba and PoBA."""
 
 POBA_NOISE = 0.01
-"""Sigma of the translation and of the point noise in PoBA's experiments, in units of a scene of size 100."""
+"""Standard deviation of translation and point noise in PoBA's experiments, for a scene of size 100."""
 
 POBA_MIN_DEPTH = 0.1
-"""PoBA drops observations nearer than this, in units of a scene of size 100."""
+"""Smallest depth of an observation in PoBA's experiments, for a scene of size 100."""
 
 POBA_SEED = 38401
-"""Default seed of rootba and PoBA. Their generator is C++'s, so equal seeds give other numbers here."""
+"""Default seed of rootba and PoBA. Their random generator is another one, so the same seed gives other numbers here."""
 
 FAR = 10.0
-"""Distance of a scene from the origin, in units of its own extent, from which it is moved there to be solved. Turning a
-camera turns it about the origin: damping then holds back what moves the scene least, and digits are lost
-(docs/game-tried.md, "Far from the origin")."""
+"""Distance of a scene from the origin, relative to its extent, from which it is shifted to the origin to be solved.
+BAL rotations are about the origin: far from it, small rotations are large motions, which distorts the damping and loses
+digits."""
 
 MIN_TRACK = 2
-"""A point needs two views to have a position. Source: rootba drops points with fewer."""
+"""Fewest observations that determine a point. Source: rootba, which drops points with fewer."""
 
 
 def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
-    """The same problem in coordinates where the points are centred and have a given spread.
+    """The same problem in coordinates in which the points are centred and have a given spread.
 
-    A similarity moves the marginal median of the points to the origin and scales their median L1
-    distance from it to `size` (scene units). Every residual, and so the cost, stays as it was.
+    A similarity moves the marginal median of the points to the origin and scales their median L1 distance from it to
+    `size`. All residuals, and so the cost, are unchanged.
+
+    Args:
+        problem: the problem to normalise.
+        size: new median L1 distance, scene units.
 
     Raises:
         ProblemError: `size` is not positive, or half of the points coincide.
@@ -55,32 +59,40 @@ def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
 
 
 def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"] | None:
-    """The middle of a scene that is far from the origin for its extent, as georeferenced ones are; None for others.
+    """The marginal median of the points if a scene is far from the origin, as georeferenced scenes are; else None.
 
-    The extent is the larger one of the median distances of points and of cameras from the middle of the points.
+    "Far" is more than `FAR` times the extent: the larger of the median distances of points and of cameras from the
+    median of the points.
+
+    Returns:
+        Shape (3,), scene units.
     """
     cameras, points = _observed(problem)
     if not points.any():
         return None
-    with np.errstate(all="ignore"):  # a scene without bounds is refused later, with a reason
-        places = np.asarray(problem.points, np.float64)[points]
+    with np.errstate(all="ignore"):  # a scene that overflows is rejected later, with a message
+        positions = np.asarray(problem.points, np.float64)[points]
         centers = camera_centers(np.asarray(problem.cameras, np.float64)[cameras])
-        middle = _upper_median(places)
-        extent = max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in (places, centers))
+        middle = _upper_median(positions)
+        extent = max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in (positions, centers))
         far = np.linalg.norm(middle) > FAR * extent > 0
     return middle if far else None
 
 
 def _observed(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Which cameras, and which points, have observations."""
+    """Whether each camera, and each point, has an observation."""
     cameras = np.bincount(problem.camera_index, minlength=problem.num_cameras)
     return cameras > 0, np.bincount(problem.point_index, minlength=problem.num_points) > 0
 
 
 def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProblem:
-    """The same scene, moved by an offset in scene units; residuals stay as they were.
+    """The same scene translated by an offset; all residuals are unchanged.
 
-    What nobody observes is left in its place.
+    Cameras and points without observations are not moved.
+
+    Args:
+        problem: the problem to shift.
+        offset: translation, scene units.
     """
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
     seen, placed = _observed(problem)
@@ -98,12 +110,12 @@ def perturb(
 ) -> BundleProblem:
     """Adds Gaussian noise to the start of a problem; the observations stay.
 
-    Read as Ceres does it: rotation noise is added to the angle-axis vector while the camera *centre*
-    stays, and translation noise is then added to the translation `t = -R c`. rootba and PoBA add theirs
-    to the centre instead, which is the same in distribution, since the noise is isotropic.
+    As in Ceres, rotation noise is added to the angle-axis vector with the camera *centre* held fixed, then translation
+    noise is added to `t = -R c`. rootba and PoBA add it to the centre c, which has the same distribution, since the
+    noise is isotropic.
 
     Args:
-        problem: the problem to start further away.
+        problem: the problem to perturb.
         seed: a seed or a generator; the same seed gives the same numbers.
         rotation_sigma: radians, on each component of the angle-axis vector.
         translation_sigma: scene units, on each component.
@@ -122,20 +134,24 @@ def perturb(
     points = points + point_sigma * rng.standard_normal(points.shape)
     cameras = np.array(problem.cameras, dtype=np.float64)
     centers = camera_centers(cameras)
-    turn = rng.standard_normal((problem.num_cameras, 3))
-    shift = translation_sigma * rng.standard_normal((problem.num_cameras, 3))
+    rotation_noise = rng.standard_normal((problem.num_cameras, 3))
+    translation_noise = translation_sigma * rng.standard_normal((problem.num_cameras, 3))
     if rotation_sigma > 0:
-        cameras[:, :3] += rotation_sigma * turn
+        cameras[:, :3] += rotation_sigma * rotation_noise
         cameras[:, 3:6] = translations(rotation_matrices(cameras[:, :3]), centers)
-    cameras[:, 3:6] += shift
+    cameras[:, 3:6] += translation_noise
     return problem.replace(cameras=cameras, points=points)
 
 
 def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> BundleProblem:
     """Removes observations of points nearer than `min_depth` (scene units) in front of their camera or behind it.
 
-    Points that keep fewer than two observations go too, and the others are numbered anew in their old
-    order; cameras keep their numbers, even one that sees nothing any more.
+    Points with fewer than `MIN_TRACK` remaining observations are removed, and the others are renumbered in order.
+    Cameras keep their indices, even without observations.
+
+    Args:
+        problem: the problem to filter.
+        min_depth: smallest depth, scene units.
 
     Raises:
         ProblemError: nothing would be left.
@@ -160,7 +176,7 @@ def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> B
 
 
 def poba_start(problem: BundleProblem, seed: int | np.random.Generator = POBA_SEED) -> BundleProblem:
-    """The start of PoBA's experiments: normalised to 100, translations and points moved by 0.01, depth >= 0.1.
+    """The start of PoBA's experiments: normalised to size 100, perturbed with sigma 0.01, depths at least 0.1.
 
     Raises:
         ProblemError: as `normalize` and `drop_invalid`.
