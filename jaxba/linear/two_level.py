@@ -1,4 +1,4 @@
-"""A two-level preconditioner whose coarse space is the rigid motion of clusters of cameras.
+"""A two-level preconditioner whose coarse space is the motion of clusters of cameras.
 
     M^-1 = D^-1 + P (P^T S P)^-1 P^T,    D = the block diagonal of S.
 

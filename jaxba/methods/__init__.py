@@ -1,1 +1,1 @@
-"""Other ways to make a step than plain Levenberg-Marquardt, reached through `registry`."""
+"""Optimisation methods besides plain Levenberg-Marquardt, by name in `registry`."""

@@ -1,1 +1,1 @@
-"""A whole solve: the loop, the choice of the linear solver, retriangulation, solver names."""
+"""A complete solve: preparation, choice of the linear solver, the loop, retriangulation, solver names."""

@@ -1,4 +1,4 @@
-"""Bundle adjustment and the search for points at other depths, in turns until that no longer pays.
+"""Bundle adjustment and retriangulation in alternation, until retriangulation no longer lowers the cost.
 
 Source: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited", section 4.4).
 """
@@ -22,7 +22,7 @@ from jaxba.solver.retriangulate import Retriangulation, retriangulate
 from jaxba.solver.solve import Solution, solve
 
 MAX_ROUNDS = 5
-"""Searches at most. Source: COLMAP, ba_global_max_refinements."""
+"""Most retriangulations. Source: COLMAP, ba_global_max_refinements."""
 
 
 def solve_and_retriangulate(
@@ -33,21 +33,22 @@ def solve_and_retriangulate(
     callback: Callable[[IterationRecord], bool | None] | None = None,
     on_search: Callable[[Retriangulation], None] | None = None,
 ) -> Solution:
-    """`solve`, and where it converged `retriangulate`, in turns, until that no longer pays.
+    """`solve` and, if it converged, `retriangulate`, alternately.
 
-    It pays as long as the cost falls by more than `ftol` of it, for `MAX_ROUNDS` searches at most. Every solve but the
-    first starts with the policy's first lambda.
+    It ends when a retriangulation lowers the cost by at most `ftol` times the cost, or after `MAX_ROUNDS` of them.
+    Every solve starts with the policy's initial lambda.
 
     Args:
         problem: start of the optimisation.
         policy: as for `solve`.
-        options: as for `solve`; the limit of linear solves is that of all solves together. The search has their loss,
-            is in float64 and is not padded.
-        callback: as for `solve`; iterations and seconds count through.
-        on_search: called after every search; what does not pay (`Retriangulation.pays`) is dropped.
+        options: as for `solve`; `max_iterations` limits all solves together. Retriangulation uses the same loss, in
+            float64 and without padding.
+        callback: as for `solve`; iterations and seconds are counted over all solves.
+        on_search: called after every retriangulation, including the last one, whose result is discarded if the decrease
+            is too small (`Retriangulation.pays`).
 
     Returns:
-        One solution for all of it. A search counts as no iteration; its seconds are in `total_s` and `compile_s`.
+        One solution for all solves. Retriangulation is not an iteration; its time is in `total_s` and `compile_s`.
 
     Raises:
         ValueError, ProblemError: as `solve`.
@@ -55,34 +56,34 @@ def solve_and_retriangulate(
     options = SolveOptions() if options is None else options
     before, stopped = (0, 0.0), False
 
-    def heard(record: IterationRecord) -> bool:
+    def forward(record: IterationRecord) -> bool:
         nonlocal stopped
-        counted = record._replace(iteration=record.iteration + before[0], time_s=record.time_s + before[1])
-        stopped = callback is not None and bool(callback(counted))
+        record_of_all = record._replace(iteration=record.iteration + before[0], time_s=record.time_s + before[1])
+        stopped = callback is not None and bool(callback(record_of_all))
         return stopped
 
-    # with a callback a solve runs step by step: one program, whatever the limit of each solve is
-    run = lambda problem, limit: solve(problem, policy, replace(options, max_iterations=limit), callback=heard)
-    whole = run(problem, options.max_iterations)
+    # a solve with a callback runs from Python, so that all limits use the same programs
+    run = lambda problem, limit: solve(problem, policy, replace(options, max_iterations=limit), callback=forward)
+    solution = run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):
-        if stopped or not whole.converged or whole.iterations == options.max_iterations:
+        if stopped or not solution.converged or solution.iterations == options.max_iterations:
             break
         started = time.perf_counter()
         with CompileClock() as clock:
-            found = retriangulate(whole.problem, options.loss)
+            found = retriangulate(solution.problem, options.loss)
         seconds = time.perf_counter() - started - clock.seconds
-        whole = replace(whole, total_s=whole.total_s + seconds, compile_s=whole.compile_s + clock.seconds)
+        solution = replace(solution, total_s=solution.total_s + seconds, compile_s=solution.compile_s + clock.seconds)
         if on_search:
             on_search(found)
         if not found.pays(options.tolerances.ftol):
             break
-        before = whole.iterations, whole.total_s
-        whole = _joined(whole, run(found.problem, options.max_iterations - whole.iterations))
-    return whole
+        before = solution.iterations, solution.total_s
+        solution = _joined(solution, run(found.problem, options.max_iterations - solution.iterations))
+    return solution
 
 
 def _joined(before: Solution, last: Solution) -> Solution:
-    """Two solves, the second of which goes on where the first ended, as one."""
+    """The solution of two consecutive solves together."""
     return replace(
         last,
         initial_cost=before.initial_cost,

@@ -1,9 +1,9 @@
-"""The loop of a solve step by step, for whoever watches it or is in a hurry.
+"""The solve loop run from Python, for callbacks and for programs that are replaced while it runs.
 
-The same iteration as in solver/loop.py, run from Python: every record carries the wall-clock time at which it was
-finished, and quickly compiled programs may give way to optimised ones (runtime/compilation.py). An iteration is three
-programs (the linear solve, the verdict on the step, the policy), so that they compile beside each other and each only
-as well as it pays.
+The iteration is that of solver/loop.py. Every record has the wall-clock time at which the iteration ended, and quickly
+compiled programs can be replaced by optimised ones (runtime/compilation.py). An iteration consists of three programs
+(linear solve, accept decision, policy), which are compiled in parallel, each with its own level of
+optimisation.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from jaxba.structure.layout import Layout, num_partitions
 
 
 class IterationRecord(NamedTuple):
-    """What a callback sees."""
+    """The argument of a callback."""
 
     iteration: int  # from 1
-    time_s: float  # seconds since the first iteration started, compilation excluded
-    step: StepInfo  # Python and NumPy scalars
+    time_s: float  # seconds since the start of the first iteration, without compilation
+    step: StepInfo  # of Python scalars
 
 
 class _Loop(NamedTuple):
-    """What stays from one iteration to the next. `call` runs programs, or has them compiled."""
+    """The constants of a solve. The argument `call` of its functions either runs a program or compiles it."""
 
     layout: Layout
     policy: DampingPolicy
@@ -55,15 +55,21 @@ class _Loop(NamedTuple):
 
     def start(self, call: Callable[..., Any], state: LMState) -> Carry:
         """The carry before the first iteration."""
-        inform = program(problem_info, "options", "max_iterations", level="quick")
-        info = call(inform, self.layout, state, self.options, self.max_iterations)
-        # without the parameters what is the policy's compiles once for all problems
+        info_program = program(problem_info, "options", "max_iterations", level="quick")
+        info = call(info_program, self.layout, state, self.options, self.max_iterations)
+        # without the parameters, whose shapes differ, the policy's program is compiled once for all problems
         return call(program(begin, level="quick"), info, self.policy, None)._replace(state=state)
 
     def iterate(
         self, call: Callable[..., Any], carry: Carry, levels: Mapping[str, Level]
     ) -> tuple[Carry, StepInfo, Any]:
-        """One iteration, its parts compiled at these levels: the carry after it, its record, and that for the host."""
+        """One iteration: the next carry, its record, and the packed report for the host.
+
+        Args:
+            call: runs or compiles a program.
+            carry: before the iteration.
+            levels: level of compilation of each part of the step.
+        """
         state, options = carry.state, self.options
         effort = None
         if decides_effort(self.policy):
@@ -71,14 +77,14 @@ class _Loop(NamedTuple):
         part = lambda name, function: program(function, "options", level=levels[name])
         min_gain = jnp.asarray(self.policy.min_gain, state.cost.dtype)
         if options.single_solve:
-            given = (self.layout, state, carry.damping)
-            proposal = call(part("propose", propose), *given, options, carry.iteration, effort)
-            state, step = call(part("try_step", try_step), *given, proposal, options, min_gain, effort)
+            arguments = (self.layout, state, carry.damping)
+            proposal = call(part("propose", propose), *arguments, options, carry.iteration, effort)
+            state, step = call(part("try_step", try_step), *arguments, proposal, options, min_gain, effort)
         else:
-            given = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
-            state, step = call(part("round", lm_step), *given)
+            arguments = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
+            state, step = call(part("round", lm_step), *arguments)
         limit = jnp.asarray(self.max_iterations, jnp.int32)
-        own = (
+        policy_arguments = (
             carry._replace(state=None),
             step,
             self.policy,
@@ -86,8 +92,8 @@ class _Loop(NamedTuple):
             limit,
             jnp.asarray(num_partitions(self.layout)),
         )
-        carry, facts = call(program(_advance_and_tell, level="quick"), *own)
-        return carry._replace(state=state), step, facts
+        carry, report = call(program(_advance_and_pack, level="quick"), *policy_arguments)
+        return carry._replace(state=state), step, report
 
 
 def run_stepwise(
@@ -101,22 +107,22 @@ def run_stepwise(
     callback: Callable[[IterationRecord], bool | None],
     stages: Mapping[str, tuple[Stage, ...]],
 ) -> tuple[Carry, History, int, float, float]:
-    """Iterates until a stop rule or the callback ends it.
+    """Runs iterations until a stopping rule or the callback ends the solve.
 
     Args:
         layout: the problem's observations.
         state: start.
         policy: chooses lambda.
         tolerances: convergence tests.
-        options: static.
+        options: static options of the step.
         max_iterations: limit of linear solves.
-        callback: sees every record; a true answer ends the solve.
-        stages: how each part of a step is compiled before it is optimised, `propose` and `try_step`, or `round`. A
-            camera round or a further trial counts for `RUNS_PER_REPAIR` more runs.
+        callback: called with every record; a true return value ends the solve.
+        stages: stages of compilation of each part of a step, before it is fully optimised. The parts are `propose` and
+            `try_step`, or `round`. A camera round or a further trial counts as `RUNS_PER_REPAIR` runs.
 
     Returns:
-        Final carry, histories of as many entries as there were iterations, how many of these had a part
-        that was not optimised, seconds of compilation and seconds of everything else.
+        Final carry; histories with one entry per iteration; number of iterations in which some part was not fully
+        optimised; seconds of compilation; seconds of everything else.
     """
     loop = _Loop(layout, policy, tolerances, options, max_iterations)
     runs = dict.fromkeys(stages, 0)
@@ -133,7 +139,7 @@ def run_stepwise(
     carry = jax.block_until_ready(loop.start(run, state))
     compile_s = 0.0
     if clock.seconds > 0 or compile_programs.loaded:
-        # a program's first run touches its memory for the first time; it is the time of later runs that is reported
+        # warm-up, so that the first iteration is timed like later ones: a first run also allocates memory
         if optimised(levels):
             jax.block_until_ready(loop.iterate(run, carry, levels)[2])
         compile_s = time.perf_counter() - started
@@ -145,8 +151,8 @@ def run_stepwise(
             with compile_programs:
                 loop.iterate(compile_programs, carry, levels)
             waited += time.perf_counter() - began
-        carry, step, facts = loop.iterate(run, carry, levels)
-        step, end = _told(facts, step)
+        carry, step, report = loop.iterate(run, carry, levels)
+        step, end = _unpack(report, step)
         records.append(step)
         quick_iterations += not optimised(levels)
         for name in runs:
@@ -162,16 +168,16 @@ def run_stepwise(
     return carry, history, quick_iterations, compile_s + waited, total_s
 
 
-def _advance_and_tell(
-    carry: Carry, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any, turns: Any
-) -> tuple[Carry, Float[Array, " facts"]]:
-    """`advance` without the parameters, and for the host the step and the end, as one array: one transfer, not 15."""
-    after = advance(carry, None, step, policy, tolerances, max_iterations, turns)
+def _advance_and_pack(
+    carry: Carry, step: StepInfo, policy: DampingPolicy, tolerances: Tolerances, max_iterations: Any, partitions: Any
+) -> tuple[Carry, Float[Array, " report"]]:
+    """`advance` without the parameters, and the record with the termination as one array: one transfer to the host."""
+    after = advance(carry, None, step, policy, tolerances, max_iterations, partitions)
     return after, jnp.stack([x.astype(step.cost.dtype) for x in (*step, after.termination)])
 
 
-def _told(facts: Float[Array, " facts"], shapes: StepInfo) -> tuple[StepInfo, Termination]:
-    """The other end of `_advance_and_tell`: Python numbers of the types that `shapes` has."""
-    *values, end = np.asarray(facts).tolist()
+def _unpack(report: Float[Array, " report"], shapes: StepInfo) -> tuple[StepInfo, Termination]:
+    """The record and the termination packed by `_advance_and_pack`, as Python scalars of the types of `shapes`."""
+    *values, end = np.asarray(report).tolist()
     kinds = {"b": bool, "i": int, "f": float}
     return StepInfo(*(kinds[x.dtype.kind](v) for v, x in zip(values, shapes, strict=True))), Termination(int(end))

@@ -1,7 +1,7 @@
-"""Which solver of the reduced camera system is fastest for a problem: a cost model with measured constants.
+"""Choice of the solver of the reduced camera system, by a cost model with measured constants.
 
-The constants were fitted on two x86-64 cores, float64 (`python -m benchmarks.choice --fit`). Only ratios
-matter for the choice, and those move little between machines.
+The time of an iteration is a sum of amounts of work (observations, pairs, cubes of unknowns, ...) times fitted seconds
+per unit. Only ratios matter for the choice, and they differ little between machines.
 """
 
 from __future__ import annotations
@@ -20,41 +20,41 @@ from jaxba.structure.observation_order import ObservationOrder
 
 
 class Work(NamedTuple):
-    """Amounts of work of an iteration by kind, or the seconds that a unit of each takes (`SECONDS`)."""
+    """Amounts of work of an iteration by kind, or seconds per unit of each kind (`SECONDS`)."""
 
     step: float = 0.0
-    """One iteration, whatever its size."""
+    """Constant cost of an iteration."""
 
     observation: float = 0.0
-    """What all solvers do beside the linear solve: an observation linearised, eliminated and its cost taken."""
+    """Work outside the linear solve: observations that are linearised, eliminated and evaluated."""
 
     pair: float = 0.0
-    """Forming the blocks: a pair of observations of one point."""
+    """Forming the blocks: pairs of observations of one point."""
 
     dense_product: float = 0.0
-    """A multiplication and addition where the system is formed as one dense product (structure/density.py)."""
+    """Forming the system as one dense matrix product (structure/density.py): multiply-add operations."""
 
     square: float = 0.0
-    """The square of the unknowns of a dense factorisation: what is written, and what one core does."""
+    """Dense factorisation, memory traffic and single-core part: unknowns squared."""
 
     cube: float = 0.0
-    """The cube of the unknowns of a dense factorisation."""
+    """Dense factorisation: unknowns cubed."""
 
     band: float = 0.0
-    """Band factorisation: an unknown times the square of the band's unknowns."""
+    """Band factorisation: unknowns times the square of the unknowns of the bandwidth."""
 
     block: float = 0.0
-    """A product of conjugate gradients with the formed blocks: a block."""
+    """Products of conjugate gradients with formed blocks: blocks."""
 
     implicit: float = 0.0
-    """A product without them: an observation."""
+    """Products of conjugate gradients without forming the system: observations."""
 
     coarse: float = 0.0
-    """Forming the coarse system of the two-level preconditioner: an observation."""
+    """Forming the coarse system of the two-level preconditioner: observations."""
 
     @property
     def seconds(self) -> float:
-        """Time that these amounts take."""
+        """Predicted time of these amounts."""
         return sum(amount * each for amount, each in zip(self, SECONDS, strict=True))
 
 
@@ -74,41 +74,42 @@ SECONDS = Work(
 `python -m benchmarks.choice --fit`."""
 
 ASSUMED_PRODUCTS = 12
-"""Conjugate gradient iterations assumed for one step with the two-level preconditioner, which takes 6 to 20 on the
-problems at hand."""
+"""Assumed conjugate gradient iterations of a step with the two-level preconditioner. Measured: 6 to 20 on real
+problems."""
 
 INEXACT_ITERATIONS = 1.2
-"""Iterations to convergence that truncated conjugate gradients take, relative to a factorisation: geometric mean over
-bulani1, bulani2, bulani4 and the rules ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
+"""Iterations to convergence with truncated conjugate gradients, relative to a factorisation. Measured: geometric mean
+over bulani1, bulani2, bulani4 and the policies ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
 
-TIED_COPIES = 5
-"""The reduced camera system, its mirror image, the tied one, that scaled, its factor."""
+SHARED_LENS_MATRICES = 5
+"""Matrices of the size of the reduced camera system in memory for shared lenses: the system, its symmetric completion,
+the sums over lenses, these scaled, their factor."""
 
-DENSE_COPIES = 4
-"""The reduced camera system, its blocks' copy, its mirror image, its factor (linear/blocks.py, linear/cholesky.py)."""
+DENSE_MATRICES = 4
+"""Matrices of that size in memory for a dense factorisation: the system, its blocks, the scaled system, its factor."""
 
 MAX_BYTES = 4e9
-"""A solver that would need more memory than this is not chosen."""
+"""Largest memory of a solver that `auto` may choose."""
 
 BYTES_PER_OBSERVATION = 1100.0
-"""Device memory of one implicit step in float64: arguments, results and temporaries. Half of it in float32. A scene of
-Ladybug-1197's size takes 1,072 (tests/test_memory.py, docs/performance.md)."""
+"""Device memory of one implicit step in float64: arguments, results and temporaries; half of it in float32. Measured:
+1,072 on a scene of the size of Ladybug-1197."""
 
 BYTES_PER_PAIR = 16.0
-"""Index and padding; the products themselves are made in batches."""
+"""Index arrays with padding; the products are computed in batches."""
 
 BYTES_PER_BLOCK = 3 * 81 * 8.0
-"""A block, its chunks and their sums."""
+"""A block of 81 numbers, its partial sums and its sum."""
 
 MAX_COUNTED_PAIRS = 20_000_000
-"""Up to this many pairs the blocks are counted, which takes under a second."""
+"""Most pairs for which blocks are counted, which takes less than a second."""
 
 MAX_COUNTED_CAMERAS = 20_000
-"""The table of camera pairs takes a byte each."""
+"""Most cameras for which blocks are counted: the table takes a byte per pair of cameras."""
 
 
 class SolverCosts(NamedTuple):
-    """Predicted seconds per iteration; infinite where memory would not do."""
+    """Predicted seconds per iteration; infinite if a solver needs more than `MAX_BYTES`."""
 
     explicit: float
     sparse: float
@@ -118,29 +119,35 @@ class SolverCosts(NamedTuple):
 def work(
     problem: BundleProblem, products: float = ASSUMED_PRODUCTS, observations: ObservationOrder | None = None
 ) -> dict[str, Work]:
-    """Work of one iteration with each linear solver that has the memory for it.
+    """Work of one iteration with each linear solver that needs at most `MAX_BYTES`.
 
     Args:
-        problem: gives the numbers of cameras, observations, pairs and co-visible blocks.
-        products: of conjugate gradients, where they are used.
-        observations: of the problem, where they are sorted already.
+        problem: determines the numbers of cameras, observations, pairs and co-visible blocks.
+        products: number of products of conjugate gradients in a step.
+        observations: the sorted observations of the problem, if they are known already.
     """
-    sorted_ = observations or ObservationOrder.of(problem)
-    counts, observed = count_pairs(problem, sorted_), problem.num_observations
+    order = observations or ObservationOrder.of(problem)
+    counts, observed = count_pairs(problem, order), problem.num_observations
     every = Work(step=1.0, observation=observed)
     blocks = _bytes_of_blocks(counts)
     solvers = {"implicit": every._replace(coarse=observed, implicit=products * observed)}
     if blocks <= MAX_BYTES:
         solvers["sparse"] = every._replace(coarse=observed, block=products * counts.blocks, pair=counts.pairs)
-    explicit, needed = _factoring(sorted_, counts, blocks)
+    explicit, needed = _factoring(order, counts, blocks)
     if needed <= MAX_BYTES:
         solvers["explicit"] = explicit._replace(step=1.0, observation=observed)
     return solvers
 
 
 def _factoring(observations: ObservationOrder, counts: PairCounts, blocks: float) -> tuple[Work, float]:
-    """Work of forming and factoring the system, and the bytes that it takes."""
-    unknowns, band, points = 9.0 * observations.num_cameras, 9.0 * counts.reach, observations.num_observed_points
+    """Work of forming and factoring the system, and the memory that it needs, bytes.
+
+    Args:
+        observations: sorted observations of the problem.
+        counts: pairs and blocks.
+        blocks: memory of the blocks, bytes.
+    """
+    unknowns, band, points = 9.0 * observations.num_cameras, 9.0 * counts.bandwidth, observations.num_observed_points
     if _is_dense(observations):
         if has_small_capacitance(points + 1, observations.num_cameras):
             side, inner = 3.0 * (points + 1), unknowns
@@ -149,19 +156,19 @@ def _factoring(observations: ObservationOrder, counts: PairCounts, blocks: float
         forming = Work(dense_product=side**2 * inner, square=side**2, cube=side**3)
         return forming, 3 * 8 * side * inner
     forming = Work(pair=counts.pairs)
-    if is_banded(observations.num_cameras, counts.reach):
+    if is_banded(observations.num_cameras, counts.bandwidth):
         return forming._replace(band=unknowns * band**2), blocks + 3 * 8 * unknowns * band
-    return forming._replace(square=unknowns**2, cube=unknowns**3), blocks + DENSE_COPIES * 8 * unknowns**2
+    return forming._replace(square=unknowns**2, cube=unknowns**3), blocks + DENSE_MATRICES * 8 * unknowns**2
 
 
 def predict(problem: BundleProblem, observations: ObservationOrder | None = None) -> SolverCosts:
-    """Costs of one iteration with each linear solver."""
+    """Predicted time of one iteration with each linear solver. Arguments as for `work`."""
     solvers = work(problem, observations=observations)
     return SolverCosts(*(solvers[name].seconds if name in solvers else np.inf for name in SolverCosts._fields))
 
 
 def _is_dense(observations: ObservationOrder) -> bool:
-    """Whether the explicit solver will form the system as one dense product, or a matrix of the points' size."""
+    """Whether the explicit solver forms the system as one dense product, or uses Woodbury's identity."""
     columns = observations.num_observed_points + 1
     if not has_dense_shape(observations.tracks, observations.num_cameras, columns):
         return False
@@ -169,15 +176,15 @@ def _is_dense(observations: ObservationOrder) -> bool:
 
 
 class PairCounts(NamedTuple):
-    """What the size of the reduced camera system follows from."""
+    """Numbers that determine the size of the reduced camera system."""
 
-    pairs: int  # pairs of observations of one point
-    blocks: int  # pairs of cameras that share a point; a camera pairs with itself
-    reach: int  # in the better order of cameras, the largest distance of two that share a point
+    pairs: int  # pairs of observations of one point, an observation with itself included
+    blocks: int  # pairs of cameras with common points, a camera with itself included
+    bandwidth: int  # largest distance of two such cameras in the better ordering
 
 
 def count_pairs(problem: BundleProblem, observations: ObservationOrder | None = None) -> PairCounts:
-    """Counts pairs; blocks and reach are exact up to `MAX_COUNTED_PAIRS` pairs, else upper bounds."""
+    """Counts pairs and blocks. Blocks and bandwidth are upper bounds for more than `MAX_COUNTED_PAIRS` pairs."""
     observations = observations or ObservationOrder.of(problem)
     pairs, cameras, tracks = observations.num_pairs, observations.num_cameras, observations.tracks
     if pairs > MAX_COUNTED_PAIRS or cameras > MAX_COUNTED_CAMERAS:
@@ -193,7 +200,7 @@ def count_pairs(problem: BundleProblem, observations: ObservationOrder | None = 
 
 
 def choose(problem: BundleProblem, observations: ObservationOrder | None = None) -> LinearSolver:
-    """The solver with the lowest predicted time to the end; a tie goes to the more exact one."""
+    """The linear solver with the lowest predicted time to convergence. Arguments as for `work`."""
     times = {
         name: time if name == "explicit" else INEXACT_ITERATIONS * time
         for name, time in predict(problem, observations)._asdict().items()
@@ -207,19 +214,18 @@ def choose_linear_solver(
     asked: LinearSolverChoice,
     observations: ObservationOrder | None = None,
 ) -> StepOptions:
-    """Options with the linear solver that was asked for.
+    """The step options with the requested linear solver.
 
     Args:
-        problem: decides `auto`.
-        options: of the step.
-        asked: `auto` or a name. A method in the place of plain LM has its own solver and leaves no choice. Fixed
-            intrinsics leave the explicit one.
-        observations: of the problem, where they are sorted already.
+        problem: determines the choice of `auto`.
+        options: options of the step.
+        asked: `auto` or a name. Methods have their own solver; fixed or shared intrinsics need the explicit one.
+        observations: the sorted observations of the problem, if they are known already.
 
     Raises:
-        ValueError: a method, and a solver asked for by name.
-        ProblemError: cameras share a lens, or some of it stays, and another than the explicit solver was asked for; or
-            a factorisation would take more memory than there is.
+        ValueError: a linear solver is requested by name for a method.
+        ProblemError: intrinsics are shared or partly fixed, and another solver than the explicit one is requested; or a
+            factorisation needs more memory than the machine has.
     """
     if options.method is not None and asked != "auto":
         raise ValueError(f"linear solver {asked!r} is for plain LM steps; {options.method.name} has its own")
@@ -231,7 +237,7 @@ def choose_linear_solver(
     if options.method is not None:
         return options
     if asked == "auto" and options.intrinsics == "free":
-        return replace(options, linear_solver=choose(problem, observations))  # it looks at memory itself
+        return replace(options, linear_solver=choose(problem, observations))  # `choose` respects MAX_BYTES
     asked = "explicit" if asked == "auto" else asked
     if asked == "explicit":
         _check_memory(problem, observations)
@@ -239,28 +245,29 @@ def choose_linear_solver(
 
 
 def _check_memory(problem: BundleProblem, observations: ObservationOrder | None) -> None:
-    """Refuses what takes more memory to factor than the machine has. Shared lenses break bands and blocks."""
+    """Raises a `ProblemError` if a factorisation, dense for shared lenses, needs more memory than the machine has."""
     try:
-        there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return
     shared = problem.lenses is not None and problem.lenses.shared
-    copies = TIED_COPIES if shared else DENSE_COPIES
-    needed = copies * 8.0 * (CAMERA_SIZE * problem.num_cameras) ** 2
+    matrices = SHARED_LENS_MATRICES if shared else DENSE_MATRICES
+    needed = matrices * 8.0 * (CAMERA_SIZE * problem.num_cameras) ** 2
     if not shared:
         observations = observations or ObservationOrder.of(problem)
         most = observations.num_pairs
         needed += _bytes_of_blocks(PairCounts(most, min(most, problem.num_cameras**2), 0))
-        if needed > there:  # so it is without counting: there may be a band
+        if needed > available:  # an upper bound: count blocks and look for a band
             counts = count_pairs(problem, observations)
             needed = _factoring(observations, counts, _bytes_of_blocks(counts))[1]
-    if needed > there:
-        of, way = (" with shared lenses", "; with fixed intrinsics they may take less") if shared else ("", "")
+    if needed > available:
+        suffix, hint = (" with shared lenses", "; with fixed intrinsics they may take less") if shared else ("", "")
         raise ProblemError(
-            f"{problem.num_cameras} cameras{of} take some {needed / 1e9:.0f} GB to "
-            f"solve by a factorisation, more than the {there / 1e9:.0f} GB of this machine{way}"
+            f"{problem.num_cameras} cameras{suffix} take some {needed / 1e9:.0f} GB to "
+            f"solve by a factorisation, more than the {available / 1e9:.0f} GB of this machine{hint}"
         )
 
 
 def _bytes_of_blocks(counts: PairCounts) -> float:
+    """Memory of the blocks and of the index arrays that form them."""
     return counts.pairs * BYTES_PER_PAIR + counts.blocks * BYTES_PER_BLOCK

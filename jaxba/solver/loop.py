@@ -1,4 +1,7 @@
-"""The loop of a solve: what an iteration does after its step, and all iterations as one compiled program."""
+"""The solve loop: an LM step, the policy's next lambda, the stopping rules, again.
+
+`solve_loop` is the whole loop as one compiled program; callback_loop.py runs the same iteration from Python.
+"""
 
 from __future__ import annotations
 
@@ -23,30 +26,30 @@ from jaxba.typing import AnyArray
 
 
 class History(NamedTuple):
-    """One entry an iteration; NumPy arrays of equal length in a `Solution`."""
+    """Records of a solve, one entry per iteration; in a `Solution` they are NumPy arrays of equal length."""
 
     cost: AnyArray  # accepted cost after the iteration, pixels^2
-    candidate_cost: AnyArray  # cost of the proposed step
-    damping: AnyArray  # lambda that was used
+    candidate_cost: AnyArray  # cost of the proposed step, pixels^2
+    damping: AnyArray  # lambda of the iteration
     gain_ratio: AnyArray
     accepted: AnyArray
     cg_iterations: AnyArray
-    gradient_max: AnyArray  # largest gradient entry before the step
+    gradient_max: AnyArray  # largest absolute gradient entry before the step
     step_norm: AnyArray
 
 
 class Carry(NamedTuple):
-    """What goes from one iteration to the next."""
+    """The state of the loop between iterations."""
 
-    state: Any  # LMState, or None where only the policy's part is wanted
-    policy: Any
-    damping: Float[Array, ""]
-    iteration: Int[Array, ""]
-    termination: Int[Array, ""]
+    state: Any  # LMState, or None where parameters are left out
+    policy: Any  # state of the damping policy
+    damping: Float[Array, ""]  # lambda of the next iteration
+    iteration: Int[Array, ""]  # number of iterations so far
+    termination: Int[Array, ""]  # integer of a `Termination`
 
 
 def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: Any) -> ProblemInfo:
-    """What a policy may know before the first iteration."""
+    """The information that a policy gets before the first iteration."""
     unit = jnp.ones_like(state.cost)
     if options.coordinates.scaling == "identity":
         linear = linearize(layout, state.cameras, state.points, options.loss)
@@ -65,7 +68,7 @@ def problem_info(layout: Layout, state: LMState, options: StepOptions, max_itera
 
 
 def begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> Carry:
-    """Carry before the first iteration."""
+    """The carry before the first iteration."""
     policy_state, damping = policy.init(info)
     count = lambda n: jnp.asarray(n, jnp.int32)
     return Carry(state, policy_state, damping, count(0), count(Termination.RUNNING))
@@ -78,16 +81,27 @@ def after_step(
     iteration: Int[Array, ""],
     tolerances: Tolerances,
     max_iterations: Any,
-    turns: Any = 1,
+    partitions: Any = 1,
 ) -> tuple[Any, Float[Array, ""], Int[Array, ""]]:
-    """The policy's answer to a step, and the stop rules: its next state, the next lambda, a `Termination`.
+    """The policy's update and the stopping rules after a step.
 
-    `turns` is `layout.num_partitions`: with several, the next step is another one though nothing has changed.
+    Args:
+        policy: the damping policy.
+        policy_state: its state before the step.
+        step: record of the iteration.
+        iteration: number of iterations so far, this one included.
+        tolerances: convergence tests.
+        max_iterations: limit of iterations.
+        partitions: number of random partitions (`layout.num_partitions`); with several, a step from the same state and
+            lambda differs from the one before.
+
+    Returns:
+        The next state of the policy, the next lambda, and the integer of a `Termination`.
     """
     after, damping = policy.propose(policy_state, step)
-    # the same state and lambda after a rejection: the policy would ask for the same step for ever
+    # same policy state and lambda after a rejection: the same step would be rejected forever
     same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (policy_state, after)), strict=True)]
-    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping) & (jnp.asarray(turns) == 1)
+    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping) & (jnp.asarray(partitions) == 1)
     return after, damping, termination_of(step, stuck, iteration, tolerances, max_iterations)
 
 
@@ -98,18 +112,18 @@ def advance(
     policy: DampingPolicy,
     tolerances: Tolerances,
     max_iterations: Any,
-    turns: Any,
+    partitions: Any,
 ) -> Carry:
-    """Everything of an iteration that follows the step.
-
-    The parameters are handed on and not looked at; None leaves them out.
-    """
+    """The carry after a step. `state` is passed on unseen, and may be None; other arguments as for `after_step`."""
     iteration = carry.iteration + 1
-    policy_state, damping, end = after_step(policy, carry.policy, step, iteration, tolerances, max_iterations, turns)
+    policy_state, damping, end = after_step(
+        policy, carry.policy, step, iteration, tolerances, max_iterations, partitions
+    )
     return Carry(state, policy_state, damping, iteration, end)
 
 
 def history_of(step: StepInfo) -> History:
+    """The fields of a record that are kept in the history."""
     return History(
         cost=step.cost,
         candidate_cost=step.candidate_cost,
@@ -132,22 +146,22 @@ def solve_loop(
     max_iterations: int,
     limit: Int[Array, ""] | None = None,
 ) -> tuple[Carry, History]:
-    """The loop as one program; vmappable over layouts and states of equal shape.
+    """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes.
 
     Args:
         layout: the problem's observations.
         state: start.
         policy: chooses lambda.
         tolerances: convergence tests.
-        options: static.
+        options: static options of the step.
         max_iterations: length of the histories, static.
-        limit: of linear solves, if it is a lower one.
+        limit: a lower limit of iterations, not static.
 
     Returns:
-        Final carry, and histories of length `max_iterations`, zero past the last iteration.
+        Final carry, and histories of length `max_iterations`, zero after the last iteration.
     """
-    most = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
-    carry = begin(problem_info(layout, state, options, most), policy, state)
+    iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
+    carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)
 
     def step_of(c: Carry) -> tuple[LMState, StepInfo]:
         effort = effort_of(policy, c.policy)
@@ -160,6 +174,6 @@ def solve_loop(
         carry, history = loop
         state, step = step_of(carry)
         history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, history_of(step))
-        return advance(carry, state, step, policy, tolerances, most, num_partitions(layout)), history
+        return advance(carry, state, step, policy, tolerances, iteration_limit, num_partitions(layout)), history
 
     return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))

@@ -1,6 +1,7 @@
-"""Solver names, the same in every command, table and file: `[method+]policy[+refineK|+embedded][@dtype]`.
+"""Solver names, the same in all commands, tables and files: `[method+]policy[+refineK|+embedded][@dtype]`.
 
-A peer has its library's name: `pyceres:MODE`, and `pyceres:MODE+policy[+refineK|+embedded]` where a policy drives it.
+Another library as a solver (a peer) is named `pyceres:MODE`, or `pyceres:MODE+policy[+refineK|+embedded]` if a damping
+policy of jaxba chooses its lambda.
 """
 
 from __future__ import annotations
@@ -18,58 +19,58 @@ from jaxba.problem.options import Refinement, StepOptions
 from jaxba.solver.options import Dtype, SolveOptions
 
 DTYPES = get_args(Dtype)
-"""Known floating point types; the first is understood where none is named."""
+"""Known floating point types; the first is the default."""
 
 INNER = "-inner"
-"""Ends a peer's mode that has embedded iterations of its own."""
+"""Suffix of a peer's mode with inner iterations, the peer's own embedded iterations."""
 
 PEERS = {"pyceres": ("dense", "sparse", "iterative", f"dense{INNER}", f"sparse{INNER}")}
-"""Libraries that can run as peers, and their modes."""
+"""Peer libraries and their modes."""
 
 
 class SolverNameError(ValueError):
-    """A name that is no solver. The message is one line for a person."""
+    """A name is not that of a solver. The message is one line for the user."""
 
 
 @dataclass(frozen=True)
 class SolverName:
-    """A parsed name; `str` gives it back in its shortest form."""
+    """A parsed solver name; `str` returns its shortest form."""
 
     policy: str
-    """Damping policy, see `jaxba.damping.make_policy`."""
+    """Name of the damping policy, see `jaxba.damping.make_policy`."""
 
     refine_points: int | None = 0
-    """Embedded point iterations and no others. None: all embedded iterations; a learned policy brings those that it
-    was trained with, `bold` those of `learned`, and a rule gets the default ones under the name `RULE+embedded`."""
+    """Number of embedded point iterations, without any other refinement. None: the full refinement: that a learned
+    policy was trained with, that of `learned` for `bold`, or for a rule (`RULE+embedded`) that of the default agent."""
 
     dtype: Dtype = DTYPES[0]
     """Floating point type."""
 
     method: str = DEFAULT_METHOD
-    """How a step is computed, see `jaxba.methods`."""
+    """Name of the optimisation method, see `jaxba.methods`."""
 
     peer: str = ""
-    """`LIBRARY:MODE` where another library computes the steps; its own rule chooses lambda if `policy` is empty."""
+    """`LIBRARY:MODE` if another library computes the steps, with its own damping rule if `policy` is empty."""
 
     def __str__(self) -> str:
-        around = ""
+        refinement = ""
         if self.refine_points is None:
-            around = "" if brings_embedded(self.policy) else "+embedded"
+            refinement = "" if brings_embedded(self.policy) else "+embedded"
         elif self.embeds or brings_embedded(self.policy):
-            around = f"+refine{self.refine_points}"
+            refinement = f"+refine{self.refine_points}"
         if self.peer:
-            return f"{self.peer}+{self.policy}{around}" if self.policy else self.peer
+            return f"{self.peer}+{self.policy}{refinement}" if self.policy else self.peer
         method = "" if self.method == DEFAULT_METHOD else f"{self.method}+"
         dtype = "" if self.dtype == DTYPES[0] else f"@{self.dtype}"
-        return f"{method}{self.policy}{around}{dtype}"
+        return f"{method}{self.policy}{refinement}{dtype}"
 
     @property
     def embeds(self) -> bool:
-        """Whether there are embedded iterations."""
+        """Whether there is any refinement of steps."""
         return self.refine_points != 0
 
     def build(self) -> tuple[DampingPolicy, SolveOptions]:
-        """The policy, and the options of the solve that it drives.
+        """The policy, and the options of the solve.
 
         Raises:
             UnknownPolicyError, PolicyFileError, UnknownMethodError: as `make_policy`, `make_method`.
@@ -87,15 +88,17 @@ class SolverName:
 
 
 def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> str:
-    """The policy that a name means: `learned` is the best of the shipped ones for the step, and `bold` has its guard.
+    """Resolves `learned` and `bold` to the variant for the kind of step.
+
+    `learned` is the shipped policy that performed best for it, and `bold` has the guard of that policy.
 
     Args:
-        policy: see `make_policy`.
-        alone: whether lambda is all that there is to choose, without embedded iterations.
-        peer: whether another library makes the step, which damps cameras as points.
+        policy: name of a policy, see `make_policy`.
+        alone: whether steps have no refinement, so that lambda is the only choice.
+        peer: whether another library computes the step, with the same damping for cameras and points.
 
     Returns:
-        A name for `make_policy`; any but `learned` and `bold` as it is.
+        A name for `make_policy`; other names than `learned` and `bold` are unchanged.
     """
     if policy not in _ALONE or not alone:
         return policy
@@ -104,11 +107,11 @@ def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> s
 
 
 _ALONE = {LEARNED: (LEARNED_PLAIN, LEARNED_DRIVER), BOLD: (BOLD_PLAIN, BOLD_DRIVER)}
-"""What these names mean for lambda alone: with jaxba's step, and with another library's."""
+"""Variants of these policies for steps without refinement: for jaxba's step, and for that of another library."""
 
 
 def parse_solver(name: str) -> SolverName:
-    """Reads a solver's name.
+    """Parses a solver name.
 
     Raises:
         SolverNameError: an unknown method, mode or type, or a malformed name.
@@ -116,7 +119,7 @@ def parse_solver(name: str) -> SolverName:
     """
     if name.strip().partition(":")[0] in PEERS:
         return _parse_peer(name.strip())
-    # a path may hold any sign: it ends where its suffix does
+    # the path of a policy file may contain `+` and `@`: it ends with the suffix of such files
     path, suffix, rest = name.strip().rpartition(SUFFIX)
     prefix, at, dtype = rest.partition("@")
     parts = prefix.split("+")
@@ -125,7 +128,7 @@ def parse_solver(name: str) -> SolverName:
         known = bool(plus) and method.partition(":")[0] in METHODS
         parts[0] = (file if known else path) + suffix + parts[0]
         parts = [method, *parts] if known else parts
-    # the plus sign of an exponent belongs to its number: constant:1e+2
+    # a `+` in an exponent belongs to the number: constant:1e+2
     merged: list[str] = []
     for part in parts:
         if merged and not merged[-1].endswith(SUFFIX) and re.search(r":\d*\.?\d*[eE]$", merged[-1]):
@@ -158,13 +161,14 @@ def parse_solver(name: str) -> SolverName:
 
 
 def _parse_peer(name: str) -> SolverName:
+    """Parses the name of a peer."""
     peer, plus, policy = name.partition("+")
     library, _, mode = peer.partition(":")
     if mode not in PEERS[library]:
         raise SolverNameError(f"unknown mode {mode!r} in {name!r}; known: {', '.join(PEERS[library])}")
     if not plus:
         return SolverName("", peer=peer)
-    if mode.endswith(INNER):  # Ceres credits them to the linear model, so that no policy could tell a gain
+    if mode.endswith(INNER):  # Ceres includes them in its gain ratio, which a policy could not interpret
         raise SolverNameError(f"{name!r} is no solver; {library} has inner iterations under its own rule alone")
     driver = parse_solver(policy)
     if driver != SolverName(driver.policy, driver.refine_points):

@@ -1,4 +1,4 @@
-"""What a caller may ask of a solve: the one table of defaults, for Python and for the command."""
+"""Options of a solve with their defaults, the same for Python and for the command `jaxba-solve`."""
 
 from __future__ import annotations
 
@@ -22,34 +22,36 @@ from jaxba.problem.options import (
 from jaxba.runtime.compilation import Compilation
 
 MAX_ITERATIONS = 100
-"""Iterations after which a solve has failed. Source: the paper."""
+"""Limit of iterations. Source: the experiments of the paper on learned damping, where a solve that takes more has
+failed."""
 
 Dtype = Literal["float64", "float32", "mixed"]
 
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """Options of `solve`; `jaxba-solve` has the same ones, with the same defaults."""
+    """Options of `solve`. The command `jaxba-solve` has the same ones, with the same defaults."""
 
     method: str | Method = DEFAULT_METHOD
-    """How a step is made: an entry of `jaxba.METHODS` or its name."""
+    """Optimisation method: an entry of `jaxba.METHODS` or its name."""
 
     linear_solver: LinearSolverChoice = "auto"
-    """Of the reduced camera system in plain LM; a method has its own.
-    `auto` chooses by a cost model (cost_model.py)."""
+    """Solver of the reduced camera system in plain LM; other methods have their own. `auto` chooses by a cost model
+    (cost_model.py)."""
 
     conjugate_gradients: ConjugateGradients = field(default_factory=ConjugateGradients)
-    """Of the linear solvers `sparse` and `implicit`."""
+    """Conjugate gradients of the linear solvers `sparse` and `implicit`."""
 
     refinement: Refinement | None = None
-    """What is done around a linear solve. None: what a learned policy was trained with; nothing under a rule."""
+    """Improvements of a step without another linear solve. None: those a learned policy was trained with; none for a
+    rule."""
 
     coordinates: Coordinates | None = None
-    """Coordinates of a step and of its damping. None: those that a learned policy was trained with; Ceres' under a
+    """Coordinates of a step and of its damping. None: those a learned policy was trained with; those of Ceres for a
     rule."""
 
     intrinsics: Intrinsics = "free"
-    """Whether focal lengths and distortions are optimised or stay."""
+    """Whether f, k1 and k2 are optimised (`free`) or `fixed`."""
 
     loss: Loss = field(default_factory=Loss)
     """Robust loss."""
@@ -65,15 +67,17 @@ class SolveOptions:
     float32."""
 
     pad: bool = False
-    """Rounds sizes up to a coarse grid, so that similar problems share one compiled program, also through a persistent
-    compilation cache; results differ by rounding alone. For many small problems with the explicit solver, which `auto`
-    then means. Other solvers and larger problems are left as they are: `Solution.capacity` is None then."""
+    """Whether array sizes are rounded up to a coarse grid, so that similar problems share one compiled program, also in
+    a persistent compilation cache. Results differ by rounding only. For many small problems with the explicit solver,
+    which `auto` then means; with other solvers and for larger problems nothing is padded, and `Solution.capacity` is
+    None."""
 
     compilation: Compilation = "auto"
-    """`full`: all optimisation, for many solves of a shape and for whoever takes the time of iterations. `quick`:
-    compiled in a third of the time, iterations take two to six times as long. `auto`: quick or, with more observations,
-    in half of the time and nearly as fast, and optimised after as many iterations as pay for it; the end of one solve
-    comes soonest. They differ by rounding. On a GPU all are `full`."""
+    """Optimisation level of compilation. `full`: fully optimised; for many solves of one shape, and for timing of
+    iterations. `quick`: compiles in a third of the time, and iterations take two to six times as long. `auto`: shortest
+    time to the end of a single solve; starts with quick programs, or for more observations with programs that compile
+    in half of the time and are nearly as fast, and replaces them by optimised ones when that pays. Results differ by
+    rounding. On a GPU all are `full`."""
 
     def __post_init__(self) -> None:
         for name, known in (("dtype", Dtype), ("linear_solver", LinearSolverChoice), ("compilation", Compilation)):
@@ -85,10 +89,10 @@ class SolveOptions:
                 raise ValueError(f"{name} must not be negative, is {value}")
 
     def step_options(self, policy: DampingPolicy) -> StepOptions:
-        """The step that is asked for under a policy; the linear solver `auto` is the explicit one.
+        """The step options for a policy. The linear solver `auto` is replaced by `explicit`, to be chosen later.
 
         Raises:
-            ValueError, UnknownMethodError: options that do not go together, or no such method.
+            ValueError, UnknownMethodError: options that exclude each other, or an unknown method.
         """
         trained = trained_step(policy)
         method = make_method(self.method) if isinstance(self.method, str) else self.method

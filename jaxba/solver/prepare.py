@@ -1,4 +1,4 @@
-"""From a problem to what a compiled loop takes: layout, state and resolved options; and back."""
+"""Preparation of a solve: from a problem to layout, initial state and resolved options; and back to a problem."""
 
 from __future__ import annotations
 
@@ -28,42 +28,42 @@ from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 
 DEFAULT_POLICY = "learned"
-"""Who chooses lambda where nobody is named."""
+"""Name of the default damping policy."""
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """What `jaxba.solve_loop` and `jaxba.lm_step` take, for one problem."""
+    """Arguments of `jaxba.solve_loop` and `jaxba.lm_step` for a problem."""
 
     layout: Layout
-    """The observations, on the device."""
+    """Observations and index arrays, on the device."""
 
     state: LMState
-    """Parameters in layout order, on the device, and their cost."""
+    """Initial parameters in layout order, on the device, and their cost."""
 
     options: StepOptions
-    """The step that was asked for, with its linear solver; static and hashable."""
+    """Step options, with the chosen linear solver; static and hashable."""
 
     policy: DampingPolicy
-    """Who chooses lambda."""
+    """The damping policy."""
 
     problem: BundleProblem
-    """As it was given."""
+    """The problem as it was given."""
 
     capacity: Capacity | None
-    """Sizes to which the problem was padded; None where it was not."""
+    """Sizes to which the problem was padded; None if it was not."""
 
     offset: np.ndarray | None
-    """By how much the scene was moved towards the origin, scene units; None where it was not."""
+    """Translation by which the scene was moved to the origin, scene units; None if it was not."""
 
     setup_s: float
     """Seconds for the layout and the transfer to the device."""
 
     compile_s: float
-    """Seconds for the compilation of the initial state."""
+    """Seconds for the compilation of the program of the initial state."""
 
     def problem_at(self, state: LMState) -> BundleProblem:
-        """The problem with the parameters of a state, NumPy float64; what is not optimised is copied bit by bit."""
+        """The problem with the parameters of a state, as NumPy float64; what is not optimised is copied exactly."""
         if self.offset is None:
             return write_back(self.problem, self.layout, state, self.options)
         return shift(write_back(shift(self.problem, -self.offset), self.layout, state, self.options), self.offset)
@@ -72,10 +72,10 @@ class Prepared:
 def prepare(
     problem: BundleProblem, options: SolveOptions | None = None, *, policy: str | DampingPolicy = DEFAULT_POLICY
 ) -> Prepared:
-    """Everything that a solve does before its first iteration, for those who jit, vmap or time the loop themselves.
+    """Everything that a solve does before its first iteration, for callers that jit, vmap or time the loop themselves.
 
-    Arrays are float64 unless the options say float32: JAX must then be allowed 64 bits where they are used, by
-    `jax.config.update("jax_enable_x64", True)` or inside of `jax.enable_x64(True)`.
+    Arrays are float64 unless the options say float32. To use them, enable 64 bits in JAX with
+    `jax.config.update("jax_enable_x64", True)` or `jax.enable_x64(True)`.
 
     Args:
         problem: start of the optimisation.
@@ -119,7 +119,7 @@ def prepare(
 
 
 def explain_start(problem: BundleProblem) -> str:
-    """Which observation makes the initial cost infinite, in one line."""
+    """A one-line message that names the observation for which the initial cost is not finite."""
     with np.errstate(all="ignore"):
         bad = np.flatnonzero(~np.isfinite(geometry.residuals(problem)).all(axis=1))
     if not bad.size:
@@ -133,13 +133,20 @@ def explain_start(problem: BundleProblem) -> str:
 
 
 def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:
-    """Optimised parameters in the problem's own order; what was not optimised is copied bit by bit."""
+    """The problem with optimised parameters, in its own order; what was not optimised is copied exactly.
+
+    Args:
+        problem: the problem at the start.
+        layout: its layout.
+        state: optimised parameters in layout order.
+        options: whether intrinsics were fixed.
+    """
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
-    seen = np.flatnonzero(layout.camera_seen)  # cameras of padding are not seen
+    seen = np.flatnonzero(layout.camera_seen)  # padding cameras are not seen
     cameras[seen] = items_first(np.asarray(state.cameras, np.float64))[seen]
     if options.intrinsics == "fixed":
         cameras[:, 6:] = problem.cameras[:, 6:]
-    elif problem.lenses is not None:  # what nobody observes has the lens of the others
+    elif problem.lenses is not None:  # unobserved cameras follow the others with their lens
         lens = np.asarray(problem.lenses.index)
         used, first = np.unique(lens[seen], return_index=True)
         follows = np.isin(lens, used)

@@ -1,13 +1,12 @@
-"""Points looked for elsewhere on their rays: what no small step finds.
+"""Retriangulation: global search for the position of every point, with the cameras held fixed.
 
-Bundle adjustment moves every point downhill from where it is. A point that a bold step, a bad start or a wrong depth
-took into a valley of its own stays there: behind its cameras, far beyond what it shows, or at a depth where two wrong
-rays nearly meet. After convergence such points are what is left of the cost that can still be had, and it can be had
-without another linear solve: given the cameras every point is a problem of three unknowns, which is solved from several
-depths. Then the adjustment goes on (solver/alternation.py).
+Bundle adjustment moves every point downhill from where it is. A point that a long step, a bad start or a wrong depth
+took to a local minimum stays there: behind its cameras, far too distant, or at a depth where two wrong rays nearly
+meet. With the cameras fixed every point is a problem of three unknowns, which is solved here from several depths,
+without a linear solve of the whole problem. Bundle adjustment then continues (solver/alternation.py).
 
 Source of the alternation: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited",
-section 4.4), bundle adjustment and re-triangulation in turns. Measured: docs/game-tried.md, "Cameras and points".
+section 4.4).
 """
 
 from __future__ import annotations
@@ -36,21 +35,23 @@ from jaxba.solver.prepare import explain_start
 from jaxba.structure.conventions import components_first, items_first
 from jaxba.structure.layout import Layout, build_layout
 
-PLACES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
-"""Where to start from besides the midpoint of the rays: multiples of a point's distance from the first camera that sees
-it. The last is its mirror image, in front of the camera if the point lies behind it. Chosen once, not fitted."""
+START_DISTANCES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
+"""Starts besides the midpoint of the rays: multiples of the distance of a point from the first camera that sees it. The
+last one is the mirror image, for points behind that camera. Chosen once, not fitted."""
 
 POINT_ITERATIONS = 6
-"""Steps of a point from each place, twice what the learned policy has in an iteration. Chosen once, not fitted."""
+"""Gauss-Newton steps of a point from each start, twice those in an iteration of the learned policy. Chosen once, not
+fitted."""
 
-VERDICTS = (1 + len(PLACES)) * POINT_ITERATIONS // 3
-"""Verdicts on a step, of three point iterations each, that take as long as a search."""
+EQUIVALENT_STEPS = (1 + len(START_DISTANCES)) * POINT_ITERATIONS // 3
+"""Accept decisions with three point iterations each that take as long as a search, to choose the compilation level."""
 
-LEAST_GAIN = 1e-3
-"""Share of its own cost that a point must gain to be moved: less is the same minimum. Chosen once, not fitted ..."""
+MIN_RELATIVE_GAIN = 1e-3
+"""Smallest decrease for which a point is moved, relative to its own cost: less means the same minimum. Chosen once, not
+fitted."""
 
-NEGLIGIBLE = 1e-6
-"""... and share of an average point's cost, at the best places, that this gain must be worth."""
+MIN_GAIN = 1e-6
+"""Smallest decrease for which a point is moved, relative to the mean cost of a point after the search."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,10 @@ class Retriangulation:
     """Result of `retriangulate`."""
 
     problem: BundleProblem
-    """The input with some points moved; cameras and all other points are unchanged, bit by bit."""
+    """The input with some points moved; cameras and all other points are exactly the same."""
 
     moved: int
-    """Points that were moved."""
+    """Number of points that were moved."""
 
     cost_before: float
     """Pixels squared."""
@@ -70,7 +71,7 @@ class Retriangulation:
     """Pixels squared; never above the cost before."""
 
     def pays(self, ftol: float) -> bool:
-        """Whether the cost fell by more than `ftol` of it, so that it is worth going on from here."""
+        """Whether the cost fell by more than `ftol` times the cost, so that another solve is worthwhile."""
         return self.cost_before - self.cost_after > ftol * self.cost_before
 
 
@@ -82,14 +83,14 @@ class _Found(NamedTuple):
 
 
 def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangulation:
-    """Looks for a cheaper place for every point while the cameras stand still.
+    """Searches a position with a lower cost for every point, with the cameras held fixed.
 
-    A point starts from the midpoint of the rays of its pixels and from several distances from the first camera that
-    sees it (`PLACES`), takes `POINT_ITERATIONS` Gauss-Newton steps from each, and moves to the cheapest place, if that
-    is worth it (`LEAST_GAIN`) and lies behind no more cameras than where it was.
+    Every point starts from the midpoint of the rays of its pixels and at several distances from the first camera that
+    sees it (`START_DISTANCES`), and takes `POINT_ITERATIONS` Gauss-Newton steps from each start. It moves to the best
+    result, if the cost falls enough (`MIN_RELATIVE_GAIN`, `MIN_GAIN`) and it is behind no more cameras than before.
 
     Args:
-        problem: cameras and points, best at the end of a solve: at a bad start points are fitted to wrong cameras.
+        problem: best at the end of a solve: at a bad start points would be fitted to wrong cameras.
         loss: robust loss of the squared whitened residual.
 
     Returns:
@@ -101,16 +102,16 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     with jax.enable_x64(True), process.single_blas_thread():
         layout = build_layout(problem, pairs=False, grid=False)
         order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
-        real = order < problem.num_points  # the layout has an empty point besides
+        real = order < problem.num_points  # without padding points
         first = np.zeros(problem.num_points, np.int64)
-        first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last
+        first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last and stays
         origin = np.zeros((3, len(order)))
         origin[:, real] = components_first(geometry.camera_centers(problem.cameras)[first[order[real]]])
-        level = level_after(VERDICTS, stages("acceptance", problem.num_observations))
+        level = level_after(EQUIVALENT_STEPS, stages("acceptance", problem.num_observations))
         search = program(_search, "loss", level=level)
         given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss())
         found = jax.device_get(compile_and_run(search, *given))
-        process.release_programs()  # many problems in one process would end it
+        process.release_programs()  # see `release_programs`: too many programs end a process
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem))
     points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real
@@ -121,7 +122,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
 
 
 def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss) -> _Found:
-    """`retriangulate` in layout order; `origin` is where the rays start, in scene units."""
+    """`retriangulate` in layout order; `origin` is the centre of the first camera of each point, scene units."""
     state = initial_state(layout, problem, StepOptions(loss=loss), jnp.float64)
     frames, start = slot_frames(layout, state.cameras), state.points
     one_pass = point_passes(layout, frames)
@@ -133,14 +134,14 @@ def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 poin
 
     own, hidden = one_pass(start, terms)
 
-    def visit(best: tuple[Array, Array], place: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
+    def try_start(best: tuple[Array, Array], position: Float[Array, "3 points"]) -> tuple[tuple[Array, Array], None]:
         points, costs = best
-        trial, _ = refine_points(layout, frames, place, loss, POINT_ITERATIONS)
-        there, lost = one_pass(trial, terms)
-        better = (there < costs) & (lost <= hidden)
-        return (jnp.where(better, trial, points), jnp.where(better, there, costs)), None
+        trial, _ = refine_points(layout, frames, position, loss, POINT_ITERATIONS)
+        trial_costs, lost = one_pass(trial, terms)
+        better = (trial_costs < costs) & (lost <= hidden)
+        return (jnp.where(better, trial, points), jnp.where(better, trial_costs, costs)), None
 
-    places = [origin + factor * (start - origin) for factor in PLACES] + [midpoints(layout, frames)]
-    (points, costs), _ = lax.scan(visit, (start, own), jnp.stack(places))
-    moved = own - costs > jnp.maximum(LEAST_GAIN * own, NEGLIGIBLE * jnp.mean(costs))
+    starts = [origin + factor * (start - origin) for factor in START_DISTANCES] + [midpoints(layout, frames)]
+    (points, costs), _ = lax.scan(try_start, (start, own), jnp.stack(starts))
+    moved = own - costs > jnp.maximum(MIN_RELATIVE_GAIN * own, MIN_GAIN * jnp.mean(costs))
     return _Found(points, moved, jnp.sum(own), jnp.sum(jnp.where(moved, costs, own)))

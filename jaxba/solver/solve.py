@@ -1,7 +1,7 @@
-"""The whole solve: iterate the step under a damping policy until it converges.
+"""`solve`: bundle adjustment of a problem with a damping policy, until convergence.
 
-Without a callback the loop is one compiled program (solver/loop.py). With one, or where compilation is in a hurry, the
-same iteration runs step by step from Python (solver/callback_loop.py).
+Without a callback and with full optimisation the loop is one compiled program (solver/loop.py). Otherwise the same
+iterations are run from Python (solver/callback_loop.py).
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ from jaxba.solver.prepare import DEFAULT_POLICY, prepare
 from jaxba.structure.layout import Layout
 from jaxba.structure.padding import Capacity
 
-LEAST_ROOM = 128
-"""Least iterations that a compiled loop keeps records of: one program for all lower limits. Else powers of two."""
+MIN_HISTORY = 128
+"""Smallest length of the histories of the compiled loop, so that all lower limits use one program; larger limits are
+rounded up to a power of two."""
 
 
 @dataclass(frozen=True)
@@ -39,43 +40,44 @@ class Solution:
     """Result of `solve`."""
 
     problem: BundleProblem
-    """The input with optimised cameras and points; what nobody observes is unchanged, but for a lens it shares."""
+    """The input with optimised cameras and points. What has no observations is unchanged, except for shared
+    intrinsics."""
 
     initial_cost: float
-    """Pixels squared."""
+    """Pixels^2."""
 
     final_cost: float
-    """Pixels squared; never above the initial cost."""
+    """Pixels^2; never above the initial cost."""
 
     iterations: int
-    """Linear solves, accepted or not."""
+    """Number of iterations (linear solves), accepted or rejected."""
 
     accepted: int
-    """Accepted iterations."""
+    """Number of accepted iterations."""
 
     termination: Termination
-    """Why it ended; `termination.converged` says whether that is a success."""
+    """Why it ended; `termination.converged` is true for a success."""
 
     history: History
-    """Fixed-length records cut to `iterations`."""
+    """Records of the iterations, arrays of length `iterations`."""
 
     linear_solver: str
-    """How the reduced camera system was solved."""
+    """Name of the linear solver, or of the method that replaced it."""
 
     setup_s: float
     """Seconds for the layout and the transfer to the device."""
 
     compile_s: float
-    """Seconds for compilation; nearly zero when an executable was at hand."""
+    """Seconds for compilation; nearly zero if the compiled program was cached."""
 
     total_s: float
-    """Seconds for the iterations, and for searches between them (solver/alternation.py)."""
+    """Seconds for the iterations, and for retriangulations between them (solver/alternation.py)."""
 
     capacity: Capacity | None = None
-    """Sizes to which the problem was padded; None where it was not."""
+    """Sizes to which the problem was padded; None if it was not."""
 
     quick_iterations: int = 0
-    """Iterations, a solve's first ones, that were computed, at least in part, by programs not fully optimised."""
+    """Number of iterations, the first ones, that ran at least in part in programs that were not fully optimised."""
 
     @property
     def converged(self) -> bool:
@@ -92,39 +94,40 @@ def solve(
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
 
+    A scene far from the origin relative to its size, as georeferenced scenes are, is shifted to the origin, solved and
+    shifted back (`preprocess.FAR`).
+
+    Many problems of different shapes can be solved in one process: before compiled programs exceed the number
+    of memory mappings that Linux allows a process, all of them are dropped (`process.release_programs`) and compiled
+    again when needed.
+
     Args:
         problem: start of the optimisation.
-        policy: chooses the damping lambda of every iteration: a policy, or the name of one (`jaxba.make_policy`).
-        options: how; the defaults if left out.
+        policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`).
+        options: options of the solve; None: the defaults.
         callback: called after every iteration; a true return value stops the solve.
 
-    A scene far from the origin for its size, as georeferenced ones are, is moved there to be solved, and back
-    (`preprocess.FAR`).
-
-    Many problems of many shapes may be solved in one process: before their programs exceed what Linux lets a process
-    map, all compiled programs of JAX are dropped (`process.release_programs`), and compiled anew where they are needed.
-
     Returns:
-        Parameters as NumPy float64 arrays, histories and timings.
+        The optimised problem in NumPy float64 arrays, histories and timings.
 
     Raises:
-        ValueError: unknown names, or options that do not go together.
-        ProblemError: the cost at the start is not finite, a factorisation would take more memory than there is, or the
-            step asked for cannot hold the problem's lenses.
+        ValueError: unknown names, or options that exclude each other.
+        ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
+            the linear solver or method does not support shared or partly fixed intrinsics.
     """
     options = SolveOptions() if options is None else options
     with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
         prepared = prepare(problem, options, policy=policy)
         layout, state, step_options = prepared.layout, prepared.state, prepared.options
-        before = _stages(options.compilation, problem, step_options)
-        run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=before)
-        if callback is None and not any(before.values()):
+        stages_of_parts = _stages(options.compilation, problem, step_options)
+        run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts)
+        if callback is None and not any(stages_of_parts.values()):
             run = _run_compiled
         final, history, quick_count, compile_s, total_s = run(
             layout, state, prepared.policy, options.tolerances, step_options, options.max_iterations
         )
         if prepared.compile_s + compile_s > 0:
-            process.release_programs()  # many problems in one process would end it
+            process.release_programs()  # see above: too many programs end a process
         count = int(final.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
         return Solution(
@@ -145,7 +148,7 @@ def solve(
 
 
 def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
-    """How each part of a step is compiled before it is optimised."""
+    """The stages of compilation of each part of a step, before it is fully optimised."""
     parts: dict[str, Part] = {"round": "decomposition"}
     if options.single_solve:
         factors = options.forms_reduced_system and options.truncated is None
@@ -165,11 +168,11 @@ def _run_compiled(
     options: StepOptions,
     max_iterations: int,
 ) -> tuple[Carry, History, int, float, float]:
-    """The loop as one optimised program; returns what `run_stepwise` does."""
+    """Runs the loop as one optimised program. Arguments and results as for `run_stepwise`."""
     started = time.perf_counter()
     with CompileClock() as clock:
-        room = max(LEAST_ROOM, 1 << (max_iterations - 1).bit_length())
+        length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
         limit = jnp.asarray(max_iterations, jnp.int32)
-        whole = solve_loop(layout, state, policy, tolerances, options, room, limit)
-        carry, history = jax.block_until_ready(whole)
+        result = solve_loop(layout, state, policy, tolerances, options, length, limit)
+        carry, history = jax.block_until_ready(result)
     return carry, history, 0, clock.seconds, time.perf_counter() - started - clock.seconds

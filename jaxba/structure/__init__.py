@@ -1,1 +1,1 @@
-"""Static index arrays that turn the sparse sums of a problem into dense ones."""
+"""Index arrays of a problem: layout, summation trees, pairs of observations, clusters, padding."""
