@@ -58,7 +58,7 @@ def system(cameras: int, width: int, tile: int) -> tuple[Band, np.ndarray, np.nd
 def on_diagonal(band: Band, camera: int) -> int:
     """Number of a camera's block; the last tile of a row is on the diagonal."""
     _, tile, columns = band.blocks.shape
-    row, within = divmod(int(band.place[camera]), tile)
+    row, within = divmod(int(band.rank[camera]), tile)
     return int(band.blocks[row, within, columns - tile + within])
 
 
@@ -85,7 +85,7 @@ def test_a_system_that_is_not_positive_definite_has_no_finite_solution(cameras, 
     """A diagonal entry is lowered until the determinant has just changed its sign: `det(S - t e e^T) = det S (1 - t
     e.S^-1 e)`. It is that of the first camera in the band, of the last, or of any other."""
     band, blocks, matrix, right = system(cameras, width, tile)
-    order = np.argsort(band.place)
+    order = np.argsort(band.rank)
     for camera in {int(order[0]), int(order[-1]), cameras // 2}:
         unit = np.eye(9 * cameras)[9 * camera + 4]
         much = 1 / (unit @ np.linalg.solve(matrix, unit))
@@ -115,7 +115,7 @@ def test_the_factor_multiplies_back_to_the_matrix():
         lower[(k + 1) * size : (k + 1) * size + rest, at] = factor.below[k]
     assert not lower[count * size :].any()  # nothing below the last tile
     lower = lower[: count * size]
-    place = (9 * np.asarray(band.place)[:, None] + np.arange(9)).ravel()
+    place = (9 * np.asarray(band.rank)[:, None] + np.arange(9)).ravel()
     np.testing.assert_allclose((lower @ lower.T)[np.ix_(place, place)], matrix, rtol=1e-11, atol=1e-11)
     padding = slice(90, None)
     assert np.array_equal(lower[padding, padding], np.eye(18))
@@ -131,7 +131,7 @@ def test_rows_of_tiles_hold_the_lower_triangle_and_a_unit_diagonal_in_the_paddin
         lower[k * size : (k + 1) * size, (k + 1) * size : (k + 1) * size + columns] = rows[k]
     assert not lower[:, :columns].any()
     lower = lower[:, columns:]
-    place = (9 * np.asarray(band.place)[:, None] + np.arange(9)).ravel()
+    place = (9 * np.asarray(band.rank)[:, None] + np.arange(9)).ravel()
     expected = np.eye(count * size)
     expected[np.ix_(place, place)] = matrix
     block = np.arange(count * size) // 9

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support import solve, step_info
 
 from jaxba import Termination, Tolerances
-from jaxba.lm.termination import HIDDEN_DECREASE, converged_in_cost, lost_in_rounding, termination_of
+from jaxba.lm.termination import MAX_UNDAMPED_RATIO, converged_in_cost, lost_in_rounding, termination_of
 from jaxba.problem import geometry
 
 LIMIT = 30
@@ -43,13 +43,13 @@ def test_on_a_parabola_it_ends_where_the_undamped_decrease_is_small(curvature, d
     decrease, undamped, share = quadratic_step(curvature, damping, gradient)
     ftol = 10.0**digits
     cost = decrease / ftol * 10.0**over
-    for edge in (decrease / (ftol * cost), undamped / (HIDDEN_DECREASE * ftol * cost)):
+    for edge in (decrease / (ftol * cost), undamped / (MAX_UNDAMPED_RATIO * ftol * cost)):
         if abs(edge - 1) < 1e-4:
             return  # rounding decides
     if cost - decrease <= 0 or decrease < 1e-11 * cost:  # no cost is negative, nor is a decrease below its last digits
         return
     info = step_info(True, cost=cost - decrease, previous_cost=cost, damping_share=share)
-    expected = decrease <= ftol * cost and undamped <= HIDDEN_DECREASE * ftol * cost
+    expected = decrease <= ftol * cost and undamped <= MAX_UNDAMPED_RATIO * ftol * cost
     assert bool(converged_in_cost(info, ftol)) == expected
 
 

@@ -19,18 +19,18 @@ from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy,
 from jaxba.linear.schur import RotationCoordinates, apply_reduced, camera_system, eliminate_points
 from jaxba.lm.damped_step import solve_step
 from jaxba.lm.termination import converged_in_cost
-from jaxba.methods.ddlm import LEAST_SHARE, DomainDecomposition, decomposed_round
+from jaxba.methods.ddlm import MIN_STEP_FRACTION, DomainDecomposition, decomposed_round
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.methods.poba import PowerSeries
 from jaxba.methods.registry import UnknownMethodError
 from jaxba.methods.stba import (
     StochasticClusters,
-    agreed_gradient,
     clustered_step,
-    eliminate_copies,
-    repair,
+    consensus_gradient,
+    eliminate_replicas,
+    richardson,
     solve_clusters,
-    split_right,
+    split_right_hand_side,
 )
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement
@@ -97,8 +97,8 @@ def test_the_clusters_solve_the_problem_whose_points_are_split(damping):
     """Below lambda 1 the step is that of a dense solution in which nothing holds the pieces of a point together."""
     problem, options = support.tiny(), MANIFOLD
     layout, linear, points, system, part = systems(problem, options, damping)
-    split = eliminate_copies(layout, linear, jnp.asarray(damping), part, options)
-    right = split_right(layout, linear, system, split)
+    split = eliminate_replicas(layout, linear, jnp.asarray(damping), part, options)
+    right = split_right_hand_side(layout, linear, system, split)
     found = solve_clusters(layout, linear, points._replace(projected=split.projected), system, right, part)
     truth = support.dense(pieces(problem, np.asarray(part.label)), options, damping)
     np.testing.assert_allclose(found.ravel(), truth.step[: found.size], rtol=1e-6, atol=1e-9)
@@ -144,7 +144,7 @@ def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_
         before = norm(first)
         assert before > 1e-6 * whole
         for rounds in (1, 2, 4, 8):
-            after = norm(repair(layout, linear, points, system, first, rounds))
+            after = norm(richardson(layout, linear, points, system, first, rounds))
             assert after <= radius**rounds * before * (1 + 1e-6) + 1e-9 * before
 
 
@@ -154,11 +154,11 @@ def test_agreed_gradients_equal_the_published_projection():
     rng = np.random.default_rng(0)
     copies = part.levels[-1].shape[0]
     gradient, diagonal = rng.normal(size=(3, copies)), rng.uniform(0.1, 9, size=(3, copies))
-    found = np.asarray(agreed_gradient(layout, part, jnp.asarray(diagonal), jnp.asarray(gradient)))
+    found = np.asarray(consensus_gradient(layout, part, jnp.asarray(diagonal), jnp.asarray(gradient)))
     compared = 0
     for point in range(layout.num_points):
         slots = np.flatnonzero(np.asarray(layout.slot_mask) & (np.asarray(layout.slot_point) == point))
-        own = np.unique(np.asarray(part.copy)[slots])
+        own = np.unique(np.asarray(part.slot_replica)[slots])
         for k in range(3):
             g, d = gradient[k, own], diagonal[k, own]
             expected = g
@@ -172,7 +172,7 @@ def test_agreed_gradients_equal_the_published_projection():
 
 def test_copies_agree_from_lambda_one_on_and_not_before():
     layout, linear, _, _, part = systems(support.tiny(), CLUSTERED, 1.0)
-    plain = lambda damping: eliminate_copies(layout, linear, jnp.asarray(damping), part, CLUSTERED)
+    plain = lambda damping: eliminate_replicas(layout, linear, jnp.asarray(damping), part, CLUSTERED)
     below, above = plain(1 - 1e-9), plain(1.0)
     assert np.abs(np.stack(below.solved) - np.stack(above.solved)).max() > 0.1
     np.testing.assert_allclose(np.stack(below.projected[0]), np.stack(above.projected[0]), rtol=1e-6)
@@ -295,7 +295,7 @@ def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
     for iteration in range(8):
         state, info = step(layout, state, 1e-2, options, 1e9, iteration)  # no gain is enough
         decreases.append(float(info.previous_cost - info.cost) / float(info.cost))
-        assert info.share == LEAST_SHARE
+        assert info.share == MIN_STEP_FRACTION
         assert not converged_in_cost(info, 1e-6)
     small = [d for d in decreases if d <= 1e-6]
     assert decreases[0] > 1e-6
@@ -340,7 +340,7 @@ def test_a_cluster_of_ddlm_that_cannot_be_factored_leaves_the_others_alone(monke
     np.testing.assert_allclose(found.cameras[:, others], expected.cameras[:, others], rtol=1e-9, atol=1e-12)
     assert (np.asarray(found.cameras)[:, others] != np.asarray(state.cameras)[:, others]).any()
     assert found.accepted
-    assert found.share == LEAST_SHARE
+    assert found.share == MIN_STEP_FRACTION
 
 
 @functools.partial(jax.jit, static_argnames=("options",))

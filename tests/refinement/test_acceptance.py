@@ -26,10 +26,10 @@ from jaxba.problem.options import Coordinates, Refinement
 from jaxba.refinement import camera_rounds
 from jaxba.refinement.acceptance import NEGLIGIBLE
 from jaxba.refinement.backtracking import SHORTER
-from jaxba.refinement.camera_rounds import GOOD_GAIN, HOPELESS, ROUNDS_OF_OTHERS, WITHIN_REACH
+from jaxba.refinement.camera_rounds import GOOD_GAIN, MAX_COST_RATIO, MIN_GAINS, ROUNDS_OF_LATER_CANDIDATES
 from jaxba.refinement.cameras import DAMPINGS, refine_cameras
 from jaxba.refinement.candidates import best_candidate
-from jaxba.refinement.pattern_move import FORESEEN, FREE
+from jaxba.refinement.pattern_move import GAIN_TOLERANCE, SMALL_DAMPING_FRACTION
 from jaxba.refinement.subproblems import Whole
 
 pytestmark = pytest.mark.step
@@ -291,7 +291,7 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
         np.testing.assert_allclose(mended.predicted, plain.predicted, rtol=1e-9)
         assert not mended.candidate_cost > plain.candidate_cost * (1 + 1e-12)
         better += bool(mended.candidate_cost < 0.9 * plain.candidate_cost)
-        if plain.gain_ratio > GOOD_GAIN or plain.candidate_cost > HOPELESS * before.cost:
+        if plain.gain_ratio > GOOD_GAIN or plain.candidate_cost > MAX_COST_RATIO * before.cost:
             trusted += 1  # the model was right, or it is past mending
             assert mended.candidate_cost == plain.candidate_cost
         # rounds, and nothing else, make a candidate better here
@@ -304,10 +304,10 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
 def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatch):
     """What one round and two leave shows who is to have the next; limits in the middle of these, so that some are."""
     scenes = wide()
-    monkeypatch.setattr(camera_rounds, "HOPELESS", np.inf)
+    monkeypatch.setattr(camera_rounds, "MAX_COST_RATIO", np.inf)
 
     def repaired(rounds: int, *limits: float) -> tuple[np.ndarray, np.ndarray]:
-        monkeypatch.setattr(camera_rounds, "WITHIN_REACH", limits)
+        monkeypatch.setattr(camera_rounds, "MIN_GAINS", limits)
         options = StepOptions(refinement=Refinement(camera_rounds=rounds))
         once = jax.jit(lambda layout, before: lm_step(layout, before, jnp.asarray(BOLD), options)[1])
         infos = [once(*scene) for scene in scenes]
@@ -323,7 +323,7 @@ def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatc
         expected = done + going_on
         done, gain = repaired(rounds, *[*limits, -np.inf][:2])
         np.testing.assert_array_equal(done, expected)
-    assert WITHIN_REACH[0] < WITHIN_REACH[1] < GOOD_GAIN
+    assert MIN_GAINS[0] < MIN_GAINS[1] < GOOD_GAIN
 
 
 @pytest.mark.fully_compiled
@@ -334,7 +334,7 @@ def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
         bare = step(layout, before, BOLD, SHORTER_ONLY, min_gain=0.25)[1]
         full = step(layout, before, BOLD, with_rounds, min_gain=0.25)[1]
         shortened = round(float(np.log(full.share) / np.log(SHORTER)))
-        assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_OTHERS)
+        assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_LATER_CANDIDATES)
         assert full.share >= bare.share  # what a round brings in need not be shortened further
         if full.share == bare.share:
             assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-12)
@@ -373,7 +373,7 @@ def test_a_pattern_move_repeats_the_way_of_the_step_twice_as_far_each_time_while
 
     costs = [cost_at(2.0**k) for k in range(5)]
     last = next((k for k in range(4) if not costs[k + 1] < costs[k]), 4)
-    held_back = short.damping_share > FREE or abs(short.gain_ratio - 1) > FORESEEN
+    held_back = short.damping_share > SMALL_DAMPING_FRACTION or abs(short.gain_ratio - 1) > GAIN_TOLERANCE
     last = last if held_back else 0
     np.testing.assert_allclose(info.cost, costs[last], rtol=1e-9)
     tried = min(last + 1, 4) if held_back else 0
@@ -388,7 +388,7 @@ def test_a_step_that_did_what_was_promised_is_not_followed():
     problem = turned(1, 1e-3)
     layout, before = start(problem, PLAIN)
     free = step(layout, before, BOLD, PLAIN)
-    assert abs(free[1].gain_ratio - 1) < FORESEEN
+    assert abs(free[1].gain_ratio - 1) < GAIN_TOLERANCE
     same, info = step(layout, before, BOLD, MOVES_ONLY)
     assert info.repairs == 0
     # two programs, which round differently when they are optimised

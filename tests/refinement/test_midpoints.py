@@ -16,7 +16,7 @@ from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
 from jaxba.problem.options import Refinement
 from jaxba.refinement import acceptance
-from jaxba.refinement.midpoints import better_starts, midpoints, refine_from_starts
+from jaxba.refinement.midpoints import choose_starts, midpoints, refine_from_starts
 from jaxba.refinement.points import PreviousPoints, refine_points
 
 LOSS = Loss()
@@ -25,7 +25,7 @@ LOSS = Loss()
 @functools.partial(jax.jit, static_argnames=("loss",))
 def _starts(layout, cameras, before, points, loss):
     previous = PreviousPoints.of(layout, before, linearize(layout, cameras, before, loss).inverse_depth)
-    return better_starts(layout, slot_frames(layout, cameras), points, loss, previous)
+    return choose_starts(layout, slot_frames(layout, cameras), points, loss, previous)
 
 
 def _there(layout, cameras, before):
@@ -165,8 +165,8 @@ def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
     args = build_layout(home), np.asarray(home.cameras).T, *[in_layout(home, points)] * 2
     options, damping = StepOptions(refinement=Refinement(points=3, starts="rays")), jnp.asarray(1e12)
     costs = {}
-    for limit, both in ((acceptance.LITTLE_LEFT, True), (0.0, False)):
-        monkeypatch.setattr(acceptance, "LITTLE_LEFT", limit)
+    for limit, both in ((acceptance.NEAR_CONVERGENCE, True), (0.0, False)):
+        monkeypatch.setattr(acceptance, "NEAR_CONVERGENCE", limit)
         once = jax.jit(lambda layout, state: lm_step(layout, state, damping, options)[1])
         info = once(args[0], initial_state(args[0], problem, options))
         assert info.predicted < 1e-3 * info.previous_cost

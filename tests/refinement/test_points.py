@@ -19,7 +19,7 @@ from jaxba import BundleProblem, Loss, StepOptions, read_bal
 from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
 from jaxba.problem.options import Refinement
-from jaxba.refinement.points import FARTHEST, LITTLE, PreviousPoints, refine_points
+from jaxba.refinement.points import MAX_DISTANCE_RATIO, SMALL_DECREASE, PreviousPoints, refine_points
 
 pytestmark = pytest.mark.step
 
@@ -83,9 +83,9 @@ def test_points_take_no_further_step_after_one_that_brought_no_more_than_enough(
     assert (brought[:3] > 0).all()
     assert (np.diff(brought[:3]) < 0).all()
     for enough in (*brought[:3] * (1 + 1e-6), *brought[:3] * (1 - 1e-6), 1e300):
-        last = next(k for k in range(4) if brought[k] <= min(enough, LITTLE * totals[k + 1]) or k == 3)
+        last = next(k for k in range(4) if brought[k] <= min(enough, SMALL_DECREASE * totals[k + 1]) or k == 3)
         np.testing.assert_allclose(total(4, enough), totals[last + 1], rtol=1e-12)
-    assert brought[0] > LITTLE * totals[1]  # so that the last of them is not after the first
+    assert brought[0] > SMALL_DECREASE * totals[1]  # so that the last of them is not after the first
 
 
 def test_cameras_are_not_touched():
@@ -249,7 +249,7 @@ def settled(problem: BundleProblem, iterations: int) -> BundleProblem:
 def test_no_point_goes_a_hundred_times_as_far_in_one_go_nor_beyond_infinity(iterations):
     problem = parallel(0)
     before, after = nearness(problem), nearness(settled(problem, iterations))
-    assert (after >= before / FARTHEST * (1 - 1e-9)).all()
+    assert (after >= before / MAX_DISTANCE_RATIO * (1 - 1e-9)).all()
 
 
 def test_points_whose_rays_meet_far_away_come_near_to_them_iteration_by_iteration():
@@ -259,7 +259,7 @@ def test_points_whose_rays_meet_far_away_come_near_to_them_iteration_by_iteratio
         distance.append(np.max(1 / nearness(problem)))
         problem = settled(problem, 10)
     assert (np.diff(distance) > 0).all()
-    assert distance[-1] > 2 * FARTHEST * distance[0]
+    assert distance[-1] > 2 * MAX_DISTANCE_RATIO * distance[0]
 
 
 def test_points_that_the_step_brought_from_behind_to_the_front_stay_there():
@@ -282,7 +282,7 @@ def test_a_point_that_the_step_took_far_away_starts_again_from_previous():
     for times, came_back in ((3e3, True), (3.0, False)):
         points = centre + times * (np.asarray(problem.points) - centre)
         moved = problem.replace(points=points)
-        assert ((nearness(moved) < nearness(problem) / FARTHEST) == came_back).all()
+        assert ((nearness(moved) < nearness(problem) / MAX_DISTANCE_RATIO) == came_back).all()
         _, there = start(moved)
         found, _ = _refined_after(layout, state, there.points, Loss(), 1)
         assert ((np.asarray(found) == np.asarray(at_previous)).all(axis=0)[real] == came_back).all()

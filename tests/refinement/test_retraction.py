@@ -14,7 +14,7 @@ from jaxba import BundleProblem, StepOptions, build_layout
 from jaxba.problem import geometry
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.options import Coordinates
-from jaxba.refinement.retraction import LARGEST_ZOOM, move_cameras, step_between
+from jaxba.refinement.retraction import MAX_FOCAL_CHANGE, move_cameras, step_between
 
 PIXELS = StepOptions(coordinates=Coordinates(lens_step="pixels"))
 FILE = StepOptions()
@@ -93,7 +93,7 @@ def test_a_zoom_along_which_the_image_stays_changes_no_pixel(growth):
 
 def test_far_from_where_it_is_linear_a_lens_is_added_as_it_is():
     cameras, step = random_step(2, 0.1)
-    near, far = 0.9 * LARGEST_ZOOM, 1.1 * LARGEST_ZOOM
+    near, far = 0.9 * MAX_FOCAL_CHANGE, 1.1 * MAX_FOCAL_CHANGE
     step[6] = cameras[6] * np.array([near, -near, far, -far, 50.0, -2.0])
     moved, plain = (np.asarray(_move(build_layout(support.tiny()), cameras, step, how)) for how in (PIXELS, FILE))
     assert (moved[7:, :2] != plain[7:, :2]).all()

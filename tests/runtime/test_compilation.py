@@ -122,7 +122,7 @@ def test_every_program_is_compiled_once_before_the_first_iteration(how):
     assert late == [len(seen.names)] * 4
     step = ["lm_step"] if how.get("method") == "ddlm" else ["propose", "try_step"]
     assert sorted(name for name in seen.names if name in ("lm_step", "try_step", "propose")) == step
-    assert seen.names.count("_advance_and_tell") == 1
+    assert seen.names.count("_advance_and_pack") == 1
 
 
 @pytest.mark.fully_compiled

@@ -114,7 +114,7 @@ def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how
         "propose",
         "try_step",
         "lm_step",
-        "_advance_and_tell",
+        "_advance_and_pack",
     )
     assert not set(seen.names) & set(parts)
     assert len(kept(folder)) == count
@@ -249,7 +249,7 @@ def test_two_rules_of_a_user_are_not_confused(folder):
         np.testing.assert_allclose(solved.history.damping[1:] / solved.history.damping[:-1], factor, rtol=1e-12)
     names = {file.name.partition("-")[0] for file in kept(folder)}
     assert {"propose", "try_step"} <= names
-    assert not {"begin", "_advance_and_tell"} & names
+    assert not {"begin", "_advance_and_pack"} & names
 
 
 def test_a_program_that_cannot_run_is_compiled_and_written_again(folder):

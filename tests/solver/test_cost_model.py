@@ -71,7 +71,7 @@ def test_the_counted_reach_is_that_of_the_layout():
     assert pairs is not None
     assert pairs.band is not None
     _, tile, columns = pairs.band.blocks.shape
-    assert columns == tile * (1 + -(-count_pairs(problem).reach // tile))
+    assert columns == tile * (1 + -(-count_pairs(problem).bandwidth // tile))
 
 
 @pytest.mark.parametrize("limit", ["MAX_COUNTED_PAIRS", "MAX_COUNTED_CAMERAS"])
@@ -82,7 +82,7 @@ def test_what_is_not_counted_is_bounded_from_above(monkeypatch, limit):
     bound = count_pairs(problem)
     assert bound.pairs == exact.pairs
     assert exact.blocks < bound.blocks <= 300 * 301 // 2
-    assert exact.reach < bound.reach == 300
+    assert exact.bandwidth < bound.bandwidth == 300
 
 
 # The choice
@@ -107,7 +107,7 @@ def test_a_system_of_hundreds_of_cameras_without_a_band_is_not_factored():
     problem = random_scene(SEQUENCE, 0)
     rng = np.random.default_rng(0)
     anywhere = problem.replace(camera_index=rng.integers(300, size=problem.num_observations).astype(np.int32))
-    assert count_pairs(anywhere).reach > 200
+    assert count_pairs(anywhere).bandwidth > 200
     assert predict(anywhere).explicit > 5 * predict(problem).explicit
     assert choose_linear_solver(anywhere, StepOptions(), "auto").linear_solver != "explicit"
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxba.structure.camera_ordering import MAX_BAND_SHARE, MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
+from jaxba.structure.camera_ordering import MAX_BAND_FRACTION, MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 
 graphs = st.tuples(st.integers(1, 40), st.sampled_from([0.0, 0.05, 0.2, 1.0]), st.integers(0, 10**6))
 
@@ -81,7 +81,7 @@ def test_two_sequences_that_take_turns_are_laid_one_after_the_other():
 
 
 def test_only_large_systems_with_a_narrow_band_are_banded():
-    widest = int(np.ceil(MAX_BAND_SHARE * 300)) - 1
+    widest = int(np.ceil(MAX_BAND_FRACTION * 300)) - 1
     assert is_banded(300, widest)
     assert not is_banded(300, widest + 1)
     assert is_banded(MIN_BAND_CAMERAS, 0)
@@ -104,9 +104,9 @@ def test_every_block_has_exactly_its_place_and_every_camera_too(graph, tile):
     tiles = -(-cameras // tile)
     assert band.camera.shape == (tiles, tile)
     flat = np.asarray(band.camera).ravel()
-    assert np.array_equal(flat[np.asarray(band.place)], np.arange(cameras))
+    assert np.array_equal(flat[np.asarray(band.rank)], np.arange(cameras))
     assert np.count_nonzero(flat == cameras) == tiles * tile - cameras
-    assert np.array_equal(band.place, rank)
+    assert np.array_equal(band.rank, rank)
 
     count = len(names)
     assert np.array_equal(np.sort(np.asarray(band.blocks)[band.blocks < count]), np.arange(count))

@@ -261,7 +261,7 @@ def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.nd
     st.integers(1, 25),
     st.integers(0, 6),
     st.sampled_from([2, 7, 2048]),
-    st.sampled_from([0, covisibility.MOST_COUNTED]),
+    st.sampled_from([0, covisibility.MAX_COUNTED_BLOCKS]),
 )
 def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points, duplicates, batch, counted):
     """Random whole numbers as weights: a pair that is missing, doubled or in the wrong block changes a sum."""
@@ -270,7 +270,7 @@ def test_the_pairs_are_all_products_of_co_visible_cameras(seed, cameras, points,
     problem = problem_of(tracks, cameras, seed, duplicates)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(covisibility, "PAIR_BATCH", batch)
-        patch.setattr(covisibility, "MOST_COUNTED", counted)
+        patch.setattr(covisibility, "MAX_COUNTED_BLOCKS", counted)
         layout = build_layout(problem, grid=False)
     weights = rng.integers(1, 1 << 20, layout.num_slots).astype(np.float64)
     assert np.array_equal(blocks_by_layout(layout, weights), blocks_by_brute_force(problem, layout, weights))

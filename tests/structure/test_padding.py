@@ -30,11 +30,11 @@ from jaxba.scenes import SceneConfig
 from jaxba.structure import covisibility
 from jaxba.structure.layout import layout_for
 from jaxba.structure.padding import (
-    LEAST_OBSERVATIONS,
-    LEAST_PAIRS,
-    LEAST_TRACK,
     MAX_CAMERAS,
     MAX_PAIRS,
+    MIN_OBSERVATIONS,
+    PAIRS_PER_SLOT,
+    SLOTS_PER_POINT,
     Capacity,
     capacity_of,
     padded_parameters,
@@ -104,7 +104,7 @@ def test_a_capacity_holds_its_problem_and_no_more_than_twice_that_or_its_slots_w
     listed = np.sum(seen[layout.pairs.left] & seen[layout.pairs.right])
     counts = (problem.num_observations + 1, problem.num_points, int(listed))
     rooms = (found.observations, found.points, found.pairs)
-    least = (LEAST_OBSERVATIONS, found.observations // LEAST_TRACK, found.observations * LEAST_PAIRS)
+    least = (MIN_OBSERVATIONS, found.observations // SLOTS_PER_POINT, found.observations * PAIRS_PER_SLOT)
     assert all(n <= room and (room < 2 * n or room == low) for n, room, low in zip(counts, rooms, least, strict=True))
     assert problem.num_cameras <= found.cameras
     assert found.cameras <= max(8, 1.5 * problem.num_cameras)

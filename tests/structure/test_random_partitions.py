@@ -124,12 +124,12 @@ def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
         for slot in used:
             key = int(layout.slot_point[slot]), int(part.label[layout.slot_camera[slot]])
             pieces.setdefault(key, []).append(slot)
-        assert len({int(part.copy[slots[0]]) for slots in pieces.values()}) == len(pieces)
+        assert len({int(part.slot_replica[slots[0]]) for slots in pieces.values()}) == len(pieces)
         for slots in pieces.values():
-            assert len(set(part.copy[slots].tolist())) == 1
-            np.testing.assert_allclose(sums[part.copy[slots[0]]], values[slots].sum(), atol=1e-12)
+            assert len(set(part.slot_replica[slots].tolist())) == 1
+            np.testing.assert_allclose(sums[part.slot_replica[slots[0]]], values[slots].sum(), atol=1e-12)
         seen_from = [{name for column, name in pieces if column == p} for p in range(layout.num_points)]
-        assert part.separator.tolist() == [len(names) > 1 for names in seen_from]
+        assert part.is_shared.tolist() == [len(names) > 1 for names in seen_from]
         listed = part.members[part.members < problem.num_cameras]
         assert sorted(listed.tolist()) == list(range(problem.num_cameras))
         for name, members in enumerate(part.members):
@@ -139,7 +139,7 @@ def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
 def test_small_problems_have_one_partition_with_one_cluster():
     partitions = partition_of(layout_for(support.tiny(), StepOptions(method=StochasticClusters())))
     assert partitions.label.shape == (1, 6)
-    assert not partitions.separator.any()
+    assert not partitions.is_shared.any()
     many = partition_of(layout_for(support.tiny(), StepOptions(method=StochasticClusters(cluster_cameras=2))))
     assert many.label.shape == (PARTITIONS, 6)
 
