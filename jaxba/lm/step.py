@@ -150,6 +150,7 @@ def try_step(
 
 
 def _check_lenses(layout: Layout, options: StepOptions) -> None:
+    """Raises a ValueError for shared or partly fixed intrinsics without the explicit solver."""
     if layout.lenses is not None and not options.factors_reduced_system:
         raise ValueError(f"shared or partly fixed lenses need the explicit solver, not {options.solver_name}")
 

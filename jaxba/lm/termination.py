@@ -54,7 +54,7 @@ class Termination(enum.IntEnum):
 
     @property
     def reason(self) -> str:
-        """One phrase for a person."""
+        """One phrase for the user."""
         return _REASONS[self]
 
 

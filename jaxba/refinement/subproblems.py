@@ -137,9 +137,8 @@ class Clusters(NamedTuple):
 
     def sums(self, terms: Float[Array, " slots"]) -> Float[Array, " clusters"]:
         """See `Subproblems`."""
-        own_terms = jnp.where(
-            self.layout.slot_mask, terms, 0
-        )  # empty slots have some camera, perhaps of another cluster
+        # empty slots have some camera, perhaps of another cluster
+        own_terms = jnp.where(self.layout.slot_mask, terms, 0)
         per_camera = tree_sum(own_terms[:, None], self.layout.camera_levels)[:, 0]
         members = self.partition.members
         own = per_camera.at[members].get(mode="clip")

@@ -155,8 +155,8 @@ def build_layout(
     order, start = observations.order, observations.start
     seen = np.bincount(camera, minlength=cameras)
 
-    made = bucket_slots(tracks) if capacity is None else padded_slots(tracks, point, capacity)
-    slot, slot_point, empty = made.slot, made.point, made.empty
+    assignment = bucket_slots(tracks) if capacity is None else padded_slots(tracks, point, capacity)
+    slot, slot_point, empty = assignment.slot, assignment.point, assignment.empty
     slots = len(slot_point)
     mask = np.zeros(slots, bool)
     mask[slot] = True
@@ -171,28 +171,36 @@ def build_layout(
     room = None if capacity is None else room_for(seen, capacity.observations, capacity.points)
     by_camera = sorted_by(camera, cameras)
     camera_levels = with_spare_row(sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room), empty)
-    table = None
-    columns = sum(map(len, made.members))
+    slot_grid = None
+    columns = sum(map(len, assignment.members))
     if pairs and factor and grid and is_dense(camera, point, tracks, cameras, columns):
-        table = np.full((columns, cameras), empty, np.int32)
-        table[slot_point[slot], camera] = slot
-    listed = None
+        slot_grid = np.full((columns, cameras), empty, np.int32)
+        slot_grid[slot_point[slot], camera] = slot
+    pair_lists = None
     ties = lens_ties(problem.lenses, seen > 0) if lenses and problem.lenses is not None else None
-    if pairs and table is None:
+    if pairs and slot_grid is None:
         banded = ties is None or not ties.shared  # a shared lens couples cameras without common points
-        ordered = camera_levels[0].ravel()
+        slots_by_camera = camera_levels[0].ravel()
         sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot
-        sorted_index[ordered] = np.arange(len(ordered))
-        spare = int(sorted_index[empty])
-        listed = pair_layout(
-            camera, sorted_index[slot], tracks, start, cameras, spare, factor=factor, banded=banded, capacity=capacity
+        sorted_index[slots_by_camera] = np.arange(len(slots_by_camera))
+        empty_index = int(sorted_index[empty])
+        pair_lists = pair_layout(
+            camera,
+            sorted_index[slot],
+            tracks,
+            start,
+            cameras,
+            empty_index,
+            factor=factor,
+            banded=banded,
+            capacity=capacity,
         )
-    drawn = None
+    drawn_partitions = None
     if partitions is not None:
-        if listed is None:
+        if pair_lists is None:
             raise ValueError("partitions need pairs that are listed: pairs=True, factor=False")
-        drawn = partition_layout(
-            camera, point, slot, cameras, len(tracks), slot_point, empty, listed, largest=partitions
+        drawn_partitions = partition_layout(
+            camera, point, slot, cameras, len(tracks), slot_point, empty, pair_lists, largest=partitions
         )
     return Layout(
         slot_camera=slot_camera,
@@ -200,16 +208,16 @@ def build_layout(
         slot_mask=mask,
         pixels=pixels,
         whitening=whitening,
-        bucket_points=made.members,
-        point_levels=made.levels,
+        bucket_points=assignment.members,
+        point_levels=assignment.levels,
         camera_levels=camera_levels,
         camera_seen=seen > 0,
-        pairs=listed,
-        grid=table,
+        pairs=pair_lists,
+        grid=slot_grid,
         clusters=cluster_layout(camera, point, slot, cameras, len(tracks), slot_point, empty) if clusters else None,
-        partitions=drawn,
+        partitions=drawn_partitions,
         lenses=ties,
-        buckets=made.buckets,
+        buckets=assignment.buckets,
     )
 
 

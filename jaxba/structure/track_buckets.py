@@ -144,9 +144,8 @@ def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
     values, counts = np.unique(tracks[tracks > 0], return_counts=True)
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
-    slots = values[:, None] * (before[1:, None] - before[:-1]).astype(
-        float
-    )  # of a bucket, by its last and first length
+    # slots of a bucket, by its last and first length
+    slots = values[:, None] * (before[1:, None] - before[:-1]).astype(float)
     penalties = total * _MAX_BUCKET_PADDING * PENALTY_FACTOR ** np.arange(PENALTIES)
     each = np.arange(PENALTIES)
     while True:
