@@ -5,7 +5,8 @@ the cost is
 
     m(d) = |r + J d|^2 / 2 = f + g.d + d.H d / 2,    g = J^T r,    H = J^T J,
 
-and the damped step d solves `(H + D) d = -g`, where D is `lambda diag(H)` or `lambda I`. Split into cameras and points:
+and the damped step d solves `(H + D) d = -g`, where D is `lambda diag(H)` or `lambda I` (times a constant for cameras).
+With cameras c and points p:
 
     [ B + D_c     E     ] [ d_c ]     [ g_c ]
     [   E^T     C + D_p ] [ d_p ] = - [ g_p ]

@@ -86,7 +86,8 @@ SHARED_LENS_MATRICES = 5
 the sums over lenses, these scaled, their factor."""
 
 DENSE_MATRICES = 4
-"""Matrices of that size in memory for a dense factorisation: the system, its blocks, the scaled system, its factor."""
+"""Matrices of that size in memory for a dense factorisation: the system, a copy of its blocks, its transpose, its
+factor."""
 
 MAX_BYTES = 4e9
 """Largest memory of a solver that `auto` may choose."""

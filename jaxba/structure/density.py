@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 MIN_DENSITY = 0.1
-"""Fraction of non-zero products from which a dense matrix product is cheaper. Measured: it is 17 times as fast per
-operation as products of listed pairs, and computes each of them twice."""
+"""Smallest number of pairs, per point and cameras squared, for which a dense matrix product is cheaper. Measured: it is
+17 times as fast per operation as products of listed pairs, and computes each of them twice."""
 
 DENSE_UNKNOWNS = 512
 """Largest system that is formed by a dense product; the operand takes 72 bytes per point and camera unknown. Also the
