@@ -194,8 +194,8 @@ def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp
         "gradient_max": 1.0,
         "step_norm": 1.0,
         "parameter_norm": 1.0,
-        "share": 1.0,
-        "damping_share": 0.0,
+        "step_fraction": 1.0,
+        "damping_fraction": 0.0,
         "forcing": 0.0,
         **changes,
     }

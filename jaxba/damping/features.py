@@ -38,7 +38,7 @@ class StepFeatures(NamedTuple):
     candidate: Array  # log10 of the candidate's cost over the cost, for rejected steps
     damping: Array  # log10 of lambda, scaled
     accepted: Array  # 1 or -1
-    damping_share: Array  # damping's share of the step's curvature
+    damping_fraction: Array  # damping's share of the step's curvature
     shortened: Array  # how often the step was shortened
 
 
@@ -136,7 +136,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         candidate=jnp.where(step.accepted, 0.0, _log(step.candidate_cost / step.previous_cost)),
         damping=_scaled_decades(guard.damping),
         accepted=jnp.where(step.accepted, 1.0, -1.0),
-        damping_share=step.damping_share,
+        damping_fraction=step.damping_fraction,
         shortened=guard.shortened / 2,
     )
     row = jnp.nan_to_num(jnp.stack(features), nan=FEATURE_LIMIT)

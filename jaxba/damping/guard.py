@@ -39,7 +39,7 @@ INEXACT_FRACTION = 0.1
 then changes nothing but the number of iterations of conjugate gradients. On random scenes of 600 to 1,197 cameras 0.01
 instead saved fewer iterations."""
 
-OVERDAMPED_DECREASE, OVERDAMPED_SHARE = 1e-2, 0.5
+OVERDAMPED_DECREASE, OVERDAMPED_FRACTION = 1e-2, 0.5
 """A step of full length is overdamped if its relative decrease is below the first number and damping's share of its
 curvature above the second. The next lambda must then be ten times smaller, or a solve could stop making progress
 without having converged. Shortened steps do not count: in a narrow valley (the COLMAP model bulani7) a smaller lambda
@@ -87,12 +87,12 @@ def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> Guar
     damping = jnp.log10(step.damping).astype(dtype)
     decrease = (step.previous_cost - step.cost) / step.previous_cost
     gain = jnp.where(jnp.isfinite(step.gain_ratio), step.gain_ratio, -1.0)
-    shortened = jnp.round(-jnp.log(step.share) / -math.log(SHORTER))
+    shortened = jnp.round(-jnp.log(step.step_fraction) / -math.log(SHORTER))
     consecutive = jnp.where(step.accepted, 0, guard.consecutive_rejections + 1).astype(jnp.int32)
     rejections = (guard.rejections + ~step.accepted).astype(jnp.int32)
     growth = jnp.where(guard.handed_over, 2 * guard.growth, Ceres().reject_growth)
     growth = jnp.where(step.accepted, 0.5 * Ceres().reject_growth, growth).astype(dtype)
-    weak = (decrease < OVERDAMPED_DECREASE) & (step.damping_share > OVERDAMPED_SHARE)
+    weak = (decrease < OVERDAMPED_DECREASE) & (step.damping_fraction > OVERDAMPED_FRACTION)
     return GuardState(
         iteration=(guard.iteration + 1).astype(jnp.int32),
         damping=damping,
@@ -103,8 +103,8 @@ def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> Guar
         rejections=rejections,
         growth=growth,
         handed_over=guard.handed_over | (rejections >= config.max_rejections) | (consecutive >= config.patience),
-        overdamped=step.accepted & (step.share == 1) & weak,
-        inexact=step.accepted & (step.damping_share < INEXACT_FRACTION * step.forcing),
+        overdamped=step.accepted & (step.step_fraction == 1) & weak,
+        inexact=step.accepted & (step.damping_fraction < INEXACT_FRACTION * step.forcing),
     )
 
 

@@ -47,9 +47,8 @@ class Round(NamedTuple):
     slope: Float[Array, ""]  # -g.d
     curvature: Float[Array, ""]  # d.H d
     gradient_max: Float[Array, ""]  # largest absolute gradient entry before the round
-    share: Float[
-        Array, ""
-    ]  # mean step fraction of the clusters, weighted by the predicted decrease of their full steps
+    # mean step fraction of the clusters, weighted by the predicted decrease of their full steps
+    step_fraction: Float[Array, ""]
     repairs: Int[Array, ""]  # see `StepInfo.repairs`: the largest of all clusters
     accepted: Bool[Array, ""]
 

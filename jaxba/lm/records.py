@@ -32,6 +32,6 @@ class StepInfo(NamedTuple):
     parameter_norm: Float[Array, ""]  # norm of the parameters before the step
     cg_iterations: Int[Array, ""]  # 0 for a factorisation
     forcing: Float[Array, ""]  # forcing term of conjugate gradients; 0 for an exact solve
-    share: Float[Array, ""]  # length of the candidate's step over the full step; below 1 after backtracking
-    damping_share: Float[Array, ""]  # d.D d / d.(H + D) d: 0 for Gauss-Newton, 1 for gradient descent
+    step_fraction: Float[Array, ""]  # length of the candidate's step over the full step; below 1 after backtracking
+    damping_fraction: Float[Array, ""]  # d.D d / d.(H + D) d: 0 for Gauss-Newton, 1 for gradient descent
     repairs: Int[Array, ""]  # camera rounds, backtracking trials and pattern moves after the first candidate

@@ -133,7 +133,7 @@ def try_step(
     damping = jnp.asarray(damping, state.cost.dtype)
     step = proposal.step
     candidate = best_candidate(Whole(layout), *state[:3], proposal.reference, step, options, min_gain, effort)
-    tried_step = [candidate.share * step.cameras, candidate.points - state.points]
+    tried_step = [candidate.step_fraction * step.cameras, candidate.points - state.points]
     return _advance(
         state,
         candidate,
@@ -143,8 +143,8 @@ def try_step(
         gradient_max=step.gradient_max,
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
-        share=candidate.share,
-        damping_share=jnp.clip(step.damped / step.slope, 0, 1),
+        step_fraction=candidate.step_fraction,
+        damping_fraction=jnp.clip(step.damped / step.slope, 0, 1),
         repairs=candidate.repairs,
     )
 
@@ -176,8 +176,8 @@ def _round(
         gradient_max=result.gradient_max,
         cg_iterations=jnp.zeros((), jnp.int32),
         forcing=jnp.zeros_like(state.cost),
-        share=result.share,
-        damping_share=jnp.clip(1 - result.curvature / result.slope, 0, 1),
+        step_fraction=result.step_fraction,
+        damping_fraction=jnp.clip(1 - result.curvature / result.slope, 0, 1),
         repairs=result.repairs,
     )
 

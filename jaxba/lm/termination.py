@@ -115,15 +115,15 @@ def lost_in_rounding(step: StepInfo) -> Bool[Array, ""]:
 
 def _is_negligible(decrease: Float[Array, ""], step: StepInfo, tolerance: Any) -> Bool[Array, ""]:
     """Whether a decrease is within a tolerance relative to the cost, for the damped step and without damping."""
-    undamped_bound = MAX_UNDAMPED_RATIO * _undamped_fraction(step) * (1 + step.damping_share)
+    undamped_bound = MAX_UNDAMPED_RATIO * _undamped_fraction(step) * (1 + step.damping_fraction)
     damping_limited = decrease > undamped_bound * tolerance * step.previous_cost
-    full_step = ~(step.share < 1)  # a backtracked step is short for another reason
+    full_step = ~(step.step_fraction < 1)  # a backtracked step is short for another reason
     return (decrease <= tolerance * step.previous_cost) & ~damping_limited & full_step
 
 
 def _undamped_fraction(step: StepInfo) -> Float[Array, ""]:
     """`1 - s` for the damping fraction s; zero where only rounding is left of it."""
-    rest = 1 - step.damping_share
+    rest = 1 - step.damping_fraction
     return jnp.where(rest <= FRACTION_ROUNDING * float(jnp.finfo(step.cost.dtype).eps), jnp.zeros_like(rest), rest)
 
 
@@ -142,7 +142,7 @@ def termination_of(
     by_cost = converged_in_cost(step, tolerances.ftol)
     bound = tolerances.xtol * (step.parameter_norm + tolerances.xtol)
     damping_limited = step.step_norm > MAX_UNDAMPED_RATIO * _undamped_fraction(step) * bound
-    by_step = step.accepted & (step.step_norm <= bound) & ~damping_limited & ~(step.share < 1)
+    by_step = step.accepted & (step.step_norm <= bound) & ~damping_limited & ~(step.step_fraction < 1)
     by_gradient = step.gradient_max <= tolerances.gtol
     limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
     stalled = ~step.accepted & stuck

@@ -130,7 +130,7 @@ def decomposed_round(
     predicted = sum_of(jnp.where(accepted, found.predicted, full_step))
     decrease = sum_of(jnp.where(accepted, found.gain * found.predicted, 0))
     offered = jnp.sum(jnp.where(solved, full_step, jnp.inf))
-    taken = sum_of(jnp.where(accepted, found.share * full_step, 0))
+    taken = sum_of(jnp.where(accepted, found.step_fraction * full_step, 0))
     new_points, new_cost = _step_shared_points(layout, cameras, points, damping, partition, options)
     # if every cluster was rejected, shared points alone may lower the cost a little, which is no sign of convergence
     fraction = jnp.where(offered - taken > NEGLIGIBLE * cost, taken / offered, 1)

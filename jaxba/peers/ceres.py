@@ -155,8 +155,8 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
         "parameter_norm": np.nan,
         "cg_iterations": 0,
         "forcing": 0.0,
-        "share": 1.0,
-        "damping_share": np.nan,
+        "step_fraction": 1.0,
+        "damping_fraction": np.nan,
         "repairs": 0,
     }
     return StepInfo(**{**fields, **known})
@@ -244,7 +244,7 @@ def solve_by_ceres(
     counts as one.
 
     In the history, `step_norm` is the one of Ceres (0 for the first step, with quaternions instead of angles).
-    `parameter_norm` and `damping_share` are NaN.
+    `parameter_norm` and `damping_fraction` are NaN.
 
     Args:
         problem: start of the optimisation.

@@ -34,9 +34,9 @@ from jaxba.solver.solve import Solution
 LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
 """Limits of the radius, so wide that they do not change the lambda of any policy."""
 
-REJECTED_DAMPING_SHARE = 0.0
-"""Assumed `damping_share` of a rejected step, which Ceres does not return. Steps are rejected for too little damping,
-so that it is near 0: for jaxba's own steps it was 0.0003 to 0.006 on Ladybug-49 and kittistereo00s."""
+REJECTED_DAMPING_FRACTION = 0.0
+"""Assumed `damping_fraction` of a rejected step, which Ceres does not return. Steps are rejected for too little
+damping, so that it is near 0: for jaxba's own steps it was 0.0003 to 0.006 on Ladybug-49 and kittistereo00s."""
 
 _after_step = jax.jit(after_step)
 _init = jax.jit(lambda policy, info: policy.init(info))
@@ -72,8 +72,8 @@ def drive_ceres(
 
     The policy gets the same record of a step as from `lm_step`. Costs, gain ratio, predicted decrease and gradient are
     those that Ceres reports (its gradient by the three tangent coordinates of a quaternion is twice the one by angles);
-    `step_metrics` computes the rest. For a rejected step, `step_norm` is NaN and `damping_share` is
-    `REJECTED_DAMPING_SHARE`.
+    `step_metrics` computes the rest. For a rejected step, `step_norm` is NaN and `damping_fraction` is
+    `REJECTED_DAMPING_FRACTION`.
 
     COLMAP gives a point behind its camera a residual of zero. If a step that Ceres accepts moves points there, it is
     tested once more with the cost that counts them.
@@ -146,10 +146,10 @@ def _iterate_under_ceres_rule(
         return _null_step(run.cost, damping, *(summary.gradient_max_norm for summary in summaries))
     first, second = summaries
     if not second.step_is_successful:
-        unknown = {"step_norm": np.nan, "damping_share": REJECTED_DAMPING_SHARE}
+        unknown = {"step_norm": np.nan, "damping_fraction": REJECTED_DAMPING_FRACTION}
         return step_of(second, first, first.cost, damping, mode, **unknown)
     metrics = step_metrics(observations, before, run.colmap.parameters())
-    names = ("step_norm", "parameter_norm", "damping_share")
+    names = ("step_norm", "parameter_norm", "damping_fraction")
     known = {name: float(getattr(metrics, name)) for name in names}
     step = step_of(second, first, first.cost, damping, mode, **known)
     behind = np.asarray(metrics.behind) & ~run.colmap.in_python
@@ -162,7 +162,7 @@ def _iterate_under_ceres_rule(
         run.count_behind(behind)
         return step._replace(cost=full_cost)
     run.colmap.restore(before)
-    return step._replace(accepted=False, cost=first.cost, step_norm=np.nan, damping_share=REJECTED_DAMPING_SHARE)
+    return step._replace(accepted=False, cost=first.cost, step_norm=np.nan, damping_fraction=REJECTED_DAMPING_FRACTION)
 
 
 def _call_ceres(run: Run, options: Any, summaries: list[Any], damping: float) -> None:
@@ -186,7 +186,12 @@ def _iterate_under_jaxba_rule(
 
 def _null_step(cost: float, damping: float, gradient_max: float = np.nan) -> StepInfo:
     """The record of a rejected step of length zero."""
-    fields = {"candidate_cost": cost, "predicted": 0.0, "gain_ratio": 0.0, "damping_share": REJECTED_DAMPING_SHARE}
+    fields = {
+        "candidate_cost": cost,
+        "predicted": 0.0,
+        "gain_ratio": 0.0,
+        "damping_fraction": REJECTED_DAMPING_FRACTION,
+    }
     return step_info(cost, damping, gradient_max=gradient_max, **fields)
 
 

@@ -26,7 +26,7 @@ class StepMetrics(NamedTuple):
     """Quantities of a step `d`, with residuals `r` and Jacobian `J` at the parameters before it."""
 
     predicted: Float[Array, ""]  # decrease of the cost under the linear model, pixels^2
-    damping_share: Float[Array, ""]  # d.D d / d.(H + D) d for a step with (H + D) d = -g
+    damping_fraction: Float[Array, ""]  # d.D d / d.(H + D) d for a step with (H + D) d = -g
     step_norm: Float[Array, ""]  # rotations in radians
     parameter_norm: Float[Array, ""]  # before the step, in BAL's parameters
     cost: Float[Array, ""]  # after the step, as BAL defines it, pixels^2
@@ -55,7 +55,7 @@ def step_metrics(observations: Observations, before: Any, after: Any) -> StepMet
     slope, curvature = -jnp.sum(residual * rate), jnp.sum(rate * rate)  # -g.d and d.H d
     return StepMetrics(
         predicted=slope - 0.5 * curvature,
-        damping_share=jnp.where(slope > 0, jnp.clip((slope - curvature) / slope, 0, 1), 0),
+        damping_fraction=jnp.where(slope > 0, jnp.clip((slope - curvature) / slope, 0, 1), 0),
         step_norm=squares(2 * turn, *moved),
         parameter_norm=squares(bal_angle, poses[:, 4:], lenses, points),
         cost=0.5 * jnp.sum((_pixel(*there) - observations.pixels) ** 2),

@@ -49,7 +49,7 @@ class Candidate(NamedTuple):
     predicted: Float[Array, "*parts"]  # decrease that the linear model predicts for this step fraction, pixels^2
     gain: Float[Array, "*parts"]  # actual over predicted decrease
     accepted: Bool[Array, "*parts"]
-    share: Float[Array, "*parts"]  # step fraction: length relative to the full step
+    step_fraction: Float[Array, "*parts"]  # length relative to the full step
     repairs: Int[Array, "*parts"]  # camera rounds, trials and pattern moves after the first candidate
 
 
@@ -106,7 +106,7 @@ def assess(
     against: Comparison,
     cameras: Float[Array, "9 cameras"],
     points: Float[Array, "3 points"],
-    share: Float[Array, "*parts"],
+    step_fraction: Float[Array, "*parts"],
     repairs: Int[Array, "*parts"],
     full_step: Bool[Array, ""] | None = None,
 ) -> Candidate:
@@ -116,7 +116,7 @@ def assess(
         against: data of the step.
         cameras: cameras of the candidate.
         points: points before their embedded iterations.
-        share: step fraction, which scales the predicted decrease.
+        step_fraction: it scales the predicted decrease.
         repairs: camera rounds, trials and pattern moves so far.
         full_step: whether this is the full step of some subproblem, after which points may also start from their rays;
             None after a camera round, where they never do.
@@ -125,13 +125,14 @@ def assess(
     if full_step is None:
         full_step = jnp.zeros((), bool)
         options = replace(options, refinement=replace(options.refinement, starts="step"))
-    min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * jnp.sum(against.step.predicted(share)))
+    min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * jnp.sum(against.step.predicted(step_fraction)))
     search = PointSearch(against.point_iterations, jnp.where(full_step, against.starts, 0), min_decrease)
     points, terms = parts.refine(cameras, points, against.previous, options, search)
-    cost, decrease, predicted = parts.sums(terms), parts.sums(against.terms - terms), against.step.predicted(share)
+    cost, decrease = parts.sums(terms), parts.sums(against.terms - terms)
+    predicted = against.step.predicted(step_fraction)
     gain = decrease / predicted
     accepted = (decrease > 0) & (cost <= against.cost) & (predicted > 0) & (gain > against.min_gain)
-    return Candidate(cameras, points, cost, predicted, gain, accepted & jnp.isfinite(cost), share, repairs)
+    return Candidate(cameras, points, cost, predicted, gain, accepted & jnp.isfinite(cost), step_fraction, repairs)
 
 
 def select(parts: Subproblems, which: Bool[Array, "*parts"], new: Candidate, old: Candidate) -> Candidate:

@@ -55,7 +55,7 @@ def with_camera_rounds(
     def one_round(carry: tuple[Candidate, Int[Array, "*parts"]]) -> tuple[Candidate, Int[Array, "*parts"]]:
         candidate, left = carry
         cameras = refine_cameras(against.parts.layout, candidate.cameras, candidate.points, against.options)
-        improved = assess(against, cameras, candidate.points, candidate.share, candidate.repairs + 1)
+        improved = assess(against, cameras, candidate.points, candidate.step_fraction, candidate.repairs + 1)
         return select(against.parts, should_continue(carry), improved, candidate), left - 1
 
     def should_continue(carry: tuple[Candidate, Int[Array, "*parts"]]) -> Bool[Array, "*parts"]:

@@ -86,14 +86,16 @@ def best_candidate(
 def _next_candidate(against: Comparison, attempt: _Attempt) -> Candidate:
     """Evaluates the next candidate, with its embedded iterations and camera rounds."""
     parts, best = against.parts, attempt.best
-    share = jnp.where(best.accepted, best.share, attempt.length)
+    step_fraction = jnp.where(best.accepted, best.step_fraction, attempt.length)
     lengths = parts.of_cameras(attempt.length)
     new_cameras = move_cameras(parts.layout, attempt.cameras, lengths * attempt.direction[0], against.options)
     if against.options.refinement.trials > 1:
         new_cameras = jnp.where(new_cameras[6] * against.cameras[6] < 0, attempt.cameras, new_cameras)
     new_points = attempt.points + parts.of_points(attempt.length) * attempt.direction[1]
     full_step = ~best.accepted & (attempt.length == 1)
-    candidate = assess(against, new_cameras, new_points, share, best.repairs + 1, jnp.any(full_step & attempt.active))
+    candidate = assess(
+        against, new_cameras, new_points, step_fraction, best.repairs + 1, jnp.any(full_step & attempt.active)
+    )
     if not against.options.refinement.camera_rounds:
         return candidate
     return with_camera_rounds(against, candidate, best, full_step, attempt.active)

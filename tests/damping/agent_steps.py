@@ -48,7 +48,7 @@ def after(config: AgentConfig, memory: Memory, accepted: bool, logdamping: float
         "previous_cost": before,
         "candidate_cost": 0.9 * before if accepted else 2 * before,
         "predicted": 0.2 * before,
-        "damping_share": 0.1,
+        "damping_fraction": 0.1,
         **changes,
     }
     return record(config, memory, step_info(accepted, damping=10.0**logdamping, **values))

@@ -35,7 +35,7 @@ def test_an_observation_is_finite_and_bounded_whatever_a_step_says(cost, steps):
                 previous_cost=memory.cost,
                 candidate_cost=candidate,
                 predicted=predicted,
-                damping_share=share,
+                damping_fraction=share,
             ),
         )
         seen = np.asarray(observe(config, memory))
@@ -74,7 +74,7 @@ def _story(config: AgentConfig, unit: float) -> np.ndarray:
             candidate_cost=candidate * unit**2,
             predicted=predicted * unit**2,
             gradient_max=7.0 * unit**2,
-            damping_share=0.2,
+            damping_fraction=0.2,
         )
         memory = record(config, memory, step)
         seen.append(observe(config, memory))

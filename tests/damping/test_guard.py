@@ -14,7 +14,7 @@ from support import step_info
 
 from jaxba import Ceres
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.guard import FIRST_DAMPING, OVERDAMPED_DECREASE, OVERDAMPED_SHARE
+from jaxba.damping.guard import FIRST_DAMPING, OVERDAMPED_DECREASE, OVERDAMPED_FRACTION
 from jaxba.game.env import _rule_damping
 
 
@@ -156,11 +156,11 @@ def test_a_solve_cannot_stand_still_under_a_large_lambda():
     """Accepted, with next to no decrease, and short for its damping: a decade down, at least."""
     config = AgentConfig(**RANGE)
     memory = begin(config, info())
-    tiny = {"cost": 100 * (1 - 0.5 * OVERDAMPED_DECREASE), "damping_share": 0.5 + 0.5 * OVERDAMPED_SHARE}
+    tiny = {"cost": 100 * (1 - 0.5 * OVERDAMPED_DECREASE), "damping_fraction": 0.5 + 0.5 * OVERDAMPED_FRACTION}
     capped = after(config, memory, ACCEPTED, 1.0, **tiny)
     np.testing.assert_allclose(decades(config, capped, 1), 0.0, atol=1e-6)
     np.testing.assert_allclose(decades(config, capped, -1), config.low, atol=1e-6)
-    for change in ({"cost": 99.0}, {"damping_share": 0.9 * OVERDAMPED_SHARE}, {"share": 0.25}):
+    for change in ({"cost": 99.0}, {"damping_fraction": 0.9 * OVERDAMPED_FRACTION}, {"step_fraction": 0.25}):
         free = after(config, memory, ACCEPTED, 1.0, **{**tiny, **change})
         np.testing.assert_allclose(decades(config, free, 1), config.high, atol=1e-6)
 
@@ -169,10 +169,10 @@ def test_lambda_does_not_fall_after_an_inexact_step_that_it_hardly_changed():
     """Conjugate gradients left more open than lambda did; after an exact step it may fall."""
     config = AgentConfig(**{**RANGE, "descent": 1.5})
     for forcing, share, lowest in [(0.1, 0.9e-2, -5.0), (0.1, 1.1e-2, -6.5), (1e-3, 0.9e-2, -6.5), (0.0, 0.0, -6.5)]:
-        memory = after(config, begin(config, info()), ACCEPTED, -5.0, damping_share=share, forcing=forcing)
+        memory = after(config, begin(config, info()), ACCEPTED, -5.0, damping_fraction=share, forcing=forcing)
         np.testing.assert_allclose(decades(config, memory, -1), lowest, atol=1e-6)
         np.testing.assert_allclose(decades(config, memory, 1), config.high, atol=1e-6)
-    rejected = after(config, begin(config, info()), REJECTED, -5.0, damping_share=0.0, forcing=0.1)
+    rejected = after(config, begin(config, info()), REJECTED, -5.0, damping_fraction=0.0, forcing=0.1)
     assert not rejected.guard.inexact
 
 

@@ -48,13 +48,13 @@ def test_on_a_parabola_it_ends_where_the_undamped_decrease_is_small(curvature, d
             return  # rounding decides
     if cost - decrease <= 0 or decrease < 1e-11 * cost:  # no cost is negative, nor is a decrease below its last digits
         return
-    info = step_info(True, cost=cost - decrease, previous_cost=cost, damping_share=share)
+    info = step_info(True, cost=cost - decrease, previous_cost=cost, damping_fraction=share)
     expected = decrease <= ftol * cost and undamped <= MAX_UNDAMPED_RATIO * ftol * cost
     assert bool(converged_in_cost(info, ftol)) == expected
 
 
 def test_a_rejected_step_never_ends_a_solve_as_converged():
-    info = step_info(False, cost=1.0, previous_cost=1.0, step_norm=0.0, damping_share=0.0)
+    info = step_info(False, cost=1.0, previous_cost=1.0, step_norm=0.0, damping_fraction=0.0)
     assert not converged_in_cost(info, 1e-6)
     code = termination_of(info, jnp.asarray(False), jnp.asarray(3, jnp.int32), Tolerances(), 100)
     assert int(code) == Termination.RUNNING
@@ -62,18 +62,18 @@ def test_a_rejected_step_never_ends_a_solve_as_converged():
 
 @pytest.mark.parametrize(("share", "ends"), [(0.0, True), (0.9, True), (0.999999, False), (1.0, False)])
 def test_the_same_small_decrease_ends_a_solve_or_not_by_what_made_it_small(share, ends):
-    info = step_info(True, cost=1 - 5e-7, previous_cost=1.0, damping_share=share)
+    info = step_info(True, cost=1 - 5e-7, previous_cost=1.0, damping_fraction=share)
     assert bool(converged_in_cost(info, 1e-6)) == ends
 
 
 def test_no_decrease_at_all_is_convergence_whatever_lambda_was():
     """Then the undamped step promises nothing either; without this a solve at the exact minimum would never end."""
-    assert converged_in_cost(step_info(True, cost=1.0, previous_cost=1.0, damping_share=0.999), 1e-6)
+    assert converged_in_cost(step_info(True, cost=1.0, previous_cost=1.0, damping_fraction=0.999), 1e-6)
 
 
 def single(**fields):
     """A refused step in float32."""
-    info = step_info(False, **{"cost": 1.0, "previous_cost": 1.0, "predicted": 5e-7, "damping_share": 0.0} | fields)
+    info = step_info(False, **{"cost": 1.0, "previous_cost": 1.0, "predicted": 5e-7, "damping_fraction": 0.0} | fields)
     return jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == jnp.float64 else x, info)
 
 
@@ -88,8 +88,8 @@ def test_a_refused_step_ends_a_solve_in_float32_where_its_promise_drowns_in_the_
     "fields",
     [
         {"predicted": 5e-6},  # more than rounding
-        {"damping_share": 1 - 1e-6},  # little only for its damping
-        {"share": 0.25},  # or for having been shortened
+        {"damping_fraction": 1 - 1e-6},  # little only for its damping
+        {"step_fraction": 0.25},  # or for having been shortened
         {"predicted": np.nan},  # a factorisation failed
         {"predicted": -1.0},  # or was of no use
         {"step_norm": np.nan},  # a peer refused it, and does not tell more
@@ -104,7 +104,7 @@ def test_no_other_step_in_float32_ends_a_solve_by_that_rule(fields):
 
 
 def test_in_float64_the_same_promise_can_be_judged():
-    info = step_info(False, cost=1.0, previous_cost=1.0, predicted=5e-7, damping_share=0.0)
+    info = step_info(False, cost=1.0, previous_cost=1.0, predicted=5e-7, damping_fraction=0.0)
     assert not lost_in_rounding(info)
     assert lost_in_rounding(info._replace(predicted=jnp.asarray(1e-15)))
 

@@ -216,7 +216,16 @@ def test_ddlm_with_one_block_is_plain_lm(embedded):
         same, theirs = step(plain, before, damping, whole)
         assert ours.accepted
         assert theirs.accepted
-        names = ("cost", "predicted", "gain_ratio", "gradient_max", "step_norm", "damping_share", "share", "repairs")
+        names = (
+            "cost",
+            "predicted",
+            "gain_ratio",
+            "gradient_max",
+            "step_norm",
+            "damping_fraction",
+            "step_fraction",
+            "repairs",
+        )
         for name in names:
             np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-6, err_msg=name)
         np.testing.assert_allclose(state.cameras, same.cameras, rtol=1e-8, atol=1e-10)
@@ -254,13 +263,13 @@ def test_clusters_of_ddlm_have_shares_and_repairs_of_their_own():
         first += problem.num_cameras
         alone.append(info)
     shares, repairs = (
-        [float(x) for x in column] for column in zip(*[(i.share, i.repairs) for i in alone], strict=True)
+        [float(x) for x in column] for column in zip(*[(i.step_fraction, i.repairs) for i in alone], strict=True)
     )
     assert (shares, repairs) == ([1, 0.25, 1], [0, 1, 1])
     assert found.repairs == 1
     np.testing.assert_allclose(found.predicted, sum(info.predicted for info in alone), rtol=1e-6)
     whole = [_step_of(problem, damping).predicted(jnp.ones(())) for problem in scenes]
-    np.testing.assert_allclose(found.share, np.dot(shares, whole) / np.sum(whole), rtol=1e-6)
+    np.testing.assert_allclose(found.step_fraction, np.dot(shares, whole) / np.sum(whole), rtol=1e-6)
 
 
 def _step_of(problem: BundleProblem, damping: float):
@@ -290,12 +299,12 @@ def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
     options = replace(DECOMPOSED, refinement=Refinement(points=3))
     layout, state = start(support.tiny(), options)
     _, good = step(layout, state, 1e-2, options)
-    assert good.share == 1
+    assert good.step_fraction == 1
     decreases = []
     for iteration in range(8):
         state, info = step(layout, state, 1e-2, options, 1e9, iteration)  # no gain is enough
         decreases.append(float(info.previous_cost - info.cost) / float(info.cost))
-        assert info.share == MIN_STEP_FRACTION
+        assert info.step_fraction == MIN_STEP_FRACTION
         assert not converged_in_cost(info, 1e-6)
     small = [d for d in decreases if d <= 1e-6]
     assert decreases[0] > 1e-6
@@ -340,7 +349,7 @@ def test_a_cluster_of_ddlm_that_cannot_be_factored_leaves_the_others_alone(monke
     np.testing.assert_allclose(found.cameras[:, others], expected.cameras[:, others], rtol=1e-9, atol=1e-12)
     assert (np.asarray(found.cameras)[:, others] != np.asarray(state.cameras)[:, others]).any()
     assert found.accepted
-    assert found.share == MIN_STEP_FRACTION
+    assert found.step_fraction == MIN_STEP_FRACTION
 
 
 @functools.partial(jax.jit, static_argnames=("options",))

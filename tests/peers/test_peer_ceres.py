@@ -247,7 +247,7 @@ def test_metrics_that_ceres_does_not_report_are_those_of_the_step_of_jaxba(dampi
     there = ColmapProblem(after.problem).parameters()
     metrics = step_metrics(observations_of(problem, colmap.pixels), before, there)
     np.testing.assert_allclose(metrics.predicted, step.predicted, rtol=1e-8)
-    np.testing.assert_allclose(metrics.damping_share, step.damping_share, rtol=1e-6)
+    np.testing.assert_allclose(metrics.damping_fraction, step.damping_fraction, rtol=1e-6)
     np.testing.assert_allclose(metrics.step_norm, step.step_norm, rtol=1e-7)
     np.testing.assert_allclose(metrics.parameter_norm, step.parameter_norm, rtol=1e-12)
     np.testing.assert_allclose(metrics.cost, geometry.cost(after.problem), rtol=1e-12)

@@ -212,7 +212,7 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         same, once = step(layout, before, BOLD, PLAIN)
         after, info = step(layout, before, BOLD, SHORTER_ONLY)
         if once.accepted:  # then nothing is tried again
-            assert (info.repairs, info.share) == (0, 1)
+            assert (info.repairs, info.step_fraction) == (0, 1)
             # another program, which rounds in another order
             for found, truth in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True):
                 np.testing.assert_allclose(found, truth, rtol=1e-9, atol=1e-9)
@@ -223,7 +223,7 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
             continue
         saved += 1
         assert once.repairs == 0
-        assert info.repairs == round(float(np.log(info.share) / np.log(SHORTER)))
+        assert info.repairs == round(float(np.log(info.step_fraction) / np.log(SHORTER)))
         linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
         whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(BOLD), PLAIN)
         power = round(float(np.log(info.step_norm / once.step_norm) / np.log(SHORTER)))
@@ -252,7 +252,7 @@ def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
     found = lambda options: _best_candidate(Whole(layout), *before[:3], linear.reference, mirrored, options, 0.0)
     plain, kept = found(PLAIN), found(SHORTER_ONLY)
     assert plain.cameras[6, 0] < 0
-    assert kept.share == 1
+    assert kept.step_fraction == 1
     assert np.array_equal(kept.cameras[:, 0], before.cameras[:, 0])
     np.testing.assert_allclose(kept.cameras[:, 1:], plain.cameras[:, 1:], rtol=1e-12)
 
@@ -333,13 +333,13 @@ def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
     for layout, before in wide():
         bare = step(layout, before, BOLD, SHORTER_ONLY, min_gain=0.25)[1]
         full = step(layout, before, BOLD, with_rounds, min_gain=0.25)[1]
-        shortened = round(float(np.log(full.share) / np.log(SHORTER)))
+        shortened = round(float(np.log(full.step_fraction) / np.log(SHORTER)))
         assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_LATER_CANDIDATES)
-        assert full.share >= bare.share  # what a round brings in need not be shortened further
-        if full.share == bare.share:
+        assert full.step_fraction >= bare.step_fraction  # what a round brings in need not be shortened further
+        if full.step_fraction == bare.step_fraction:
             assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-12)
         lower = full.candidate_cost < 0.999 * bare.candidate_cost
-        better += bool(full.share < 1 and (full.share > bare.share or lower))
+        better += bool(full.step_fraction < 1 and (full.step_fraction > bare.step_fraction or lower))
     assert better >= 1
 
 
@@ -373,7 +373,7 @@ def test_a_pattern_move_repeats_the_way_of_the_step_twice_as_far_each_time_while
 
     costs = [cost_at(2.0**k) for k in range(5)]
     last = next((k for k in range(4) if not costs[k + 1] < costs[k]), 4)
-    held_back = short.damping_share > SMALL_DAMPING_FRACTION or abs(short.gain_ratio - 1) > GAIN_TOLERANCE
+    held_back = short.damping_fraction > SMALL_DAMPING_FRACTION or abs(short.gain_ratio - 1) > GAIN_TOLERANCE
     last = last if held_back else 0
     np.testing.assert_allclose(info.cost, costs[last], rtol=1e-9)
     tried = min(last + 1, 4) if held_back else 0
