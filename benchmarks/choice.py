@@ -1,6 +1,6 @@
 """Times of the linear solvers, compared with the predictions of the cost model (`solver/cost_model.py`).
 
-    python -m benchmarks.choice [PROBLEM ...] [--damping ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
+    python -m benchmarks.choice [PROBLEM ...] [--solver ceres+refine3] [--iterations 6] [--repeats 5] [--fit]
 
 A problem is a file or a random scene (`scene:random-150`). Default: those in `JAXBA_DATA` and two random scenes. For
 each linear solver, the whole loop is one compiled program; the solvers are timed alternately. `loss` is the time of the
@@ -35,14 +35,14 @@ class Timed(NamedTuple):
     products: float  # matrix-vector products of conjugate gradients per iteration
 
 
-def measure(problem: BundleProblem, damping: str, iterations: int, repeats: int) -> dict[str, Timed]:
+def measure(problem: BundleProblem, solver: str, iterations: int, repeats: int) -> dict[str, Timed]:
     """Median time of an iteration with each linear solver that fits into memory, timed alternately. The first round
     compiles and is not counted."""
     seconds: dict[str, list[float]] = {name: [] for name in work(problem)}
     products = {}
     for repeat in range(repeats + 1):
         for name, times in seconds.items():
-            policy, options = parse_solver(damping).build()
+            policy, options = parse_solver(solver).build()
             end = jaxba.solve(
                 problem,
                 policy,
@@ -67,7 +67,7 @@ def main() -> None:
     """Prints a line for each problem, and the fit."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("problem", nargs="*")
-    parser.add_argument("--damping", default="ceres+refine3")
+    parser.add_argument("--solver", default="ceres+refine3")
     parser.add_argument("--iterations", type=int, default=6)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--fit", action="store_true")
@@ -78,7 +78,7 @@ def main() -> None:
     print("problem: solver measured ms (predicted, with the products counted) ...: loss of auto")
     for source in sources(args.problem or [*real_problems(), *LARGE_SCENES]):
         problem = source.read()
-        times = measure(problem, args.damping, args.iterations, args.repeats)
+        times = measure(problem, args.solver, args.iterations, args.repeats)
         taken = choose(problem)
         losses.append(times[taken].seconds / min(time.seconds for time in times.values()))
         cells = []

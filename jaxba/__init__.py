@@ -13,6 +13,7 @@ from jaxba.damping import (
     save_policy,
 )
 from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.learned import LearnedPolicy
 from jaxba.io import (
     read_bal,
     read_bundler,
@@ -59,6 +60,7 @@ __all__ = [
     "IterationRecord",
     "LMState",
     "Layout",
+    "LearnedPolicy",
     "Lenses",
     "Loss",
     "Method",

@@ -1,7 +1,11 @@
-"""Array aliases and limits that every room may use."""
+"""Array aliases and limits that every room may use, and how its dataclasses become pytrees."""
 
 from __future__ import annotations
 
+from dataclasses import fields
+from typing import TypeVar
+
+import jax
 import numpy as np
 from jax import Array
 
@@ -10,3 +14,34 @@ AnyArray = np.ndarray | Array
 
 LARGEST_COUNT = 2**31 - 1
 """Largest count that an option may have: programs count in 32 bits."""
+
+T = TypeVar("T")
+
+
+def register_pytree(kind: type[T]) -> type[T]:
+    """Registers a dataclass as a pytree, as `jax.tree_util.register_dataclass` does, but rebuilt without `__init__`.
+
+    JAX rebuilds pytrees with tracers, batches, shapes or None in the place of arrays. Annotations speak of what people
+    pass to the constructor, so types are checked there, where somebody checks them, and not when JAX rebuilds.
+
+    Args:
+        kind: a dataclass; fields with the metadata `{"static": True}` are part of the tree's structure.
+    """
+    data = [field.name for field in fields(kind) if not field.metadata.get("static")]  # pyright: ignore
+    static = [field.name for field in fields(kind) if field.metadata.get("static")]  # pyright: ignore
+
+    def flatten(node):
+        return [getattr(node, name) for name in data], tuple(getattr(node, name) for name in static)
+
+    def flatten_with_keys(node):
+        children, structure = flatten(node)
+        return [(jax.tree_util.GetAttrKey(n), child) for n, child in zip(data, children, strict=True)], structure
+
+    def unflatten(structure, children):
+        node = object.__new__(kind)
+        for name, value in [*zip(data, children, strict=True), *zip(static, structure, strict=True)]:
+            object.__setattr__(node, name, value)
+        return node
+
+    jax.tree_util.register_pytree_with_keys(kind, flatten_with_keys, unflatten, flatten)
+    return kind

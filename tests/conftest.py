@@ -6,7 +6,6 @@ most of the time of all these tests is compilation. `.ci/run` has the slow ones,
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import os
 import platform
@@ -35,7 +34,6 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("compilation") == "quick":
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}".strip()
     jax.config.update("jax_enable_x64", True)
-    jax.tree_util.register_dataclass = _register_dataclass
     cache = getattr(config, "cache", None)
     if cache is not None:
         folder = cache.mkdir(f"xla-{_machine()}")
@@ -75,7 +73,7 @@ def _machine() -> str:
 def few_programs():
     """Many modules compile more programs than one process may map. Inside a module they stay, as far as they may, so
     that its tests can count them."""
-    from jaxba.runtime import process  # not before `pytest_configure` has prepared what its classes are registered with
+    from jaxba.runtime import process  # here, so that the import hook of jaxtyping sees it
 
     share, process.MAPPINGS_SHARE = process.MAPPINGS_SHARE, 0.8
     yield
@@ -89,35 +87,3 @@ def unchecked():
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
-
-
-_original_register_dataclass = jax.tree_util.register_dataclass
-
-
-def _register_dataclass(nodetype: type, *args, **kwargs) -> type:
-    """`jax.tree_util.register_dataclass`, except that putting a tree together checks no types.
-
-    JAX rebuilds pytrees with tracers, with batches, with shapes or with None in place of arrays, and does so through
-    `__init__`. The annotations speak of what people pass, and jaxtyping checks them there.
-    """
-    if args or kwargs or not nodetype.__module__.startswith("jaxba."):
-        return _original_register_dataclass(nodetype, *args, **kwargs)
-    init = nodetype.__init__  # jaxtyping wraps it only later
-    fields = dataclasses.fields(nodetype)
-    data = [field.name for field in fields if not field.metadata.get("static")]
-    static = [field.name for field in fields if field.metadata.get("static")]
-
-    def flatten(node):
-        return [getattr(node, name) for name in data], tuple(getattr(node, name) for name in static)
-
-    def flatten_with_keys(node):
-        children, aux = flatten(node)
-        return [(jax.tree_util.GetAttrKey(n), child) for n, child in zip(data, children, strict=True)], aux
-
-    def unflatten(aux, children):
-        node = object.__new__(nodetype)
-        init(node, **dict(zip(data, children, strict=True)), **dict(zip(static, aux, strict=True)))
-        return node
-
-    jax.tree_util.register_pytree_with_keys(nodetype, flatten_with_keys, unflatten, flatten)
-    return nodetype

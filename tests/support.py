@@ -25,17 +25,20 @@ from jaxba import (
     Solution,
     SolveOptions,
     StepOptions,
+    Tolerances,
     initial_state,
     like,
     lm_step,
     random_scene,
 )
 from jaxba.lm.records import StepInfo
+from jaxba.problem import geometry
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.segment_sums import point_sum, point_sums, tree_sum
 
 DATA = os.environ.get("JAXBA_DATA")
 needs_data = pytest.mark.skipif(DATA is None, reason="JAXBA_DATA names no folder of real problems")
+DAMPINGS = (1e-8, 1e-4, 1e-2, 1.0, 100.0)
 MINIATURES = ("dubrovnik-3-7-pre", "dubrovnik-3-7-18-pre", "dubrovnik-1-1-pre")
 
 _step = jax.jit(lm_step, static_argnames=("options",))
@@ -47,17 +50,25 @@ def step(layout, state: LMState, damping, options: StepOptions, min_gain=0.0, it
     return _step(layout, state, number(damping), options, number(min_gain), jnp.asarray(iteration, jnp.int32))
 
 
+def solve_options(step: StepOptions | None = None, **asked) -> SolveOptions:
+    """Options of a solve with the given step, by default the one that the policy was made for, in one program.
+
+    Args:
+        step: of the solve; its linear system is solved explicitly where nothing else is said.
+        asked: fields of `SolveOptions`.
+    """
+    given = {}
+    if step is not None:
+        kept = ("conjugate_gradients", "refinement", "coordinates", "intrinsics", "loss")
+        given = {name: getattr(step, name) for name in kept} | {"method": step.method or "lm"}
+    if {**given, **asked}.get("method", "lm") == "lm":
+        given["linear_solver"] = "explicit" if step is None else step.linear_solver
+    return SolveOptions(**{"compilation": "full", **given, **asked})
+
+
 def solve(problem, policy="ceres", options: StepOptions | None = None, *, callback=None, **asked) -> Solution:
-    """`jaxba.solve` with the options of a step, by default the one that the policy was made for, solved explicitly, and
-    the whole loop compiled as one program unless `asked`, which holds fields of `SolveOptions`, says otherwise."""
-    if options is None:
-        given = {"linear_solver": "explicit"}
-    else:
-        given = {name: getattr(options, name) for name in ("refinement", "coordinates", "intrinsics", "loss")}
-        given |= {"linear_solver": "auto" if options.method else options.linear_solver}
-        given |= {"conjugate_gradients": options.conjugate_gradients}
-        given |= {"method": options.method} if options.method else {}
-    return jaxba.solve(problem, policy, SolveOptions(**{"compilation": "full", **given, **asked}), callback=callback)
+    """`jaxba.solve` with `solve_options`."""
+    return jaxba.solve(problem, policy, solve_options(options, **asked), callback=callback)
 
 
 def bal_file(name: str) -> Path:
@@ -123,6 +134,28 @@ def single() -> BundleProblem:
     """One camera, one point, one observation: two equations for twelve numbers."""
     camera = [[0.1, -0.2, 0.05, 0.3, 0.2, -4.0, 500, -0.01, 0.002]]
     return BundleProblem.create(camera, [[0.5, -0.4, 0.7]], [[60.0, -20.0]], [0], [0])
+
+
+@functools.cache
+def solved() -> BundleProblem:
+    """`tiny` at its minimum."""
+    return solve(tiny(), "ceres", tolerances=Tolerances(ftol=1e-12)).problem
+
+
+def strayed(factor: float, every: int = 5) -> BundleProblem:
+    """Every fifth point at a multiple of its distance from the first camera that sees it."""
+    problem, points = solved(), np.array(solved().points)
+    centers = geometry.camera_centers(problem.cameras)
+    for point in range(0, len(points), every):
+        center = centers[problem.camera_index[np.argmax(problem.point_index == point)]]
+        points[point] = center + factor * (points[point] - center)
+    return problem.replace(points=points)
+
+
+def thrown(seed: int, size: float) -> BundleProblem:
+    """All points far from where they belong."""
+    noise = np.random.default_rng(seed).normal(size=solved().points.shape)
+    return solved().replace(points=solved().points + size * noise)
 
 
 def arrays(problem: BundleProblem) -> tuple:
@@ -344,6 +377,49 @@ def difference(problem: BundleProblem, after: BundleProblem, options: StepOption
         )
         cameras[:, :3] = turned.as_rotvec()
     return np.concatenate([cameras.ravel(), (after.points - problem.points).ravel()])
+
+
+def check_step(problem: BundleProblem, options: StepOptions, damping: float) -> None:
+    """Everything that a step says and does, against the dense solution of the damped normal equations.
+
+    Parameters are compared in the norm of the damped Hessian. With seven gauge freedoms its condition number is
+    about 1 / lambda under diagonal scaling and 1e15 for the smallest lambda under identity scaling, so that
+    float64 does not define the gauge part of the step to 1e-8 in any other norm; in this one it always does.
+    Where the condition number allows it, every kind of parameter and the cost behind the step are
+    compared too.
+    """
+    layout, before = start(problem, options)
+    after, info = step(layout, before, damping, options)
+    truth = dense(problem, options, damping)
+    now = cost(problem, options)
+    well_conditioned = (
+        min(1, options.coordinates.camera_damping) * damping > 5e-5 and options.coordinates.scaling == "diagonal"
+    )
+
+    np.testing.assert_allclose(before.cost, now, rtol=1e-12)
+    np.testing.assert_allclose(info.previous_cost, now, rtol=1e-12)
+    np.testing.assert_allclose(info.predicted, truth.predicted, rtol=1e-8)
+    np.testing.assert_allclose(info.gradient_max, np.max(np.abs(truth.gradient)), rtol=1e-10)
+    np.testing.assert_allclose(info.gain_ratio, (now - info.candidate_cost) / truth.predicted, rtol=1e-7)
+    assert bool(info.accepted) == (info.candidate_cost < now)
+    assert float(info.damping) == damping
+    if well_conditioned:
+        there = cost(moved(problem, options, truth.step), options)
+        np.testing.assert_allclose(info.candidate_cost, there, rtol=1e-8, atol=1e-10 * now)
+        np.testing.assert_allclose(info.step_norm, np.linalg.norm(truth.step), rtol=1e-8)
+    if not info.accepted:
+        assert same_bits(after, before)
+        return
+    end = back(problem, before, after)
+    np.testing.assert_allclose(after.cost, cost(end, options), rtol=1e-9, atol=1e-12 * now)
+    found = difference(problem, end, options)
+    assert truth.norm(found - truth.step) <= 1e-8 * truth.norm(truth.step)
+    if well_conditioned:
+        size = problem.cameras.size
+        cameras, expected = found[:size].reshape(-1, 9), truth.step[:size].reshape(-1, 9)
+        for part in (slice(0, 3), slice(3, 6), 6, 7, 8):
+            assert np.linalg.norm((cameras - expected)[:, part]) <= 1e-8 * np.linalg.norm(expected[:, part])
+        assert np.linalg.norm(found[size:] - truth.step[size:]) <= 1e-8 * np.linalg.norm(truth.step[size:])
 
 
 def batch_sums(pairs, chunks: np.ndarray) -> np.ndarray:

@@ -80,7 +80,7 @@ class AgentConfig:
     point_starts: PointStarts = "rays"
     """Where embedded point iterations start, see `StepOptions`."""
 
-    remembered_steps: int = 3
+    previous_steps: int = 3
     """Earlier steps that are combined with the new one, if the method supports it; see `StepOptions`."""
 
     effort: EffortMode = "fixed"
@@ -119,7 +119,7 @@ class AgentConfig:
             trials=self.trials,
             camera_rounds=self.camera_rounds,
             pattern_moves=self.pattern_moves,
-            previous_steps=self.remembered_steps,
+            previous_steps=self.previous_steps,
         )
         return replace(options, refinement=refinement, coordinates=coordinates)
 

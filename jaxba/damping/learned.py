@@ -17,7 +17,7 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.linear.step import Effort
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 
 class AgentPolicy:
@@ -57,7 +57,7 @@ class AgentPolicy:
         return memory._replace(effort=effort), damping_of(self.config, memory.guard, action[0])
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class ConstantAction(AgentPolicy):
     """The same action in every iteration: what the guard alone achieves, without a network.
@@ -88,7 +88,7 @@ class Layer(NamedTuple):
     bias: Float[AnyArray, " outputs"]
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class LearnedPolicy(AgentPolicy):
     """The mean action of a trained actor, limited by the guard.

@@ -8,13 +8,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
+from jaxba.typing import register_pytree
 
 LARGEST = 1e32
 """Upper bound of every lambda. Source: Ceres' smallest trust-region radius 1e-32."""
@@ -27,7 +27,7 @@ def _scalar(value: Any, info: ProblemInfo) -> Array:
     return jnp.asarray(value, info.cost.dtype)
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Classic:
     """The paper's baseline: halve after a good step, double otherwise.
@@ -63,7 +63,7 @@ class _Growing(NamedTuple):
     growth: Float[Array, ""]  # factor after the next rejection
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Ceres:
     """Ceres' trust-region rule with radius 1 / lambda.
@@ -119,7 +119,7 @@ def nielsen() -> Ceres:
     return Ceres(initial=1e-5, shrink_ceiling=2 / 3, min_gain=0.0, minimum=SMALLEST, relative=1.0)
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Geometric:
     """Multiply by a constant after success, by another after a rejection."""
@@ -169,7 +169,7 @@ def theseus() -> Geometric:
     return Geometric(initial=1e-3, success=1 / 9, failure=11.0, minimum=1e-7, maximum=1e7, min_gain=0.1)
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Schedule:
     """Repeats a list of lambdas whatever happens; a list of one is a constant.

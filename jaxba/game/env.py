@@ -35,6 +35,7 @@ from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
+from jaxba.typing import register_pytree
 
 Reward = Literal["duration", "constant", "reduction", "reversed"]
 
@@ -104,7 +105,7 @@ class GameState(NamedTuple):
     key: Array
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Game:
     """A batch of environments; satisfies `protocol.Environment`."""

@@ -34,6 +34,7 @@ from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
 from jaxba.runtime.atomic import atomic_write
+from jaxba.typing import register_pytree
 
 MAX_SLOPE = 1.0
 """Limit of the derivative of log10(cost) with respect to the action for each scene, so that one diverging step does not
@@ -42,7 +43,7 @@ dominate a batch. A step with a non-finite cost counts as this limit, towards a 
 _DAMPING, _PRESENT = StepFeatures._fields.index("damping"), StepFeatures._fields.index("present")
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class ZeroNet:
     """A damping policy: a ReLU network from the last states, actions and rewards to one action."""

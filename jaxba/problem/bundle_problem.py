@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.problem.intrinsics import Lenses, checked_lenses
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 CAMERA_SIZE = 9
 """Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""
@@ -27,7 +26,7 @@ class ProblemError(ValueError):
     """Input that is no valid bundle adjustment problem. The message is one line for a person."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class BundleProblem:
     """Cameras, points and the pixels at which they were seen (BAL convention).

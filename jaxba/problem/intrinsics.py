@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 LENS_SIZE = 3
 """Numbers of a lens: f (pixels), k1, k2."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Lenses:
     """The lenses of a problem's cameras."""

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_matrix
 
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 CLUSTER_CAMERAS = 8
 """Cameras a cluster; larger where that would make more than `MAX_CLUSTERS`. On the real problems at hand 8 took as many
@@ -31,7 +30,7 @@ MAX_PRODUCTS = 2e7
 """Pairs of observations counted to find out which cameras share points; a second's work."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class ClusterLayout:
     """Which cluster a camera belongs to, and how the coarse system is summed."""

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from jaxtyping import Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 MAX_BAND_SHARE = 1 / 3
 """A band of `b` of `n` cameras is factored as one if `b / n` is below this. The two factorisations run at the same
@@ -27,7 +26,7 @@ TILE_CAMERAS = 11
 """Cameras factored at once. From 4 to 11 the time was the same, larger tiles waste operations on the band's edge."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Band:
     """The reduced camera system cut into tiles of `m` cameras, of which a row holds `span` up to the diagonal."""

@@ -9,14 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxba.structure.camera_ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, sorted_by, sum_tree
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 PAIR_CHUNKS = (4, 8)
 """Candidate numbers of pairs multiplied at once for a block of the reduced camera system."""
@@ -32,7 +31,7 @@ PAIR_ITEM_COST = 1.5
 """Cost of one partial 9 x 9 block, in pairs; decides between few long and many short chunks."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class PairLayout:
     """Which observations multiply into which block of the reduced camera system (lower triangle)."""

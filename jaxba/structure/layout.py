@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -29,13 +28,13 @@ from jaxba.structure.random_partitions import Partition, partition_layout
 from jaxba.structure.shared_intrinsics import LensTies, lens_ties
 from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 CAMERA_CHUNK = 8
 """Observations multiplied at once for a camera; the products are written out term by term, so it is a program size."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Layout:
     """A problem's observations in slot order, and how to sum them."""

@@ -22,7 +22,7 @@ from jaxba.structure.camera_clusters import cluster_members
 from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.louvain import camera_graph, clusterings
 from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 PARTITIONS = 16
 """Different partitions of a problem, used in turn."""
@@ -31,7 +31,7 @@ SEED = 0
 """Decides the clusterings: the same problem gets the same ones."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Partition:
     """One clustering, or several of them along a leading axis."""

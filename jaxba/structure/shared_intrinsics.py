@@ -9,20 +9,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.intrinsics import Lenses
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, register_pytree
 
 POSE_SIZE = 6
 """Unknowns of a camera that are its own: rotation and translation. Those of the lens follow."""
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class LensTies:
     """What a layout knows of lenses."""

@@ -6,11 +6,11 @@ saves checkpoints and logs between chunks.
 
 from __future__ import annotations
 
-import collections
 import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -22,9 +22,6 @@ from jaxba.training import sac as agent
 from jaxba.training.replay import Replay, Transition
 from jaxba.training.sac import Learner, SacConfig
 from jaxba.typing import LARGEST_COUNT
-
-TRACES: collections.Counter[str] = collections.Counter()
-"""How often each compiled function was traced in this process."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +65,7 @@ class LoopState(NamedTuple):
 def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions"]) -> tuple[LoopState, Step]:
     """One vector step, stored in the buffer. A truncated episode has discount 1 and its true last observation."""
     env_state, step = env.step(state.env_state, action)
+    _check_step(env, step)
     transitions = Transition(
         state.observation, action, step.reward, step.final_observation, 1.0 - jnp.asarray(step.terminated, jnp.float32)
     )
@@ -80,6 +78,16 @@ def _play(env: Environment, state: LoopState, action: Float[Array, "envs actions
     return after, step
 
 
+def _check_step(env: Environment, step: Step) -> None:
+    """Refuses an environment whose shapes are not those of the protocol, when it is traced: the buffer would broadcast.
+
+    Raises:
+        AssertionError: naming the shapes.
+    """
+    chex.assert_shape([step.observation, step.final_observation], (env.num_envs, env.observation_size))
+    chex.assert_shape([step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,))
+
+
 @functools.partial(jax.jit, static_argnames=("sac", "loop"))
 def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
     """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions.
@@ -90,9 +98,9 @@ def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> Loo
         env: a pytree; its arrays are traced.
         key: of all random numbers; the same key gives bitwise identical results on the same machine.
     """
-    TRACES["start"] += 1
     key, learner_key, reset_key, warmup_key = jax.random.split(key, 4)
     env_state, observation = env.reset(reset_key)
+    chex.assert_shape(observation, (env.num_envs, env.observation_size))
     zero = lambda: jnp.zeros((), jnp.int32)
     state = LoopState(
         learner=agent.init(sac, learner_key, env.observation_size, env.action_size),
@@ -129,7 +137,6 @@ def run_chunk(
         `action_std`; `episodes`, the number of episodes that ended, and `episode/NAME`, the mean of a metric of the
         environment over them (0 if none ended); `dropped`, transitions with numbers that are not finite.
     """
-    TRACES["run_chunk"] += 1
 
     def body(state: LoopState, _: None) -> tuple[LoopState, tuple[dict[str, Array], dict[str, Array], Array]]:
         key, act_key, sample_key = jax.random.split(state.key, 3)

@@ -9,6 +9,7 @@ import re
 import signal
 import stat
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,10 +18,10 @@ import pytest
 import support
 from support import solve
 
-from jaxba import StepOptions, read_bal, write_bal
+from jaxba import Refinement, SolveOptions, StepOptions, read_bal, write_bal
 from jaxba.bench.records import record_from_json
 from jaxba.cli import table
-from jaxba.cli.solve import run
+from jaxba.cli.solve import Arguments, run, solve_options
 from jaxba.problem import geometry
 from jaxba.problem.options import Coordinates
 
@@ -169,6 +170,21 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     assert run([str(tiny), "--method", "stba:3", "--policy", "stba", "--max-iterations", "2", "--log", str(log)]) == 0
     assert json.loads(log.read_text())["solver"] == "stba:3+stba"
     assert "method stba:3" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", ["learned", "ceres"])
+def test_left_out_options_are_those_of_a_solve_in_python(name):
+    policy, options = solve_options(Arguments(policy=name))
+    assert replace(options, refinement=None, coordinates=None) == SolveOptions()
+    assert options.step_options(policy) == SolveOptions().step_options(policy)
+
+
+def test_an_option_of_the_step_leaves_the_others_as_the_policy_was_trained():
+    _, trained = solve_options(Arguments())
+    _, turned = solve_options(Arguments(rotation="manifold", refine_points=2))
+    assert turned.coordinates == replace(trained.coordinates, rotation="manifold")
+    assert turned.refinement == Refinement(points=2)
+    assert replace(turned, coordinates=trained.coordinates, refinement=trained.refinement) == trained
 
 
 def test_fixed_intrinsics_are_bitwise_unchanged_and_the_rest_is_optimised(tiny, tmp_path):
@@ -401,6 +417,7 @@ BAD = {
     "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
     "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
     "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
+    "negative xtol": (lambda tiny: [str(tiny), "--xtol", "-1"], "--xtol must not be negative, is -1"),
     "loss without scale": (
         lambda tiny: [str(tiny), "--loss", "huber", "--loss-scale", "0"],
         "--loss-scale must be positive",

@@ -8,22 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from textbook_cg import PRECONDITIONERS, SIZE, by_hand, right, spd
 
 from jaxba.linear.conjugate_gradients import conjugate_gradients
 
-SIZE = 24
 ALWAYS = {"forcing": 0.0, "tolerance": 0.0}
 """Neither of the early stops."""
-
-
-def spd(condition: float, seed: int = 0) -> np.ndarray:
-    """A dense symmetric positive definite matrix with eigenvalues from 1 down to 1 / condition."""
-    basis = np.linalg.qr(np.random.default_rng(seed).normal(size=(SIZE, SIZE)))[0]
-    return basis * np.geomspace(1, 1 / condition, SIZE) @ basis.T
-
-
-def right(seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=(SIZE // 3, 3))
 
 
 @functools.partial(jax.jit, static_argnames=("forcing", "tolerance", "max_iterations"))
@@ -33,29 +23,6 @@ def run(matrix, b, inverse, *, forcing, tolerance, max_iterations):
     return conjugate_gradients(
         times(matrix), b, times(inverse), forcing=forcing, tolerance=tolerance, max_iterations=max_iterations
     )
-
-
-def by_hand(matrix, b, inverse, count: int) -> list[np.ndarray]:
-    """Iterates of textbook preconditioned conjugate gradients in NumPy."""
-    x, r = np.zeros(b.size), b.reshape(-1).copy()
-    p = z = inverse @ r
-    found = []
-    for _ in range(count):
-        q = matrix @ p
-        alpha = (r @ z) / (p @ q)
-        x, after = x + alpha * p, r - alpha * q
-        found.append(x)
-        z_after = inverse @ after
-        p = z_after + (after @ z_after) / (r @ z) * p
-        r, z = after, z_after
-    return found
-
-
-PRECONDITIONERS = {
-    "none": lambda a: np.eye(SIZE),
-    "diagonal": lambda a: np.diag(1 / np.diag(a)),
-    "blocks": lambda a: np.kron(np.eye(SIZE // 3), np.ones((3, 3))) * np.linalg.inv(a),
-}
 
 
 @pytest.mark.parametrize("kind", list(PRECONDITIONERS))

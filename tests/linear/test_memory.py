@@ -1,5 +1,3 @@
-from jaxba.problem.options import Refinement
-
 """What a step needs of the device's memory, by XLA's own account of the program it has made."""
 
 from dataclasses import replace
@@ -8,9 +6,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxba import StepOptions, initial_state, like, lm_step, random_scene
+from jaxba import Refinement, StepOptions, initial_state, like, lm_step, random_scene
 from jaxba.solver.cost_model import BYTES_PER_OBSERVATION
 from jaxba.structure.layout import layout_for
+
+pytestmark = pytest.mark.xla
 
 
 def bytes_per_observation(problem, options, dtype):

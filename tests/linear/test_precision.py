@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
+from support import solve
 
-import jaxba
 from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene
 from jaxba.problem import geometry
 from jaxba.structure.segment_sums import total
@@ -20,8 +20,7 @@ from jaxba.structure.segment_sums import total
 )
 def test_every_type_ends_at_the_cost_of_float64(linear_solver, dtype, gap):
     problem = random_scene(replace(like("random-150"), cameras=12, points=300, observations=1300), 3)
-    options = StepOptions(linear_solver=linear_solver)
-    exact, rough = (jaxba.solve(problem, options=options, dtype=name) for name in ("float64", dtype))
+    exact, rough = (solve(problem, linear_solver=linear_solver, dtype=name) for name in ("float64", dtype))
     assert exact.converged
     assert rough.converged
     assert exact.initial_cost > 2 * exact.final_cost
@@ -47,7 +46,7 @@ def test_a_mixed_step_is_the_full_one_up_to_its_forcing_term():
     layout = jax.tree.map(jnp.asarray, build_layout(problem))
     state = initial_state(layout, problem, StepOptions())
     full, _ = lm_step(layout, state, jnp.asarray(1e-2), StepOptions())
-    mixed, info = lm_step(layout, state, jnp.asarray(1e-2), StepOptions(algebra="mixed"))
+    mixed, info = lm_step(layout, state, jnp.asarray(1e-2), StepOptions(mixed_precision=True))
     moved = np.linalg.norm(np.asarray(full.cameras - state.cameras))
     assert np.linalg.norm(np.asarray(mixed.cameras - full.cameras)) < 1e-3 * moved
     assert mixed.cameras.dtype == jnp.float64

@@ -17,15 +17,14 @@ from jaxba.scenes import SceneConfig, random_scene
 from jaxba.structure.layout import layout_for
 
 EXACT = StepOptions()
-TO_THE_END = StepOptions(
-    linear_solver="implicit", conjugate_gradients=ConjugateGradients(forcing=0.0, tolerance=1e-12, max_iterations=3000)
-)
+UNTIL_NOTHING_CHANGES = ConjugateGradients(forcing=0.0, tolerance=1e-12, max_iterations=3000)
+TO_THE_END = StepOptions(linear_solver="implicit", conjugate_gradients=UNTIL_NOTHING_CHANGES)
 OPTIONS = {
     "explicit": EXACT,
     "sparse": replace(TO_THE_END, linear_solver="sparse"),
     "implicit": TO_THE_END,
     "schur-jacobi": replace(
-        TO_THE_END, conjugate_gradients=replace(TO_THE_END.conjugate_gradients, preconditioner="schur-jacobi")
+        TO_THE_END, conjugate_gradients=replace(UNTIL_NOTHING_CHANGES, preconditioner="schur-jacobi")
     ),
 }
 DAMPING = 1e-4
@@ -93,5 +92,5 @@ def test_two_levels_need_at_most_half_the_iterations_of_one():
     for name in ("sparse", "implicit"):
         two_level = int(taken(name, DAMPING)[2].cg_iterations)
         assert 0 < two_level <= one_level / 2
-    assert one_level < TO_THE_END.cg_max_iterations
+    assert one_level < UNTIL_NOTHING_CHANGES.max_iterations
     assert taken("explicit", DAMPING)[2].cg_iterations == 0

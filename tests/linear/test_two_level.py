@@ -19,17 +19,17 @@ from scipy.spatial.transform import Rotation
 
 from jaxba import BundleProblem, Loss, StepOptions, initial_state
 from jaxba.linear.preconditioners import diagonal_blocks, preconditioner
-from jaxba.linear.reduced_system import apply_reduced
 from jaxba.linear.schur import RotationCoordinates, camera_system, eliminate_points
 from jaxba.linear.two_level import MODES, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.model import camera
 from jaxba.model.linearize import linearize
-from jaxba.problem.options import Coordinates
+from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.runtime.process import single_blas_thread
 from jaxba.structure import camera_clusters
 from jaxba.structure.layout import layout_for
 
 MANIFOLD = StepOptions(linear_solver="implicit", coordinates=Coordinates(rotation="manifold"))
+IDENTITY = Coordinates(rotation="manifold", scaling="identity")
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -59,12 +59,7 @@ def part(problem: BundleProblem, cameras: int, points: int) -> BundleProblem:
 
 # cameras a cluster, problem, options, lambda
 CASES = {
-    "three-clusters": (
-        2,
-        support.tiny,
-        replace(MANIFOLD, coordinates=replace(MANIFOLD.coordinates, scaling="identity")),
-        1000.0,
-    ),
+    "three-clusters": (2, support.tiny, replace(MANIFOLD, coordinates=IDENTITY), 1000.0),
     "unseen-camera": (2, lambda: whitened(support.odd()), replace(MANIFOLD, loss=Loss("huber", 1.7)), 0.1),
     "more-clusters-than-points": (1, lambda: part(support.paper(0), 5, 2), MANIFOLD, 0.1),
     "two-cameras": (8, lambda: part(support.tiny(), 2, 40), MANIFOLD, 0.1),
@@ -115,8 +110,8 @@ def everything(layout, problem, damping, more, options: StepOptions):
     frames = camera.frames(state.cameras)
     anchor = Anchor(frames.rotation, frames.translation, state.points)
     modes = camera_modes(layout, anchor)
-    product = lambda x: apply_reduced(layout, linear, points, system, x)
-    apply = preconditioner(layout, linear, points, system, anchor, None, product, options)
+    rule = options.conjugate_gradients.preconditioner
+    apply = preconditioner(layout, linear, points, system, anchor, None, rule)
     unit = jnp.eye(9 * layout.num_cameras).reshape(-1, layout.num_cameras, 9)
     return (
         modes,
@@ -227,10 +222,7 @@ def test_clusters_sum_their_cameras():
 
 def test_a_layout_without_clusters_is_refused():
     problem = support.tiny()
-    layout = layout_for(
-        problem,
-        replace(MANIFOLD, conjugate_gradients=replace(MANIFOLD.conjugate_gradients, preconditioner="schur-jacobi")),
-    )
+    layout = layout_for(problem, replace(MANIFOLD, conjugate_gradients=ConjugateGradients("schur-jacobi")))
     with pytest.raises(ValueError, match="clusters=True"):
         everything(layout, problem, jnp.asarray(0.1), np.zeros((6, 9, 9)), MANIFOLD)
 

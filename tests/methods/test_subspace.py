@@ -1,4 +1,4 @@
-"""Remembered steps: against textbook conjugate gradients and dense algebra, and what a solve remembers."""
+"""Steps of earlier iterations: against textbook conjugate gradients and dense algebra, and which ones a solve keeps."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ import numpy as np
 import pytest
 import support
 from support import solve, start, step
-from test_cg import PRECONDITIONERS, SIZE, by_hand, right, spd
+from textbook_cg import PRECONDITIONERS, SIZE, by_hand, right, spd
 
-from jaxba import LMState, StepOptions, make_policy, random_scene
+from jaxba import LMState, StepOptions, make_method, make_policy, random_scene
+from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.methods.poba import PowerSeries
 from jaxba.methods.subspace import on_manifold, with_previous
 from jaxba.model import camera
 from jaxba.problem.options import ConjugateGradients, Refinement
 from jaxba.scenes import SceneConfig
 
+CUT_SHORT = GlobalConjugateGradients(ConjugateGradients(forcing=0.0, max_iterations=20))
 SERIES = StepOptions(method=PowerSeries(order=3), refinement=Refinement(previous_steps=2))
 
 combine = jax.jit(
@@ -29,7 +31,7 @@ combine = jax.jit(
 
 
 @pytest.mark.parametrize("kind", list(PRECONDITIONERS))
-def test_a_fixed_solver_and_one_remembered_step_are_conjugate_gradients(kind):
+def test_a_fixed_solver_and_one_previous_step_are_conjugate_gradients(kind):
     """Newton's iteration on one quadratic: each step a solver's, made the best one together with the last."""
     matrix, b = spd(1e3), right()
     inverse = PRECONDITIONERS[kind](matrix)
@@ -53,7 +55,7 @@ def test_it_is_the_minimum_over_the_span(count):
     np.testing.assert_allclose(basis.T @ (b.ravel() - matrix @ made), 0, atol=1e-10)
 
 
-def test_what_is_not_remembered_yet_and_steps_that_are_parallel_change_nothing():
+def test_missing_previous_steps_and_parallel_ones_change_nothing():
     matrix, b = spd(1e2), right()
     found = np.random.default_rng(0).normal(size=b.shape)
     alone = combine(matrix, b, found, np.zeros((0, *b.shape)))
@@ -79,7 +81,7 @@ def test_changes_of_the_file_are_turned_to_the_manifold():
         np.testing.assert_array_equal(turned[k, :, 3:], change[k, 3:].T)
 
 
-def test_accepted_changes_of_the_cameras_are_remembered_and_refused_ones_are_not():
+def test_accepted_changes_of_the_cameras_are_kept_and_refused_ones_are_not():
     problem = support.tiny()
     layout, first = start(problem, SERIES)
     np.testing.assert_array_equal(first.previous_steps, np.zeros((2, *first.cameras.shape)))
@@ -94,7 +96,7 @@ def test_accepted_changes_of_the_cameras_are_remembered_and_refused_ones_are_not
     np.testing.assert_array_equal(same.previous_steps, third.previous_steps)
 
 
-def test_a_step_with_remembered_ones_predicts_what_its_own_linear_model_says():
+def test_a_step_with_previous_ones_predicts_what_its_own_linear_model_says():
     problem, damping = support.tiny(), 1e-2
     layout, first = start(problem, SERIES)
     before, _ = step(layout, first, 1e-2, SERIES)
@@ -107,28 +109,24 @@ def test_a_step_with_remembered_ones_predicts_what_its_own_linear_model_says():
     assert np.linalg.norm(made - support.dense(there, SERIES, damping).step) > 1e-4 * np.linalg.norm(made)
 
 
-@pytest.mark.parametrize("solver", ["explicit", "implicit", "clustered", "decomposed"])
-def test_other_solvers_remember_nothing(solver):
-    problem, options = support.tiny(), StepOptions(linear_solver=solver, refinement=Refinement(previous_steps=1))
-    _, state = start(problem, options)
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"linear_solver": "implicit"}, {"method": make_method("stba")}, {"method": make_method("ddlm")}],
+    ids=["explicit", "implicit", "stba", "ddlm"],
+)
+def test_other_solvers_keep_no_steps(options):
+    _, state = start(support.tiny(), StepOptions(**options, refinement=Refinement(previous_steps=1)))
     assert isinstance(state, LMState)
     assert state.previous_steps is None
 
 
-@pytest.mark.parametrize("method", ["power", "normal"])
-def test_a_solver_that_remembers_converges_where_it_crawls_without(method):
+@pytest.mark.parametrize("method", [PowerSeries(), CUT_SHORT], ids=["poba", "deeplm"])
+def test_a_solver_that_keeps_a_step_converges_where_it_crawls_without(method):
     """A sequence of thirty cameras under Ceres' rule, conjugate gradients cut short; to the end of plain LM."""
     problem, ceres = random_scene(SceneConfig(30, 400, 1600), 0), make_policy("ceres")
     best = solve(problem, ceres, StepOptions(refinement=Refinement(points=3))).final_cost
-    options = StepOptions(
-        linear_solver=method,
-        refinement=Refinement(points=3),
-        conjugate_gradients=ConjugateGradients(forcing=0.0, max_iterations=20),
-    )
-    crawling, found = (
-        solve(problem, ceres, replace(options, refinement=replace(options.refinement, previous_steps=k)))
-        for k in (0, 1)
-    )
+    kept = lambda count: StepOptions(method=method, refinement=Refinement(points=3, previous_steps=count))
+    crawling, found = (solve(problem, ceres, kept(count)) for count in (0, 1))
     assert crawling.final_cost > best * (1 + 1e-3)
     assert found.termination.converged
     assert found.final_cost < best * (1 + 1e-4)

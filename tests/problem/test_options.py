@@ -6,35 +6,42 @@ import dataclasses
 
 import pytest
 
-from jaxba import Loss, StepOptions
-from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement
+from jaxba import ConjugateGradients, Coordinates, Loss, Refinement, StepOptions, make_method
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("kind", "change", "message"),
     [
-        ({"linear_solver": "dense"}, "linear_solver must be one of explicit"),
-        ({"linear_solver": "auto"}, "linear_solver must be one of explicit"),
-        ({"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
-        ({"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),
-        ({"refine_points": -1}, "refine_points must be at least 0"),
-        ({"camera_damping": 0.0}, "camera_damping must be positive and finite, is 0"),
-        ({"camera_damping": float("nan")}, "camera_damping must be positive and finite, is nan"),
-        ({"camera_damping": float("inf")}, "camera_damping must be positive and finite, is inf"),
-        ({"camera_rounds": -1}, "camera_rounds must be at least 0"),
-        ({"trials": 0}, "trials must be at least 1"),
-        ({"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
-        ({"intrinsics": "fixed", "linear_solver": "implicit"}, "intrinsics 'fixed' need the explicit solver"),
-        ({"cg_max_iterations": 0}, "cg_max_iterations must be at least 1"),
-        ({"cg_forcing": float("nan")}, "cg_forcing must not be negative, is nan"),
-        ({"cg_tolerance": -1.0}, "cg_tolerance must not be negative, is -1"),
-        ({"refine_points": 2.5}, "refine_points must be a whole number, is 2.5"),
-        ({"refine_points": 2**32}, "refine_points must be at most 2147483647"),
+        (StepOptions, {"linear_solver": "dense"}, "linear_solver must be one of explicit"),
+        (StepOptions, {"linear_solver": "auto"}, "linear_solver must be one of explicit"),
+        (StepOptions, {"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
+        (
+            StepOptions,
+            {"intrinsics": "fixed", "linear_solver": "implicit"},
+            "intrinsics 'fixed' need the explicit solver, not implicit",
+        ),
+        (StepOptions, {"intrinsics": "fixed", "method": make_method("poba")}, "explicit solver, not poba"),
+        (Coordinates, {"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
+        (Coordinates, {"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),
+        (Coordinates, {"lens_step": "zoom"}, "lens_step must be one of file, pixels, not 'zoom'"),
+        (Coordinates, {"camera_damping": 0.0}, "camera_damping must be positive and finite, is 0"),
+        (Coordinates, {"camera_damping": float("nan")}, "camera_damping must be positive and finite, is nan"),
+        (Coordinates, {"camera_damping": float("inf")}, "camera_damping must be positive and finite, is inf"),
+        (Refinement, {"points": -1}, "points must be at least 0"),
+        (Refinement, {"points": 2.5}, "points must be a whole number, is 2.5"),
+        (Refinement, {"points": 2**32}, "points must be at most 2147483647"),
+        (Refinement, {"starts": "anywhere"}, "starts must be one of step, rays, not 'anywhere'"),
+        (Refinement, {"camera_rounds": -1}, "camera_rounds must be at least 0"),
+        (Refinement, {"trials": 0}, "trials must be at least 1"),
+        (ConjugateGradients, {"preconditioner": "none"}, "preconditioner must be one of two-level"),
+        (ConjugateGradients, {"max_iterations": 0}, "max_iterations must be at least 1"),
+        (ConjugateGradients, {"forcing": float("nan")}, "forcing must not be negative, is nan"),
+        (ConjugateGradients, {"tolerance": -1.0}, "tolerance must not be negative, is -1"),
     ],
 )
-def test_an_option_that_makes_no_sense_is_one_clear_line(change, message, unchecked):
+def test_an_option_that_makes_no_sense_is_one_clear_line(kind, change, message, unchecked):
     with pytest.raises(ValueError, match=message) as caught:
-        StepOptions(**change)
+        kind(**change)
     assert "\n" not in str(caught.value)
 
 
@@ -57,18 +64,17 @@ def test_equal_options_are_one_key_and_different_ones_are_not():
 
 def test_options_cannot_change_under_a_compiled_program():
     with pytest.raises(dataclasses.FrozenInstanceError):
-        StepOptions().scaling = "identity"  # type: ignore[misc]
+        StepOptions().intrinsics = "fixed"  # type: ignore[misc]
 
 
 def test_the_defaults_are_those_of_ceres():
-    options = StepOptions()
-    assert (options.coordinates.scaling, options.coordinates.rotation, options.refinement.points) == (
-        "diagonal",
-        "angle-axis",
-        0,
-    )
-    assert (options.conjugate_gradients.forcing, options.conjugate_gradients.max_iterations, options.loss.name) == (
-        0.1,
-        500,
-        "squared",
-    )
+    assert Coordinates() == Coordinates(scaling="diagonal", camera_damping=1.0, rotation="angle-axis", lens_step="file")
+    rule = ConjugateGradients()
+    assert (rule.forcing, rule.tolerance, rule.max_iterations) == (0.1, 0.0, 500)
+    assert StepOptions().loss == Loss("squared")
+
+
+def test_the_default_is_a_plain_step():
+    assert Refinement() == Refinement(points=0, trials=1, camera_rounds=0, pattern_moves=0, previous_steps=0)
+    assert StepOptions().single_solve
+    assert StepOptions().kept_steps == 0

@@ -11,17 +11,6 @@ import pytest
 import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxba.refinement.trial import (
-    FORESEEN,
-    FREE,
-    GOOD_GAIN,
-    HOPELESS,
-    NEGLIGIBLE,
-    ROUNDS_OF_OTHERS,
-    SHORTER,
-    WITHIN_REACH,
-    best_trial,
-)
 from scipy.optimize import least_squares
 from support import same_bits, solve, start, step
 
@@ -34,8 +23,13 @@ from jaxba.lm.damped_step import solve_step
 from jaxba.model.linearize import cost, linearize
 from jaxba.problem import geometry
 from jaxba.problem.options import Coordinates, Refinement
-from jaxba.refinement import trial
+from jaxba.refinement import camera_rounds
+from jaxba.refinement.acceptance import NEGLIGIBLE
+from jaxba.refinement.backtracking import SHORTER
+from jaxba.refinement.camera_rounds import GOOD_GAIN, HOPELESS, ROUNDS_OF_OTHERS, WITHIN_REACH
 from jaxba.refinement.cameras import DAMPINGS, refine_cameras
+from jaxba.refinement.candidates import best_candidate
+from jaxba.refinement.pattern_move import FORESEEN, FREE
 from jaxba.refinement.subproblems import Whole
 
 pytestmark = pytest.mark.step
@@ -247,7 +241,7 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
     assert saved >= 3
 
 
-_best_trial = jax.jit(best_trial, static_argnames=("options", "min_gain"))
+_best_candidate = jax.jit(best_candidate, static_argnames=("options", "min_gain"))
 
 
 def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
@@ -255,7 +249,7 @@ def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
     linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
     whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(1e-3), PLAIN)
     mirrored = whole._replace(cameras=whole.cameras.at[6, 0].set(-1.5 * before.cameras[6, 0]))
-    found = lambda options: _best_trial(Whole(layout), *before[:3], linear.reference, mirrored, options, 0.0)
+    found = lambda options: _best_candidate(Whole(layout), *before[:3], linear.reference, mirrored, options, 0.0)
     plain, kept = found(PLAIN), found(SHORTER_ONLY)
     assert plain.cameras[6, 0] < 0
     assert kept.share == 1
@@ -310,10 +304,10 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
 def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatch):
     """What one round and two leave shows who is to have the next; limits in the middle of these, so that some are."""
     scenes = wide()
-    monkeypatch.setattr(trial, "HOPELESS", np.inf)
+    monkeypatch.setattr(camera_rounds, "HOPELESS", np.inf)
 
     def repaired(rounds: int, *limits: float) -> tuple[np.ndarray, np.ndarray]:
-        monkeypatch.setattr(trial, "WITHIN_REACH", limits)
+        monkeypatch.setattr(camera_rounds, "WITHIN_REACH", limits)
         options = StepOptions(refinement=Refinement(camera_rounds=rounds))
         once = jax.jit(lambda layout, before: lm_step(layout, before, jnp.asarray(BOLD), options)[1])
         infos = [once(*scene) for scene in scenes]
@@ -349,7 +343,7 @@ def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
     assert better >= 1
 
 
-def test_a_promise_too_small_to_matter_is_tried_once():
+def test_a_predicted_decrease_too_small_to_matter_is_tried_once():
     """At such a lambda the step promises next to nothing; refused, it is refused at full length."""
     layout, before = start(turned(2, 0.3))
     for damping, tries in ((1e12, 1), (1e-3, 4)):

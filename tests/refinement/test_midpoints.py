@@ -9,41 +9,41 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from support import solve
-from test_retriangulate import solved, strayed, thrown
+from support import solve, solved, strayed, thrown
 
 from jaxba import BundleProblem, Loss, StepOptions, build_layout, initial_state, lm_step
 from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
 from jaxba.problem.options import Refinement
-from jaxba.refinement import trial
+from jaxba.refinement import acceptance
 from jaxba.refinement.midpoints import better_starts, midpoints, refine_from_starts
-from jaxba.refinement.points import Home, refine_points
+from jaxba.refinement.points import PreviousPoints, refine_points
 
 LOSS = Loss()
 
 
 @functools.partial(jax.jit, static_argnames=("loss",))
 def _starts(layout, cameras, before, points, loss):
-    home = Home.of(layout, before, linearize(layout, cameras, before, loss).inverse_depth)
-    return better_starts(layout, slot_frames(layout, cameras), points, loss, home)
+    previous = PreviousPoints.of(layout, before, linearize(layout, cameras, before, loss).inverse_depth)
+    return better_starts(layout, slot_frames(layout, cameras), points, loss, previous)
 
 
 def _there(layout, cameras, before):
-    return slot_frames(layout, cameras), Home.of(layout, before, linearize(layout, cameras, before, LOSS).inverse_depth)
+    depths = linearize(layout, cameras, before, LOSS).inverse_depth
+    return slot_frames(layout, cameras), PreviousPoints.of(layout, before, depths)
 
 
 @jax.jit
 def _refined(layout, cameras, before, start):
     """Points and costs, stacked."""
-    frames, home = _there(layout, cameras, before)
-    return jnp.concatenate([(found := refine_points(layout, frames, start, LOSS, 3, home))[0], found[1][None]])
+    frames, previous = _there(layout, cameras, before)
+    return jnp.concatenate([(found := refine_points(layout, frames, start, LOSS, 3, previous))[0], found[1][None]])
 
 
 @jax.jit
 def _from_starts(layout, cameras, before, points, starts):
-    frames, home = _there(layout, cameras, before)
-    found = refine_from_starts(layout, frames, points, LOSS, 3, home, starts)
+    frames, previous = _there(layout, cameras, before)
+    found = refine_from_starts(layout, frames, points, LOSS, 3, previous, starts)
     return jnp.concatenate([found[0], found[1][None]])
 
 
@@ -165,8 +165,8 @@ def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
     args = build_layout(home), np.asarray(home.cameras).T, *[in_layout(home, points)] * 2
     options, damping = StepOptions(refinement=Refinement(points=3, starts="rays")), jnp.asarray(1e12)
     costs = {}
-    for limit, both in ((trial.LITTLE_LEFT, True), (0.0, False)):
-        monkeypatch.setattr(trial, "LITTLE_LEFT", limit)
+    for limit, both in ((acceptance.LITTLE_LEFT, True), (0.0, False)):
+        monkeypatch.setattr(acceptance, "LITTLE_LEFT", limit)
         once = jax.jit(lambda layout, state: lm_step(layout, state, damping, options)[1])
         info = once(args[0], initial_state(args[0], problem, options))
         assert info.predicted < 1e-3 * info.previous_cost

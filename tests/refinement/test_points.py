@@ -6,7 +6,6 @@ A step with a lambda of 1e30 moves no camera and no point by itself, so that all
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 
 import jax
 import numpy as np
@@ -20,7 +19,7 @@ from jaxba import BundleProblem, Loss, StepOptions, read_bal
 from jaxba.model.linearize import linearize, slot_frames
 from jaxba.problem import geometry
 from jaxba.problem.options import Refinement
-from jaxba.refinement.points import FARTHEST, LITTLE, Home, refine_points
+from jaxba.refinement.points import FARTHEST, LITTLE, PreviousPoints, refine_points
 
 pytestmark = pytest.mark.step
 
@@ -149,7 +148,7 @@ def test_points_whose_rays_are_parallel_stay_finite():
     problem = BundleProblem.create(
         [camera, camera], points, rng.normal(scale=80, size=(12, 2)), np.tile([0, 1], 6), np.repeat(np.arange(6), 2)
     )
-    options = replace(StepOptions(), refinement=replace(StepOptions().refinement, points=3))
+    options = StepOptions(refinement=Refinement(points=3))
     layout, before = start(problem, options)
     for damping in (STILL, 1e-2, 1e-8, 1e-16):
         after, info = step(layout, before, damping, options)
@@ -178,34 +177,37 @@ def mirrored(problem: BundleProblem, which: np.ndarray) -> BundleProblem:
 
 
 @functools.partial(jax.jit, static_argnames=("loss", "iterations"))
-def _at_home(layout, state, points, loss, iterations):
-    home = Home.of(layout, state.points, linearize(layout, state.cameras, state.points, loss).inverse_depth)
-    return refine_points(layout, slot_frames(layout, state.cameras), points, loss, iterations, home)
+def _refined_after(layout, state, points, loss, iterations):
+    """Points that a step took from those of the state to `points`, after point iterations."""
+    previous = PreviousPoints.of(
+        layout, state.points, linearize(layout, state.cameras, state.points, loss).inverse_depth
+    )
+    return refine_points(layout, slot_frames(layout, state.cameras), points, loss, iterations, previous)
 
 
-def test_points_that_a_step_sent_behind_a_camera_start_again_from_home():
+def test_points_that_a_step_sent_behind_a_camera_start_again_from_previous():
     problem, lost = support.tiny(), np.arange(0, 40, 3)
     layout, state = start(problem)
     assert (depths(problem) > 0).all()
     elsewhere = mirrored(problem, lost)
     assert (depths(elsewhere) < 0).any()
     _, there = start(elsewhere)
-    from_home, _ = _at_home(layout, state, state.points, Loss(), 3)
-    found, costs = _at_home(layout, state, there.points, Loss(), 3)
-    np.testing.assert_allclose(found, from_home, rtol=1e-9)
+    from_previous, _ = _refined_after(layout, state, state.points, Loss(), 3)
+    found, costs = _refined_after(layout, state, there.points, Loss(), 3)
+    np.testing.assert_allclose(found, from_previous, rtol=1e-9)
     assert np.isfinite(costs).all()
 
 
-def test_points_that_the_step_left_in_front_do_not_start_from_home():
+def test_points_that_the_step_left_in_front_do_not_start_from_previous():
     problem, lost = support.tiny(), np.arange(0, 40, 3)
     layout, state = start(problem)
     moved = problem.replace(points=np.array(problem.points) + 0.3)
     _, there = start(moved)
     _, both = start(mirrored(moved, lost))
-    apart, _ = _at_home(layout, state, there.points, Loss(), 1)
-    mixed, _ = _at_home(layout, state, both.points, Loss(), 1)
-    at_home, _ = _at_home(layout, state, state.points, Loss(), 1)
-    came_back = (np.asarray(mixed) == np.asarray(at_home)).all(axis=0)
+    apart, _ = _refined_after(layout, state, there.points, Loss(), 1)
+    mixed, _ = _refined_after(layout, state, both.points, Loss(), 1)
+    at_previous, _ = _refined_after(layout, state, state.points, Loss(), 1)
+    came_back = (np.asarray(mixed) == np.asarray(at_previous)).all(axis=0)
     stayed = (np.asarray(mixed) == np.asarray(apart)).all(axis=0)
     real = [(point == problem.points).all(axis=1).any() for point in np.asarray(state.points).T]
     assert (came_back ^ stayed)[real].all()
@@ -235,7 +237,7 @@ def parallel(seed: int) -> BundleProblem:
 def settled(problem: BundleProblem, iterations: int) -> BundleProblem:
     """The problem with its points after point iterations alone."""
     layout, state = start(problem)
-    found, _ = _at_home(layout, state, state.points, Loss(), iterations)
+    found, _ = _refined_after(layout, state, state.points, Loss(), iterations)
     order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     points = np.array(problem.points)
     real = order < problem.num_points
@@ -265,31 +267,31 @@ def test_points_that_the_step_brought_from_behind_to_the_front_stay_there():
     layout, there = start(problem)
     _, state = start(mirrored(problem, np.arange(problem.num_points)))
     points = np.asarray(state.points).T
-    alone = _at_home(layout, there, there.points, Loss(), 2)[0]
-    came = _at_home(layout, there._replace(points=state.points), there.points, Loss(), 2)[0]
+    alone = _refined_after(layout, there, there.points, Loss(), 2)[0]
+    came = _refined_after(layout, there._replace(points=state.points), there.points, Loss(), 2)[0]
     assert not np.allclose(points.T, there.points)
     np.testing.assert_array_equal(came, alone)
 
 
-def test_a_point_that_the_step_took_far_away_starts_again_from_home():
+def test_a_point_that_the_step_took_far_away_starts_again_from_previous():
     problem = support.tiny()
     layout, state = start(problem)
     centre = np.mean([-Rotation.from_rotvec(c[:3]).inv().apply(c[3:6]) for c in problem.cameras], axis=0)
-    at_home, _ = _at_home(layout, state, state.points, Loss(), 1)
+    at_previous, _ = _refined_after(layout, state, state.points, Loss(), 1)
     real = [(point == problem.points).all(axis=1).any() for point in np.asarray(state.points).T]
     for times, came_back in ((3e3, True), (3.0, False)):
         points = centre + times * (np.asarray(problem.points) - centre)
         moved = problem.replace(points=points)
         assert ((nearness(moved) < nearness(problem) / FARTHEST) == came_back).all()
         _, there = start(moved)
-        found, _ = _at_home(layout, state, there.points, Loss(), 1)
-        assert ((np.asarray(found) == np.asarray(at_home)).all(axis=0)[real] == came_back).all()
+        found, _ = _refined_after(layout, state, there.points, Loss(), 1)
+        assert ((np.asarray(found) == np.asarray(at_previous)).all(axis=0)[real] == came_back).all()
 
 
 @needs_data
 @pytest.mark.slow
 def test_points_of_a_street_stay_in_front_of_their_cameras():
-    """kittistereo00s: without a home the same solve ended at 2952 with 61 observations behind."""
+    """kittistereo00s: without a previous place to return to, it ended at 2952 with 61 observations behind."""
     folder = bal_file("x").parent.parent / "bal-converted"
     problem = read_bal(folder / "kittistereo00s-77-15638-pre.txt.bz2")
     solution = solve(problem, "learned")

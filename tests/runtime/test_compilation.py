@@ -10,10 +10,10 @@ import jax
 import numpy as np
 import pytest
 import support
-from jax import monitoring
+from compilations import Compilations
 from support import solve
 
-from jaxba import SceneConfig, Termination, random_scene, solve_and_retriangulate
+from jaxba import SceneConfig, SolveOptions, Termination, random_scene, solve_and_retriangulate
 from jaxba.cli.solve import run
 from jaxba.io import write_problem
 from jaxba.lm.step import lm_step, propose, try_step
@@ -33,9 +33,6 @@ from jaxba.runtime.compilation import (
 )
 
 pytestmark = pytest.mark.step
-
-PROGRAM = "/jax/core/compile/backend_compile_duration"
-"""What JAX calls the compilation of a program by XLA."""
 
 on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU has lower levels")
 
@@ -68,15 +65,15 @@ def test_this_jaxlib_knows_the_options_of_both_lower_levels():
 @pytest.mark.parametrize(
     "how",
     [
-        {"damping": "ceres"},
-        {"damping": "learned"},
-        {"damping": "learned", "method": "stba"},
-        {"damping": "learned", "method": "ddlm"},
-        {"damping": "learned", "method": "deeplm"},
-        {"damping": "learned", "linear_solver": "sparse"},
-        {"damping": "learned", "linear_solver": "implicit"},
-        {"damping": "ceres", "method": "poba"},
-        {"damping": "learned", "pad": True},
+        {"policy": "ceres"},
+        {"policy": "learned"},
+        {"policy": "learned", "method": "stba"},
+        {"policy": "learned", "method": "ddlm"},
+        {"policy": "learned", "method": "deeplm"},
+        {"policy": "learned", "linear_solver": "sparse"},
+        {"policy": "learned", "linear_solver": "implicit"},
+        {"policy": "ceres", "method": "poba"},
+        {"policy": "learned", "pad": True},
     ],
     ids=str,
 )
@@ -109,22 +106,7 @@ def test_a_solve_compiled_at_level_medium_is_the_same_solve(how, monkeypatch):
     np.testing.assert_allclose(medium.history.cost, full.history.cost, rtol=1e-8)
 
 
-class Compilations:
-    """Names of the programs that JAX compiles while it is open."""
-
-    def __enter__(self):
-        self.names = []
-        monitoring.register_event_duration_secs_listener(self._listen)
-        return self
-
-    def _listen(self, event, duration, **facts):
-        if event == PROGRAM:
-            self.names.append(facts.get("fun_name", "").removeprefix("jit(").removesuffix(")"))
-
-    def __exit__(self, *_):
-        monitoring.unregister_event_duration_listener(self._listen)
-
-
+@pytest.mark.xla
 @pytest.mark.parametrize(
     "how",
     [{"compilation": "full"}, {"compilation": "quick", "dtype": "float32"}, {"compilation": "quick", "method": "ddlm"}],
@@ -138,7 +120,7 @@ def test_every_program_is_compiled_once_before_the_first_iteration(how):
         solved = solve(problem, "learned", **how, max_iterations=4, callback=watch)
     assert solved.iterations == 4
     assert late == [len(seen.names)] * 4
-    step = ["lm_step"] if how.get("method") == "ddlm" else ["try_step", "propose"]
+    step = ["lm_step"] if how.get("method") == "ddlm" else ["propose", "try_step"]
     assert sorted(name for name in seen.names if name in ("lm_step", "try_step", "propose")) == step
     assert seen.names.count("_advance_and_tell") == 1
 
@@ -219,6 +201,7 @@ def test_the_optimised_program_takes_over_and_the_records_go_on(watched, monkeyp
         assert times[-1] <= mixed.total_s
 
 
+@pytest.mark.xla
 @on_a_cpu
 def test_a_second_quick_solve_compiles_nothing_and_each_level_has_its_program():
     assert len({program(propose, "options", level=level) for level in get_args(Level)}) == 3
@@ -237,9 +220,7 @@ def test_a_callback_stops_a_quick_solve():
 
 @on_a_cpu
 def test_iterations_of_alternating_solves_are_added():
-    turns = solve_and_retriangulate(
-        support.tiny(), "ceres", StepOptions(refinement=Refinement(points=3)), compilation="quick"
-    )
+    turns = solve_and_retriangulate(support.tiny(), "ceres", SolveOptions(compilation="quick"))
     assert turns.quick_iterations == turns.iterations
 
 
@@ -257,7 +238,7 @@ def test_an_unknown_choice_is_refused_in_one_line(unchecked):
 def test_the_command_reports_iterations_of_lower_levels(tmp_path, capsys, monkeypatch):
     path = tmp_path / "tiny.txt"
     write_problem(support.tiny(), path)
-    fast = [str(path), "--max-iterations", "3", "--damping", "ceres", "--ftol", "0"]
+    fast = [str(path), "--max-iterations", "3", "--policy", "ceres", "--ftol", "0"]
     assert run(fast) == 0
     assert " (all with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out
     assert run([*fast, "--compilation", "full"]) == 0

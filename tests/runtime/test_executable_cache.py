@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
+from compilations import Compilations
 from jax.experimental.compilation_cache import compilation_cache
 from support import solve
-from test_compilation import Compilations
 
-from jaxba import make_policy
+from jaxba import Loss, make_policy
 from jaxba.io import write_problem
 from jaxba.lm.step import try_step
 from jaxba.problem.options import Refinement, StepOptions
@@ -27,7 +27,10 @@ from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import ParallelCompilation, Stage, compile_and_run, program
 from jaxba.solver.retriangulate import retriangulate
 
-pytestmark = pytest.mark.skipif(jax.default_backend() != "cpu", reason="tried on a CPU alone")
+pytestmark = [
+    pytest.mark.xla,
+    pytest.mark.skipif(jax.default_backend() != "cpu", reason="tried on a CPU alone"),
+]
 
 
 @pytest.fixture(autouse=True)
@@ -82,16 +85,16 @@ def call(x, power=1):
 @pytest.mark.parametrize(
     "how",
     [
-        {"damping": "learned", "compilation": "auto"},
-        {"damping": "ceres", "dtype": "mixed"},
-        {"damping": "learned", "dtype": "float32"},
-        {"damping": "learned", "method": "stba"},
-        {"damping": "learned", "method": "ddlm"},
-        {"damping": "learned", "method": "deeplm"},
-        {"damping": "learned", "linear_solver": "sparse"},
-        {"damping": "ceres", "linear_solver": "implicit"},
-        {"damping": "ceres", "method": "poba"},
-        {"damping": "learned", "pad": True},
+        {"policy": "learned", "compilation": "auto"},
+        {"policy": "ceres", "dtype": "mixed"},
+        {"policy": "learned", "dtype": "float32"},
+        {"policy": "learned", "method": "stba"},
+        {"policy": "learned", "method": "ddlm"},
+        {"policy": "learned", "method": "deeplm"},
+        {"policy": "learned", "linear_solver": "sparse"},
+        {"policy": "ceres", "linear_solver": "implicit"},
+        {"policy": "ceres", "method": "poba"},
+        {"policy": "learned", "pad": True},
     ],
     ids=str,
 )
@@ -217,12 +220,13 @@ def test_everything_that_changes_a_program_changes_its_file(folder, monkeypatch)
         (double, {"power": lambda: 0}, 1.0),
         (double, {"power": Choice()}, 1.0),
         (double, {"power": (1, Choice())}, 1.0),
+        (double, {"power": StepOptions(loss=Loss(abs))}, 1.0),
         (double, {"power": 1}, Rule(1.0)),
         (double, {"power": 1}, [Rule(1.0)]),
         (call, {"power": 1}, 1.0),
         (lambda x: x, {}, 1.0),
     ],
-    ids=["builtin", "lambda", "class", "inside", "tree", "in a tree", "function", "nameless"],
+    ids=["builtin", "lambda", "class", "inside", "loss", "tree", "in a tree", "function", "nameless"],
 )
 def test_programs_with_code_of_other_packages_are_not_stored(function, static, argument, folder):
     assert executable_cache.ExecutableCache(folder).path_for(function, static, (argument,)) is None

@@ -91,6 +91,7 @@ def test_a_dependency_leaves_the_value_as_it_is():
     assert np.isnan(computed_after(first[1:], value)).all()
 
 
+@pytest.mark.xla
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
 def test_unfused_computation_is_a_branch_of_its_own():
     """XLA fuses nothing into a branch: one kernel becomes two and a conditional."""
@@ -162,6 +163,7 @@ def test_trees_of_vectors_are_taken_as_operands():
         np.testing.assert_allclose(row, truth, rtol=1e-14, atol=1e-15)
 
 
+@pytest.mark.xla
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
 def test_many_vectors_come_out_of_one_loop():
     """As a reduction with as many results as there are vectors; one by one each has its own loop."""
@@ -194,6 +196,7 @@ def test_fast_compilation_is_traced_anew():
     assert seen == [False, True]
 
 
+@pytest.mark.xla
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="what XLA does on a CPU")
 def test_a_single_vector_is_no_sum():
     """XLA hands a sum of one operand to a library, with its operand stored for both halves."""

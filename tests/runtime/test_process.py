@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
+from support import solve, tiny
 
-import jaxba
 from jaxba.runtime import process
 
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux reports the mappings of a process")
@@ -20,6 +20,7 @@ def mappings() -> int:
     return len(Path("/proc/self/maps").read_text().splitlines())
 
 
+@pytest.mark.xla
 @linux
 def test_programs_are_dropped_near_the_limit_and_only_there():
     @jax.jit
@@ -38,19 +39,19 @@ def test_programs_are_dropped_near_the_limit_and_only_there():
 def test_dropping_programs_gives_their_mappings_back():
     process.release_programs(share=0.0)
     before = mappings()
-    jaxba.solve(jaxba.random_scene(jaxba.like("tiny"), 0), "ceres", max_iterations=1)  # some 500
+    solve(tiny(), max_iterations=1)  # some 500
     during = mappings()
     assert process.release_programs(share=0.0)
     assert mappings() - before < 0.5 * (during - before)
 
 
 def test_only_a_solve_that_compiled_checks_the_mappings(monkeypatch):
-    problem, called = jaxba.random_scene(jaxba.like("tiny"), 0), []
+    called = []
     monkeypatch.setattr(process, "release_programs", lambda: called.append(1))
     jax.clear_caches()
-    jaxba.solve(problem, "ceres", max_iterations=2)
+    solve(tiny(), max_iterations=2)
     assert len(called) == 1
-    jaxba.solve(problem, "ceres", max_iterations=2)
+    solve(tiny(), max_iterations=2)
     assert len(called) == 1
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -10,45 +10,22 @@ import pytest
 import support
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from support import published_loss, same_bits
+from support import published_loss, same_bits, solve, solve_options, solved, strayed, thrown
 
+import jaxba
 from jaxba import (
     BundleProblem,
     Loss,
     ProblemError,
-    StepOptions,
+    Refinement,
+    Solution,
+    SolveOptions,
     Termination,
     Tolerances,
     retriangulate,
-    solve,
     solve_and_retriangulate,
 )
 from jaxba.problem import geometry
-from jaxba.problem.options import Refinement
-
-TIGHT = Tolerances(ftol=1e-12)
-
-
-@functools.cache
-def solved() -> BundleProblem:
-    """`tiny` at its minimum."""
-    return solve(support.tiny(), "ceres", tolerances=TIGHT).problem
-
-
-def strayed(factor: float, every: int = 5) -> BundleProblem:
-    """Every fifth point at a multiple of its distance from the first camera that sees it."""
-    problem, points = solved(), np.array(solved().points)
-    centers = geometry.camera_centers(problem.cameras)
-    for point in range(0, len(points), every):
-        center = centers[problem.camera_index[np.argmax(problem.point_index == point)]]
-        points[point] = center + factor * (points[point] - center)
-    return problem.replace(points=points)
-
-
-def thrown(seed: int, size: float) -> BundleProblem:
-    """All points far from where they belong."""
-    noise = np.random.default_rng(seed).normal(size=solved().points.shape)
-    return solved().replace(points=solved().points + size * noise)
 
 
 def point_costs(problem: BundleProblem, loss: Loss) -> np.ndarray:
@@ -126,6 +103,7 @@ def test_units_and_axes_of_the_scene_do_not_matter():
     np.testing.assert_allclose(two.cost_after, one.cost_after, rtol=1e-6)
 
 
+@pytest.mark.xla
 def test_a_second_problem_of_equal_shape_compiles_nothing():
     events = []
     retriangulate(strayed(2.0))
@@ -152,7 +130,7 @@ def test_a_cost_that_is_not_finite_is_refused():
 # In turns with the solve
 
 
-STRANDING = "ceres", StepOptions(refinement=Refinement(points=3))
+STRANDING = solve_options(refinement=Refinement(points=3))
 """A step that leaves a point in the valley where it is; `learned` looks where its rays meet."""
 
 
@@ -161,15 +139,24 @@ def one_astray() -> BundleProblem:
     return strayed(-3.0, every=40)
 
 
+def in_turns(options: SolveOptions = STRANDING, **heard) -> Solution:
+    """That point, searched for in turns with the solve."""
+    return solve_and_retriangulate(one_astray(), "ceres", options, **heard)
+
+
+def no_search(_) -> None:
+    pytest.fail("a search")
+
+
 def test_a_step_that_asks_the_rays_finds_the_point_by_itself():
     np.testing.assert_allclose(solve(one_astray(), "learned").final_cost, geometry.cost(solved()), rtol=1e-6)
-    assert solve(one_astray(), *STRANDING).final_cost > 1.1 * geometry.cost(solved())
+    assert jaxba.solve(one_astray(), "ceres", STRANDING).final_cost > 1.1 * geometry.cost(solved())
 
 
 def test_turns_end_lower_than_the_solve_alone_and_count_through():
-    start, heard, searches = one_astray(), [], []
-    alone = solve(start, *STRANDING)
-    both = solve_and_retriangulate(start, *STRANDING, callback=heard.append, on_search=searches.append)
+    heard, searches = [], []
+    alone = jaxba.solve(one_astray(), "ceres", STRANDING)
+    both = in_turns(callback=heard.append, on_search=searches.append)
     assert both.converged
     assert alone.converged
     assert both.final_cost < alone.final_cost / 1.1
@@ -190,13 +177,13 @@ def test_turns_end_lower_than_the_solve_alone_and_count_through():
 def test_where_there_is_nothing_to_find_it_is_the_solve():
     problem = support.tiny()
     watched = solve(problem, "ceres", callback=lambda record: None)  # of two programs, as it is
-    assert same_bits(solve_and_retriangulate(problem, "ceres").problem, watched.problem)
+    assert same_bits(solve_and_retriangulate(problem, "ceres", solve_options()).problem, watched.problem)
 
 
 def test_all_iterations_together_keep_the_limit():
-    alone = solve(one_astray(), *STRANDING)
+    alone = jaxba.solve(one_astray(), "ceres", STRANDING)
     for more in (0, 1):
-        both = solve_and_retriangulate(one_astray(), *STRANDING, max_iterations=alone.iterations + more)
+        both = in_turns(replace(STRANDING, max_iterations=alone.iterations + more))
         assert both.iterations == alone.iterations + more
         assert both.converged == (more == 0)
     assert both.termination == Termination.MAX_ITERATIONS
@@ -204,37 +191,28 @@ def test_all_iterations_together_keep_the_limit():
 
 
 def test_a_stop_by_the_callback_ends_all_of_it():
-    stopped = solve_and_retriangulate(
-        one_astray(),
-        *STRANDING,
-        callback=lambda record: record.iteration == 2,
-        on_search=lambda _: pytest.fail("a search"),
-    )
+    stopped = in_turns(callback=lambda record: record.iteration == 2, on_search=no_search)
     assert stopped.termination == Termination.STOPPED
     assert stopped.iterations == 2
-    last = solve(one_astray(), *STRANDING).iterations
-    converged = solve_and_retriangulate(
-        one_astray(),
-        *STRANDING,
-        callback=lambda record: record.iteration == last,
-        on_search=lambda _: pytest.fail("a search"),
-    )
+    last = jaxba.solve(one_astray(), "ceres", STRANDING).iterations
+    converged = in_turns(callback=lambda record: record.iteration == last, on_search=no_search)
     assert converged.termination == Termination.COST
     assert converged.iterations == last
 
 
 def test_the_search_counts_the_loss_of_the_solve():
-    searches, options = [], StepOptions(loss=Loss("cauchy", 2.0))
-    found = solve_and_retriangulate(support.tiny(), "ceres", options, on_search=searches.append)
-    np.testing.assert_allclose(searches[0].cost_before, point_costs(found.problem, options.loss).sum(), rtol=1e-9)
+    searches, loss = [], Loss("cauchy", 2.0)
+    found = solve_and_retriangulate(support.tiny(), "ceres", solve_options(loss=loss), on_search=searches.append)
+    np.testing.assert_allclose(searches[0].cost_before, point_costs(found.problem, loss).sum(), rtol=1e-9)
     assert searches[0].cost_before < 0.95 * geometry.cost(found.problem)
 
 
 def test_what_does_not_pay_is_dropped():
     """With a tolerance so wide that no search pays, the solve alone is what comes back."""
-    searches, wide = [], Tolerances(ftol=0.5)
-    both = solve_and_retriangulate(one_astray(), *STRANDING, tolerances=wide, on_search=searches.append)
+    searches, wide = [], replace(STRANDING, tolerances=Tolerances(ftol=0.5))
+    both = in_turns(wide, on_search=searches.append)
     (search,) = searches
     assert search.moved > 0
     assert not search.pays(0.5)
-    assert same_bits(both.problem, solve(one_astray(), *STRANDING, tolerances=wide, callback=lambda _: None).problem)
+    watched = jaxba.solve(one_astray(), "ceres", wide, callback=lambda _: None)
+    assert same_bits(both.problem, watched.problem)

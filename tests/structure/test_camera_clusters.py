@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 
-from jaxba import BundleProblem, Layout, build_layout
-from jaxba.problem.options import StepOptions
+from jaxba import BundleProblem, ConjugateGradients, Layout, StepOptions, build_layout, make_method
 from jaxba.structure import camera_clusters
 from jaxba.structure.camera_clusters import CLUSTER_CAMERAS, ClusterLayout, agglomerate, shared_points
 from jaxba.structure.layout import layout_for
@@ -196,6 +195,6 @@ def test_clusters_are_made_only_where_the_two_level_preconditioner_is_asked_for(
     made = lambda **changes: layout_for(problem, StepOptions(**changes)).clusters is not None
     assert made(linear_solver="sparse")
     assert made(linear_solver="implicit")
-    assert not made(linear_solver="implicit", preconditioner="schur-jacobi")
+    assert not made(linear_solver="implicit", conjugate_gradients=ConjugateGradients("schur-jacobi"))
     assert not made(linear_solver="explicit")
-    assert not made(linear_solver="power")
+    assert not made(method=make_method("deeplm"))

@@ -11,6 +11,7 @@ import pytest
 import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import solve
 from test_layout import blocks_by_brute_force, blocks_by_layout, problem_of, rows_of, rows_of_problem, sum_by_levels
 
 from jaxba import (
@@ -21,7 +22,6 @@ from jaxba import (
     build_layout,
     initial_state,
     random_scene,
-    solve,
     solve_loop,
 )
 from jaxba.paper.subproblem import sub_problem
@@ -74,9 +74,9 @@ def shapes(tree) -> list:
     return [jax.tree.structure(tree), *((x.shape, x.dtype) for x in jax.tree.leaves(tree))]
 
 
-def stepwise(problem, damping="ceres", options=None, **settings):
+def stepwise(problem, policy="ceres", options=None, **settings):
     """A solve step by step: the compiled step is shared by policies."""
-    return solve(problem, damping, options, callback=lambda record: None, **settings)
+    return solve(problem, policy, options, callback=lambda record: None, **settings)
 
 
 BATCHES = st.sampled_from([3, 40, 2048])
@@ -264,11 +264,11 @@ def test_in_mixed_arithmetic_it_is_the_same_to_float32():
     check_same(padded, plain, rtol=float(np.finfo(np.float32).eps))
 
 
-@pytest.mark.parametrize("damping", ["learned", "classic", "nielsen"])
-def test_policies_see_the_true_problem(damping):
+@pytest.mark.parametrize("policy", ["learned", "classic", "nielsen"])
+def test_policies_see_the_true_problem(policy):
     """The learned one observes numbers of cameras, points and observations."""
     problem = windows(1)[0]
-    check_same(stepwise(problem, damping, pad=True), stepwise(problem, damping))
+    check_same(stepwise(problem, policy, pad=True), stepwise(problem, policy))
 
 
 def test_a_band_is_factored_dense_to_the_same_end():
@@ -308,6 +308,7 @@ def compilations(run) -> int:
     return len(events)
 
 
+@pytest.mark.xla
 @pytest.mark.parametrize("run", [solve, stepwise])
 @pytest.mark.parametrize("dense", [False, True], ids=["pairs", "dense product"])
 def test_another_problem_of_the_same_cell_compiles_nothing(run, dense):
@@ -319,6 +320,7 @@ def test_another_problem_of_the_same_cell_compiles_nothing(run, dense):
     assert again(pad=False) > 0
 
 
+@pytest.mark.xla
 def test_a_program_is_the_same_text_for_every_problem_of_a_cell():
     """So that a persistent cache, which goes by the text, serves the next process too."""
     texts = set()

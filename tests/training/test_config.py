@@ -44,7 +44,7 @@ def test_what_is_written_reads_as_the_same_configuration(name, tmp_path):
 
 def test_policies_for_lambda_alone_learn_as_the_default_and_differ_in_the_step():
     step = ("min_gain", "refine_points", "trials", "camera_rounds", "pattern_moves", "camera_damping")
-    step += ("lens_step", "point_starts", "remembered_steps")
+    step += ("lens_step", "point_starts", "previous_steps")
     plain, driver = load("plain"), load("driver")
     assert settings.differences(load("default"), plain) == [f"game.agent.{name}" for name in step]
     assert settings.differences(plain, driver) == ["game.agent.camera_damping"]

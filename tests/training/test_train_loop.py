@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import toys
 
+from jaxba.game.protocol import Step
 from jaxba.training import sac
 from jaxba.training.sac import SacConfig
-from jaxba.training.train_loop import TRACES, LoopConfig, LoopState, run_chunk, start
+from jaxba.training.train_loop import LoopConfig, LoopState, run_chunk, start
 
 GAMMA = 0.8
 TWIN = SacConfig(
@@ -175,16 +178,31 @@ def test_the_warm_up_holds_the_demonstrations() -> None:
 
 
 def test_compiles_once() -> None:
-    start.clear_cache()
-    run_chunk.clear_cache()
-    before = TRACES.copy()
+    once = functools.partial(jax.jit, static_argnames=("sac", "loop"))
+    begin, chunk = (once(chex.assert_max_traces(function.__wrapped__, n=1)) for function in (start, run_chunk))
     for seed, slope in enumerate((1.0, 2.0, -1.0)):  # other numbers, other keys, several chunks: the same program
         game = dataclasses.replace(toys.SEEN, slope=slope)
-        state = start(LEARNS, SHORT, game, jax.random.key(seed))
+        state = begin(LEARNS, SHORT, game, jax.random.key(seed))
         for _ in range(3):
-            state, _ = run_chunk(LEARNS, SHORT, game, state)
-    assert TRACES - before == {"start": 1, "run_chunk": 1}
+            state, _ = chunk(LEARNS, SHORT, game, state)
     assert int(state.updates) == 3 * 5 * 2
+
+
+@dataclasses.dataclass(frozen=True)
+class OneRewardForAll(toys.Toy):
+    """A mistake: a reward that would be broadcast over all environments."""
+
+    def step(self, state: Any, action: jax.Array) -> tuple[Any, Step]:
+        after, step = super().step(state, action)
+        return after, step._replace(reward=step.reward[:1])
+
+
+jax.tree_util.register_dataclass(OneRewardForAll)
+
+
+def test_an_environment_of_other_shapes_than_the_protocols_is_refused(unchecked) -> None:
+    with pytest.raises(AssertionError, match="shape"):
+        start(LEARNS, SHORT, OneRewardForAll(), jax.random.key(0))
 
 
 def test_a_state_that_was_played_on_is_given_away_and_its_memory_used_again() -> None:

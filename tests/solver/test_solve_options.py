@@ -1,0 +1,121 @@
+"""The one table of defaults: what is asked for, what a policy brings, and what the command does with it."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import fields
+
+import pytest
+import support
+
+import jaxba
+from jaxba import (
+    Coordinates,
+    Loss,
+    ProblemError,
+    Refinement,
+    SceneConfig,
+    SolveOptions,
+    Tolerances,
+    make_policy,
+    prepare,
+)
+from jaxba.cli.solve import Arguments, run, solve_options
+from jaxba.damping.policy import trained_step
+from jaxba.io import read_problem, write_problem
+
+# Defaults
+
+
+def test_every_default_of_the_command_is_that_of_the_options():
+    command, options = Arguments(), SolveOptions()
+    plain = {field.name for field in fields(Arguments)} & {field.name for field in fields(SolveOptions)} - {"loss"}
+    for name in plain:
+        assert getattr(command, name) == getattr(options, name), name
+    assert command.preconditioner == options.conjugate_gradients.preconditioner
+    assert (command.loss, command.loss_scale) == (options.loss.name, options.loss.scale)
+    assert (command.ftol, command.xtol, command.gtol) == options.tolerances[:3]
+    assert options.refinement is command.refine_points is None
+    assert options.coordinates is command.scaling is command.rotation is None
+    grouped = {"conjugate_gradients", "loss", "tolerances", "refinement", "coordinates"}
+    assert {field.name for field in fields(SolveOptions)} == plain | grouped
+
+
+def test_the_command_asks_for_the_same_step():
+    policy, options = solve_options(Arguments())
+    assert options.step_options(policy) == SolveOptions().step_options(make_policy("learned"))
+
+
+@pytest.mark.parametrize("function", [jaxba.solve, jaxba.solve_and_retriangulate, jaxba.prepare])
+def test_who_chooses_lambda_is_the_same_everywhere(function):
+    assert inspect.signature(function).parameters["policy"].default == Arguments().policy == "learned"
+
+
+def test_a_solve_with_defaults_is_what_the_command_writes(tmp_path):
+    start, written, expected = (tmp_path / name for name in ("start.txt", "written.txt", "expected.txt"))
+    write_problem(support.tiny(), start)
+    assert run([str(start), "--output", str(written)]) == 0
+    write_problem(jaxba.solve(read_problem(start)).problem, expected)
+    assert written.read_bytes() == expected.read_bytes()
+
+
+# What a policy was trained with
+
+
+def test_a_loss_leaves_the_step_that_the_policy_was_trained_with():
+    trained = trained_step(make_policy("learned"))
+    assert trained.refinement != Refinement()
+    found = prepare(support.tiny(), SolveOptions(loss=Loss("huber", 2.0)), policy="learned").options
+    assert found.loss == Loss("huber", 2.0)
+    assert (found.refinement, found.coordinates) == (trained.refinement, trained.coordinates)
+
+
+def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
+    trained, loss = trained_step(make_policy("learned")), Loss("huber", 2.0)
+    spelled_out = SolveOptions(loss=loss, refinement=trained.refinement, coordinates=trained.coordinates)
+    found, expected = (jaxba.solve(support.tiny(), "learned", o) for o in (SolveOptions(loss=loss), spelled_out))
+    assert support.same_bits(found.history, expected.history)
+
+
+def test_what_is_asked_for_wins_over_what_the_policy_was_trained_with():
+    refinement, coordinates = Refinement(points=1, trials=2), Coordinates(camera_damping=0.5, rotation="manifold")
+    trained = trained_step(make_policy("learned"))
+    one = prepare(support.tiny(), SolveOptions(refinement=refinement)).options
+    assert (one.refinement, one.coordinates) == (refinement, trained.coordinates)
+    other = prepare(support.tiny(), SolveOptions(coordinates=coordinates)).options
+    assert (other.refinement, other.coordinates) == (trained.refinement, coordinates)
+
+
+def test_a_rule_brings_a_plain_step():
+    found = prepare(support.tiny(), policy="ceres").options
+    assert (found.refinement, found.coordinates) == (Refinement(), Coordinates())
+
+
+# What is refused
+
+
+@pytest.mark.parametrize("asked", [{"linear_solver": "explicit"}, {"intrinsics": "fixed"}], ids=str)
+def test_a_factorisation_that_does_not_fit_the_memory_is_refused(asked, monkeypatch):
+    scene = jaxba.random_scene(SceneConfig(cameras=50, points=500, observations=2000), 0)
+    monkeypatch.setattr("os.sysconf", lambda name: 1000)  # 1000 pages of 1000 bytes
+    with pytest.raises(ProblemError, match="50 cameras take some 0 GB to solve by a factorisation"):
+        jaxba.solve(scene, "ceres", SolveOptions(**asked))
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"dtype": "float16"}, "dtype must be one of float64, float32, mixed, not 'float16'"),
+        ({"linear_solver": "power"}, "linear_solver must be one of auto, explicit, sparse, implicit, not 'power'"),
+        ({"compilation": "fast"}, "compilation must be one of"),
+        ({"max_iterations": 0}, "max_iterations must be at least 1"),
+        ({"tolerances": Tolerances(xtol=-1.0)}, "xtol must not be negative, is -1"),
+    ],
+)
+def test_options_are_checked_where_they_are_made(asked, message, unchecked):
+    with pytest.raises(ValueError, match=message):
+        SolveOptions(**asked)
+
+
+def test_options_are_hashable_so_that_they_can_be_keys():
+    assert len({SolveOptions(), SolveOptions(), SolveOptions(method="poba"), SolveOptions(loss=Loss("huber"))}) == 3
