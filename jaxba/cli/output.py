@@ -62,4 +62,4 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
     common.print_line(f"wrote {output}")
     if lost:
-        common.print_line(f"note: that file has no place for: {lost}")
+        common.print_line(f"note: that file cannot store: {lost}")

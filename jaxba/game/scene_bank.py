@@ -25,7 +25,7 @@ from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.game.warm_starts import warm_starts
 from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
-from jaxba.problem.options import Intrinsics, Refinement, StepOptions
+from jaxba.problem.options import Intrinsics, Refinement, StepOptions, check_count
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose lowest cost is the best known one, each with point iterations."""
@@ -122,6 +122,7 @@ class BankConfig:
     def __post_init__(self) -> None:
         if len(self.classes) != len(self.scenes) or not self.classes:
             raise ValueError(f"{len(self.classes)} classes of scenes but {len(self.scenes)} numbers of scenes")
+        check_count("refine_points", self.refine_points, 0)
         if min(self.scenes) < 1:
             raise ValueError("every class needs at least one scene")
         if not 0 <= self.warm_share <= 1:

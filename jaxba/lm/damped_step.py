@@ -88,9 +88,8 @@ def solve_step(
         solved = solve_reduced(layout, linear, eliminated, reduced, anchor, options, forcing)
         solution = MethodStep(solved[0], None, solved[1], residual_orthogonal=True)
     else:
-        system = DampedSystem(layout, linear, eliminated, reduced, damping)
-        method = cast(StepMethod, options.method)
-        solution = method.solve(system, options, forcing, iteration, cameras, previous)
+        system = DampedSystem(layout, linear, eliminated, reduced, damping, cameras, iteration, forcing, previous)
+        solution = cast(StepMethod, options.method).solve(system, options)
     manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
     point_step = solution.points
     if point_step is None:

@@ -25,6 +25,11 @@ class DampedSystem(NamedTuple):
     points: PointSystem
     cameras: CameraSystem
     damping: Float[Array, ""]  # lambda
+    parameters: Float[Array, "9 cameras"]  # current cameras
+    iteration: int | Int[Array, ""]  # number of the iteration, from 0
+    forcing: float | Float[Array, ""]  # forcing term of truncated conjugate gradients, where they are used
+    # last changes of the cameras, newest first; None unless they are part of the search space
+    previous_steps: Float[Array, "steps 9 cameras"] | None
 
 
 class MethodStep(NamedTuple):
@@ -57,24 +62,12 @@ class Round(NamedTuple):
 class StepMethod(MethodTraits, Protocol):
     """A method that solves the damped linear system in its own way."""
 
-    def solve(
-        self,
-        system: DampedSystem,
-        options: StepOptions,
-        forcing: float | Float[Array, ""],
-        iteration: int | Int[Array, ""],
-        parameters: Float[Array, "9 cameras"],
-        previous: Float[Array, "steps 9 cameras"] | None,
-    ) -> MethodStep:
+    def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """The camera step, and the point step if the method computes it too.
 
         Args:
             system: the damped system.
             options: static options of the step.
-            forcing: forcing term of truncated conjugate gradients, if the method uses them.
-            iteration: number of the iteration, from 0.
-            parameters: current cameras.
-            previous: last changes of the cameras, newest first; None unless they are part of the search space.
         """
         ...
 

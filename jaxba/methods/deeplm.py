@@ -51,21 +51,12 @@ class GlobalConjugateGradients:
         """See `Method`."""
         return replace(base, method=self)
 
-    def solve(
-        self,
-        system: DampedSystem,
-        options: StepOptions,
-        forcing: float | Float[Array, ""],
-        iteration: int | Int[Array, ""],
-        parameters: Float[Array, "9 cameras"],
-        previous: Float[Array, "steps 9 cameras"] | None,
-    ) -> MethodStep:
+    def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
         rule = self.conjugate_gradients
-        step, points, iterations = solve_normal(*system[:4], rule, forcing)
-        if previous is not None:
-            # no point step: it follows by back-substitution
-            step, points = best_in_span(system, step, parameters, previous), None
+        step, points, iterations = solve_normal(*system[:4], rule, system.forcing)
+        if system.previous_steps is not None:
+            step, points = best_in_span(system, step), None  # the point step follows by back-substitution
         return MethodStep(step, points, iterations, True)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxba.linear.preconditioners import block_inverse
 from jaxba.linear.schur import CameraSystem, apply_reduced
@@ -50,22 +50,15 @@ class PowerSeries:
         """See `Method`."""
         return replace(base, method=self)
 
-    def solve(
-        self,
-        system: DampedSystem,
-        options: StepOptions,
-        forcing: float | Float[Array, ""],
-        iteration: int | Int[Array, ""],
-        parameters: Float[Array, "9 cameras"],
-        previous: Float[Array, "steps 9 cameras"] | None,
-    ) -> MethodStep:
+    def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
         product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
         inverse = block_inverse(system.cameras.blocks)
         step = series(product, system.cameras, inverse, system.cameras.right, self.order)
-        if previous is not None:
-            step = best_in_span(system, step, parameters, previous)
-        return MethodStep(step, None, jnp.asarray(self.order, jnp.int32), previous is not None)
+        improved = system.previous_steps is not None
+        if improved:
+            step = best_in_span(system, step)
+        return MethodStep(step, None, jnp.asarray(self.order, jnp.int32), improved)
 
 
 def series(

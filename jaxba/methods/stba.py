@@ -22,7 +22,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxba.linear.cholesky import MIN_UNKNOWNS, factor_and_solve
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
@@ -78,18 +78,10 @@ class StochasticClusters:
         """See `Method`."""
         return replace(base, method=self)
 
-    def solve(
-        self,
-        system: DampedSystem,
-        options: StepOptions,
-        forcing: float | Float[Array, ""],
-        iteration: int | Int[Array, ""],
-        parameters: Float[Array, "9 cameras"],
-        previous: Float[Array, "steps 9 cameras"] | None,
-    ) -> MethodStep:
+    def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
-        partition = partition_of(system.layout).at(iteration)
-        step = clustered_step(*system, partition, options, self.repairs)
+        partition = partition_of(system.layout).at(system.iteration)
+        step = clustered_step(*system[:5], partition, options, self.repairs)
         return MethodStep(step, None, jnp.zeros((), jnp.int32), False)
 
 

@@ -31,25 +31,23 @@ RIDGE = 64.0
 """Machine epsilons added to the unit diagonal of the scaled Gram matrix, whose vectors may be nearly parallel."""
 
 
-def best_in_span(
-    system: DampedSystem,
-    step: Float[Array, "cameras 9"],
-    parameters: Float[Array, "9 cameras"],
-    previous: Float[Array, "steps 9 cameras"],
-) -> Float[Array, "cameras 9"]:
-    """The minimum of the damped linear model over the span of a camera step and of previous changes of the cameras.
+def best_in_span(system: DampedSystem, step: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
+    """The minimum of the damped linear model over the span of a camera step and of the previous steps of the system.
 
     Args:
-        system: the damped system, points eliminated.
+        system: the damped system, points eliminated, with previous steps; these are zero where there are none yet.
         step: the inexact step, in manifold coordinates.
-        parameters: current cameras.
-        previous: last changes of the camera parameters, newest first; zeros where there are none yet.
 
     Returns:
         A camera step in manifold coordinates.
+
+    Raises:
+        ValueError: the system has no previous steps.
     """
+    if system.previous_steps is None:
+        raise ValueError("this system has no previous steps")
     product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
-    return with_previous(product, system.cameras.right, step, on_manifold(parameters, previous))
+    return with_previous(product, system.cameras.right, step, on_manifold(system.parameters, system.previous_steps))
 
 
 def with_previous(
