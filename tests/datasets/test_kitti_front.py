@@ -482,7 +482,7 @@ def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys, features):
 @pytest.mark.slow
 def test_bundle_adjustment_ends_within_a_hundredth_of_the_real_drive_of_the_truth(tmp_path, capsys):
     """200 frames, 145 m with a right turn, by the three commands of the documentation. Odometry has begun 0.6 to 3.4 m
-    from the truth, by version and machine; the lowest cost, under Ceres too, lies at 1.0 to 1.3 m (docs/kitti.md)."""
+    from the truth, by version and machine; the lowest cost, under Ceres too, lies at 1.0 to 1.3 m."""
     assert DATA is not None
     root = Path(DATA) / "kitti"
     out, solved, poses = tmp_path / "k.txt.bz2", tmp_path / "s.txt.bz2", str(root / "poses" / "00.txt")
