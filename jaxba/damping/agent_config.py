@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
-from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions
+from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions, check_count
 
 Observation = Literal["scale-free", "paper", "duration"]
 GuardMode = Literal["off", "hand-over"]
@@ -108,6 +108,7 @@ class AgentConfig:
             raise ValueError(f"escalate must be 0 to {LARGEST_ESCALATION:g}, is {self.escalate}")
         if self.effort != "fixed" and not self.refine_points:
             raise ValueError(f"effort {self.effort!r} needs embedded point iterations to choose from: refine_points")
+        check_count("refine_points", self.refine_points, 0)
         self.step_options(StepOptions())
 
     def step_options(self, options: StepOptions) -> StepOptions:

@@ -127,6 +127,7 @@ class BankConfig:
             raise ValueError("every class needs at least one scene")
         if not 0 <= self.warm_share <= 1:
             raise ValueError(f"warm_share must be 0 to 1, is {self.warm_share}")
+        check_count("refine_points", self.refine_points, 0)
         _ = self.options  # raises ValueError if impossible
 
 

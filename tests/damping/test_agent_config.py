@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxba import StepOptions
+from jaxba import ConjugateGradients, StepOptions
 from jaxba.damping.agent_config import AgentConfig, config_from
 
 
@@ -40,10 +40,14 @@ configs = st.builds(
 @given(configs)
 def test_a_configuration_comes_back_from_its_numbers(config):
     assert config_from(asdict(config)) == config
-    made = config.step_options(StepOptions(cg_forcing=0.2))
-    own = "refine_points", "trials", "camera_rounds", "pattern_moves", "camera_damping", "lens_step", "point_starts"
-    assert [getattr(made, name) for name in own] == [getattr(config, name) for name in own]
-    assert made.cg_forcing == 0.2
+    made = config.step_options(StepOptions(conjugate_gradients=ConjugateGradients(forcing=0.2)))
+    assert made.conjugate_gradients.forcing == 0.2
+    refinement, coordinates = made.refinement, made.coordinates
+    assert (refinement.points, refinement.starts) == (config.refine_points, config.point_starts)
+    same = "trials", "camera_rounds", "pattern_moves", "previous_steps"
+    assert [getattr(refinement, name) for name in same] == [getattr(config, name) for name in same]
+    same = "camera_damping", "lens_step"
+    assert [getattr(coordinates, name) for name in same] == [getattr(config, name) for name in same]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from safetensors.numpy import save_file
 from support import same_bits, solve
 
 import jaxba
-from jaxba import METHODS, StepOptions, like, make_policy, random_scene, solve_loop
+from jaxba import METHODS, SolveOptions, StepOptions, like, make_policy, random_scene, solve_loop
 from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
@@ -280,16 +280,17 @@ def test_the_path_of_a_policy_is_a_name(tmp_path, folder):
 def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     policy, options = parse_solver("learned").build()
     assert same_bits(policy.layers, load_policy(shipped["learned"]).layers)
-    rounds = AGENT.camera_rounds
-    own = StepOptions(coordinates=Coordinates(lens_step="pixels"))
-    embedded = {"refine_points": 2, "trials": 3, "camera_rounds": rounds, "pattern_moves": 1, "point_starts": "rays"}
-    assert options == replace(own, **embedded, refinement=replace(own.refinement, previous_steps=3))
+    coordinates = Coordinates(lens_step="pixels")
+    embedded = Refinement(2, "rays", trials=3, camera_rounds=AGENT.camera_rounds, pattern_moves=1, previous_steps=3)
+    assert options == SolveOptions(refinement=embedded, coordinates=coordinates)
     policy, options = parse_solver("learned+refine0").build()
     assert same_bits(policy.layers, load_policy(shipped["learned-plain"]).layers)
-    assert options == own
-    assert parse_solver("learned+refine3").build()[1] == replace(own, refinement=replace(own.refinement, points=3))
-    assert parse_solver("ceres+refine3").build()[1] == StepOptions(refinement=Refinement(points=3))
-    assert parse_solver("ceres+embedded").build()[1] == AgentConfig().step_options(StepOptions())
+    assert options == SolveOptions(refinement=Refinement(), coordinates=coordinates)
+    assert parse_solver("learned+refine3").build()[1] == replace(options, refinement=Refinement(points=3))
+    options = parse_solver("ceres+refine3").build()[1]
+    assert options == SolveOptions(refinement=Refinement(points=3), coordinates=Coordinates())
+    policy, options = parse_solver("ceres+embedded").build()
+    assert options.step_options(policy) == AgentConfig().step_options(StepOptions())
 
 
 def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
@@ -325,7 +326,7 @@ def test_the_camera_damping_of_a_policys_training_goes_with_it_whatever_the_poin
     path = tmp_path / "mine.safetensors"
     trained = random_policy(5)
     save_policy(path, replace(trained, config=replace(trained.config, camera_damping=0.01)))
-    assert SolverName(str(path), refine).build()[1].camera_damping == 0.01
+    assert SolverName(str(path), refine).build()[1].coordinates.camera_damping == 0.01
 
 
 @pytest.mark.slow
