@@ -1,1 +1,1 @@
-"""Command-line programs. Modules import JAX and other slow packages only after the arguments have been checked."""
+"""Command-line programs, one module each, and the code that they share."""

@@ -1,4 +1,4 @@
-"""The files of `jaxba-solve`: whether they can be written is checked before the solve."""
+"""Output files of `jaxba-solve`: checks before the solve, and writing."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from jaxba.io.files import strip_compression
 from jaxba.problem.bundle_problem import BundleProblem
 
 FILE_ENDINGS = (".txt", ".bal", ".ply")
-"""Endings by which the output of a COLMAP model is a file and no model, besides those of compression."""
+"""If the output has one of these endings, or one of compression, a COLMAP model is written as a single file."""
 
 
 def is_model(output: str, source: str | None) -> bool:
-    """Whether the output is the folder of a COLMAP model: what has no ending of a file, where the problem is a model.
+    """Whether the output is written as a COLMAP model: the problem is one, and the output has no ending of a file.
 
     Args:
-        output: where to write.
-        source: path of the problem; None if it has none.
+        output: path of the output.
+        source: path of the problem; None for a random scene.
     """
     if source is None or not Path(source).is_dir():
         return False
@@ -28,10 +28,10 @@ def is_model(output: str, source: str | None) -> bool:
 
 
 def check_outputs(output: str | None, log: str | None, source: str | None) -> None:
-    """Refuses what could not be written later, or would replace something else.
+    """Checks that the output files can be written and differ from each other and from the problem.
 
     Raises:
-        UsageError, ProblemError: in one line.
+        UsageError, ProblemError: they cannot; the message is one line.
     """
     if output and is_model(output, source):
         common.check_folder("--output", output)
@@ -46,10 +46,10 @@ def check_outputs(output: str | None, log: str | None, source: str | None) -> No
 
 
 def write_solution(output: str, problem: BundleProblem, source: str | None) -> None:
-    """Writes the solution, and says so.
+    """Writes the solution, and prints what was written and what the file format cannot store.
 
     Raises:
-        UsageError: it could not be written.
+        UsageError: the solution cannot be written.
     """
     lost = ""
     try:

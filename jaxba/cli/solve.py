@@ -51,7 +51,7 @@ DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
 """Description of the scene that is solved if no problem is given."""
 
 OPTION_OF_FIELD = {"points": "refine_points", "scale": "loss_scale"}
-"""Options that are not called as the field that they fill."""
+"""Fields of options whose command-line option has another name."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def solver_name(args: Arguments) -> SolverName:
 
 
 def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
-    """The policy and the options that the arguments ask for.
+    """The policy and the options for the arguments.
 
     Raises:
         UsageError: a number out of range, or options that do not go together; the message names the option.
@@ -183,16 +183,16 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
             pad=args.pad,
             compilation=args.compilation,
         )
-        options.step_options(policy)  # refuses what does not go together
+        options.step_options(policy)  # raises an error for incompatible options
         return policy, options
     except ValueError as error:
-        if type(error) is not ValueError:  # a subclass has a message for a person
+        if type(error) is not ValueError:  # subclasses have messages that need no option name
             raise
         raise common.UsageError(_about_option(str(error))) from None
 
 
 def _about_option(message: str) -> str:
-    """The message of an options class, which begins with the name of a field, about the option for that field."""
+    """A message that begins with the name of a field, with that name replaced by the command-line option."""
     field, _, rest = message.partition(" ")
     option = OPTION_OF_FIELD.get(field, field)
     return f"--{option.replace('_', '-')} {rest}" if hasattr(Arguments, option) else message
@@ -232,7 +232,7 @@ def _solve(args: Arguments) -> int:
 def _iterate(
     args: Arguments, problem: BundleProblem, policy: DampingPolicy, options: SolveOptions
 ) -> tuple[Solution, list[IterationRecord]]:
-    """Solves, and prints every iteration; the first Ctrl-C stops after the present one."""
+    """Solves, and prints every iteration. The first Ctrl-C stops after the current iteration."""
     steps: list[IterationRecord] = []
     with Interrupt("iteration", graceful=True) as interrupt:
 

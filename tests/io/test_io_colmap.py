@@ -220,7 +220,7 @@ def test_a_name_with_a_dot_is_a_folder_and_a_file_says_what_it_lacks(tmp_path, c
     folder = write(model_of(["PINHOLE"]), tmp_path / "model")
     assert run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "refined.v2")]) == 0
     assert (tmp_path / "refined.v2" / "cameras.bin").is_file()
-    assert "has no place" not in capsys.readouterr().out
+    assert "cannot store" not in capsys.readouterr().out
     assert run([str(folder), "--max-iterations", "2", "--output", str(tmp_path / "flat.txt.gz")]) == 0
     lost = "which images share a lens, which numbers of a lens stay as they are, weights of observations"
     assert f"note: that file cannot store: {lost}\n" in capsys.readouterr().out
