@@ -134,6 +134,7 @@ def test_the_effort_of_the_last_step_is_observed():
 # Policies
 
 
+@pytest.mark.slow
 def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_one_does(tmp_path):
     """In both loops of a solve, and after it was written to a file and read."""
     config = replace(POINTS, guard="off")
@@ -180,6 +181,7 @@ def test_an_iteration_is_paid_by_the_point_iterations_that_the_action_chose():
     assert game.demonstrate(state, jax.random.key(1)).shape == (6, 2)
 
 
+@pytest.mark.slow
 def test_an_iteration_is_paid_by_its_conjugate_gradients_where_the_action_chooses_the_forcing_term():
     config = replace(RULES, agent=replace(BOTH, guard="off", refine_points=1))
     game = make_game(config, [KIND], [tiny_bank()], [4], StepOptions(method=GlobalConjugateGradients()))

@@ -181,6 +181,7 @@ def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera,
     assert sorted(p.name for p in tmp_path.iterdir()) == ["problem.frames.json", "problem.txt.bz2", "problem.work"]
 
 
+@pytest.mark.slow
 def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     """jaxba-kitti, jaxba-solve and jaxba-kitti evaluate, one after the other."""
     out, solved, folder = tmp_path / "p.txt", tmp_path / "solved.txt.gz", tmp_path / "eval"

@@ -27,6 +27,7 @@ def test_every_type_ends_at_the_cost_of_float64(linear_solver, dtype, gap):
     assert geometry.cost(rough.problem) == pytest.approx(exact.final_cost, rel=gap)
 
 
+@pytest.mark.slow
 def test_one_dense_product_and_chosen_pairs_make_the_same_step():
     problem = support.tiny()
     steps = []

@@ -120,6 +120,7 @@ def test_other_solvers_keep_no_steps(options):
     assert state.previous_steps is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [PowerSeries(), CUT_SHORT], ids=["poba", "deeplm"])
 def test_a_solver_that_keeps_a_step_converges_where_it_crawls_without(method):
     """A sequence of thirty cameras under Ceres' rule, conjugate gradients cut short; to the end of plain LM."""

@@ -404,6 +404,7 @@ def test_a_refused_step_is_not_followed():
     assert refused.repairs == 0
 
 
+@pytest.mark.slow
 def test_pattern_moves_make_no_step_worse_and_a_crawl_shorter():
     """A large lambda throughout, whose steps crawl."""
     problem = turned(2, 0.2)

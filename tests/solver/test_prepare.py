@@ -38,7 +38,7 @@ def test_a_loop_of_steps_written_by_hand_is_the_solve():
     check_same(prepared.problem_at(state), solution)
 
 
-@pytest.mark.parametrize("policy", ["ceres", "learned"])
+@pytest.mark.parametrize("policy", ["ceres", pytest.param("learned", marks=pytest.mark.slow)])
 def test_the_compiled_loop_is_the_solve(policy):
     solution = jaxba.solve(support.tiny(), policy, OPTIONS)
     prepared = prepare(support.tiny(), OPTIONS, policy=policy)

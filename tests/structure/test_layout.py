@@ -86,7 +86,7 @@ def rows_of_problem(problem: BundleProblem) -> Counter:
 # Slots
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(tracks_and_cameras, st.integers(0, 3))
 def test_every_observation_is_in_exactly_one_slot(case, duplicates):
     problem = problem_of(*case, seed=0, duplicates=duplicates)

@@ -264,7 +264,7 @@ def test_in_mixed_arithmetic_it_is_the_same_to_float32():
     check_same(padded, plain, rtol=float(np.finfo(np.float32).eps))
 
 
-@pytest.mark.parametrize("policy", ["learned", "classic", "nielsen"])
+@pytest.mark.parametrize("policy", [pytest.param("learned", marks=pytest.mark.slow), "classic", "nielsen"])
 def test_policies_see_the_true_problem(policy):
     """The learned one observes numbers of cameras, points and observations."""
     problem = windows(1)[0]
