@@ -41,7 +41,7 @@ LIMIT = 25
 # Scenes
 
 LARGE = pytest.param(SceneClass(40, 400), marks=pytest.mark.slow, id="large")
-"""The largest that issue 3 names; forty of them are 600,000 slots."""
+"""A large class of scenes; forty of them are 600,000 slots."""
 
 
 @pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper"), LARGE])
@@ -193,7 +193,7 @@ def test_scenes_of_a_class_share_random_clusters(method):
 
 @pytest.mark.slow
 def test_scenes_whose_clusters_have_trials_and_rounds_are_played_as_each_alone():
-    """Loops with a verdict per cluster, scenes along another axis: as one scene after the other."""
+    """Rounds that accept cluster by cluster, vectorised over scenes: the same as one scene after the other."""
     bank, damping = tiny_bank(), 1e-6
     options = StepOptions(
         method=DomainDecomposition(cluster_cameras=2),

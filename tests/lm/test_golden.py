@@ -79,7 +79,7 @@ def test_initial_cost_is_that_of_ceres(name):
 @pytest.mark.parametrize("name", [LADYBUG, TRAFALGAR])
 def test_ceres_rule_walks_the_path_of_ceres(name, solved):
     """Five costs to seven digits, all of them to five: late on Ladybug lambda is 1e-8 and what little it adds differs,
-    since Ceres clamps the diagonal after scaling the columns and jaxba before (design, section 2)."""
+    since Ceres clamps the diagonal after scaling the columns and jaxba before."""
     solution = solved(name, "ceres")
     expected = np.array(CERES[name].split(), float)
     costs = np.append(solution.initial_cost, solution.history.cost)[: len(expected)]

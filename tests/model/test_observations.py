@@ -1,4 +1,4 @@
-"""Sums over each point's observations: the same as sums of dense Jacobians, made together or in haste."""
+"""Sums over each point's observations: the same as sums of dense Jacobians, in one loop or compiled fast."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def two_tracks() -> BundleProblem:
     )
 
 
-def sums(layout: Layout, problem: BundleProblem, loss: Loss, haste: bool, dtype: str = "float64") -> np.ndarray:
+def sums(layout: Layout, problem: BundleProblem, loss: Loss, fast: bool, dtype: str = "float64") -> np.ndarray:
     """The eleven sums that point iterations need, as [sum, point of the problem]."""
 
     def found(layout, problem):
@@ -49,7 +49,7 @@ def sums(layout: Layout, problem: BundleProblem, loss: Loss, haste: bool, dtype:
 
     columns = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = columns < problem.num_points
-    with fast_compilation(haste):
+    with fast_compilation(fast):
         values = np.asarray(jax.jit(found)(layout, problem))
     result = np.zeros((len(values), problem.num_points))
     result[:, columns[real]] = values[:, : len(columns)][:, real]
@@ -69,14 +69,14 @@ def dense_sums(problem: BundleProblem, loss: Loss) -> np.ndarray:
     return np.stack([*entries, *(gradient[first + i] for i in range(3)), cost])
 
 
-@pytest.mark.parametrize("haste", [False, True], ids=["together", "in haste"])
+@pytest.mark.parametrize("fast", [False, True], ids=["one loop", "fast compilation"])
 @pytest.mark.parametrize("loss", [Loss(), Loss("huber", 2.0)], ids=["squared", "huber"])
 @pytest.mark.parametrize("make", [two_tracks, support.odd, support.single])
-def test_sums_of_a_pass_are_those_of_dense_jacobians(make, loss, haste):
+def test_sums_of_a_pass_are_those_of_dense_jacobians(make, loss, fast):
     problem = make()
     layout = build_layout(problem)
     truth = dense_sums(problem, loss)
-    found = sums(layout, problem, loss, haste)[:10]
+    found = sums(layout, problem, loss, fast)[:10]
     scale = np.abs(truth).max(axis=0) + 1e-300
     np.testing.assert_allclose(found / scale, truth / scale, rtol=0, atol=1e-12)
 
@@ -94,11 +94,11 @@ def test_the_problem_of_these_tests_has_several_buckets():
     assert len(build_layout(two_tracks()).buckets) > 1
 
 
-@pytest.mark.parametrize("haste", [False, True], ids=["together", "in haste"])
-def test_a_pass_in_float32_loses_no_more_than_rounding(haste):
+@pytest.mark.parametrize("fast", [False, True], ids=["one loop", "fast compilation"])
+def test_a_pass_in_float32_loses_no_more_than_rounding(fast):
     problem = two_tracks()
     layout = build_layout(problem)
-    exact, found = (sums(layout, problem, Loss(), haste, dtype)[:10] for dtype in ("float64", "float32"))
+    exact, found = (sums(layout, problem, Loss(), fast, dtype)[:10] for dtype in ("float64", "float32"))
     # the cost and the gradient are sums of terms with residuals, which are differences of pixels
     scale = np.abs(exact).max(axis=0)
     assert (np.abs(found - exact)[:, scale > 0] / scale[scale > 0]).max() < 1e-3
@@ -110,20 +110,20 @@ def test_vectors_over_slots_reach_the_slots_they_belong_to():
     numbers = np.where(layout.slot_mask, np.arange(layout.num_slots, dtype=float), 0.0)
     truth = np.bincount(np.asarray(layout.slot_point), numbers, minlength=layout.num_points)
 
-    for haste in (True, False):
-        with fast_compilation(haste):
+    for fast in (True, False):
+        with fast_compilation(fast):
             one_pass = point_passes(layout, slot_frames(layout, state.cameras))
             found = one_pass(state.points, lambda views, number: [number], jnp.asarray(numbers))[0]
         np.testing.assert_array_equal(found, truth)
 
 
 @pytest.mark.parametrize("loss", [Loss(), Loss("huber", 2.0)], ids=["squared", "huber"])
-def test_point_iterations_are_the_same_in_haste(loss):
+def test_point_iterations_are_the_same_in_fast_compilation(loss):
     problem = two_tracks()
     layout, state = start(problem)
 
-    def found(haste: bool):
-        with fast_compilation(haste):
+    def found(fast: bool):
+        with fast_compilation(fast):
             frames = slot_frames(layout, state.cameras)
             return jax.jit(lambda layout, points: refine_points(layout, frames, points, loss, 3))(layout, state.points)
 

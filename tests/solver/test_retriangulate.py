@@ -134,14 +134,14 @@ STRANDING = solve_options(refinement=Refinement(points=3))
 """A step that leaves a point in the valley where it is; `learned` looks where its rays meet."""
 
 
-def one_astray() -> BundleProblem:
+def one_diverged() -> BundleProblem:
     """One point of forty behind its cameras: it drags them along, and such a solve converges far above the minimum."""
     return strayed(-3.0, every=40)
 
 
 def in_turns(options: SolveOptions = STRANDING, **heard) -> Solution:
     """That point, searched for in turns with the solve."""
-    return solve_and_retriangulate(one_astray(), "ceres", options, **heard)
+    return solve_and_retriangulate(one_diverged(), "ceres", options, **heard)
 
 
 def no_search(_) -> None:
@@ -149,13 +149,13 @@ def no_search(_) -> None:
 
 
 def test_a_step_that_asks_the_rays_finds_the_point_by_itself():
-    np.testing.assert_allclose(solve(one_astray(), "learned").final_cost, geometry.cost(solved()), rtol=1e-6)
-    assert jaxba.solve(one_astray(), "ceres", STRANDING).final_cost > 1.1 * geometry.cost(solved())
+    np.testing.assert_allclose(solve(one_diverged(), "learned").final_cost, geometry.cost(solved()), rtol=1e-6)
+    assert jaxba.solve(one_diverged(), "ceres", STRANDING).final_cost > 1.1 * geometry.cost(solved())
 
 
 def test_turns_end_lower_than_the_solve_alone_and_count_through():
     heard, searches = [], []
-    alone = jaxba.solve(one_astray(), "ceres", STRANDING)
+    alone = jaxba.solve(one_diverged(), "ceres", STRANDING)
     both = in_turns(callback=heard.append, on_search=searches.append)
     assert both.converged
     assert alone.converged
@@ -181,7 +181,7 @@ def test_where_there_is_nothing_to_find_it_is_the_solve():
 
 
 def test_all_iterations_together_keep_the_limit():
-    alone = jaxba.solve(one_astray(), "ceres", STRANDING)
+    alone = jaxba.solve(one_diverged(), "ceres", STRANDING)
     for more in (0, 1):
         both = in_turns(replace(STRANDING, max_iterations=alone.iterations + more))
         assert both.iterations == alone.iterations + more
@@ -194,7 +194,7 @@ def test_a_stop_by_the_callback_ends_all_of_it():
     stopped = in_turns(callback=lambda record: record.iteration == 2, on_search=no_search)
     assert stopped.termination == Termination.STOPPED
     assert stopped.iterations == 2
-    last = jaxba.solve(one_astray(), "ceres", STRANDING).iterations
+    last = jaxba.solve(one_diverged(), "ceres", STRANDING).iterations
     converged = in_turns(callback=lambda record: record.iteration == last, on_search=no_search)
     assert converged.termination == Termination.COST
     assert converged.iterations == last
@@ -214,5 +214,5 @@ def test_what_does_not_pay_is_dropped():
     (search,) = searches
     assert search.moved > 0
     assert not search.pays(0.5)
-    watched = jaxba.solve(one_astray(), "ceres", wide, callback=lambda _: None)
+    watched = jaxba.solve(one_diverged(), "ceres", wide, callback=lambda _: None)
     assert same_bits(both.problem, watched.problem)
