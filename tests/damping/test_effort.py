@@ -64,26 +64,25 @@ def test_a_step_with_fewer_point_iterations_is_that_of_options_with_fewer_and_co
     assert none.cost > costs[0]
 
 
+def implicit(forcing: float) -> StepOptions:
+    rule = ConjugateGradients(forcing=forcing)
+    return StepOptions(linear_solver="implicit", refinement=Refinement(points=1), conjugate_gradients=rule)
+
+
+def deeplm(forcing: float) -> StepOptions:
+    method = GlobalConjugateGradients(ConjugateGradients(forcing=forcing))
+    return StepOptions(method=method, refinement=Refinement(points=1))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["implicit", "normal"])
-def test_a_step_with_another_forcing_term_is_that_of_options_with_it(solver):
-    options = StepOptions(
-        linear_solver=solver, refinement=Refinement(points=1), conjugate_gradients=ConjugateGradients(forcing=1e-3)
-    )
-    layout, state = start(tiny(), options)
+@pytest.mark.parametrize("options", [implicit, deeplm])
+def test_a_step_with_another_forcing_term_is_that_of_options_with_it(options):
+    own = 1e-3
+    layout, state = start(tiny(), options(own))
     iterations = []
-    for forcing in (0.5, 1e-6, None):  # None: that of the options
-        if forcing is None:
-            forcing, chosen = options.conjugate_gradients.forcing, effort(1)
-        else:
-            chosen = effort(1, forcing)
-        expected, one = step(
-            layout,
-            state,
-            1e-6,
-            replace(options, conjugate_gradients=replace(options.conjugate_gradients, forcing=forcing)),
-        )
-        found, other = _step(layout, state, jnp.asarray(1e-6), options, effort=chosen)
+    for forcing, chosen in ((0.5, effort(1, 0.5)), (1e-6, effort(1, 1e-6)), (own, effort(1))):
+        expected, one = step(layout, state, 1e-6, options(forcing))
+        found, other = _step(layout, state, jnp.asarray(1e-6), options(own), effort=chosen)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
         assert int(one.cg_iterations) == int(other.cg_iterations)
         np.testing.assert_allclose([one.forcing, other.forcing], forcing)
