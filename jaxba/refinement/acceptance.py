@@ -131,7 +131,9 @@ def assess(
     cost, decrease = parts.sums(terms), parts.sums(against.terms - terms)
     predicted = against.step.predicted(step_fraction)
     gain = decrease / predicted
-    accepted = (decrease > 0) & (cost <= against.cost) & (predicted > 0) & (gain > against.min_gain)
+    # the costs before and after come from two computations: below the rounding of the cost their difference is noise
+    rounding = float(jnp.finfo(against.cost.dtype).eps) * against.cost
+    accepted = (decrease > 0) & (cost <= against.cost) & (predicted > rounding) & (gain > against.min_gain)
     return Candidate(cameras, points, cost, predicted, gain, accepted & jnp.isfinite(cost), step_fraction, repairs)
 
 
