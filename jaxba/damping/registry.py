@@ -68,8 +68,9 @@ def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
     Args:
-        name: `learned` (here the policy for plain LM) or another key of `SHIPPED`; the path of a policy file; a key of
-            `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; `bold-plain`, `bold-driver`; or `constant:LAMBDA`.
+        name: `learned` (the one for steps with embedded iterations) or another key of `SHIPPED`; the path of a policy
+            file; a key of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; `bold-plain`, `bold-driver`; or
+            `constant:LAMBDA`.
 
     Raises:
         UnknownPolicyError: no such policy, or a lambda that is not a positive number.

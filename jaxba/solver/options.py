@@ -30,7 +30,7 @@ Dtype = Literal["float64", "float32", "mixed"]
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """Options of `solve`. The command `jaxba-solve` has the same ones, with the same defaults."""
+    """Options of `solve`. The command `jaxba-solve` has the same defaults, and an option for most of these."""
 
     method: str | Method = DEFAULT_METHOD
     """Optimisation method: an entry of `jaxba.METHODS` or its name."""
