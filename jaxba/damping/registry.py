@@ -85,6 +85,10 @@ def make_policy(name: str) -> DampingPolicy:
     base, colon, number = name.partition(":")
     if base == CONSTANT:
         return Schedule(values=(_damping(name, number),))
+    if "+" in base:
+        raise UnknownPolicyError(
+            f"unknown damping policy {name!r}: its name has no '+'; embedded iterations are options of the step"
+        )
     if base not in POLICIES:
         known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}"])
         raise UnknownPolicyError(f"unknown damping policy {name!r}; known: {known}")
