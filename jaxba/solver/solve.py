@@ -103,7 +103,8 @@ def solve(
 
     Args:
         problem: start of the optimisation.
-        policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`).
+        policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`). With a
+            refinement without point iterations `learned` and `bold` mean their variants for plain steps.
         options: options of the solve; None: the defaults.
         callback: called after every iteration; a true return value stops the solve.
 
