@@ -44,7 +44,7 @@ class SacConfig:
     """Discount of a step."""
 
     tau: float = 0.005
-    """Step fraction of the target networks at each refresh. Source: Haarnoja et al. 2018."""
+    """Fraction by which the target networks move towards the critics at each refresh. Source: Haarnoja et al. 2018."""
 
     target_every: int = 1
     """Updates between refreshes of the target networks."""
