@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
@@ -183,7 +184,12 @@ def solve_loop(
 
     Returns:
         Final carry, and histories of length `max_iterations`, zero after the last iteration.
+
+    Raises:
+        ValueError: the state is float64, and 64 bits are not enabled in JAX.
     """
+    if state.cost.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError('the state is float64: call jax.config.update("jax_enable_x64", True) first')
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
     carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)
 

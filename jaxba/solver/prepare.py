@@ -89,6 +89,8 @@ def prepare(
         ValueError, ProblemError: as `solve`.
     """
     options = checked_options(options)
+    if not isinstance(problem, BundleProblem):
+        raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
     if isinstance(policy, str):
         alone = options.refinement is not None and not options.refinement.points
         policy = make_policy(fitting_policy(policy, alone=alone))

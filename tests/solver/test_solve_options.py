@@ -130,5 +130,10 @@ def test_options_that_are_none_are_refused(function, unchecked):
         function(support.tiny(), options="ceres")
 
 
+def test_a_path_is_no_problem(unchecked):
+    with pytest.raises(ValueError, match=r"problem must be a BundleProblem, as jaxba.read_problem returns it, not 'a"):
+        jaxba.solve("a.txt")
+
+
 def test_options_are_hashable_so_that_they_can_be_keys():
     assert len({SolveOptions(), SolveOptions(), SolveOptions(method="poba"), SolveOptions(loss=Loss("huber"))}) == 3
