@@ -60,28 +60,28 @@ class AgentConfig:
     shortened. Without effect if it is 0 or the guard is off."""
 
     refine_points: int = 3
-    """Embedded point iterations of the step, see `StepOptions`."""
+    """Embedded point iterations of the step, `Refinement.points`."""
 
     trials: int = 4
-    """Trials of the step, see `StepOptions`."""
+    """Trials of the step, `Refinement.trials`."""
 
     camera_rounds: int = 3
-    """Camera rounds of the step, see `StepOptions`."""
+    """Camera rounds of the step, `Refinement.camera_rounds`."""
 
     pattern_moves: int = 1
-    """Pattern moves of the step, see `StepOptions`."""
+    """Pattern moves of the step, `Refinement.pattern_moves`."""
 
     camera_damping: float = 1.0
-    """Damping of the cameras relative to that of the points, see `StepOptions`."""
+    """Damping of the cameras relative to that of the points, `Coordinates.camera_damping`."""
 
     lens_step: LensStep = "pixels"
-    """How a step is added to focal length and distortion, see `StepOptions`."""
+    """How a step is added to focal length and distortion, `Coordinates.lens_step`."""
 
     point_starts: PointStarts = "rays"
-    """Where embedded point iterations start, see `StepOptions`."""
+    """Where embedded point iterations start, `Refinement.starts`."""
 
     previous_steps: int = 3
-    """Earlier steps that are combined with the new one, if the method supports it; see `StepOptions`."""
+    """Earlier steps that are combined with the new one, if the method supports it, `Refinement.previous_steps`."""
 
     effort: EffortMode = "fixed"
     """What an action decides besides lambda. `fixed`: nothing. `points`: its second number, the embedded point

@@ -15,13 +15,26 @@ from jaxba.problem.options import StepOptions
 class ProblemInfo(NamedTuple):
     """What a policy knows before the first iteration."""
 
-    cost: Float[Array, ""]  # at the start, pixels^2
+    cost: Float[Array, ""]
+    """Cost at the start, pixels^2."""
+
     observations: Int[Array, ""]
+    """Number of observations."""
+
     cameras: Int[Array, ""]
+    """Number of cameras that are observed."""
+
     points: Int[Array, ""]
-    unit: Float[Array, ""]  # largest Hessian diagonal under identity scaling, 1 under diagonal scaling
-    focal: Float[Array, ""]  # median focal length, pixels
+    """Number of points that are observed."""
+
+    unit: Float[Array, ""]
+    """Largest Hessian diagonal under identity scaling, 1 under diagonal scaling."""
+
+    focal: Float[Array, ""]
+    """Median focal length, pixels."""
+
     max_iterations: Int[Array, ""]
+    """Limit of iterations."""
 
 
 @runtime_checkable
@@ -29,8 +42,11 @@ class DampingPolicy(Protocol):
     """Chooses lambda for every iteration.
 
     A policy is a frozen dataclass and a pytree: its numbers are traced, so that changing one never
-    recompiles, and its class selects the code. Both functions are pure and jittable. A policy may have two more
-    functions: `effort(state)`, see `effort_of`, and `step_options(base)`, see `trained_step`.
+    recompiles, and its class selects the code. Both functions are pure and jittable.
+
+    A policy may have two more functions. `effort(state)` gives the point iterations and the forcing term of the next
+    iteration (`jaxba.linear.step.Effort`). `step_options(base)` gives the `StepOptions` that it was made for, which
+    `solve` uses unless its options say otherwise.
     """
 
     @property

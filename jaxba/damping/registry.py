@@ -68,8 +68,9 @@ def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
     Args:
-        name: `learned` (here the policy for plain LM) or another key of `SHIPPED`; the path of a policy file; a key of
-            `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; `bold-plain`, `bold-driver`; or `constant:LAMBDA`.
+        name: `learned` (the one for steps with embedded iterations) or another key of `SHIPPED`; the path of a policy
+            file; a key of `POLICIES`, with `:FIRST_LAMBDA` for rules that have one; `bold-plain`, `bold-driver`; or
+            `constant:LAMBDA`.
 
     Raises:
         UnknownPolicyError: no such policy, or a lambda that is not a positive number.
@@ -84,6 +85,10 @@ def make_policy(name: str) -> DampingPolicy:
     base, colon, number = name.partition(":")
     if base == CONSTANT:
         return Schedule(values=(_damping(name, number),))
+    if "+" in base:
+        raise UnknownPolicyError(
+            f"unknown damping policy {name!r}: its name has no '+'; embedded iterations are options of the step"
+        )
     if base not in POLICIES:
         known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}"])
         raise UnknownPolicyError(f"unknown damping policy {name!r}; known: {known}")

@@ -1,4 +1,4 @@
-"""Hand-written damping rules. All lambdas multiply what `StepOptions.scaling` says.
+"""Hand-written damping rules. What lambda multiplies is `Coordinates.scaling`.
 
 Formulas and sources are in the docstring of each class.
 """

@@ -11,12 +11,23 @@ from jaxtyping import Bool, Float
 class Step(NamedTuple):
     """Result of one action in every environment."""
 
-    observation: Float[Array, "envs features"]  # for the next action; of a new episode if this one ended
+    observation: Float[Array, "envs features"]
+    """For the next action; of a new episode if this one ended."""
+
     reward: Float[Array, " envs"]
-    terminated: Bool[Array, " envs"]  # the episode ended: the value of what follows is zero
-    truncated: Bool[Array, " envs"]  # it was cut off: the value of what follows is that of `final_observation`
-    final_observation: Float[Array, "envs features"]  # after the action, before any reset
-    metrics: dict[str, Float[Array, " envs"]]  # of an episode, valid if it ended; always the same keys
+    """For the action."""
+
+    terminated: Bool[Array, " envs"]
+    """Whether the episode ended: the value of what follows is zero."""
+
+    truncated: Bool[Array, " envs"]
+    """Whether it was cut off: the value of what follows is that of `final_observation`."""
+
+    final_observation: Float[Array, "envs features"]
+    """After the action, before any reset."""
+
+    metrics: dict[str, Float[Array, " envs"]]
+    """Of an episode, valid if it ended; always the same keys."""
 
 
 @runtime_checkable

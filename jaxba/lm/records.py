@@ -12,26 +12,62 @@ class LMState(NamedTuple):
     """Current parameters, in layout order, and their cost."""
 
     cameras: Float[Array, "9 cameras"]
+    """Camera parameters."""
+
     points: Float[Array, "3 points"]
-    cost: Float[Array, ""]  # pixels^2
-    previous_steps: Float[Array, "steps 9 cameras"] | None = None  # last changes of the cameras; None: not used
+    """Points, in layout order."""
+
+    cost: Float[Array, ""]
+    """Pixels^2."""
+
+    previous_steps: Float[Array, "steps 9 cameras"] | None = None
+    """Last changes of the cameras, newest first; None if they are not used."""
 
 
 class StepInfo(NamedTuple):
     """Record of one iteration. A damping policy sees this and nothing else of the solve."""
 
-    cost: Float[Array, ""]  # accepted cost after the iteration, pixels^2
-    previous_cost: Float[Array, ""]  # accepted cost before it, pixels^2
-    candidate_cost: Float[Array, ""]  # cost at the proposed parameters, may be non-finite
-    predicted: Float[Array, ""]  # decrease predicted by the linear model, pixels^2
-    gain_ratio: Float[Array, ""]  # actual over predicted decrease
+    cost: Float[Array, ""]
+    """Accepted cost after the iteration, pixels^2."""
+
+    previous_cost: Float[Array, ""]
+    """Accepted cost before it, pixels^2."""
+
+    candidate_cost: Float[Array, ""]
+    """Cost at the proposed parameters, pixels^2; may be non-finite."""
+
+    predicted: Float[Array, ""]
+    """Decrease predicted by the linear model, pixels^2."""
+
+    gain_ratio: Float[Array, ""]
+    """Actual over predicted decrease."""
+
     accepted: Bool[Array, ""]
-    damping: Float[Array, ""]  # lambda of this iteration
-    gradient_max: Float[Array, ""]  # largest absolute gradient entry before the step
-    step_norm: Float[Array, ""]  # norm of the candidate's step, including refined points
-    parameter_norm: Float[Array, ""]  # norm of the parameters before the step
-    cg_iterations: Int[Array, ""]  # 0 for a factorisation
-    forcing: Float[Array, ""]  # forcing term of conjugate gradients; 0 for an exact solve
-    step_fraction: Float[Array, ""]  # length of the candidate's step over the full step; below 1 after backtracking
-    damping_fraction: Float[Array, ""]  # d.D d / d.(H + D) d: 0 for Gauss-Newton, 1 for gradient descent
-    repairs: Int[Array, ""]  # camera rounds, backtracking trials and pattern moves after the first candidate
+    """Whether the candidate replaced the parameters."""
+
+    damping: Float[Array, ""]
+    """Lambda of this iteration."""
+
+    gradient_max: Float[Array, ""]
+    """Largest absolute gradient entry before the step."""
+
+    step_norm: Float[Array, ""]
+    """Norm of the candidate's step, including refined points."""
+
+    parameter_norm: Float[Array, ""]
+    """Norm of the parameters before the step."""
+
+    cg_iterations: Int[Array, ""]
+    """Iterations of conjugate gradients; 0 for a factorisation."""
+
+    forcing: Float[Array, ""]
+    """Forcing term of conjugate gradients; 0 for an exact solve."""
+
+    step_fraction: Float[Array, ""]
+    """Length of the candidate's step over the full step; below 1 after backtracking."""
+
+    damping_fraction: Float[Array, ""]
+    """`d.D d / d.(H + D) d`: 0 for Gauss-Newton, 1 for gradient descent."""
+
+    repairs: Int[Array, ""]
+    """Number of camera rounds, backtracking trials and pattern moves after the first candidate."""

@@ -16,7 +16,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.loop import History
-from jaxba.solver.options import SolveOptions
+from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.retriangulate import Retriangulation, retriangulate
 from jaxba.solver.solve import Solution, solve
@@ -53,7 +53,7 @@ def solve_and_retriangulate(
     Raises:
         ValueError, ProblemError: as `solve`.
     """
-    options = SolveOptions() if options is None else options
+    options = checked_options(options)
     before, stopped = (0, 0.0), False
 
     def forward(record: IterationRecord) -> bool:

@@ -39,9 +39,14 @@ from jaxba.structure.layout import Layout, num_partitions
 class IterationRecord(NamedTuple):
     """The argument of a callback."""
 
-    iteration: int  # from 1
-    time_s: float  # seconds since the start of the first iteration, without compilation
-    step: StepInfo  # of Python scalars
+    iteration: int
+    """Number of the iteration, from 1."""
+
+    time_s: float
+    """Seconds since the start of the first iteration, without compilation."""
+
+    step: StepInfo
+    """Record of the iteration, as Python scalars."""
 
 
 class _Loop(NamedTuple):

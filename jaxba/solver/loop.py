@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
@@ -28,24 +29,48 @@ from jaxba.typing import AnyArray
 class History(NamedTuple):
     """Records of a solve, one entry per iteration; in a `Solution` they are NumPy arrays of equal length."""
 
-    cost: AnyArray  # accepted cost after the iteration, pixels^2
-    candidate_cost: AnyArray  # cost of the proposed step, pixels^2
-    damping: AnyArray  # lambda of the iteration
+    cost: AnyArray
+    """Accepted cost after the iteration, pixels^2."""
+
+    candidate_cost: AnyArray
+    """Cost of the proposed step, pixels^2."""
+
+    damping: AnyArray
+    """Lambda of the iteration."""
+
     gain_ratio: AnyArray
+    """Actual over predicted decrease."""
+
     accepted: AnyArray
+    """Whether the step was accepted."""
+
     cg_iterations: AnyArray
-    gradient_max: AnyArray  # largest absolute gradient entry before the step
+    """Iterations of conjugate gradients; 0 for a factorisation."""
+
+    gradient_max: AnyArray
+    """Largest absolute gradient entry before the step."""
+
     step_norm: AnyArray
+    """Norm of the candidate's step."""
 
 
 class Carry(NamedTuple):
     """The state of the loop between iterations."""
 
-    state: Any  # LMState, or None where parameters are left out
-    policy: Any  # state of the damping policy
-    damping: Float[Array, ""]  # lambda of the next iteration
-    iteration: Int[Array, ""]  # number of iterations so far
-    termination: Int[Array, ""]  # integer of a `Termination`
+    state: Any
+    """`LMState`, or None where parameters are left out."""
+
+    policy: Any
+    """State of the damping policy."""
+
+    damping: Float[Array, ""]
+    """Lambda of the next iteration."""
+
+    iteration: Int[Array, ""]
+    """Number of iterations so far."""
+
+    termination: Int[Array, ""]
+    """Integer of a `Termination`."""
 
 
 def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: Any) -> ProblemInfo:
@@ -159,7 +184,12 @@ def solve_loop(
 
     Returns:
         Final carry, and histories of length `max_iterations`, zero after the last iteration.
+
+    Raises:
+        ValueError: the state is float64, and 64 bits are not enabled in JAX.
     """
+    if state.cost.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise ValueError('the state is float64: call jax.config.update("jax_enable_x64", True) first')
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
     carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)
 

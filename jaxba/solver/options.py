@@ -27,10 +27,27 @@ failed."""
 
 Dtype = Literal["float64", "float32", "mixed"]
 
+_CHOICES = {
+    "dtype": Dtype,
+    "linear_solver": LinearSolverChoice,
+    "intrinsics": Intrinsics,
+    "compilation": Compilation,
+}
+"""Options that are one of a few words."""
+
+_GROUPS = {
+    "conjugate_gradients": ConjugateGradients,
+    "refinement": Refinement,
+    "coordinates": Coordinates,
+    "loss": Loss,
+    "tolerances": Tolerances,
+}
+"""Options that are a group of options."""
+
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """Options of `solve`. The command `jaxba-solve` has the same ones, with the same defaults."""
+    """Options of `solve`. The command `jaxba-solve` has the same defaults, and an option for most of these."""
 
     method: str | Method = DEFAULT_METHOD
     """Optimisation method: an entry of `jaxba.METHODS` or its name."""
@@ -80,7 +97,15 @@ class SolveOptions:
     rounding. On a GPU all are `full`."""
 
     def __post_init__(self) -> None:
-        for name, known in (("dtype", Dtype), ("linear_solver", LinearSolverChoice), ("compilation", Compilation)):
+        for name, kind in _GROUPS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind) and not (value is None and name in ("refinement", "coordinates")):
+                raise ValueError(f"{name} must be made with jaxba.{kind.__name__}, is {value!r}")
+        if isinstance(self.method, str):
+            make_method(self.method)
+        elif not isinstance(self.method, Method):
+            raise ValueError(f"method must be an entry of jaxba.METHODS or its name, is {self.method!r}")
+        for name, known in _CHOICES.items():
             if getattr(self, name) not in get_args(known):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
         check_count("max_iterations", self.max_iterations, 1)
@@ -107,3 +132,16 @@ class SolveOptions:
                 mixed_precision=self.dtype == "mixed",
             )
         )
+
+
+def checked_options(options: SolveOptions | None) -> SolveOptions:
+    """The options, or the defaults for None.
+
+    Raises:
+        ValueError: they are something else, such as the name of a policy.
+    """
+    if options is None:
+        return SolveOptions()
+    if not isinstance(options, SolveOptions):
+        raise ValueError(f"options must be made with jaxba.SolveOptions, are {options!r}")
+    return options

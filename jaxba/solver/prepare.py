@@ -21,7 +21,7 @@ from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.names import fitting_policy
-from jaxba.solver.options import SolveOptions
+from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.observation_order import ObservationOrder
@@ -29,6 +29,9 @@ from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, wi
 
 DEFAULT_POLICY = "learned"
 """Name of the default damping policy."""
+
+POLICY_PARTS = ("min_gain", "init", "propose")
+"""What every damping policy has (`DampingPolicy`)."""
 
 
 @dataclass(frozen=True)
@@ -85,16 +88,17 @@ def prepare(
     Raises:
         ValueError, ProblemError: as `solve`.
     """
-    options = SolveOptions() if options is None else options
+    options = checked_options(options)
+    if not isinstance(problem, BundleProblem):
+        raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
     if isinstance(policy, str):
         alone = options.refinement is not None and not options.refinement.points
         policy = make_policy(fitting_policy(policy, alone=alone))
-    if not isinstance(policy, DampingPolicy):
-        raise ValueError(f"policy must be the name of a policy or a policy, not {policy!r}")
+    _check_policy(policy)
     step = options.step_options(policy)
     scaling = step.coordinates.scaling
     if getattr(policy, "step_options", None) is not None and scaling != trained_step(policy).coordinates.scaling:
-        raise ProblemError(f"this policy knows lambda as a factor on the diagonal, not with scaling {scaling!r}")
+        raise ProblemError(f"this policy takes lambda as a factor on the diagonal, not with scaling {scaling!r}")
     capacity, asked = None, options.linear_solver
     observations = ObservationOrder.of(problem)
     if options.pad:
@@ -116,6 +120,18 @@ def prepare(
         if not np.isfinite(float(state.cost)):
             raise ProblemError(explain_start(problem))
     return Prepared(layout, state, step, policy, problem, capacity, offset, setup_s, clock.seconds)
+
+
+def _check_policy(policy: object) -> None:
+    """Raises a ValueError that says what a policy lacks."""
+    missing = [name for name in POLICY_PARTS if not hasattr(policy, name)]
+    if isinstance(policy, type) or len(missing) == len(POLICY_PARTS):
+        raise ValueError(f"policy must be the name of a policy or a policy, not {policy!r}")
+    name = type(policy).__name__
+    if missing:
+        raise ValueError(f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)")
+    if jax.tree_util.treedef_is_leaf(jax.tree.structure(policy)):
+        raise ValueError(f"policy {name} is no pytree: decorate its dataclass with jax.tree_util.register_dataclass")
 
 
 def explain_start(problem: BundleProblem) -> str:

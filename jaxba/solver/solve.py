@@ -25,7 +25,7 @@ from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, Part, Stage, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord, run_stepwise
 from jaxba.solver.loop import Carry, History, solve_loop
-from jaxba.solver.options import SolveOptions
+from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, prepare
 from jaxba.structure.layout import Layout
 from jaxba.structure.padding import Capacity
@@ -103,7 +103,8 @@ def solve(
 
     Args:
         problem: start of the optimisation.
-        policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`).
+        policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`). With a
+            refinement without point iterations `learned` and `bold` mean their variants for plain steps.
         options: options of the solve; None: the defaults.
         callback: called after every iteration; a true return value stops the solve.
 
@@ -115,7 +116,7 @@ def solve(
         ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
             the linear solver or method does not support shared or partly fixed intrinsics.
     """
-    options = SolveOptions() if options is None else options
+    options = checked_options(options)
     with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
         prepared = prepare(problem, options, policy=policy)
         layout, state, step_options = prepared.layout, prepared.state, prepared.options

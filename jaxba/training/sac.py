@@ -1,7 +1,7 @@
 """Soft actor-critic in two forms, as pure functions of a learner and a batch.
 
 `twin` is Haarnoja et al. 2018, "Soft Actor-Critic Algorithms and Applications": two critics, target networks of both,
-a learned temperature. `value` is the form of the seed paper (Belder et al. 2023), that of Haarnoja et al. 2018,
+a learned temperature. `value` is the form of the paper (Belder et al. 2023), that of Haarnoja et al. 2018,
 "Soft Actor-Critic: Off-Policy Maximum Entropy Deep RL": policy, two critics, a value network and its target network, a
 fixed temperature.
 """
@@ -26,7 +26,7 @@ class SacConfig:
     """Settings of the agent. Hashable: static in compiled programs."""
 
     variant: Literal["twin", "value"] = "twin"
-    """`twin`: target critics, learned temperature. `value`: the seed paper's, with a value network and its target."""
+    """`twin`: target critics, learned temperature. `value`: the paper's, with a value network and its target."""
 
     width: int = 64
     """Units of a hidden layer. 64 is five times faster on a CPU than the paper's 256 (six without layer norm)."""
@@ -44,7 +44,7 @@ class SacConfig:
     """Discount of a step."""
 
     tau: float = 0.005
-    """Step fraction of the target networks at each refresh. Source: Haarnoja et al. 2018."""
+    """Fraction by which the target networks move towards the critics at each refresh. Source: Haarnoja et al. 2018."""
 
     target_every: int = 1
     """Updates between refreshes of the target networks."""
@@ -83,7 +83,7 @@ class SacConfig:
 
     @classmethod
     def paper(cls) -> SacConfig:
-        """The seed paper's agent; what the paper does not state is taken from its released code.
+        """The paper's agent; what the paper does not state is taken from its released code.
 
         Three fully connected layers of 256, mean squared errors, target value network refreshed every 5 iterations.
         """

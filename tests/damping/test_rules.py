@@ -220,6 +220,7 @@ def test_every_name_makes_its_policy_with_the_lambda_that_was_asked_for():
     [
         ("cerse", "unknown damping policy 'cerse'; known: learned, ceres, classic"),
         ("", "unknown damping policy ''"),
+        ("ceres+embedded", "unknown damping policy 'ceres+embedded': its name has no '+'"),
         ("ceres:x", "must be a positive number, not 'x'"),
         ("ceres:-1", "must be a positive number, not '-1'"),
         ("ceres:nan", "must be a positive number, not 'nan'"),

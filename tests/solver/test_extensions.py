@@ -93,6 +93,26 @@ def test_a_policy_written_by_hand_brings_a_plain_step():
     assert jaxba.prepare(support.tiny(), policy=Steady()).options == jaxba.StepOptions()
 
 
-def test_what_is_no_policy_is_refused(unchecked):
-    with pytest.raises(ValueError, match="policy must be the name of a policy or a policy"):
-        jaxba.solve(support.tiny(), object())
+class OnlyStarts:
+    def init(self, info):
+        return info.cost, info.cost
+
+
+@dataclass(frozen=True)
+class Unregistered(Steady):
+    """As `Steady`, without the decorator."""
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (object(), "policy must be the name of a policy or a policy, not <object"),
+        (Steady, "policy must be the name of a policy or a policy, not <class"),
+        (OnlyStarts(), "policy OnlyStarts has no min_gain and no propose"),
+        (Unregistered(), "policy Unregistered is no pytree: decorate its dataclass"),
+    ],
+)
+def test_what_is_no_policy_is_refused_in_one_line(policy, message, unchecked):
+    with pytest.raises(ValueError, match=message) as caught:
+        jaxba.solve(support.tiny(), policy)
+    assert "\n" not in str(caught.value)

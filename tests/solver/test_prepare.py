@@ -113,6 +113,13 @@ def test_a_padded_problem_comes_back_in_its_own_sizes():
     assert same_bits(prepared.problem_at(prepared.state), problem)
 
 
+def test_double_precision_without_64_bits_is_refused_in_one_line():
+    prepared = prepare(support.tiny(), OPTIONS, policy="ceres")
+    with jax.enable_x64(False), pytest.raises(ValueError, match="the state is float64: call jax") as caught:
+        solve_loop(prepared.layout, prepared.state, prepared.policy, OPTIONS.tolerances, prepared.options, 3)
+    assert "\n" not in str(caught.value)
+
+
 def test_single_precision_is_prepared_as_such():
     prepared = prepare(support.tiny(), SolveOptions(dtype="float32"), policy="ceres")
     assert prepared.state.cost.dtype == prepared.state.cameras.dtype == jnp.float32

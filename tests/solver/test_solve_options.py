@@ -108,6 +108,13 @@ def test_a_factorisation_that_does_not_fit_the_memory_is_refused(asked, monkeypa
         ({"dtype": "float16"}, "dtype must be one of float64, float32, mixed, not 'float16'"),
         ({"linear_solver": "power"}, "linear_solver must be one of auto, explicit, sparse, implicit, not 'power'"),
         ({"compilation": "fast"}, "compilation must be one of"),
+        ({"intrinsics": "shared"}, "intrinsics must be one of free, fixed, not 'shared'"),
+        ({"method": "magic"}, "unknown method 'magic'; known: lm, stba, deeplm, ddlm, poba"),
+        ({"method": 3}, "method must be an entry of jaxba.METHODS or its name, is 3"),
+        ({"refinement": 3}, "refinement must be made with jaxba.Refinement, is 3"),
+        ({"loss": "huber"}, "loss must be made with jaxba.Loss, is 'huber'"),
+        ({"loss": None}, "loss must be made with jaxba.Loss, is None"),
+        ({"tolerances": 1e-6}, "tolerances must be made with jaxba.Tolerances, is 1e-06"),
         ({"max_iterations": 0}, "max_iterations must be at least 1"),
         ({"tolerances": Tolerances(xtol=-1.0)}, "xtol must not be negative, is -1"),
     ],
@@ -115,6 +122,17 @@ def test_a_factorisation_that_does_not_fit_the_memory_is_refused(asked, monkeypa
 def test_options_are_checked_where_they_are_made(asked, message, unchecked):
     with pytest.raises(ValueError, match=message):
         SolveOptions(**asked)
+
+
+@pytest.mark.parametrize("function", [jaxba.solve, jaxba.solve_and_retriangulate, jaxba.prepare])
+def test_options_that_are_none_are_refused(function, unchecked):
+    with pytest.raises(ValueError, match=r"options must be made with jaxba.SolveOptions, are 'ceres'"):
+        function(support.tiny(), options="ceres")
+
+
+def test_a_path_is_no_problem(unchecked):
+    with pytest.raises(ValueError, match=r"problem must be a BundleProblem, as jaxba.read_problem returns it, not 'a"):
+        jaxba.solve("a.txt")
 
 
 def test_options_are_hashable_so_that_they_can_be_keys():
