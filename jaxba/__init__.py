@@ -14,6 +14,7 @@ from jaxba.damping import (
 )
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.learned import LearnedPolicy
+from jaxba.damping.policy import trained_step
 from jaxba.io import (
     read_bal,
     read_bundler,
@@ -24,6 +25,7 @@ from jaxba.io import (
     write_ply,
     write_problem,
 )
+from jaxba.linear.step import Effort
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
@@ -36,7 +38,7 @@ from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_star
 from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord
-from jaxba.solver.loop import History, solve_loop
+from jaxba.solver.loop import Carry, History, solve_loop
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Prepared, prepare
 from jaxba.solver.retriangulate import Retriangulation, retriangulate
@@ -50,11 +52,13 @@ __all__ = [
     "POLICIES",
     "AgentConfig",
     "BundleProblem",
+    "Carry",
     "Ceres",
     "Classic",
     "ConjugateGradients",
     "Coordinates",
     "DampingPolicy",
+    "Effort",
     "Geometric",
     "History",
     "IterationRecord",
@@ -100,6 +104,7 @@ __all__ = [
     "solve",
     "solve_and_retriangulate",
     "solve_loop",
+    "trained_step",
     "write_bal",
     "write_colmap",
     "write_ply",

@@ -65,7 +65,8 @@ class SolveOptions:
 
     coordinates: Coordinates | None = None
     """Coordinates of a step and of its damping. None: those a learned policy was trained with; those of Ceres for a
-    rule."""
+    rule. A group that is given counts as a whole: to change one of its fields, use
+    `dataclasses.replace(jaxba.trained_step(policy).coordinates, ...)`."""
 
     intrinsics: Intrinsics = "free"
     """Whether f, k1 and k2 are optimised (`free`) or `fixed`."""
