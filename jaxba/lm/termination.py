@@ -16,6 +16,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.lm.records import StepInfo
+from jaxba.refinement.acceptance import COST_ROUNDING
 
 DAMPING_LIMIT = 1e32
 """A step rejected with a lambda of this size ends the solve. Source: Ceres min_trust_region_radius 1e-32."""
@@ -27,10 +28,6 @@ than this many times as large."""
 FRACTION_ROUNDING = 64.0
 """Machine epsilons within which a damping fraction counts as one: with lambda = 1e30 it was computed as 1 or just
 below."""
-
-COST_ROUNDING = 8.0
-"""Rounding error of a cost in machine epsilons, relative to the cost: 1e-6 in float32, which was measured on real
-problems, and 2e-15 in float64."""
 
 
 class Termination(enum.IntEnum):
