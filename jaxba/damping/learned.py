@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -20,15 +21,15 @@ from jaxba.problem.options import StepOptions
 from jaxba.typing import AnyArray, register_pytree
 
 
-class AgentPolicy:
+class AgentPolicy(ABC):
     """What policies of an agent share: they observe, choose an action, and get the lambda that the guard allows."""
 
     config: AgentConfig
     """What is observed, what an action means, and the step that the policy is made for."""
 
+    @abstractmethod
     def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
         """The action in [-1, 1] for an observation."""
-        raise NotImplementedError
 
     @property
     def min_gain(self) -> float:
