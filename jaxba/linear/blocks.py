@@ -5,9 +5,10 @@ A block of the reduced camera system is a sum over the points that two cameras b
 
 from __future__ import annotations
 
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float
 
+from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.segment_sums import outer_sum, take_rows, tree_sum
@@ -31,7 +32,7 @@ def pair_products(
         return compute_unfused(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums)
 
     # batch by batch, so that the gathered rows and their products stay in the cache
-    partial = lax.map(batch, (pairs.left, pairs.right, pairs.sums)).reshape(-1, width * width)
+    partial = loops.map_rows(batch, (pairs.left, pairs.right, pairs.sums)).reshape(-1, width * width)
     return compute_unfused(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums)
 
 

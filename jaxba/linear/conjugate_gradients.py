@@ -10,8 +10,10 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float, Int
+
+from jaxba.runtime import loops
 
 
 class _Carry(NamedTuple):
@@ -73,6 +75,6 @@ def conjugate_gradients(
     product = jnp.sum(right * scaled)
     zero = jnp.zeros_like(right)
     start = _Carry(zero, right, scaled, product, jnp.zeros_like(product), jnp.zeros((), jnp.int32), product > 0)
-    end = lax.while_loop(lambda c: c.running, body, start)
+    end = loops.while_loop(lambda c: c.running, body, start)
     # with a non-finite preconditioner or right-hand side the loop does not start: return nan, not a zero step
     return jnp.where(jnp.isfinite(product), end.x, jnp.full_like(right, jnp.nan)), end.count

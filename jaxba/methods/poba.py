@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float
 
 from jaxba.linear.preconditioners import block_inverse
@@ -23,6 +23,7 @@ from jaxba.linear.schur import CameraSystem, apply_reduced
 from jaxba.lm.method import DampedSystem, MethodStep
 from jaxba.methods.subspace import best_in_span
 from jaxba.problem.options import StepOptions, check_count
+from jaxba.runtime import loops
 
 
 @dataclass(frozen=True)
@@ -84,4 +85,4 @@ def series(
         return total + term, term
 
     start = inverse(right)
-    return lax.fori_loop(0, order, body, (start, start))[0]
+    return loops.fori_loop(0, order, body, (start, start))[0]

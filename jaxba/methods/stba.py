@@ -32,6 +32,7 @@ from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, damping
 from jaxba.lm.method import DampedSystem, MethodStep
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import StepOptions, check_count
+from jaxba.runtime import loops
 from jaxba.runtime.fusion import computed_after
 from jaxba.structure.layout import Layout, partition_of
 from jaxba.structure.random_partitions import Partition
@@ -223,4 +224,4 @@ def richardson(
     """
     inverse = block_inverse(computed_after(step, system.blocks))
     iteration = lambda _, x: x + inverse(system.right - apply_reduced(layout, linear, points, system, x))
-    return lax.fori_loop(0, rounds, iteration, step)
+    return loops.fori_loop(0, rounds, iteration, step)

@@ -8,11 +8,12 @@ Chen and Wang 2019, "Bundle adjustment revisited"), used here to correct second-
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Int
 
 from jaxba.refinement.acceptance import Candidate, Comparison, assess, select
 from jaxba.refinement.cameras import refine_cameras
+from jaxba.runtime import loops
 
 GOOD_GAIN = 0.5
 """Gain ratio from which the linear model is trusted and there are no camera rounds."""
@@ -67,4 +68,4 @@ def with_camera_rounds(
             (left > 0) & insufficient & (candidate.cost < MAX_COST_RATIO * against.cost) & promising & against.matters
         )
 
-    return lax.while_loop(lambda carry: jnp.any(should_continue(carry)), one_round, (candidate, rounds))[0]
+    return loops.while_loop(lambda carry: jnp.any(should_continue(carry)), one_round, (candidate, rounds))[0]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float
 
 from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
 from jaxba.model.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
+from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.conventions import components_first
 from jaxba.structure.layout import Layout
@@ -60,4 +61,4 @@ def refine_cameras(
     # a loop instead of unrolled attempts: half as much to compile
     dampings, unseen = jnp.asarray(DAMPINGS, cameras.dtype), ~jnp.asarray(layout.camera_seen)
     more = lambda carry: (carry[2] < len(DAMPINGS)) & ~jnp.all(carry[1])
-    return lax.while_loop(more, attempt, (cameras, unseen, jnp.zeros((), jnp.int32)))[0]
+    return loops.while_loop(more, attempt, (cameras, unseen, jnp.zeros((), jnp.int32)))[0]

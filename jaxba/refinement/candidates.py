@@ -19,7 +19,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba.linear.step import Effort, Step
@@ -31,6 +31,7 @@ from jaxba.refinement.camera_rounds import with_camera_rounds
 from jaxba.refinement.pattern_move import should_extend, should_repeat
 from jaxba.refinement.retraction import move_cameras, step_between
 from jaxba.refinement.subproblems import Subproblems
+from jaxba.runtime import loops
 
 
 class _Attempt(NamedTuple):
@@ -80,7 +81,7 @@ def best_candidate(
         return _next_candidate(against, start)
     # the full step is the first iteration of the loop, so that the program contains its body only once
     advance = lambda attempt: _next_attempt(against, attempt)
-    return lax.while_loop(lambda attempt: jnp.any(attempt.active), advance, start).best
+    return loops.while_loop(lambda attempt: jnp.any(attempt.active), advance, start).best
 
 
 def _next_candidate(against: Comparison, attempt: _Attempt) -> Candidate:

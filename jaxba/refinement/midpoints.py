@@ -10,7 +10,7 @@ import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.linear.cholesky3 import cholesky3
@@ -19,6 +19,7 @@ from jaxba.model.linearize import slot_costs, view_residuals
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
 from jaxba.refinement.points import PreviousPoints, has_receded, refine_points
+from jaxba.runtime import loops
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 
@@ -134,7 +135,7 @@ def refine_from_starts(
     """
     # a loop of at most one iteration: under vmap both branches of a condition would be computed
     candidates = lambda _, __: jnp.stack(choose_starts(layout, frames, points, loss, previous))
-    candidates = lax.fori_loop(0, jnp.minimum(starts, 1), candidates, jnp.stack([points, points]))
+    candidates = loops.fori_loop(0, jnp.minimum(starts, 1), candidates, jnp.stack([points, points]))
 
     def refine_start(number: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
         found, costs = refine_points(layout, frames, candidates[number], loss, iterations, previous, min_decrease)
@@ -142,4 +143,4 @@ def refine_from_starts(
         return jnp.where(lower, found, best[0]), jnp.where(lower, costs, best[1])
 
     infinite = jnp.full_like(points[0], jnp.inf)
-    return lax.fori_loop(0, jnp.maximum(starts, 1), refine_start, (points, infinite))
+    return loops.fori_loop(0, jnp.maximum(starts, 1), refine_start, (points, infinite))

@@ -22,7 +22,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
@@ -30,6 +30,7 @@ from jaxba.model import camera
 from jaxba.model.linearize import point_terms
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
+from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sum
@@ -167,7 +168,7 @@ def refine_points(
         points, infinite, system, damping, points, zero, not_delayed, jnp.zeros((), jnp.int32), jnp.zeros((), bool)
     )
     more = lambda c: (c.passes <= iterations + jnp.any(c.delayed)) & ~c.converged
-    carry = lax.while_loop(more, body, carry)
+    carry = loops.while_loop(more, body, carry)
     return carry.points, carry.costs
 
 
