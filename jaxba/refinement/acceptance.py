@@ -13,7 +13,6 @@ Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -113,7 +112,7 @@ def assess(
     points: Float[Array, "3 points"],
     step_fraction: Float[Array, "*parts"],
     repairs: Int[Array, "*parts"],
-    full_step: Bool[Array, ""] | None = None,
+    full_step: Bool[Array, ""],
 ) -> Candidate:
     """Refines the points of a candidate and decides whether it is accepted.
 
@@ -123,13 +122,9 @@ def assess(
         points: points before their embedded iterations.
         step_fraction: it scales the predicted decrease.
         repairs: camera rounds, trials and pattern moves so far.
-        full_step: whether this is the full step of some subproblem, after which points may also start from their rays;
-            None after a camera round, where they never do.
+        full_step: whether this is the full step of some subproblem, after which points may also start from their rays.
     """
     options, parts = against.options, against.parts
-    if full_step is None:
-        full_step = jnp.zeros((), bool)
-        options = replace(options, refinement=replace(options.refinement, starts="step"))
     min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * jnp.sum(against.step.predicted(step_fraction)))
     search = PointSearch(against.point_iterations, jnp.where(full_step, against.starts, 0), min_decrease)
     points, terms = parts.refine(cameras, points, against.previous, options, search)

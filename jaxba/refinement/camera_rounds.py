@@ -11,9 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Int
 
-from jaxba.refinement.acceptance import Candidate, Comparison, assess, select
-from jaxba.refinement.cameras import refine_cameras
-from jaxba.runtime import loops
+from jaxba.refinement.acceptance import Candidate, Comparison
 
 GOOD_GAIN = 0.5
 """Gain ratio from which the linear model is trusted and there are no camera rounds."""
@@ -33,39 +31,25 @@ ROUNDS_OF_LATER_CANDIDATES = 1
 with three; on real problems three took a tenth more work than one."""
 
 
-def with_camera_rounds(
+def should_refine_cameras(
     against: Comparison,
     candidate: Candidate,
     best: Candidate,
     full_step: Bool[Array, "*parts"],
-    active: Bool[Array, "*parts"],
-) -> Candidate:
-    """A candidate after camera rounds, as long as these may lead to its acceptance.
+    done: Int[Array, "*parts"],
+) -> Bool[Array, "*parts"]:
+    """Whether a camera round, or another one, may lead to the acceptance of a candidate.
 
     Args:
         against: data of the step.
         candidate: the candidate to improve.
         best: the best candidate so far; a pattern move must have a lower cost.
         full_step: whether the candidate is the full step, which may have all rounds.
-        active: subproblems for which the candidate is evaluated.
+        done: number of its camera rounds so far.
     """
     most = against.options.refinement.camera_rounds
-    rounds = jnp.where(full_step, most, min(ROUNDS_OF_LATER_CANDIDATES, most))
-    rounds = jnp.where(active, rounds, 0)
-
-    def one_round(carry: tuple[Candidate, Int[Array, "*parts"]]) -> tuple[Candidate, Int[Array, "*parts"]]:
-        candidate, left = carry
-        cameras = refine_cameras(against.parts.layout, candidate.cameras, candidate.points, against.options)
-        improved = assess(against, cameras, candidate.points, candidate.step_fraction, candidate.repairs + 1)
-        return select(against.parts, should_continue(carry), improved, candidate), left - 1
-
-    def should_continue(carry: tuple[Candidate, Int[Array, "*parts"]]) -> Bool[Array, "*parts"]:
-        candidate, left = carry
-        insufficient = jnp.where(best.accepted, candidate.cost >= best.cost, candidate.gain < GOOD_GAIN)
-        done = rounds - left
-        promising = candidate.gain > jnp.select([done == 0, done == 1], [-jnp.inf, MIN_GAINS[0]], MIN_GAINS[1])
-        return (
-            (left > 0) & insufficient & (candidate.cost < MAX_COST_RATIO * against.cost) & promising & against.matters
-        )
-
-    return loops.while_loop(lambda carry: jnp.any(should_continue(carry)), one_round, (candidate, rounds))[0]
+    limit = jnp.where(full_step, most, min(ROUNDS_OF_LATER_CANDIDATES, most))
+    insufficient = jnp.where(best.accepted, candidate.cost >= best.cost, candidate.gain < GOOD_GAIN)
+    promising = candidate.gain > jnp.select([done == 0, done == 1], [-jnp.inf, MIN_GAINS[0]], MIN_GAINS[1])
+    near = candidate.cost < MAX_COST_RATIO * against.cost
+    return (done < limit) & insufficient & near & promising & against.matters

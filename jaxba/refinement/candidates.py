@@ -18,32 +18,53 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxba.linear.step import Effort, Step
 from jaxba.model.linearize import Reference
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import Candidate, Comparison, assess, comparison, select
 from jaxba.refinement.backtracking import SHORTER, should_backtrack
-from jaxba.refinement.camera_rounds import with_camera_rounds
+from jaxba.refinement.camera_rounds import should_refine_cameras
+from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.pattern_move import should_extend, should_repeat
 from jaxba.refinement.retraction import move_cameras, step_between
 from jaxba.refinement.subproblems import Subproblems
 from jaxba.runtime import loops
 
 
-class _Attempt(NamedTuple):
-    """The next candidate of every subproblem: shorter steps until one is accepted, then pattern moves."""
+class _Search(NamedTuple):
+    """The candidates of every subproblem: shorter steps until one is accepted, then pattern moves; after each of them
+    its camera rounds."""
 
-    best: Candidate  # the last rejected candidate or, once one was accepted, the one with the lowest cost
-    cameras: Float[Array, "9 cameras"]  # origin of the next candidate
+    best: Candidate
+    """The last rejected candidate or, once one was accepted, the one with the lowest cost."""
+
+    cameras: Float[Array, "9 cameras"]
+    """Origin of the next candidate."""
+
     points: Float[Array, "3 points"]
-    # the step, or the change by the first accepted candidate
+
     direction: tuple[Float[Array, "9 cameras"], Float[Array, "3 points"]]
-    length: Float[Array, "*parts"]  # length of the next candidate, in units of `direction`
-    active: Bool[Array, "*parts"]  # whether there is a next candidate
+    """The step, or the change by the first accepted candidate."""
+
+    length: Float[Array, "*parts"]
+    """Length of the next candidate, in units of `direction`."""
+
+    active: Bool[Array, "*parts"]
+    """Whether there is a next candidate."""
+
+    candidate: Candidate
+    """The candidate that camera rounds improve."""
+
+    rounds: Int[Array, "*parts"]
+    """Its camera rounds so far."""
+
+    refining: Bool[Array, "*parts"]
+    """Whether it has another camera round, before there is a next candidate."""
 
 
 def best_candidate(
@@ -76,54 +97,81 @@ def best_candidate(
     ones, true = jnp.ones_like(cost), jnp.ones(cost.shape, bool)
     infinite, zeros = jnp.full_like(cost, jnp.inf), jnp.zeros(cost.shape, jnp.int32)
     initial = Candidate(cameras, points, infinite, -ones, -infinite, ~true, ones, zeros - 1)
-    start = _Attempt(initial, cameras, points, (step.cameras, step.points), ones, true)
-    if options.refinement.trials == 1 and not options.refinement.pattern_moves:
-        return _next_candidate(against, start)
-    # the full step is the first iteration of the loop, so that the program contains its body only once
-    advance = lambda attempt: _next_attempt(against, attempt)
-    return loops.while_loop(lambda attempt: jnp.any(attempt.active), advance, start).best
+    direction = step.cameras, step.points
+    start = _Search(initial, cameras, points, direction, ones, true, initial, zeros, ~true)
+    refinement = options.refinement
+    if refinement.trials == 1 and not refinement.pattern_moves and not refinement.camera_rounds:
+        return _assess_next(against, start)
+    # full step, shorter steps, pattern moves and camera rounds are iterations of one loop, so that the program contains
+    # the evaluation of a candidate only once
+    advance = lambda search: _advance(against, search)
+    return loops.while_loop(lambda search: jnp.any(search.active), advance, start).best
 
 
-def _next_candidate(against: Comparison, attempt: _Attempt) -> Candidate:
-    """Evaluates the next candidate, with its embedded iterations and camera rounds."""
-    parts, best = against.parts, attempt.best
-    step_fraction = jnp.where(best.accepted, best.step_fraction, attempt.length)
-    lengths = parts.of_cameras(attempt.length)
-    new_cameras = move_cameras(parts.layout, attempt.cameras, lengths * attempt.direction[0], against.options)
+def _assess_next(against: Comparison, search: _Search) -> Candidate:
+    """Evaluates the next candidate or, where that is due, a camera round of the last one."""
+    parts, best = against.parts, search.best
+    lengths = parts.of_cameras(search.length)
+    cameras = move_cameras(parts.layout, search.cameras, lengths * search.direction[0], against.options)
     if against.options.refinement.trials > 1:
-        new_cameras = jnp.where(new_cameras[6] * against.cameras[6] < 0, attempt.cameras, new_cameras)
-    new_points = attempt.points + parts.of_points(attempt.length) * attempt.direction[1]
-    full_step = ~best.accepted & (attempt.length == 1)
-    candidate = assess(
-        against, new_cameras, new_points, step_fraction, best.repairs + 1, jnp.any(full_step & attempt.active)
-    )
+        cameras = jnp.where(cameras[6] * against.cameras[6] < 0, search.cameras, cameras)
+    points = search.points + parts.of_points(search.length) * search.direction[1]
+    fraction = jnp.where(best.accepted, best.step_fraction, search.length)
+    full_step = jnp.any(_is_full_step(search) & search.active)
+    repairs = best.repairs + 1
+    if against.options.refinement.camera_rounds:
+        last, refining = search.candidate, jnp.any(search.refining)
+        refine = lambda _, __: refine_cameras(parts.layout, last.cameras, last.points, against.options)
+        # a loop of at most one iteration: under vmap both branches of a condition would be computed
+        cameras = loops.fori_loop(0, refining.astype(jnp.int32), refine, cameras)
+        points = jnp.where(refining, last.points, points)
+        fraction = jnp.where(refining, last.step_fraction, fraction)
+        repairs = jnp.where(refining, last.repairs + 1, repairs)
+        full_step = full_step & ~refining
+    return assess(against, cameras, points, fraction, repairs, full_step)
+
+
+def _is_full_step(search: _Search) -> Bool[Array, "*parts"]:
+    return ~search.best.accepted & (search.length == 1)
+
+
+def _advance(against: Comparison, search: _Search) -> _Search:
+    """Evaluates a candidate or a camera round, and decides what comes after it."""
+    candidate = _assess_next(against, search)
     if not against.options.refinement.camera_rounds:
-        return candidate
-    return with_camera_rounds(against, candidate, best, full_step, attempt.active)
+        return _after_candidate(against, search._replace(candidate=candidate))
+    refined = jnp.any(search.refining)
+    candidate = select(against.parts, search.refining | ~refined, candidate, search.candidate)
+    rounds = jnp.where(refined, search.rounds + 1, 0)
+    full_step = _is_full_step(search)
+    refining = should_refine_cameras(against, candidate, search.best, full_step, rounds) & search.active
+    same = search._replace(candidate=candidate, rounds=rounds, refining=refining)
+    choose = lambda new, old: jnp.where(jnp.any(refining), old, new)
+    return jax.tree.map(choose, _after_candidate(against, same), same)
 
 
-def _next_attempt(against: Comparison, attempt: _Attempt) -> _Attempt:
-    """Evaluates the next candidate and decides what to try after it."""
-    parts, best, candidate = against.parts, attempt.best, _next_candidate(against, attempt)
+def _after_candidate(against: Comparison, search: _Search) -> _Search:
+    """What to try after a candidate that has had its camera rounds."""
+    parts, best, candidate = against.parts, search.best, search.candidate
     first = candidate.accepted & ~best.accepted
     better = candidate.accepted & best.accepted & (candidate.cost < best.cost)
-    tried = best._replace(repairs=jnp.where(attempt.active, candidate.repairs, best.repairs))
-    best_now = select(parts, attempt.active & (better | ~best.accepted), candidate, tried)
-    shorter = should_backtrack(against, candidate, attempt.length)
+    tried = best._replace(repairs=jnp.where(search.active, candidate.repairs, best.repairs))
+    best_now = select(parts, search.active & (better | ~best.accepted), candidate, tried)
+    shorter = should_backtrack(against, candidate, search.length)
     if not against.options.refinement.pattern_moves:
-        return attempt._replace(best=best_now, length=SHORTER * attempt.length, active=attempt.active & shorter)
-    further = should_extend(against, better, attempt.length)
+        return search._replace(best=best_now, length=SHORTER * search.length, active=search.active & shorter)
+    further = should_extend(against, better, search.length)
     continues = jnp.where(first, should_repeat(against, candidate), jnp.where(best.accepted, further, shorter))
-    starts_pattern = attempt.active & first
+    starts_pattern = search.active & first
     change = step_between(against.cameras, best_now.cameras, against.options), best_now.points - against.points
-    return _Attempt(
-        best_now,
-        jnp.where(parts.of_cameras(best_now.accepted), best_now.cameras, against.cameras),
-        jnp.where(parts.of_points(best_now.accepted), best_now.points, against.points),
-        (
-            jnp.where(parts.of_cameras(starts_pattern), change[0], attempt.direction[0]),
-            jnp.where(parts.of_points(starts_pattern), change[1], attempt.direction[1]),
+    return search._replace(
+        best=best_now,
+        cameras=jnp.where(parts.of_cameras(best_now.accepted), best_now.cameras, against.cameras),
+        points=jnp.where(parts.of_points(best_now.accepted), best_now.points, against.points),
+        direction=(
+            jnp.where(parts.of_cameras(starts_pattern), change[0], search.direction[0]),
+            jnp.where(parts.of_points(starts_pattern), change[1], search.direction[1]),
         ),
-        jnp.where(first, 1, jnp.where(best.accepted, 2, SHORTER) * attempt.length),
-        attempt.active & continues,
+        length=jnp.where(first, 1, jnp.where(best.accepted, 2, SHORTER) * search.length),
+        active=search.active & continues,
     )

@@ -11,7 +11,7 @@ import operator
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float, Int
 
 from jaxba.runtime.fusion import fast_compilation, sum_in_one_loop
@@ -51,9 +51,12 @@ def as_rows(columns: list[Float[Array, " n"]]) -> Float[Array, "n k"]:
 def outer_sum(left: Float[Array, "n terms a"], right: Float[Array, "n terms b"]) -> Float[Array, "n a b"]:
     """`sum_k left[:, k]^T right[:, k]` for many small items, unrolled over k.
 
-    XLA compiles this to one fused loop, vectorised and multi-threaded. Its batched matrix product is neither for
-    blocks of this size on a CPU and took four times as long.
+    XLA compiles this to one fused loop, vectorised and multi-threaded. Its batched matrix product, a call of a library,
+    takes 1.7 times as long for blocks of this size on a CPU, but as long without optimisation, which makes the loop 16
+    times as slow.
     """
+    if fast_compilation.value:
+        return lax.dot_general(left, right, (((1,), (1,)), ((0,), (0,))), precision="highest")
     total = left[:, 0, :, None] * right[:, 0, None, :]
     for k in range(1, left.shape[1]):
         total = total + left[:, k, :, None] * right[:, k, None, :]
