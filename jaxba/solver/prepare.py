@@ -73,7 +73,7 @@ class Prepared:
 
 
 def prepare(
-    problem: BundleProblem, options: SolveOptions | None = None, *, policy: str | DampingPolicy = DEFAULT_POLICY
+    problem: BundleProblem, policy: str | DampingPolicy = DEFAULT_POLICY, options: SolveOptions | None = None
 ) -> Prepared:
     """Everything that a solve does before its first iteration, for callers that jit, vmap or time the loop themselves.
 
@@ -82,8 +82,8 @@ def prepare(
 
     Args:
         problem: start of the optimisation.
-        options: as for `solve`.
         policy: as for `solve`.
+        options: as for `solve`.
 
     Raises:
         ValueError, ProblemError: as `solve`.

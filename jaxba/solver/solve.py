@@ -118,7 +118,7 @@ def solve(
     """
     options = checked_options(options)
     with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
-        prepared = prepare(problem, options, policy=policy)
+        prepared = prepare(problem, policy, options)
         layout, state, step_options = prepared.layout, prepared.state, prepared.options
         stages_of_parts = _stages(options.compilation, problem, step_options)
         run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts)

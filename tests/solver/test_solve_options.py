@@ -65,7 +65,7 @@ def test_a_solve_with_defaults_is_what_the_command_writes(tmp_path):
 def test_a_loss_leaves_the_step_that_the_policy_was_trained_with():
     trained = trained_step(make_policy("learned"))
     assert trained.refinement != Refinement()
-    found = prepare(support.tiny(), SolveOptions(loss=Loss("huber", 2.0)), policy="learned").options
+    found = prepare(support.tiny(), "learned", SolveOptions(loss=Loss("huber", 2.0))).options
     assert found.loss == Loss("huber", 2.0)
     assert (found.refinement, found.coordinates) == (trained.refinement, trained.coordinates)
 
@@ -80,14 +80,14 @@ def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
 def test_what_is_asked_for_wins_over_what_the_policy_was_trained_with():
     refinement, coordinates = Refinement(points=1, trials=2), Coordinates(camera_damping=0.5, rotation="manifold")
     trained = trained_step(make_policy("learned"))
-    one = prepare(support.tiny(), SolveOptions(refinement=refinement)).options
+    one = prepare(support.tiny(), options=SolveOptions(refinement=refinement)).options
     assert (one.refinement, one.coordinates) == (refinement, trained.coordinates)
-    other = prepare(support.tiny(), SolveOptions(coordinates=coordinates)).options
+    other = prepare(support.tiny(), options=SolveOptions(coordinates=coordinates)).options
     assert (other.refinement, other.coordinates) == (trained.refinement, coordinates)
 
 
 def test_a_rule_brings_a_plain_step():
-    found = prepare(support.tiny(), policy="ceres").options
+    found = prepare(support.tiny(), "ceres").options
     assert (found.refinement, found.coordinates) == (Refinement(), Coordinates())
 
 
