@@ -260,7 +260,7 @@ def scene_throughput(repeats: int) -> Iterator[Metric]:
 
     scenes = 256
     with jax.enable_x64(True):
-        problems = [jaxba.random_scene(jaxba.like("paper"), seed) for seed in range(scenes)]
+        problems = [jaxba.random_scene(jaxba.scene_like("paper"), seed) for seed in range(scenes)]
         options = jaxba.StepOptions()
         stack = lambda trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
         layouts = [jaxba.build_layout(problem) for problem in problems]

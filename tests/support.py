@@ -27,9 +27,9 @@ from jaxba import (
     StepOptions,
     Tolerances,
     initial_state,
-    like,
     lm_step,
     random_scene,
+    scene_like,
 )
 from jaxba.lm.records import StepInfo
 from jaxba.problem import geometry
@@ -83,13 +83,13 @@ def bal_file(name: str) -> Path:
 @functools.cache
 def tiny() -> BundleProblem:
     """6 cameras, 40 points, 200 observations: 40 visibilities are missing, so tracks differ."""
-    return random_scene(like("tiny"), 0)
+    return random_scene(scene_like("tiny"), 0)
 
 
 @functools.cache
 def paper(seed: int) -> BundleProblem:
     """10 cameras, 10 points, all visible: every seed has the same shape, so all share one program."""
-    return random_scene(like("paper"), seed)
+    return random_scene(scene_like("paper"), seed)
 
 
 @functools.cache

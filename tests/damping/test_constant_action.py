@@ -11,7 +11,7 @@ from agent_steps import ACCEPTED, REJECTED, after, info
 from support import same_bits
 from test_learned import random_policy
 
-from jaxba import SolveOptions, like, make_policy, perturb, random_scene, solve
+from jaxba import SolveOptions, make_policy, perturb, random_scene, scene_like, solve
 from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import begin
@@ -29,7 +29,7 @@ def boldest_network(config: AgentConfig) -> LearnedPolicy:
 @functools.cache
 def hard_scene():
     """Starts so far from the solution that steps are shortened and rejected."""
-    return perturb(random_scene(like("paper"), 3), 0, point_sigma=0.5)
+    return perturb(random_scene(scene_like("paper"), 3), 0, point_sigma=0.5)
 
 
 @pytest.mark.parametrize("embedded", [True, False])

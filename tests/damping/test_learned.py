@@ -18,7 +18,7 @@ from safetensors.numpy import save_file
 from support import same_bits, solve
 
 import jaxba
-from jaxba import METHODS, SolveOptions, StepOptions, like, make_policy, random_scene, solve_loop
+from jaxba import METHODS, SolveOptions, StepOptions, make_policy, random_scene, scene_like, solve_loop
 from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
@@ -346,7 +346,7 @@ def test_a_solve_damps_cameras_as_the_policy_was_trained():
 @functools.cache
 def scene(seed: int):
     """Scenes of one shape: one program for all."""
-    return random_scene(like("paper"), seed)
+    return random_scene(scene_like("paper"), seed)
 
 
 def test_another_policy_of_the_same_shape_compiles_nothing():
