@@ -296,7 +296,7 @@ class Dense:
 def cost(problem: BundleProblem, options: StepOptions) -> float:
     """The objective in float64."""
     residual = _residual(problem)[0]
-    return 0.5 * float(np.sum(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[0]))
+    return 0.5 * float(np.sum(published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[0]))
 
 
 def _residual(problem: BundleProblem):
@@ -315,7 +315,7 @@ def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np
     residual, (turn, camera, point) = _residual(problem)
     if options.coordinates.rotation == "manifold":
         camera[:, :, :3] = turn
-    weight = np.sqrt(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[1])
+    weight = np.sqrt(published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[1])
     count, cameras = problem.num_observations, problem.num_cameras
     if options.intrinsics == "fixed":
         camera[:, :, 6:] = 0

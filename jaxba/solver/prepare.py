@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.policy import trained_step
 from jaxba.lm.records import LMState
 from jaxba.lm.step import initial_state
 from jaxba.problem import geometry
@@ -96,16 +95,11 @@ def prepare(
         policy = make_policy(fitting_policy(policy, alone=alone))
     _check_policy(policy)
     step = options.step_options(policy)
-    scaling = step.coordinates.scaling
-    if getattr(policy, "step_options", None) is not None and scaling != trained_step(policy).coordinates.scaling:
-        raise ProblemError(f"this policy takes lambda as a factor on the diagonal, not with scaling {scaling!r}")
     capacity, asked = None, options.linear_solver
     observations = ObservationOrder.of(problem)
     if options.pad:
         capacity, asked = with_padded_solver(capacity_of(problem, observations), step, asked)
     step = choose_linear_solver(problem, step, asked, observations)
-    if step.mixed_precision and step.method is not None:
-        raise ProblemError("mixed types are for plain LM; methods have float64 or float32")
     dtype = jnp.dtype("float32" if options.dtype == "float32" else "float64")
     with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
         started = time.perf_counter()

@@ -412,6 +412,10 @@ BAD = {
     ),
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must be at least 0"),
     "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "not with scaling 'identity'"),
+    "mixed types of a method": (
+        lambda tiny: [str(tiny), "--method", "stba", "--dtype", "mixed"],
+        "mixed types are for plain LM",
+    ),
     "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be at least 1"),
     "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be at least 1"),
     "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),

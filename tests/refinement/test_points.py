@@ -47,7 +47,7 @@ def refined(problem: BundleProblem, iterations: int, loss: Loss | None = None):
 def point_costs(problem: BundleProblem, loss: Loss) -> np.ndarray:
     """Cost of each point's observations."""
     squared = np.sum(geometry.residuals(problem) ** 2, axis=1)
-    values = 0.5 * published_loss(loss.name, loss.scale, squared)[0]
+    values = 0.5 * published_loss(loss.rho, loss.scale, squared)[0]
     return np.bincount(problem.point_index, values, minlength=problem.num_points)
 
 
@@ -110,7 +110,7 @@ def test_every_point_ends_where_scipy_ends_on_that_point_alone(loss):
                 return r.ravel()
             squared = np.sum(r**2, axis=1)
             # the same direction with the length sqrt(rho), so that the sum of squares is the sum of rho
-            return (r * np.sqrt(published_loss(loss.name, loss.scale, squared)[0] / squared)[:, None]).ravel()
+            return (r * np.sqrt(published_loss(loss.rho, loss.scale, squared)[0] / squared)[:, None]).ravel()
 
         best = least_squares(residuals, problem.points[point], method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
         np.testing.assert_allclose(found.points[point], best.x, rtol=1e-6, atol=1e-6)

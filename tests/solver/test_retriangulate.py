@@ -31,7 +31,7 @@ from jaxba.problem import geometry
 def point_costs(problem: BundleProblem, loss: Loss) -> np.ndarray:
     """Cost of each point's observations."""
     squared = np.sum(geometry.residuals(problem) ** 2, axis=1)
-    values = 0.5 * published_loss(loss.name, loss.scale, squared)[0]
+    values = 0.5 * published_loss(loss.rho, loss.scale, squared)[0]
     return np.bincount(problem.point_index, values, minlength=problem.num_points)
 
 

@@ -33,7 +33,7 @@ def test_every_default_of_the_command_is_that_of_the_options():
     for name in plain:
         assert getattr(command, name) == getattr(options, name), name
     assert command.preconditioner == options.conjugate_gradients.preconditioner
-    assert (command.loss, command.loss_scale) == (options.loss.name, options.loss.scale)
+    assert (command.loss, command.loss_scale) == (options.loss.rho, options.loss.scale)
     assert (command.ftol, command.xtol, command.gtol) == options.tolerances[:3]
     assert options.refinement is command.refine_points is None
     assert options.coordinates is command.scaling is command.rotation is None
