@@ -192,8 +192,7 @@ def _with_suite(args: Arguments) -> Arguments:
     """The arguments, completed by those of the suite."""
     if args.suite is None:
         return args
-    from jaxba.io import configurations
-    from jaxba.training import settings
+    from jaxba.io import configurations, settings
 
     try:
         data = configurations.read("bench", args.suite)

@@ -132,8 +132,8 @@ def use_compilation_cache(untraced: bool = False) -> None:
     """
     import jax
 
-    from jaxba.datasets.bal.paths import user_cache
     from jaxba.runtime import compilation
+    from jaxba.runtime.user_cache import user_cache
 
     choice = os.environ.get(CACHE_VARIABLE, "")
     if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):
