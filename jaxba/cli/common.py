@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
 import stat
 import sys
 from collections.abc import Callable, Sequence
-from io import TextIOWrapper
+from contextlib import redirect_stderr
+from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -21,6 +24,9 @@ INTERRUPTED = 130
 CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable with the folder of compiled programs; `off` disables the cache."""
 
+
+_COLORS = re.compile(r"\x1b\[[\d;]*m")
+"""Control sequences that colour text on a terminal."""
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
@@ -46,11 +52,11 @@ def run_command(
     Returns:
         The exit status: that of `main`, 2 after an error, or 130 after Ctrl-C.
     """
-    import tyro
-
     escape_unencodable_output()
     try:
-        parsed = tyro.cli(arguments, args=argv, description=description)
+        parsed = _parse(arguments, description, argv)
+        if isinstance(parsed, str):
+            return print_error(parsed)
         from jaxba.damping.policy_file import PolicyFileError
         from jaxba.damping.registry import UnknownPolicyError
         from jaxba.methods.registry import UnknownMethodError
@@ -71,6 +77,25 @@ def run_command(
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str:
+    """The parsed command line, or what is wrong with it, in one line."""
+    import tyro
+
+    drawn = StringIO()
+    try:
+        with redirect_stderr(drawn):
+            return tyro.cli(arguments, args=argv, description=description)
+    except SystemExit as end:
+        if end.code != BAD_INPUT:  # after --help
+            raise
+    # a box: the message, a rule, help or options with a similar name, a rule, the name of --help
+    text = _COLORS.sub("", drawn.getvalue())
+    rows = [row.strip("│ ") for row in text.splitlines() if row.startswith("│")]
+    message = " ".join(itertools.takewhile(lambda row: not row.startswith("─"), rows))
+    near = re.findall(r"^│ {5}(--[\w-]+)", text.partition("Perhaps you meant:")[2], re.MULTILINE)
+    return f"{message or text}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
 
 
 def escape_unencodable_output() -> None:

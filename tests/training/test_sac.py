@@ -242,5 +242,4 @@ def test_presets() -> None:
     assert (paper.variant, paper.width, paper.target_every, paper.tau) == ("value", 256, 5, 1.0)
     assert not paper.learn_temperature
     assert (paper.log_std_min, paper.log_std_max) == (-20.0, 2.0)
-    assert SacConfig.default() == SacConfig()
     assert hash(paper) != hash(SacConfig())
