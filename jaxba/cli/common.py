@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import re
 import stat
@@ -90,12 +89,13 @@ def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | N
     except SystemExit as end:
         if end.code != BAD_INPUT:  # after --help
             raise
-    # a box: the message, a rule, help or options with a similar name, a rule, the name of --help
+    # a box: the title, a rule, the message, a rule, help on the option or options with a similar name, a rule, and how
+    # to get help; in an encoding that has lines the title stands in the first rule, and lines are its border
     text = _COLORS.sub("", drawn.getvalue())
-    rows = [row.strip("│ ") for row in text.splitlines() if row.startswith("│")]
-    message = " ".join(itertools.takewhile(lambda row: not row.startswith("─"), rows))
-    near = re.findall(r"^│ {5}(--[\w-]+)", text.partition("Perhaps you meant:")[2], re.MULTILINE)
-    return f"{message or text}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
+    parts = re.split(r"^(?:╭.*|[│ ]*[─-]{3,}.*)$", text, flags=re.MULTILINE)
+    message = " ".join(re.sub(r"^│|│$", "", parts[1], flags=re.MULTILINE).split()) if len(parts) > 1 else text
+    near = re.findall(r"^. {5}(--[\w-]+)", text.partition("Perhaps you meant:")[2], re.MULTILINE)
+    return f"{message}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
 
 
 def escape_unencodable_output() -> None:
