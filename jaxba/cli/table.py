@@ -12,6 +12,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.names import split_refinement
 from jaxba.solver.retriangulate import Retriangulation
 from jaxba.solver.solve import Solution
 from jaxba.structure.padding import capacity_of
@@ -44,7 +45,7 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         for kind, number in Counter(map(tuple, free.tolist())).most_common():
             names = [one for one, used in zip(("f", "k1", "k2"), kind, strict=True) if used]
             sizes += f", {number} lens{'es' * (number > 1)} ({', '.join(names) or 'fixed'})"
-    return f"{name}: {sizes}\npolicy {args.policy}{refine}, {args.dtype}, {solver}"
+    return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {args.dtype}, {solver}"
 
 
 def _counted(count: int, noun: str) -> str:

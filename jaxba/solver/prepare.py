@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba.damping import DampingPolicy, make_policy
+from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState
 from jaxba.lm.step import initial_state
 from jaxba.problem import geometry
@@ -19,7 +19,7 @@ from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver
-from jaxba.solver.names import fitting_policy
+from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout, layout_for
@@ -91,8 +91,7 @@ def prepare(
     if not isinstance(problem, BundleProblem):
         raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
     if isinstance(policy, str):
-        alone = options.refinement is not None and not options.refinement.points
-        policy = make_policy(fitting_policy(policy, alone=alone))
+        policy, options = resolve_policy(policy, options)
     _check_policy(policy)
     step = options.step_options(policy)
     capacity, asked = None, options.linear_solver
