@@ -114,7 +114,7 @@ def solve(
         The optimised problem in NumPy float64 arrays, histories and timings.
 
     Raises:
-        ValueError: unknown names, or options that exclude each other or what the name of the policy states.
+        ValueError: unknown names, or options that exclude each other, or that contradict the name of the policy.
         ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
             the linear solver or method does not support shared or partly fixed intrinsics.
     """

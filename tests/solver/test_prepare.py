@@ -95,7 +95,7 @@ def test_each_point_comes_back_to_its_own_place():
     assert not seen.all()
     np.testing.assert_array_equal(moved.points[seen], 2 * problem.points[seen])
     np.testing.assert_array_equal(moved.points[~seen], problem.points[~seen])
-    assert same_bits(moved.replace(points=problem.points), problem)
+    chex.assert_trees_all_equal(moved.replace(points=problem.points), problem, strict=True)
 
 
 def test_a_scene_far_from_the_origin_is_prepared_near_it_and_comes_back_where_it_was():
@@ -110,7 +110,7 @@ def test_a_padded_problem_comes_back_in_its_own_sizes():
     problem = support.tiny()
     prepared = prepare(problem, "ceres", SolveOptions(pad=True))
     assert prepared.state.cameras.shape[1] > problem.num_cameras
-    assert same_bits(prepared.problem_at(prepared.state), problem)
+    chex.assert_trees_all_equal(prepared.problem_at(prepared.state), problem, strict=True)
 
 
 def test_double_precision_without_64_bits_is_refused_in_one_line():

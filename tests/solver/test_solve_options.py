@@ -77,7 +77,7 @@ def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
     trained, loss = trained_step(make_policy("learned")), Loss("huber", 2.0)
     spelled_out = SolveOptions(loss=loss, refinement=trained.refinement, coordinates=trained.coordinates)
     found, expected = (jaxba.solve(support.tiny(), "learned", o) for o in (SolveOptions(loss=loss), spelled_out))
-    assert support.same_bits(found.history, expected.history)
+    chex.assert_trees_all_equal(found.history, expected.history, strict=True)
 
 
 def test_what_is_asked_for_wins_over_what_the_policy_was_trained_with():
