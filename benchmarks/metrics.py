@@ -70,7 +70,7 @@ def write_baseline(path: Path, metrics: Iterable[Metric]) -> None:
 
 def to_json(metrics: Iterable[Metric], machine: dict[str, str]) -> str:
     """The metrics and a description of the machine as a JSON document."""
-    return json.dumps({"facts": machine, "metrics": [asdict(m) for m in metrics]}, indent=1) + "\n"
+    return json.dumps({"machine": machine, "metrics": [asdict(m) for m in metrics]}, indent=1) + "\n"
 
 
 def to_text(metrics: Iterable[Metric]) -> str:

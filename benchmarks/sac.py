@@ -177,7 +177,7 @@ def run(repeats: int, envs: int, updates: int) -> list[Metric]:
     programs: dict[str, Callable[[], Sample]] = {
         "jaxba, width 256": ours(peer_like, envs, updates),
         "jaxba, width 64": ours(dataclasses.replace(peer_like, width=64), envs, 5 * updates),
-        "jaxba, default (64, layer norm)": ours(SacConfig.default(), envs, 5 * updates),
+        "jaxba, default (64, layer norm)": ours(SacConfig(), envs, 5 * updates),
         "jaxba, paper": ours(SacConfig.paper(), envs, updates),
     }
     peers: list[Sbx] = []

@@ -50,11 +50,13 @@ TOLERANCE_SOLVERS = (
     "nielsen+refine3",
     "ceres+embedded",
     "learned",
+    "bold",
     "ceres+refine3@float32",
     "nielsen+refine3@float32",
     "learned@float32",
 )
-"""Rules with point iterations, and the shipped policy; also in float32, which is accurate enough for 1e-3."""
+"""Rules with embedded iterations, the shipped policy, and `bold`, its twin without a network; some also in float32,
+which is accurate enough for 1e-3."""
 
 ROUNDING = 2e-5
 """Relative error of a cost in float32, by which a solve may end above its target: a fiftieth of the tolerance."""
@@ -260,7 +262,7 @@ def scene_throughput(repeats: int) -> Iterator[Metric]:
 
     scenes = 256
     with jax.enable_x64(True):
-        problems = [jaxba.random_scene(jaxba.like("paper"), seed) for seed in range(scenes)]
+        problems = [jaxba.random_scene(jaxba.scene_like("paper"), seed) for seed in range(scenes)]
         options = jaxba.StepOptions()
         stack = lambda trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
         layouts = [jaxba.build_layout(problem) for problem in problems]

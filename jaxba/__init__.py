@@ -35,7 +35,7 @@ from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
-from jaxba.scenes import SceneConfig, like, random_scene, random_scene_with_truth
+from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.loop import Carry, History, solve_loop
@@ -84,7 +84,6 @@ __all__ = [
     "build_layout",
     "drop_invalid",
     "initial_state",
-    "like",
     "lm_step",
     "load_policy",
     "make_method",
@@ -101,6 +100,7 @@ __all__ = [
     "read_problem",
     "retriangulate",
     "save_policy",
+    "scene_like",
     "solve",
     "solve_and_retriangulate",
     "solve_loop",

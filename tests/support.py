@@ -27,9 +27,9 @@ from jaxba import (
     StepOptions,
     Tolerances,
     initial_state,
-    like,
     lm_step,
     random_scene,
+    scene_like,
 )
 from jaxba.lm.records import StepInfo
 from jaxba.problem import geometry
@@ -83,13 +83,13 @@ def bal_file(name: str) -> Path:
 @functools.cache
 def tiny() -> BundleProblem:
     """6 cameras, 40 points, 200 observations: 40 visibilities are missing, so tracks differ."""
-    return random_scene(like("tiny"), 0)
+    return random_scene(scene_like("tiny"), 0)
 
 
 @functools.cache
 def paper(seed: int) -> BundleProblem:
     """10 cameras, 10 points, all visible: every seed has the same shape, so all share one program."""
-    return random_scene(like("paper"), seed)
+    return random_scene(scene_like("paper"), seed)
 
 
 @functools.cache
@@ -296,7 +296,7 @@ class Dense:
 def cost(problem: BundleProblem, options: StepOptions) -> float:
     """The objective in float64."""
     residual = _residual(problem)[0]
-    return 0.5 * float(np.sum(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[0]))
+    return 0.5 * float(np.sum(published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[0]))
 
 
 def _residual(problem: BundleProblem):
@@ -315,7 +315,7 @@ def linear(problem: BundleProblem, options: StepOptions) -> tuple[np.ndarray, np
     residual, (turn, camera, point) = _residual(problem)
     if options.coordinates.rotation == "manifold":
         camera[:, :, :3] = turn
-    weight = np.sqrt(published_loss(options.loss.name, options.loss.scale, np.sum(residual**2, axis=1))[1])
+    weight = np.sqrt(published_loss(options.loss.rho, options.loss.scale, np.sum(residual**2, axis=1))[1])
     count, cameras = problem.num_observations, problem.num_cameras
     if options.intrinsics == "fixed":
         camera[:, :, 6:] = 0

@@ -117,7 +117,7 @@ def test_importing_starts_no_backend_and_does_not_switch_to_64_bits():
 def test_solving_in_float64_leaves_the_rest_of_the_process_in_32_bits():
     code = (
         "import jax, jax.numpy as jnp, numpy as np, jaxba\n"
-        "problem = jaxba.random_scene(jaxba.like('paper'), 0)\n"
+        "problem = jaxba.random_scene(jaxba.scene_like('paper'), 0)\n"
         "solution = jaxba.solve(problem, options=jaxba.SolveOptions(max_iterations=1))\n"
         "assert not jax.config.jax_enable_x64\n"
         "assert jnp.asarray(1.0).dtype == jnp.float32\n"

@@ -58,7 +58,7 @@ def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, A
 def scene_throughput(count: int, dtype: Any) -> float:
     """LM steps per second on `count` scenes of 10 cameras and 10 points in one program."""
     options = StepOptions()
-    problems = [jaxba.random_scene(jaxba.like("paper"), seed) for seed in range(min(count, 256))]
+    problems = [jaxba.random_scene(jaxba.scene_like("paper"), seed) for seed in range(min(count, 256))]
     layouts = [jaxba.build_layout(problem) for problem in problems]
     states = [jaxba.initial_state(la, p, options, dtype) for la, p in zip(layouts, problems, strict=True)]
     tile = lambda x: jnp.tile(x, (-(-count // len(problems)),) + (1,) * (x.ndim - 1))[:count]

@@ -26,7 +26,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.process import out_of_memory
 from jaxba.solver.callback_loop import IterationRecord
-from jaxba.solver.names import SolverName, parse_solver
+from jaxba.solver.names import SolverName, SolverNameError, parse_solver
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution, solve
 
@@ -204,13 +204,24 @@ def plan(sources: Sequence[Source], solvers: Sequence[str], repeats: int) -> lis
     """All runs of a benchmark, ordered by problem, solver and repeat. Repeated solver names count once.
 
     Raises:
-        SolverNameError, UnknownPolicyError: an unknown solver, or one whose library is not installed.
+        SolverNameError, UnknownPolicyError: an unknown solver, one whose type its method does not have, or one whose
+            library is not installed.
     """
     names = list(dict.fromkeys(str(parse_solver(name)) for name in solvers))
     parsed = [parse_solver(name) for name in names]
     for solver in parsed:
         require(solver)
+        if not solver.peer:
+            _check_options(solver)
     return [Job(source, solver, repeat) for source in sources for solver in parsed for repeat in range(repeats)]
+
+
+def _check_options(solver: SolverName) -> None:
+    policy, options = solver.build()
+    try:
+        options.step_options(policy)
+    except ValueError as error:
+        raise SolverNameError(f"{error} (in {str(solver)!r})") from None
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_problem
 from jaxba.io.files import display_name
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.scenes import SceneConfig, like, random_scene
+from jaxba.scenes import SceneConfig, random_scene, scene_like
 
 SCENE_PREFIX = "scene:"
 """Prefix of a random scene: `scene:NAME` or `scene:NAME:SEED`."""
@@ -49,7 +49,7 @@ class Source:
         if not self.location.startswith(SCENE_PREFIX):
             return read_problem(self.location)
         name, seed = _scene(self.location)
-        return random_scene(DEFAULT_SCENES.get(name) or like(name), seed)
+        return random_scene(DEFAULT_SCENES.get(name) or scene_like(name), seed)
 
 
 def default_sources() -> list[Source]:
@@ -72,7 +72,7 @@ def sources(locations: list[str]) -> list[Source]:
         if location.startswith(SCENE_PREFIX):
             name, seed = _scene(location)
             if name not in DEFAULT_SCENES:
-                like(name)
+                scene_like(name)
             label, family = (f"{name}-{seed}" if seed else name), "scene"
         else:
             name, location = location, resolve(location)

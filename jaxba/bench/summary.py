@@ -148,7 +148,7 @@ class Summary:
     virtual: dict[str, dict[str, TargetSummary]] = field(default_factory=dict)
     """Virtual best of the hand-written rules with the same step (`virtual.py`): by name, then by `Target.key`."""
     metadata: dict[str, Any] = field(default_factory=dict)
-    """Device, threads, versions and the like; written to `summary.json` as `facts`."""
+    """Device, threads, versions and the like."""
 
 
 def summarize(
@@ -298,7 +298,6 @@ def _coverage_warnings(cells: Sequence[Cell], solvers: Sequence[str], names: Seq
 def to_json(summary: Summary) -> dict[str, Any]:
     """The JSON object of `summary.json`. Non-finite numbers (never reached, unknown) become None."""
     body = asdict(summary)
-    body["facts"] = body.pop("metadata")
     body["targets"] = [{"key": t.key, "label": t.label, "kind": t.kind, "value": t.value} for t in summary.targets]
     rules = {
         "iteration_limit": profile.ITERATION_LIMIT,

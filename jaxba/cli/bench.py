@@ -15,8 +15,9 @@ import tyro
 from jaxba.cli import common
 from jaxba.problem.options import LinearSolverChoice
 
-DEFAULT_SOLVERS = "learned,classic,ceres,ceres+refine3,ceres+embedded"
-"""The shipped policy, the paper's baseline, Ceres' rule, and Ceres' rule with embedded iterations."""
+DEFAULT_SOLVERS = "learned,bold,classic,ceres,ceres+refine3,ceres+embedded"
+"""The shipped policy, its twin without a network, the paper's baseline, and Ceres' rule alone and with embedded
+iterations."""
 
 FILE_WIDTH = 180
 """Width of the tables in characters if the output is not a terminal."""
@@ -43,7 +44,7 @@ class Arguments:
     solvers: str | None = None
     """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], or, with the extra `ceres`,
     pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default:
-    learned,classic,ceres,ceres+refine3,ceres+embedded."""
+    learned,bold,classic,ceres,ceres+refine3,ceres+embedded."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default: 1e-3."""
@@ -192,8 +193,7 @@ def _with_suite(args: Arguments) -> Arguments:
     """The arguments, completed by those of the suite."""
     if args.suite is None:
         return args
-    from jaxba.io import configurations
-    from jaxba.training import settings
+    from jaxba.io import configurations, settings
 
     try:
         data = configurations.read("bench", args.suite)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 import sys
 from collections.abc import Callable, Sequence
-from io import TextIOWrapper
+from contextlib import redirect_stderr
+from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -21,6 +23,9 @@ INTERRUPTED = 130
 CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable with the folder of compiled programs; `off` disables the cache."""
 
+
+_COLORS = re.compile(r"\x1b\[[\d;]*m")
+"""Control sequences that colour text on a terminal."""
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
@@ -46,11 +51,11 @@ def run_command(
     Returns:
         The exit status: that of `main`, 2 after an error, or 130 after Ctrl-C.
     """
-    import tyro
-
     escape_unencodable_output()
     try:
-        parsed = tyro.cli(arguments, args=argv, description=description)
+        parsed = _parse(arguments, description, argv)
+        if isinstance(parsed, str):
+            return print_error(parsed)
         from jaxba.damping.policy_file import PolicyFileError
         from jaxba.damping.registry import UnknownPolicyError
         from jaxba.methods.registry import UnknownMethodError
@@ -71,6 +76,26 @@ def run_command(
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str:
+    """The parsed command line, or what is wrong with it, in one line."""
+    import tyro
+
+    drawn = StringIO()
+    try:
+        with redirect_stderr(drawn):
+            return tyro.cli(arguments, args=argv, description=description)
+    except SystemExit as end:
+        if end.code != BAD_INPUT:  # after --help
+            raise
+    # a box: the title, a rule, the message, a rule, help on the option or options with a similar name, a rule, and how
+    # to get help; in an encoding that has lines the title stands in the first rule, and lines are its border
+    text = _COLORS.sub("", drawn.getvalue())
+    parts = re.split(r"^(?:╭.*|[│ ]*[─-]{3,}.*)$", text, flags=re.MULTILINE)
+    message = " ".join(re.sub(r"^│|│$", "", parts[1], flags=re.MULTILINE).split()) if len(parts) > 1 else text
+    near = re.findall(r"^. {5}(--[\w-]+)", text.partition("Perhaps you meant:")[2], re.MULTILINE)
+    return f"{message}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
 
 
 def escape_unencodable_output() -> None:
@@ -132,8 +157,8 @@ def use_compilation_cache(untraced: bool = False) -> None:
     """
     import jax
 
-    from jaxba.datasets.bal.paths import user_cache
     from jaxba.runtime import compilation
+    from jaxba.runtime.user_cache import user_cache
 
     choice = os.environ.get(CACHE_VARIABLE, "")
     if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):

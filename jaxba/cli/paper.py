@@ -59,9 +59,9 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _paper(args: Arguments) -> int:
     from rich.console import Console
 
+    from jaxba.io.settings import SettingsError
     from jaxba.paper import config as configs
     from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
-    from jaxba.training.settings import SettingsError
 
     console = Console(soft_wrap=True, highlight=False)
     if args.list:
@@ -93,9 +93,9 @@ def _open(folder: Path, config: Any) -> None:
     Raises:
         UsageError: the folder has another configuration, or cannot be written.
     """
+    from jaxba.io import settings
     from jaxba.paper import config as configs
     from jaxba.runtime.atomic import write_text
-    from jaxba.training import settings
 
     path = folder / configs.CONFIG
     try:

@@ -17,7 +17,7 @@ from jaxba.bench.sources import default_sources
 from jaxba.cli import common, table
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.output import check_outputs, write_solution
-from jaxba.damping import DampingPolicy, brings_embedded
+from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import read_problem
 from jaxba.io.files import open_output, stream_number
@@ -36,7 +36,7 @@ from jaxba.problem.options import (
 from jaxba.runtime.compilation import Compilation
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord
-from jaxba.solver.names import SolverName
+from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.solve import Solution, solve
@@ -66,7 +66,8 @@ class Arguments:
     """Damping policy, which chooses lambda: learned (the shipped policy for the options of the step), a .safetensors
     file of jaxba-train, or one of the rules ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton,
     bold (the smallest lambda that the guard of learned allows), constant:1e-4. Most rules take the first lambda, as in
-    classic:0.03."""
+    classic:0.03. All may end with +embedded (all embedded iterations, as around learned) or +refineK (K point
+    iterations after each camera step, as --refine-points K)."""
 
     method: str = DEFAULT_METHOD
     """Method that computes a step. lm: Levenberg-Marquardt. stba: random clusters of at most 100 cameras; stba:16: of
@@ -153,9 +154,18 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def solver_name(args: Arguments) -> SolverName:
-    """The name of the solver in records and tables."""
-    refine = 0 if args.refine_points is None and not brings_embedded(args.policy) else args.refine_points
-    return SolverName(args.policy, refine, args.dtype, args.method)
+    """The name of the solver in records and tables.
+
+    Raises:
+        UsageError: the name of the policy states another number of point iterations than `--refine-points`.
+    """
+    name = replace(parse_policy(args.policy), dtype=args.dtype, method=args.method)
+    if args.refine_points is None:
+        return name
+    _, stated_points, stated = split_refinement(args.policy)
+    if stated and stated_points != args.refine_points:
+        raise common.UsageError(f"--refine-points {args.refine_points} contradicts --policy {args.policy}")
+    return replace(name, refine_points=args.refine_points)
 
 
 def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:

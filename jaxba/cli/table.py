@@ -12,6 +12,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.names import split_refinement
 from jaxba.solver.retriangulate import Retriangulation
 from jaxba.solver.solve import Solution
 from jaxba.structure.padding import capacity_of
@@ -21,29 +22,34 @@ _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      la
 
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
     """Size of the problem, and the policy and options of the solve."""
-    refine = f" + {options.refinement.points} point iterations" if options.refinement.points else ""
+    refine = f" + {_counted(options.refinement.points, 'point iteration')}" if options.refinement.points else ""
     if refine and options.refinement.starts == "rays":
         refine += " from the better of step and rays"
     if options.refinement.camera_rounds:
-        refine += f", up to {options.refinement.camera_rounds} camera rounds"
+        refine += f", up to {_counted(options.refinement.camera_rounds, 'camera round')}"
     if options.refinement.trials > 1:
         refine += f", up to {options.refinement.trials} trials"
     if options.refinement.pattern_moves:
-        refine += f", up to {options.refinement.pattern_moves} pattern moves"
+        refine += f", up to {_counted(options.refinement.pattern_moves, 'pattern move')}"
     if options.coordinates.lens_step == "pixels":
         refine += ", distortion per pixel"
     if options.kept_steps:
-        refine += f", {options.kept_steps} previous step{'s' * (options.kept_steps > 1)}"
+        refine += f", {_counted(options.kept_steps, 'previous step')}"
     if options.coordinates.camera_damping != 1:
         refine += f", cameras damped by {options.coordinates.camera_damping:g} lambda"
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
-    sizes = f"{problem.num_cameras} cameras, {problem.num_points} points, {problem.num_observations} observations"
+    counts = ("camera", problem.num_cameras), ("point", problem.num_points), ("observation", problem.num_observations)
+    sizes = ", ".join(_counted(count, noun) for noun, count in counts)
     if problem.lenses is not None:
         free = np.asarray(problem.lenses.free) & (options.intrinsics == "free")
         for kind, number in Counter(map(tuple, free.tolist())).most_common():
             names = [one for one, used in zip(("f", "k1", "k2"), kind, strict=True) if used]
             sizes += f", {number} lens{'es' * (number > 1)} ({', '.join(names) or 'fixed'})"
-    return f"{name}: {sizes}\npolicy {args.policy}{refine}, {args.dtype}, {solver}"
+    return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {args.dtype}, {solver}"
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def header(initial_cost: float) -> str:
@@ -80,7 +86,8 @@ def summary(problem: BundleProblem, solution: Solution) -> str:
     lines = [
         f"{state}: {solution.termination.reason}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e} (rms {rms[0]:.4g} -> {rms[1]:.4g} px)",
-        f"{solution.iterations} iterations, {solution.accepted} accepted; linear solver {solution.linear_solver}",
+        f"{_counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
+        f"linear solver {solution.linear_solver}",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
         f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
     ]
@@ -126,11 +133,11 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
     before, after = (int(np.sum(geometry.depths(p) <= 0)) for p in (problem, solution.problem))
     found = [
-        (int(np.sum(cameras == 0)), "cameras without observations, whose poses stay"),
-        (int(np.sum(points == 0)), "points without observations, kept as they are"),
-        (int(np.sum(points == 1)), "points seen once; damping alone fixes their depth"),
+        (int(np.sum(cameras == 0)), "camera", "without observations; poses stay as they are"),
+        (int(np.sum(points == 0)), "point", "without observations; positions stay as they are"),
+        (int(np.sum(points == 1)), "point", "seen once; damping alone fixes the depth"),
     ]
-    lines = [f"note: {count} {text}" for count, text in found if count]
+    lines = [f"note: {_counted(count, noun)} {text}" for count, noun, text in found if count]
     if before or after:
         lines.append(f"note: observations behind their camera: {before} at the start, {after} at the end")
     return lines

@@ -135,7 +135,7 @@ def damping_of(config: AgentConfig, guard: GuardState, action: Float[Array, ""])
     rise = config.escalate * jnp.where(rejected, 1.0, guard.shortened)
     wanted = jnp.where(must_rise, jnp.maximum(wanted, guard.damping + rise), wanted)
     wanted = jnp.where(guard.overdamped, jnp.minimum(wanted, guard.damping - 1), wanted)
-    rule = guard.damping + jnp.log10(jnp.where(rejected, guard.growth, Ceres().after_success(guard.gain)))
+    rule = guard.damping + jnp.log10(Ceres().factor(~rejected, guard.gain, guard.growth))
     # Ceres' rule starts at the last accepted lambda, or at its own first one if twice the rejected lambda is larger.
     # It starts again in the same way when it is rejected `patience` times in a row itself.
     restart = jnp.where(guard.accepted_damping > rule, guard.accepted_damping, FIRST_DAMPING)

@@ -87,7 +87,7 @@ def make_policy(name: str) -> DampingPolicy:
         return Schedule(values=(_damping(name, number),))
     if "+" in base:
         raise UnknownPolicyError(
-            f"unknown damping policy {name!r}: its name has no '+'; embedded iterations are options of the step"
+            f"unknown damping policy {name!r}: its name has no '+'; the method and embedded iterations are options"
         )
     if base not in POLICIES:
         known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}"])

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.policy import ProblemInfo
 from jaxba.lm.records import StepInfo
@@ -93,9 +93,13 @@ class Ceres:
     relative: float = 0.0
     """1 where `initial` counts in units of the largest Hessian entry under identity scaling (g2o)."""
 
-    def after_success(self, gain: Float[Array, ""]) -> Float[Array, ""]:
-        """Factor on lambda after an accepted step with this gain ratio."""
-        return jnp.clip(1 - (2 * gain - 1) ** 3, self.shrink_floor, self.shrink_ceiling)
+    def factor(self, accepted: Bool[Array, ""], gain: Float[Array, ""], growth: Float[Array, ""]) -> Float[Array, ""]:
+        """Factor on lambda after a step with this gain ratio, or after a rejected one, whose factor is `growth`."""
+        return jnp.where(accepted, jnp.clip(1 - (2 * gain - 1) ** 3, self.shrink_floor, self.shrink_ceiling), growth)
+
+    def growth_after(self, rejections: Int[Array, ""]) -> Float[Array, ""]:
+        """Factor after a number of rejections in a row, at least one."""
+        return self.reject_growth * 2.0 ** (rejections - 1)
 
     def init(self, info: ProblemInfo) -> tuple[_Growing, Array]:
         """See `DampingPolicy`."""
@@ -104,7 +108,7 @@ class Ceres:
 
     def propose(self, state: _Growing, step: StepInfo) -> tuple[_Growing, Array]:
         """See `DampingPolicy`."""
-        factor = jnp.where(step.accepted, self.after_success(step.gain_ratio), state.growth)
+        factor = self.factor(step.accepted, step.gain_ratio, state.growth)
         growth = jnp.where(step.accepted, self.reject_growth, 2 * state.growth).astype(state.growth.dtype)
         damping = jnp.clip(state.damping * factor, self.minimum, LARGEST).astype(state.damping.dtype)
         return _Growing(damping, growth), damping

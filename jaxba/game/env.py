@@ -242,9 +242,9 @@ class Game:
 
 def _rule_damping(guard: GuardState) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
-    shrink, rejections = Ceres().after_success(guard.gain), guard.consecutive_rejections
-    factor = jnp.where(guard.iteration == 0, 1.0, jnp.where(rejections > 0, 2.0**rejections, shrink))
-    return guard.damping + jnp.log10(factor)
+    rule, rejections = Ceres(), guard.consecutive_rejections
+    factor = rule.factor(rejections == 0, guard.gain, rule.growth_after(rejections))
+    return guard.damping + jnp.where(guard.iteration == 0, 0.0, jnp.log10(factor))
 
 
 def make_game(

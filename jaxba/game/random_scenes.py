@@ -198,11 +198,9 @@ def _local(rig: _Rig, world: Array) -> Float[Array, "cameras points 3"]:
 
 def _project(rig: _Rig, world: Float[Array, "points 3"]) -> Float[Array, "2 cameras points"]:
     """Pixels of every point in every camera."""
-    local = _local(rig, world)
-    p = -local[..., :2] / local[..., 2:]
-    r = jnp.sum(p * p, axis=-1)
-    f, k1, k2 = rig.intrinsics[:, :, None]
-    return jnp.moveaxis((f * (1 + r * (k1 + k2 * r)))[..., None] * p, -1, 0)
+    rotation = jnp.moveaxis(rig.rotation, 0, -1)[..., None]
+    frames = camera.Frames(rotation, _translation(rig.rotation, rig.center).T[..., None], *rig.intrinsics[..., None])
+    return jnp.stack(list(camera.project(frames, world.T[:, None]).pixel))
 
 
 def _visible(rig: _Rig, world: Float[Array, "points 3"], half: Array) -> Bool[Array, "cameras points"]:
@@ -276,8 +274,11 @@ def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[
 
 
 def _camera_columns(rotation: Array, center: Array, lens: Array) -> Float[Array, "9 cameras"]:
-    translation = -jnp.einsum("nij,nj->ni", rotation, center)
-    return jnp.concatenate([_angle_axis(rotation).T, translation.T, lens])
+    return jnp.concatenate([_angle_axis(rotation).T, _translation(rotation, center).T, lens])
+
+
+def _translation(rotation: Array, center: Array) -> Float[Array, "n 3"]:
+    return -jnp.einsum("nij,nj->ni", rotation, center)
 
 
 def _angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:

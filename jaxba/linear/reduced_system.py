@@ -23,7 +23,7 @@ from jaxba.linear.cholesky import factor_and_solve, factor_panels
 from jaxba.linear.conjugate_gradients import conjugate_gradients
 from jaxba.linear.preconditioners import preconditioner
 from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
-from jaxba.linear.shared_intrinsics_solve import solve_tied
+from jaxba.linear.shared_intrinsics_solve import solve_shared_lenses
 from jaxba.linear.two_level import Anchor
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
@@ -68,9 +68,9 @@ def solve_reduced(
     """
     product = lambda x: apply_reduced(layout, linear, points, system, x)
     explicit, grid = options.linear_solver == "explicit", layout.grid
-    if system.ties is not None:
+    if system.shared_lenses is not None:
         formed = _dense_matrix(layout, linear, points, system)
-        return solve_tied(system.ties, formed, system.right), _no_iterations()
+        return solve_shared_lenses(system.shared_lenses, formed, system.right), _no_iterations()
     # the system of a scene with few points is small: float32 would save nothing
     if explicit and grid is not None and (not options.mixed_precision or has_few_points(*grid.shape)):
         return solve_dense(grid, linear, points, system), _no_iterations()

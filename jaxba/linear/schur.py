@@ -40,7 +40,7 @@ from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.conventions import components_first
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, point_sums, take, take_each, take_rows, tree_sum
-from jaxba.structure.shared_intrinsics import LensTies
+from jaxba.structure.shared_intrinsics import SharedLenses
 
 
 class RotationCoordinates(NamedTuple):
@@ -84,7 +84,7 @@ class CameraSystem(NamedTuple):
     damping: Float[Array, "cameras 9"]  # D_c, diagonal in the options' coordinates
     # [J_c, r, r - Q h], two rows an observation, sorted by camera (structure/layout.py)
     rows: Float[Array, "chunks terms 11"] | None = None
-    ties: LensTies | None = None  # shared intrinsics: each camera holds an equal part of their damping
+    shared_lenses: SharedLenses | None = None  # shared intrinsics: each camera holds an equal part of their damping
 
 
 def eliminate_points(
@@ -150,16 +150,16 @@ def camera_system(
     )
     factor = options.coordinates.camera_damping * damping
     extra = damping_diagonal(diagonal, factor, options)
-    ties = layout.lenses if layout.lenses is not None and layout.lenses.shared else None
-    if ties is not None:
-        whole = damping_diagonal(ties.total(diagonal[:, 6:]), factor, options)
-        extra = extra.at[:, 6:].set(ties.spread(whole / jnp.maximum(ties.counts(), 1)[:, None]))
+    lenses = layout.lenses if layout.lenses is not None and layout.lenses.shared else None
+    if lenses is not None:
+        whole = damping_diagonal(lenses.total(diagonal[:, 6:]), factor, options)
+        extra = extra.at[:, 6:].set(lenses.spread(whole / jnp.maximum(lenses.counts(), 1)[:, None]))
     # a camera without observations gets a unit block, and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     on_manifold = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
     added = extra[:, :, None] * jnp.eye(9, dtype=extra.dtype)
     added = added.at[:, :3, :3].set(on_manifold)
-    return CameraSystem(blocks + added, added, gradient, right, extra, gathered, ties)
+    return CameraSystem(blocks + added, added, gradient, right, extra, gathered, lenses)
 
 
 def back_substitute(
@@ -227,7 +227,9 @@ def jacobian_product(
 def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates) -> Float[Array, ""]:
     """Largest absolute entry of the gradient, in the options' coordinates."""
     rotation = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
-    lens = system.gradient[:, 6:] if system.ties is None else system.ties.total(system.gradient[:, 6:])
+    lens = system.gradient[:, 6:]
+    if system.shared_lenses is not None:
+        lens = system.shared_lenses.total(lens)
     parts = rotation, system.gradient[:, 3:6], lens, jnp.stack(points.gradient)
     return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts])
 

@@ -15,33 +15,33 @@ from jaxtyping import Float
 
 from jaxba.linear.cholesky import factor_and_solve
 from jaxba.problem.intrinsics import LENS_SIZE
-from jaxba.structure.shared_intrinsics import POSE_SIZE, LensTies
+from jaxba.structure.shared_intrinsics import POSE_SIZE, SharedLenses
 
 
-def solve_tied(
-    ties: LensTies, matrix: Float[Array, "unknowns unknowns"], right: Float[Array, "cameras 9"]
+def solve_shared_lenses(
+    shared: SharedLenses, matrix: Float[Array, "unknowns unknowns"], right: Float[Array, "cameras 9"]
 ) -> Float[Array, "cameras 9"]:
     """Solves `T^T S T y = T^T b` by a dense Cholesky factorisation.
 
     Args:
-        ties: T.
+        shared: T, by the lenses of the cameras.
         matrix: S; only its lower triangle is read.
         right: b.
 
     Returns:
         T y; non-finite if `T^T S T` is not positive definite.
     """
-    cameras, lenses = ties.members.shape
+    cameras, lenses = shared.members.shape
     lower = jnp.tril(matrix)
     full = (lower + jnp.tril(matrix, -1).T).reshape(cameras, 9, cameras, 9)
     pose_pose = full[:, :POSE_SIZE, :, :POSE_SIZE].reshape(POSE_SIZE * cameras, -1)
-    own = ties.members.astype(matrix.dtype)
+    own = shared.members.astype(matrix.dtype)
     columns = jnp.einsum("cadk,dl->calk", full[..., POSE_SIZE:], own, precision="highest")  # [c, 9, lens, 3]
     pose_lens = columns[:, :POSE_SIZE].reshape(-1, LENS_SIZE * lenses)
     lens_lens = jnp.einsum("cl,cjmk->ljmk", own, columns[:, POSE_SIZE:], precision="highest")
-    unused = jnp.repeat(ties.counts() == 0, LENS_SIZE).astype(matrix.dtype)  # its step is zero
+    unused = jnp.repeat(shared.counts() == 0, LENS_SIZE).astype(matrix.dtype)  # its step is zero
     lens_lens = lens_lens.reshape(LENS_SIZE * lenses, -1) + jnp.diag(unused)
-    tied = jnp.block([[pose_pose, pose_lens], [pose_lens.T, lens_lens]])
-    step = factor_and_solve(tied, jnp.concatenate([right[:, :POSE_SIZE].ravel(), ties.total(right[:, 6:]).ravel()]))
+    summed = jnp.block([[pose_pose, pose_lens], [pose_lens.T, lens_lens]])
+    step = factor_and_solve(summed, jnp.concatenate([right[:, :POSE_SIZE].ravel(), shared.total(right[:, 6:]).ravel()]))
     pose, lens = step[: POSE_SIZE * cameras], step[POSE_SIZE * cameras :]
-    return jnp.concatenate([pose.reshape(cameras, POSE_SIZE), ties.spread(lens.reshape(lenses, LENS_SIZE))], axis=1)
+    return jnp.concatenate([pose.reshape(cameras, POSE_SIZE), shared.spread(lens.reshape(lenses, LENS_SIZE))], axis=1)

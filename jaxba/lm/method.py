@@ -21,15 +21,31 @@ class DampedSystem(NamedTuple):
     """The damped normal equations `(H + D) d = -g` of one iteration, points eliminated."""
 
     layout: Layout
+    """The problem's observations."""
+
     linear: Linearization
+    """Residuals and Jacobians."""
+
     points: PointSystem
+    """The eliminated points."""
+
     cameras: CameraSystem
-    damping: Float[Array, ""]  # lambda
-    parameters: Float[Array, "9 cameras"]  # current cameras
-    iteration: int | Int[Array, ""]  # number of the iteration, from 0
-    forcing: float | Float[Array, ""]  # forcing term of truncated conjugate gradients, where they are used
-    # last changes of the cameras, newest first; None unless they are part of the search space
+    """Blocks, gradient and right-hand side of the cameras."""
+
+    damping: Float[Array, ""]
+    """Lambda."""
+
+    parameters: Float[Array, "9 cameras"]
+    """Current cameras."""
+
+    iteration: int | Int[Array, ""]
+    """Number of the iteration, from 0."""
+
+    forcing: float | Float[Array, ""]
+    """Forcing term of truncated conjugate gradients, where they are used."""
+
     previous_steps: Float[Array, "steps 9 cameras"] | None
+    """Last changes of the cameras, newest first; None unless they are part of the search space."""
 
 
 class MethodStep(NamedTuple):
@@ -45,17 +61,37 @@ class Round(NamedTuple):
     """Result of one round of a method that solves several subproblems, each with its own accept decision."""
 
     cameras: Float[Array, "9 cameras"]
+    """Cameras after the round."""
+
     points: Float[Array, "3 points"]
-    cost: Float[Array, ""]  # pixels^2
-    predicted: Float[Array, ""]  # predicted decrease, summed over accepted candidates and full rejected steps, pixels^2
-    gain: Float[Array, ""]  # actual decrease of the accepted clusters over `predicted`
-    slope: Float[Array, ""]  # -g.d
-    curvature: Float[Array, ""]  # d.H d
-    gradient_max: Float[Array, ""]  # largest absolute gradient entry before the round
-    # mean step fraction of the clusters, weighted by the predicted decrease of their full steps
+    """Points after the round, scene units."""
+
+    cost: Float[Array, ""]
+    """Cost after the round, pixels^2."""
+
+    predicted: Float[Array, ""]
+    """Predicted decrease, summed over accepted candidates and full rejected steps, pixels^2."""
+
+    gain: Float[Array, ""]
+    """Actual decrease of the accepted clusters over `predicted`."""
+
+    slope: Float[Array, ""]
+    """-g.d, with the gradient g and the step d."""
+
+    curvature: Float[Array, ""]
+    """d.H d, with the Gauss-Newton Hessian H."""
+
+    gradient_max: Float[Array, ""]
+    """Largest absolute gradient entry before the round."""
+
     step_fraction: Float[Array, ""]
-    repairs: Int[Array, ""]  # see `StepInfo.repairs`: the largest of all clusters
+    """Mean step fraction of the clusters, weighted by the predicted decrease of their full steps."""
+
+    repairs: Int[Array, ""]
+    """See `StepInfo.repairs`: the largest of all clusters."""
+
     accepted: Bool[Array, ""]
+    """Whether any cluster was accepted."""
 
 
 @runtime_checkable

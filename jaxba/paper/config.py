@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from jaxba.io import configurations
-from jaxba.training import settings
-from jaxba.training.settings import SettingsError
+from jaxba.io import configurations, settings
+from jaxba.io.settings import SettingsError
 
 CONFIG = "config.yaml"
 """Settings of a run, in its folder."""

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from jaxba.problem import geometry
+
 try:
     # in this order: pycolmap returns objects of pyceres' types
     import pyceres
@@ -91,9 +93,9 @@ class TwoSidedReprojection(pyceres.CostFunction):
         turned = np.cross(v, point)
         local = point + 2 * (w * turned + np.cross(v, turned)) + pose[4:]
         with np.errstate(all="ignore"):
-            p = local[:2] / local[2]
+            p = geometry.perspective(local[None])[0]
             r = p @ p
-            distortion = 1 + r * (k1 + k2 * r)
+            distortion = geometry.radial_distortion(r, k1, k2)
             residuals[:] = f * distortion * p + (cx, cy) - self.pixel
             if jacobians is None:
                 return True

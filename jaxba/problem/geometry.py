@@ -99,7 +99,7 @@ def perspective(local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
         return local[:, :2] / local[:, 2:]
 
 
-def radial_distortion(square: np.ndarray, k1: np.ndarray, k2: np.ndarray) -> np.ndarray:
+def radial_distortion(square: np.ndarray | float, k1: np.ndarray | float, k2: np.ndarray | float) -> np.ndarray | float:
     """Factor `1 + k1 r^2 + k2 r^4` at the squared radius r^2 in the image plane. Shapes broadcast."""
     return 1 + square * (k1 + square * k2)
 

@@ -65,28 +65,28 @@ class Loss:
     no negative derivative; JAX differentiates it. Define the function once: another function object compiles again.
     """
 
-    name: str | Callable[[Array], Array] = "squared"
+    rho: str | Callable[[Array], Array] = "squared"
     """One of `squared`, `huber`, `soft_l1`, `cauchy`, `tukey`, or a function of `s / scale^2`."""
 
     scale: float = 1.0
     """Residual norm in pixels at which the loss starts to flatten; no effect for `squared`."""
 
     def __post_init__(self) -> None:
-        if not callable(self.name) and self.name not in _SHAPES:
-            raise ValueError(f"unknown loss {self.name!r}; known: {', '.join(NAMES)}")
+        if not callable(self.rho) and self.rho not in _SHAPES:
+            raise ValueError(f"unknown loss {self.rho!r}; known: {', '.join(NAMES)}")
         if not (self.scale > 0 and 0 < self.scale * self.scale < float("inf")):
             raise ValueError(f"scale must be positive, and its square a finite number, is {self.scale}")
 
     @property
     def trivial(self) -> bool:
         """Whether this is the squared loss, with weight one everywhere."""
-        return self.name == "squared"
+        return self.rho == "squared"
 
     def __call__(self, squared: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """`rho(s)` (pixels^2) and `rho'(s)` at squared residual norms s (pixels^2)."""
         area = self.scale * self.scale
-        if callable(self.name):
-            value, slope = jax.jvp(self.name, (squared / area,), (jnp.ones_like(squared),))
+        if callable(self.rho):
+            value, slope = jax.jvp(self.rho, (squared / area,), (jnp.ones_like(squared),))
         else:
-            value, slope = _SHAPES[self.name](squared / area)
+            value, slope = _SHAPES[self.rho](squared / area)
         return area * value, slope

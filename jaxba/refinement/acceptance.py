@@ -48,30 +48,68 @@ class Candidate(NamedTuple):
     """Proposed parameters, with the accept decision for every subproblem."""
 
     cameras: Float[Array, "9 cameras"]
+    """Proposed cameras."""
+
     points: Float[Array, "3 points"]
-    cost: Float[Array, "*parts"]  # pixels^2
-    predicted: Float[Array, "*parts"]  # decrease that the linear model predicts for this step fraction, pixels^2
-    gain: Float[Array, "*parts"]  # actual over predicted decrease
+    """Proposed points, scene units."""
+
+    cost: Float[Array, "*parts"]
+    """Their cost, pixels^2."""
+
+    predicted: Float[Array, "*parts"]
+    """Decrease that the linear model predicts for this step fraction, pixels^2."""
+
+    gain: Float[Array, "*parts"]
+    """Actual over predicted decrease."""
+
     accepted: Bool[Array, "*parts"]
-    step_fraction: Float[Array, "*parts"]  # length relative to the full step
-    repairs: Int[Array, "*parts"]  # camera rounds, trials and pattern moves after the first candidate
+    """The accept decision."""
+
+    step_fraction: Float[Array, "*parts"]
+    """Length relative to the full step."""
+
+    repairs: Int[Array, "*parts"]
+    """Camera rounds, trials and pattern moves after the first candidate."""
 
 
 class Comparison(NamedTuple):
     """The data of one step with which its candidates are evaluated."""
 
     parts: Subproblems
-    cameras: Float[Array, "9 cameras"]  # before the step
-    points: Float[Array, "3 points"]  # before the step
-    cost: Float[Array, "*parts"]  # before the step, pixels^2
-    terms: Float[Array, " terms"]  # its terms: differences are summed, since the difference of sums cancels in float32
+    """The subproblems, each with its own accept decision."""
+
+    cameras: Float[Array, "9 cameras"]
+    """Cameras before the step."""
+
+    points: Float[Array, "3 points"]
+    """Points before the step, scene units."""
+
+    cost: Float[Array, "*parts"]
+    """Cost before the step, pixels^2."""
+
+    terms: Float[Array, " terms"]
+    """Terms of that cost. Differences are summed, since the difference of sums cancels in float32."""
+
     previous: PreviousPoints
+    """Where diverged points return to."""
+
     step: Step
+    """The full step."""
+
     options: StepOptions
+    """Options of the step."""
+
     min_gain: float | Float[Array, ""]
+    """Gain ratio that an accepted candidate must exceed."""
+
     point_iterations: int | Int[Array, ""]
-    starts: Int[Array, ""]  # starts of points after the full step, see `PointSearch`
-    matters: Bool[Array, "*parts"]  # whether the predicted decrease is worth camera rounds and further trials
+    """Number of embedded point iterations."""
+
+    starts: Int[Array, ""]
+    """Starts of points after the full step, see `PointSearch`."""
+
+    matters: Bool[Array, "*parts"]
+    """Whether the predicted decrease is worth camera rounds and further trials."""
 
 
 def comparison(

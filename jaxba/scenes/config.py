@@ -215,7 +215,7 @@ LIKE: dict[str, SceneConfig] = {
 cameras and 10 points, all visible, of the paper that this project reproduces."""
 
 
-def like(name: str) -> SceneConfig:
+def scene_like(name: str) -> SceneConfig:
     """The configuration of a name in `LIKE`.
 
     Raises:

@@ -87,6 +87,50 @@ class SolverName:
         )
 
 
+def split_refinement(name: str) -> tuple[str, int | None, bool]:
+    """The name of a policy without `+refineK` or `+embedded` at its end.
+
+    Returns:
+        The rest of the name; the number of embedded point iterations, None for the full refinement, as in
+        `SolverName.refine_points`; and whether the name says it. What it does not say is 0.
+    """
+    match = _REFINEMENT.fullmatch(name)
+    if match is None:
+        return name, 0, False
+    return match[1], None if match[2] is None else int(match[2]), True
+
+
+_REFINEMENT = re.compile(r"(.*)\+(?:refine(\d+)|embedded)", re.DOTALL)
+
+
+def parse_policy(name: str) -> SolverName:
+    """The solver with plain LM in float64 of a name `policy[+refineK|+embedded]`. The policy itself is not checked."""
+    policy, refine, stated = split_refinement(name)
+    return SolverName(policy, None if brings_embedded(policy) and not stated else refine)
+
+
+def resolve_policy(name: str, options: SolveOptions) -> tuple[DampingPolicy, SolveOptions]:
+    """The policy of a name `policy[+refineK|+embedded]`, and the options with the refinement that the name states.
+
+    Args:
+        name: as in a solver's name. Without an ending, `learned` and `bold` mean their variants for plain steps if the
+            options have a refinement without point iterations.
+        options: options of the solve. Coordinates that they give take precedence over those that come with `+embedded`.
+
+    Raises:
+        ValueError: the options have another refinement than the name.
+        UnknownPolicyError, PolicyFileError: as `make_policy`.
+    """
+    policy, _, stated = split_refinement(name)
+    if not stated:
+        alone = options.refinement is not None and not options.refinement.points
+        return make_policy(fitting_policy(name, alone=alone)), options
+    built, own = parse_policy(name).build()
+    if options.refinement not in (None, own.refinement):
+        raise ValueError(f"policy {name!r} states its refinement: leave out that of the options, or name {policy!r}")
+    return built, replace(options, refinement=own.refinement, coordinates=options.coordinates or own.coordinates)
+
+
 def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> str:
     """Resolves `learned` and `bold` to the variant for the kind of step.
 
@@ -122,6 +166,7 @@ def parse_solver(name: str) -> SolverName:
     # the path of a policy file may contain `+` and `@`: it ends with the suffix of such files
     path, suffix, rest = name.strip().rpartition(SUFFIX)
     prefix, at, dtype = rest.partition("@")
+    prefix, refine, stated = split_refinement(prefix)
     parts = prefix.split("+")
     if suffix:
         method, plus, file = path.partition("+")
@@ -135,16 +180,6 @@ def parse_solver(name: str) -> SolverName:
             merged[-1] += "+" + part
         else:
             merged.append(part)
-    refine: int | None = 0
-    stated = True
-    if len(merged) > 1 and (match := re.fullmatch(r"refine(\d+)", merged[-1])):
-        refine = int(match[1])
-        merged.pop()
-    elif len(merged) > 1 and merged[-1] == "embedded":
-        refine = None
-        merged.pop()
-    else:
-        stated = False
     method = merged.pop(0) if len(merged) > 1 else DEFAULT_METHOD
     if len(merged) != 1 or not merged[0]:
         raise SolverNameError(f"{name!r} is no solver; the form is [method+]policy[+refineK|+embedded][@dtype]")

@@ -122,7 +122,7 @@ class SolveOptions:
         """
         trained = trained_step(policy)
         method = make_method(self.method) if isinstance(self.method, str) else self.method
-        return method.options(
+        step = method.options(
             StepOptions(
                 linear_solver="explicit" if self.linear_solver == "auto" else self.linear_solver,
                 conjugate_gradients=self.conjugate_gradients,
@@ -133,6 +133,12 @@ class SolveOptions:
                 mixed_precision=self.dtype == "mixed",
             )
         )
+        scaling = step.coordinates.scaling
+        if getattr(policy, "step_options", None) is not None and scaling != trained.coordinates.scaling:
+            raise ValueError(f"this policy takes lambda as a factor on the diagonal, not with scaling {scaling!r}")
+        if step.mixed_precision and step.method is not None:
+            raise ValueError("mixed types are for plain LM; methods have float64 or float32")
+        return step
 
 
 def checked_options(options: SolveOptions | None) -> SolveOptions:

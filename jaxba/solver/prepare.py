@@ -9,8 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.policy import trained_step
+from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState
 from jaxba.lm.step import initial_state
 from jaxba.problem import geometry
@@ -20,7 +19,7 @@ from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver
-from jaxba.solver.names import fitting_policy
+from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout, layout_for
@@ -73,7 +72,7 @@ class Prepared:
 
 
 def prepare(
-    problem: BundleProblem, options: SolveOptions | None = None, *, policy: str | DampingPolicy = DEFAULT_POLICY
+    problem: BundleProblem, policy: str | DampingPolicy = DEFAULT_POLICY, options: SolveOptions | None = None
 ) -> Prepared:
     """Everything that a solve does before its first iteration, for callers that jit, vmap or time the loop themselves.
 
@@ -82,8 +81,8 @@ def prepare(
 
     Args:
         problem: start of the optimisation.
-        options: as for `solve`.
         policy: as for `solve`.
+        options: as for `solve`.
 
     Raises:
         ValueError, ProblemError: as `solve`.
@@ -92,20 +91,14 @@ def prepare(
     if not isinstance(problem, BundleProblem):
         raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
     if isinstance(policy, str):
-        alone = options.refinement is not None and not options.refinement.points
-        policy = make_policy(fitting_policy(policy, alone=alone))
+        policy, options = resolve_policy(policy, options)
     _check_policy(policy)
     step = options.step_options(policy)
-    scaling = step.coordinates.scaling
-    if getattr(policy, "step_options", None) is not None and scaling != trained_step(policy).coordinates.scaling:
-        raise ProblemError(f"this policy takes lambda as a factor on the diagonal, not with scaling {scaling!r}")
     capacity, asked = None, options.linear_solver
     observations = ObservationOrder.of(problem)
     if options.pad:
         capacity, asked = with_padded_solver(capacity_of(problem, observations), step, asked)
     step = choose_linear_solver(problem, step, asked, observations)
-    if step.mixed_precision and step.method is not None:
-        raise ProblemError("mixed types are for plain LM; methods have float64 or float32")
     dtype = jnp.dtype("float32" if options.dtype == "float32" else "float64")
     with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
         started = time.perf_counter()

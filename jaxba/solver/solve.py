@@ -103,8 +103,10 @@ def solve(
 
     Args:
         problem: start of the optimisation.
-        policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`). With a
-            refinement without point iterations `learned` and `bold` mean their variants for plain steps.
+        policy: damping policy, which chooses lambda in every iteration, or its name (`jaxba.make_policy`). A name may
+            end with `+embedded`, all embedded iterations of the default agent around a rule, or `+refineK`, K point
+            iterations and no other refinement. With a refinement without point iterations `learned` and `bold` mean
+            their variants for plain steps.
         options: options of the solve; None: the defaults.
         callback: called after every iteration; a true return value stops the solve.
 
@@ -112,13 +114,13 @@ def solve(
         The optimised problem in NumPy float64 arrays, histories and timings.
 
     Raises:
-        ValueError: unknown names, or options that exclude each other.
+        ValueError: unknown names, or options that exclude each other, or that contradict the name of the policy.
         ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
             the linear solver or method does not support shared or partly fixed intrinsics.
     """
     options = checked_options(options)
     with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
-        prepared = prepare(problem, options, policy=policy)
+        prepared = prepare(problem, policy, options)
         layout, state, step_options = prepared.layout, prepared.state, prepared.options
         stages_of_parts = _stages(options.compilation, problem, step_options)
         run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts)

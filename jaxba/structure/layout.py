@@ -32,7 +32,7 @@ from jaxba.structure.density import is_dense
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.random_partitions import Partition, partition_layout
-from jaxba.structure.shared_intrinsics import LensTies, lens_ties
+from jaxba.structure.shared_intrinsics import SharedLenses, shared_lenses_of
 from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 from jaxba.typing import AnyArray, register_pytree
@@ -87,7 +87,7 @@ class Layout:
     partitions: Partition | None
     """Random partitions of the cameras, along a leading axis; None if no method uses them."""
 
-    lenses: LensTies | None
+    lenses: SharedLenses | None
     """Shared and fixed intrinsics; None if every camera has its own intrinsics and optimises all of them."""
 
     buckets: tuple[Bucket, ...] = field(metadata={"static": True})
@@ -177,9 +177,10 @@ def build_layout(
         slot_grid = np.full((columns, cameras), empty, np.int32)
         slot_grid[slot_point[slot], camera] = slot
     pair_lists = None
-    ties = lens_ties(problem.lenses, seen > 0) if lenses and problem.lenses is not None else None
+    shared_lenses = shared_lenses_of(problem.lenses, seen > 0) if lenses and problem.lenses is not None else None
     if pairs and slot_grid is None:
-        banded = ties is None or not ties.shared  # a shared lens couples cameras without common points
+        # a shared lens couples cameras without common points
+        banded = shared_lenses is None or not shared_lenses.shared
         slots_by_camera = camera_levels[0].ravel()
         sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot
         sorted_index[slots_by_camera] = np.arange(len(slots_by_camera))
@@ -216,7 +217,7 @@ def build_layout(
         grid=slot_grid,
         clusters=cluster_layout(camera, point, slot, cameras, len(tracks), slot_point, empty) if clusters else None,
         partitions=drawn_partitions,
-        lenses=ties,
+        lenses=shared_lenses,
         buckets=assignment.buckets,
     )
 

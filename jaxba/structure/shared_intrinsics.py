@@ -27,7 +27,7 @@ POSE_SIZE = 6
 
 @register_pytree
 @dataclass(frozen=True)
-class LensTies:
+class SharedLenses:
     """The matrix T of shared intrinsics, and the intrinsics that are optimised."""
 
     lens: Int[AnyArray, " cameras"]
@@ -55,7 +55,7 @@ class LensTies:
         return values[self.lens]
 
 
-def lens_ties(lenses: Lenses, seen: Bool[np.ndarray, " cameras"]) -> LensTies:
+def shared_lenses_of(lenses: Lenses, seen: Bool[np.ndarray, " cameras"]) -> SharedLenses:
     """The shared intrinsics of a problem, for its layout.
 
     Args:
@@ -66,4 +66,4 @@ def lens_ties(lenses: Lenses, seen: Bool[np.ndarray, " cameras"]) -> LensTies:
     members = np.zeros((len(index), 0), bool)
     if lenses.shared:
         members = (index[:, None] == np.arange(len(lenses.free))) & seen[:, None]
-    return LensTies(index, members, np.asarray(lenses.free)[index].T, lenses.shared)
+    return SharedLenses(index, members, np.asarray(lenses.free)[index].T, lenses.shared)

@@ -15,12 +15,11 @@ from jaxba.damping.features import observation_size
 from jaxba.damping.policy_file import LARGEST_FILE
 from jaxba.game.env import GameConfig
 from jaxba.game.scene_bank import BankConfig
-from jaxba.io import configurations
+from jaxba.io import configurations, settings
+from jaxba.io.settings import SettingsError
 from jaxba.methods.registry import DEFAULT_METHOD, MethodName, make_method
 from jaxba.problem.options import StepOptions
-from jaxba.training import settings
 from jaxba.training.sac import SacConfig
-from jaxba.training.settings import SettingsError
 from jaxba.training.train_loop import LoopConfig
 
 METADATA_BYTES = 1 << 14

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxba.io import settings
 from jaxba.runtime.atomic import TEMPORARY, write_text
-from jaxba.training import checkpoint, settings
+from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig, load, to_yaml
 from jaxba.training.log import Log, Row
 from jaxba.training.sac import Learner

@@ -23,7 +23,7 @@ from jaxba.training.replay import Transition
 
 @dataclass(frozen=True)
 class SacConfig:
-    """Settings of the agent. Hashable: static in compiled programs."""
+    """Settings of the agent, by default chosen for a CPU. Hashable: static in compiled programs."""
 
     variant: Literal["twin", "value"] = "twin"
     """`twin`: target critics, learned temperature. `value`: the paper's, with a value network and its target."""
@@ -75,11 +75,6 @@ class SacConfig:
 
     max_grad_norm: float | None = None
     """Largest norm of a network's gradient, which is scaled down to it; no limit if None."""
-
-    @classmethod
-    def default(cls) -> SacConfig:
-        """The defaults, chosen for a CPU."""
-        return cls()
 
     @classmethod
     def paper(cls) -> SacConfig:

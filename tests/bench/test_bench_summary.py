@@ -138,7 +138,7 @@ def test_summary_file_is_json_without_nan_and_replaces_the_old_one(tmp_path, rec
     write_summary(path, summarize(records, 1e-2, metadata={"threads": 2, "where": tmp_path}))
     data = json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(name))
     assert data["targets"][0]["key"] == "tau_0.01"
-    assert data["facts"] == {"threads": 2, "where": str(tmp_path)}
+    assert data["metadata"] == {"threads": 2, "where": str(tmp_path)}
     row = next(s for s in data["solvers"] if s["solver"] == "learned")
     assert row["against"]["classic"]["converged"]["both"] == 2
     assert data["cells"][-1]["reach"]["converged"] == {"iterations": None, "seconds": None}

@@ -356,6 +356,7 @@ def test_wildcards_and_variables_in_a_suite_are_expanded(tmp_path, undrawn, caps
 BAD = {
     "unknown solver": (["scene:tiny", "--solvers", "ceres,cerse"], "unknown damping policy 'cerse'"),
     "unknown method": (["scene:tiny", "--solvers", "sgd+ceres"], "unknown method 'sgd'"),
+    "mixed types of a method": (["scene:tiny", "--solvers", "ceres,stba+ceres@mixed"], "mixed types are for plain LM"),
     "missing policy": (["scene:tiny", "--solvers", "no.safetensors"], "no.safetensors: No such file"),
     "no solver": (["scene:tiny", "--solvers", ","], "--solvers names no solver"),
     "missing file": (["no-such-file.txt"], "no-such-file.txt: no such file"),

@@ -138,7 +138,7 @@ def test_a_rejected_step_is_marked(tiny, capsys):
     printed = capsys.readouterr().out
     assert rows(printed)[1][-1] == "rejected"
     assert "not converged: " in printed
-    assert "1 iterations, 0 accepted" in printed
+    assert "1 iteration, 0 accepted" in printed
 
 
 def test_the_point_cloud_has_every_point_and_camera(tiny, tmp_path, capsys):
@@ -206,9 +206,9 @@ def test_notes_on_the_data_have_the_right_counts(tmp_path, capsys):
     assert once >= 2
     after = int(np.sum(geometry.depths(read_bal(output)) <= 0))
     assert notes == [
-        "note: 1 cameras without observations, whose poses stay",
-        "note: 2 points without observations, kept as they are",
-        f"note: {once} points seen once; damping alone fixes their depth",
+        "note: 1 camera without observations; poses stay as they are",
+        "note: 2 points without observations; positions stay as they are",
+        f"note: {once} points seen once; damping alone fixes the depth",
         f"note: observations behind their camera: 1 at the start, {after} at the end",
     ]
 
@@ -412,6 +412,10 @@ BAD = {
     ),
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must be at least 0"),
     "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "not with scaling 'identity'"),
+    "mixed types of a method": (
+        lambda tiny: [str(tiny), "--method", "stba", "--dtype", "mixed"],
+        "mixed types are for plain LM",
+    ),
     "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be at least 1"),
     "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be at least 1"),
     "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
@@ -457,13 +461,17 @@ def test_bad_input_is_one_line_and_status_2_and_nothing_is_written(kind, tiny, t
 
 
 @pytest.mark.parametrize("argv", [["--dtype", "float16"], ["--max-iterations", "many"], ["--no-such-option", "1"]])
-def test_parser_errors_have_status_2_and_print_nothing_on_stdout(argv, capsys):
-    with pytest.raises(SystemExit) as caught:
-        run(argv)
-    assert caught.value.code == 2
+def test_errors_of_the_parser_are_one_line_with_status_2_and_print_nothing_on_stdout(argv, capsys):
+    status = run(argv)
     printed = capsys.readouterr()
+    check_one_line(status, printed.err)
     assert printed.out == ""
     assert argv[0] in printed.err
+
+
+def test_the_parser_proposes_the_nearest_option(capsys):
+    assert run(["--polcy", "ceres"]) == 2
+    assert capsys.readouterr().err.endswith("perhaps you meant --policy\n")
 
 
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])

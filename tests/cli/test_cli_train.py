@@ -7,8 +7,7 @@ import shutil
 import signal
 from pathlib import Path
 
-import jax
-import numpy as np
+import chex
 import pytest
 from safetensors import safe_open
 
@@ -148,8 +147,7 @@ def test_an_interrupted_run_continues_with_the_same_results(folder, finished, ca
     plain = lambda row: {k: v for k, v in row.items() if k not in CLOCKS}
     assert list(map(plain, log.read(folder))) == list(map(plain, log.read(finished)))
     ours, theirs = (load_policy(run_folder / "policy.safetensors") for run_folder in (folder, finished))
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        np.testing.assert_array_equal(a, b)
+    chex.assert_trees_all_equal(ours, theirs)
 
 
 # Errors

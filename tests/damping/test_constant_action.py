@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import functools
 
+import chex
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from agent_steps import ACCEPTED, REJECTED, after, info
-from support import same_bits
 from test_learned import random_policy
 
-from jaxba import SolveOptions, like, make_policy, perturb, random_scene, solve
+from jaxba import SolveOptions, make_policy, perturb, random_scene, scene_like, solve
 from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import begin
@@ -29,7 +29,7 @@ def boldest_network(config: AgentConfig) -> LearnedPolicy:
 @functools.cache
 def hard_scene():
     """Starts so far from the solution that steps are shortened and rejected."""
-    return perturb(random_scene(like("paper"), 3), 0, point_sigma=0.5)
+    return perturb(random_scene(scene_like("paper"), 3), 0, point_sigma=0.5)
 
 
 @pytest.mark.parametrize("embedded", [True, False])
@@ -38,8 +38,9 @@ def test_bold_is_a_network_that_always_asks_for_the_smallest_lambda(embedded):
     found = solve(hard_scene(), policy, options)
     expected = solve(hard_scene(), boldest_network(policy.config), options)
     assert found.iterations == expected.iterations > 3
-    assert same_bits(found.history.damping, expected.history.damping)
-    assert same_bits((found.problem.cameras, found.problem.points), (expected.problem.cameras, expected.problem.points))
+    chex.assert_trees_all_equal(found.history.damping, expected.history.damping, strict=True)
+    ends = [(end.problem.cameras, end.problem.points) for end in (found, expected)]
+    chex.assert_trees_all_equal(*ends, strict=True)
     # the two programs may sum a cost, which chooses nothing here, in another order
     np.testing.assert_allclose(found.history.cost, expected.history.cost, rtol=1e-14)
 

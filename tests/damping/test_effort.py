@@ -20,11 +20,11 @@ from jaxba.damping.guard import FORCING, effort_for
 from jaxba.damping.learned import Layer, LearnedPolicy
 from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
 from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
+from jaxba.io.settings import SettingsError
 from jaxba.linear.step import Effort
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.problem.options import ConjugateGradients, Refinement
 from jaxba.training import config as configs
-from jaxba.training.settings import SettingsError
 
 POINTS = replace(AGENT, effort="points", refine_points=3)
 BOTH = replace(POINTS, effort="points+forcing")

@@ -8,6 +8,7 @@ import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +19,7 @@ from safetensors.numpy import save_file
 from support import same_bits, solve
 
 import jaxba
-from jaxba import METHODS, SolveOptions, StepOptions, like, make_policy, random_scene, solve_loop
+from jaxba import METHODS, SolveOptions, StepOptions, make_policy, random_scene, scene_like, solve_loop
 from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
@@ -73,7 +74,7 @@ def test_a_path_is_the_name_of_a_policy(tmp_path):
     save_policy(path, random_policy(3))
     policy = make_policy(str(path))
     assert isinstance(policy, LearnedPolicy)
-    assert same_bits(policy.layers, random_policy(3).layers)
+    chex.assert_trees_all_equal(policy.layers, random_policy(3).layers, strict=True)
 
 
 def _tensors(policy: LearnedPolicy) -> dict[str, np.ndarray]:
@@ -273,18 +274,18 @@ def test_the_path_of_a_policy_is_a_name(tmp_path, folder):
         name = parse_solver(f"{path}{ending}")
         assert name == SolverName(str(path), refine)
         assert parse_solver(str(name)) == name
-        assert same_bits(name.build()[0].layers, random_policy(5).layers)
+        chex.assert_trees_all_equal(name.build()[0].layers, random_policy(5).layers, strict=True)
     assert parse_solver(f"{path}@float32").dtype == "float32"
 
 
 def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
     policy, options = parse_solver("learned").build()
-    assert same_bits(policy.layers, load_policy(shipped["learned"]).layers)
+    chex.assert_trees_all_equal(policy.layers, load_policy(shipped["learned"]).layers, strict=True)
     coordinates = Coordinates(lens_step="pixels")
     embedded = Refinement(2, "rays", trials=3, camera_rounds=AGENT.camera_rounds, pattern_moves=1, previous_steps=3)
     assert options == SolveOptions(refinement=embedded, coordinates=coordinates)
     policy, options = parse_solver("learned+refine0").build()
-    assert same_bits(policy.layers, load_policy(shipped["learned-plain"]).layers)
+    chex.assert_trees_all_equal(policy.layers, load_policy(shipped["learned-plain"]).layers, strict=True)
     assert options == SolveOptions(refinement=Refinement(), coordinates=coordinates)
     assert parse_solver("learned+refine3").build()[1] == replace(options, refinement=Refinement(points=3))
     options = parse_solver("ceres+refine3").build()[1]
@@ -297,13 +298,13 @@ def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
     """Each with the camera damping that it was trained with: another library has none."""
     expected = load_policy(shipped["learned"]).layers
     for method in (*METHODS, "ddlm:3"):
-        assert same_bits(parse_solver(f"{method}+learned").build()[0].layers, expected)
-        assert same_bits(parse_solver(f"{method}+learned+refine3").build()[0].layers, expected)
+        chex.assert_trees_all_equal(parse_solver(f"{method}+learned").build()[0].layers, expected, strict=True)
+        chex.assert_trees_all_equal(parse_solver(f"{method}+learned+refine3").build()[0].layers, expected, strict=True)
         alone = parse_solver(f"{method}+learned+refine0").build()[0]
-        assert same_bits(alone.layers, load_policy(shipped["learned-plain"]).layers)
+        chex.assert_trees_all_equal(alone.layers, load_policy(shipped["learned-plain"]).layers, strict=True)
     driver = parse_solver("pyceres:dense+learned+refine0").build()[0]
-    assert same_bits(driver.layers, load_policy(shipped["learned-driver"]).layers)
-    assert same_bits(parse_solver("pyceres:dense+learned").build()[0].layers, expected)
+    chex.assert_trees_all_equal(driver.layers, load_policy(shipped["learned-driver"]).layers, strict=True)
+    chex.assert_trees_all_equal(parse_solver("pyceres:dense+learned").build()[0].layers, expected, strict=True)
 
 
 @pytest.mark.parametrize("name", registry.SHIPPED)
@@ -346,7 +347,7 @@ def test_a_solve_damps_cameras_as_the_policy_was_trained():
 @functools.cache
 def scene(seed: int):
     """Scenes of one shape: one program for all."""
-    return random_scene(like("paper"), seed)
+    return random_scene(scene_like("paper"), seed)
 
 
 def test_another_policy_of_the_same_shape_compiles_nothing():

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 from dataclasses import replace
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,7 +94,7 @@ def test_the_paper_s_starts_are_off_by_what_its_code_says():
 
 def test_the_same_key_makes_the_same_scenes_and_another_one_others():
     first, again, other = (make_scenes(KIND, jax.random.key(k), 40) for k in (7, 7, 8))
-    assert same_bits(first, again)
+    chex.assert_trees_all_equal(first, again, strict=True)
     assert not np.allclose(first.cameras, other.cameras)
     assert len({c.tobytes() for c in np.asarray(first.cameras)}) == 40
 
@@ -458,9 +459,9 @@ def test_the_same_key_and_actions_give_the_same_numbers_and_the_game_is_traced_o
     traced = _jitted_step._cache_size()
     state, _ = _jitted_reset(game, jax.random.key(3))
     for action, (before, _, _, step) in zip(actions(50), found, strict=True):
-        assert same_bits(before.episodes, state.episodes)
+        chex.assert_trees_all_equal(before.episodes, state.episodes, strict=True)
         state, again = _jitted_step(game, state, action)
-        assert same_bits(again, step)
+        chex.assert_trees_all_equal(again, step, strict=True)
     other, _ = _jitted_reset(game, jax.random.key(4))
     assert not same_bits(other.episodes, found[0][0].episodes)
     _jitted_step(dataclasses.replace(game, banks=(_shifted(game.banks[0]),)), other, actions(1)[0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -23,7 +24,9 @@ def warmed(share: float, key: int = 0):
 
 def test_a_warm_start_is_the_same_scene_at_a_lower_cost():
     bank, scenes, cost = warmed(1.0)
-    assert same_bits(scenes._replace(cameras=0, points=0), bank.scenes._replace(cameras=0, points=0))
+    chex.assert_trees_all_equal(
+        scenes._replace(cameras=0, points=0), bank.scenes._replace(cameras=0, points=0), strict=True
+    )
     before, after = np.asarray(bank.initial_cost), np.asarray(cost)
     assert (after <= before).all()
     assert (after < before).mean() > 0.5
@@ -33,7 +36,7 @@ def test_a_warm_start_is_the_same_scene_at_a_lower_cost():
 
 def test_the_share_says_how_many_scenes_move():
     bank, scenes, cost = warmed(0.0)
-    assert same_bits((scenes, cost), (bank.scenes, bank.initial_cost))
+    chex.assert_trees_all_equal((scenes, cost), (bank.scenes, bank.initial_cost), strict=True)
     moved = np.mean([np.asarray(warmed(0.3, key)[2]) != np.asarray(bank.initial_cost) for key in range(3)])
     all_moved = np.mean([np.asarray(warmed(1.0, key)[2]) != np.asarray(bank.initial_cost) for key in range(3)])
     assert moved == pytest.approx(0.3 * all_moved, abs=0.1)
@@ -41,7 +44,7 @@ def test_the_share_says_how_many_scenes_move():
 
 def test_the_same_key_gives_the_same_warm_starts_and_another_one_others():
     first, again, other = (warmed(1.0, key)[1:] for key in (1, 1, 2))
-    assert same_bits(first, again)
+    chex.assert_trees_all_equal(first, again, strict=True)
     assert not same_bits(first, other)
 
 
@@ -49,7 +52,7 @@ def test_a_bank_with_warm_starts_begins_nearer_the_best_cost_and_says_so_to_the_
     cold, warm = (draft(KIND, jax.random.key(5), 120, OPTIONS, 40, rules=("ceres",), warm_share=s) for s in (0.0, 1.0))
     ratio = lambda made: np.median(np.asarray(made.bank.initial_cost / made.bank.best_cost))
     assert ratio(warm) < 0.1 * ratio(cold)
-    assert same_bits(warm.bank.info.cost, warm.bank.initial_cost)
+    chex.assert_trees_all_equal(warm.bank.info.cost, warm.bank.initial_cost, strict=True)
 
 
 @pytest.mark.parametrize("share", [-0.5, 1.5])

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxba import Refinement, StepOptions, initial_state, like, lm_step, random_scene
+from jaxba import Refinement, StepOptions, initial_state, lm_step, random_scene, scene_like
 from jaxba.solver.cost_model import BYTES_PER_OBSERVATION
 from jaxba.structure.layout import layout_for
 
@@ -26,7 +26,7 @@ def bytes_per_observation(problem, options, dtype):
 
 @pytest.mark.parametrize(("dtype", "share", "refine"), [(jnp.float64, 1.0, 3), (jnp.float32, 0.55, 0)])
 def test_an_implicit_step_keeps_to_the_stated_bytes_per_observation(dtype, share, refine):
-    problem = random_scene(like("random-150"), 0)
+    problem = random_scene(scene_like("random-150"), 0)
     used = bytes_per_observation(
         problem, StepOptions(linear_solver="implicit", refinement=Refinement(points=refine)), dtype
     )
@@ -37,7 +37,8 @@ def test_an_implicit_step_keeps_to_the_stated_bytes_per_observation(dtype, share
 def test_memory_of_an_implicit_step_grows_with_the_observations_only():
     options = StepOptions(linear_solver="implicit")
     sizes = [
-        replace(like("random-150"), points=points, observations=4 * points, cameras=50) for points in (5_000, 20_000)
+        replace(scene_like("random-150"), points=points, observations=4 * points, cameras=50)
+        for points in (5_000, 20_000)
     ]
     small, large = (bytes_per_observation(random_scene(size, 0), options, jnp.float64) for size in sizes)
     assert large < 1.1 * small

@@ -9,7 +9,7 @@ import pytest
 import support
 from support import solve
 
-from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene
+from jaxba import StepOptions, build_layout, initial_state, lm_step, random_scene, scene_like
 from jaxba.problem import geometry
 from jaxba.structure.segment_sums import total
 
@@ -19,7 +19,7 @@ from jaxba.structure.segment_sums import total
     [("explicit", "mixed", 1e-6), ("explicit", "float32", 1e-4), ("implicit", "float32", 1e-4)],
 )
 def test_every_type_ends_at_the_cost_of_float64(linear_solver, dtype, gap):
-    problem = random_scene(replace(like("random-150"), cameras=12, points=300, observations=1300), 3)
+    problem = random_scene(replace(scene_like("random-150"), cameras=12, points=300, observations=1300), 3)
     exact, rough = (solve(problem, linear_solver=linear_solver, dtype=name) for name in ("float64", dtype))
     assert exact.converged
     assert rough.converged

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import support
 
-from jaxba import StepOptions, build_layout, initial_state, like, lm_step, random_scene
+from jaxba import StepOptions, build_layout, initial_state, lm_step, random_scene, scene_like
 from jaxba.linear import reduced_system
 from jaxba.linear.schur import CameraSystem
 from jaxba.linear.woodbury import capacitance_solve
@@ -123,7 +123,7 @@ def test_float32_is_solved_to_single_precision():
 @pytest.mark.parametrize("damping", [1e-6, 1e-3, 1.0])
 def test_a_step_by_way_of_the_points_is_the_step_by_way_of_the_cameras(monkeypatch, damping):
     """With a camera that nobody observes."""
-    problem = random_scene(like("paper"), 0)
+    problem = random_scene(scene_like("paper"), 0)
     seen = problem.camera_index != 3
     problem = problem.replace(
         observations=problem.observations[seen],

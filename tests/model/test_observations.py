@@ -64,7 +64,7 @@ def dense_sums(problem: BundleProblem, loss: Loss) -> np.ndarray:
     first = 3 * np.arange(problem.num_points)
     entries = [hessian[first + i, first + j] for i in range(3) for j in range(i + 1)]
     unweighted = support.linear(problem, StepOptions())[0].reshape(-1, 2)
-    costs = 0.5 * published_loss(loss.name, loss.scale, np.sum(unweighted**2, axis=1))[0]
+    costs = 0.5 * published_loss(loss.rho, loss.scale, np.sum(unweighted**2, axis=1))[0]
     cost = np.bincount(problem.point_index, costs, minlength=problem.num_points)
     return np.stack([*entries, *(gradient[first + i] for i in range(3)), cost])
 

@@ -11,13 +11,13 @@ import pytest
 
 from jaxba import BundleProblem, ProblemError
 from jaxba.bench.records import Record, TracePoint
+from jaxba.io.settings import SettingsError
 from jaxba.paper import claims, config, real_problems, rows
 from jaxba.paper.markdown import Line, disagreements, lines_table
 from jaxba.paper.rows import Outcome, Row
 from jaxba.paper.schedule import average_schedule
 from jaxba.paper.store import PLAYS, SOLVES, Play, Store
 from jaxba.paper.subproblem import SubProblem, neighbouring_cameras, sub_problem
-from jaxba.training.settings import SettingsError
 
 # Sub-problems
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,9 +105,8 @@ def test_a_network_is_read_as_it_was_written(tmp_path):
     zero_net.save(tmp_path / "net.npz", net)
     again = zero_net.restore(tmp_path / "net.npz", AGENT)
     assert [p.name for p in tmp_path.iterdir()] == ["net.npz"]
-    same = [np.array_equal(a, b) for a, b in zip(jax.tree.leaves(net), jax.tree.leaves(again), strict=True)]
-    assert len(same) == 6
-    assert all(same)
+    assert len(jax.tree.leaves(net)) == 6
+    chex.assert_trees_all_equal(net, again, strict=True)
 
 
 @pytest.mark.slow

@@ -164,10 +164,10 @@ def test_a_start_without_a_finite_cost_is_refused_in_one_line():
 ALONE = """
 import gc, sys
 import numpy as np
-from jaxba import like, random_scene
+from jaxba import scene_like, random_scene
 from jaxba.peers.colmap import pyceres
 from jaxba.peers.colmap_problem import ColmapProblem
-colmaps = [ColmapProblem(random_scene(like("tiny"), seed)) for seed in range(3)]
+colmaps = [ColmapProblem(random_scene(scene_like("tiny"), seed)) for seed in range(3)]
 del colmaps[1]
 gc.collect()
 junk = [np.full(7, np.nan) for _ in range(10000)]

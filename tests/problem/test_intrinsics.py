@@ -64,7 +64,7 @@ def grid() -> BundleProblem:
     return with_lenses(support.paper(0), np.arange(10) % 2, np.array([[1, 1, 1], [1, 0, 0]], bool))
 
 
-def ties(problem: BundleProblem) -> np.ndarray:
+def copy_matrix(problem: BundleProblem) -> np.ndarray:
     """T: a column for every number that is optimised, with a one where a parameter is that number."""
     assert problem.lenses is not None
     columns, names = [], {}
@@ -84,19 +84,19 @@ def ties(problem: BundleProblem) -> np.ndarray:
 
 
 def dense_step(problem: BundleProblem, options: StepOptions, damping: float) -> np.ndarray:
-    """The damped step of the tied problem."""
+    """The damped step of the problem with shared lenses."""
     residual, jacobian = support.linear(problem, options)
-    tied = ties(problem)
-    small = jacobian @ tied
+    copies = copy_matrix(problem)
+    small = jacobian @ copies
     diagonal = np.ones(small.shape[1])
     if options.coordinates.scaling == "diagonal":
         diagonal = np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)
-    of_camera = tied[: problem.cameras.size].any(axis=0)
+    of_camera = copies[: problem.cameras.size].any(axis=0)
     diagonal[of_camera] *= options.coordinates.camera_damping
     stacked = np.vstack([small, np.diag(np.sqrt(damping * diagonal))])
     scale = 1 / np.linalg.norm(stacked, axis=0)
     right = np.concatenate([-residual, np.zeros(len(diagonal))])
-    return tied @ (scale * np.linalg.lstsq(stacked * scale, right, rcond=None)[0])
+    return copies @ (scale * np.linalg.lstsq(stacked * scale, right, rcond=None)[0])
 
 
 @pytest.mark.parametrize("make", [shared, unseen, grid])
@@ -110,7 +110,7 @@ def dense_step(problem: BundleProblem, options: StepOptions, damping: float) -> 
     ids=["diagonal", "manifold-soft", "identity"],
 )
 @pytest.mark.parametrize("damping", [1e-4, 1.0])
-def test_a_step_is_that_of_the_dense_tied_problem(make, options, damping):
+def test_a_step_is_that_of_the_dense_problem_with_shared_lenses(make, options, damping):
     problem = make()
     layout, before = support.start(problem, options)
     after, info = support.step(layout, before, damping, options, min_gain=-np.inf)
@@ -123,7 +123,7 @@ def test_a_step_is_that_of_the_dense_tied_problem(make, options, damping):
     np.testing.assert_allclose(found[seen], wanted[seen], rtol=0, atol=1e-8 * np.abs(wanted).max())
 
 
-def test_the_promised_decrease_and_the_gradient_are_those_of_the_tied_problem():
+def test_the_promised_decrease_and_the_gradient_are_those_of_the_problem_with_shared_lenses():
     problem, options = shared(), StepOptions(coordinates=Coordinates(rotation="manifold"))
     layout, before = support.start(problem, options)
     _, info = support.step(layout, before, 1e-2, options)
@@ -131,22 +131,22 @@ def test_the_promised_decrease_and_the_gradient_are_those_of_the_tied_problem():
     change = dense_step(problem, options, 1e-2)
     model = 0.5 * np.sum(residual**2) - 0.5 * np.sum((residual + jacobian @ change) ** 2)
     np.testing.assert_allclose(info.predicted, model, rtol=1e-9)
-    gradient = np.abs(ties(problem).T @ (jacobian.T @ residual)).max()
+    gradient = np.abs(copy_matrix(problem).T @ (jacobian.T @ residual)).max()
     np.testing.assert_allclose(info.gradient_max, gradient, rtol=1e-10)
 
 
 @pytest.mark.parametrize("policy", ["ceres", "learned"])
 def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
     problem = shared()
-    tied = ties(problem)
+    copies = copy_matrix(problem)
     start = np.concatenate([problem.cameras.ravel(), problem.points.ravel()])
 
     def residuals(unknowns):
-        every = start + tied @ unknowns
+        every = start + copies @ unknowns
         cameras, points = every[: problem.cameras.size].reshape(-1, 9), every[problem.cameras.size :].reshape(-1, 3)
         return geometry.residuals(problem.replace(cameras=cameras, points=points)).ravel()
 
-    truth = least_squares(residuals, np.zeros(tied.shape[1]), x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12)
+    truth = least_squares(residuals, np.zeros(copies.shape[1]), x_scale="jac", ftol=1e-12, xtol=1e-12, gtol=1e-12)
     solution = solve(problem, policy)
     assert solution.converged
     np.testing.assert_allclose(solution.final_cost, truth.cost, rtol=2e-6)
@@ -191,9 +191,9 @@ def test_a_long_sequence_with_one_lens_is_solved():
     assert solution.final_cost < geometry.cost(true.replace(observations=scene.observations))
     assert solution.linear_solver == "explicit"
     assert np.ptp(solution.problem.cameras[:, 6:], axis=0).max() == 0
-    # nothing is left to win: the undamped tied model promises next to nothing
+    # nothing is left to win: the undamped linear model promises next to nothing
     residual, jacobian = support.linear(solution.problem, StepOptions())
-    small = jacobian @ ties(solution.problem)
+    small = jacobian @ copy_matrix(solution.problem)
     best = np.linalg.lstsq(small / np.linalg.norm(small, axis=0), -residual, rcond=1e-12)[0]
     rest = residual + (small / np.linalg.norm(small, axis=0)) @ best
     assert np.sum(residual**2) - np.sum(rest**2) < 1e-5 * np.sum(residual**2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,7 @@ import support
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
-from support import same_bits, solve, start, step
+from support import solve, start, step
 
 from jaxba import BundleProblem, Layout, LMState, StepOptions, lm_step, make_policy
 from jaxba.game.random_scenes import SceneClass, make_scenes
@@ -214,12 +215,11 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         if once.accepted:  # then nothing is tried again
             assert (info.repairs, info.step_fraction) == (0, 1)
             # another program, which rounds in another order
-            for found, truth in zip(jax.tree.leaves(after), jax.tree.leaves(same), strict=True):
-                np.testing.assert_allclose(found, truth, rtol=1e-9, atol=1e-9)
+            chex.assert_trees_all_close(after, same, rtol=1e-9, atol=1e-9)
             continue
-        assert same_bits(same, before)
+        chex.assert_trees_all_equal(same, before, strict=True)
         if not info.accepted:
-            assert same_bits(after, before)
+            chex.assert_trees_all_equal(after, before, strict=True)
             continue
         saved += 1
         assert once.repairs == 0
@@ -277,7 +277,7 @@ def test_a_refused_step_leaves_every_bit_alone(options):
         layout, before = start(problem)
         after, info = step(layout, before, 1e-3, options, min_gain=1e9)
         assert not info.accepted
-        assert same_bits(after, before)
+        chex.assert_trees_all_equal(after, before, strict=True)
         assert info.cost == info.previous_cost
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -97,8 +98,8 @@ def test_far_from_where_it_is_linear_a_lens_is_added_as_it_is():
     step[6] = cameras[6] * np.array([near, -near, far, -far, 50.0, -2.0])
     moved, plain = (np.asarray(_move(build_layout(support.tiny()), cameras, step, how)) for how in (PIXELS, FILE))
     assert (moved[7:, :2] != plain[7:, :2]).all()
-    assert same_bits(moved[:, 2:], plain[:, 2:])
-    assert same_bits(moved[:7], plain[:7])
+    chex.assert_trees_all_equal(moved[:, 2:], plain[:, 2:], strict=True)
+    chex.assert_trees_all_equal(moved[:7], plain[:7], strict=True)
 
 
 def test_a_camera_without_focal_length_stays_finite():
@@ -106,7 +107,7 @@ def test_a_camera_without_focal_length_stays_finite():
     cameras[6, 0] = 0
     moved, plain = (np.asarray(_move(build_layout(support.tiny()), cameras, step, how)) for how in (PIXELS, FILE))
     assert np.isfinite(moved).all()
-    assert same_bits(moved[:, 0], plain[:, 0])
+    chex.assert_trees_all_equal(moved[:, 0], plain[:, 0], strict=True)
 
 
 def test_what_of_a_lens_stays_is_not_touched_by_a_zoom():
@@ -119,11 +120,11 @@ def test_what_of_a_lens_stays_is_not_touched_by_a_zoom():
     moved = np.asarray(_move(layout, cameras, step, PIXELS))
     for row, column in ((7, 1), (8, 2)):
         free = held[lenses.index, column]
-        assert same_bits(moved[row, ~free], cameras[row, ~free])
+        chex.assert_trees_all_equal(moved[row, ~free], cameras[row, ~free], strict=True)
         assert (moved[row, free] != (cameras + step)[row, free]).all()
     fixed = StepOptions(intrinsics="fixed", coordinates=Coordinates(lens_step="pixels"))
     step[6:] = 0
-    assert same_bits(np.asarray(_move(layout, cameras, step, fixed))[6:], cameras[6:])
+    chex.assert_trees_all_equal(np.asarray(_move(layout, cameras, step, fixed))[6:], cameras[6:], strict=True)
 
 
 @pytest.mark.slow
@@ -142,4 +143,4 @@ def test_without_a_change_of_focal_length_nothing_differs():
     cameras, step = random_step(5, 0.1)
     step[6] = 0
     layout = build_layout(support.tiny())
-    assert same_bits(_move(layout, cameras, step, PIXELS), _move(layout, cameras, step, FILE))
+    chex.assert_trees_all_equal(_move(layout, cameras, step, PIXELS), _move(layout, cameras, step, FILE), strict=True)

@@ -6,6 +6,7 @@ import importlib
 import time
 from typing import get_args
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -134,8 +135,7 @@ def test_the_two_parts_are_the_step():
     parts = jax.jit(try_step, static_argnums=4)(layout, state, damping, proposal, options)
     whole = jax.jit(lm_step, static_argnums=3)(layout, state, damping, options)
     assert whole[1].accepted
-    for part, one in zip(jax.tree.leaves(parts), jax.tree.leaves(whole), strict=True):
-        np.testing.assert_allclose(part, one, rtol=1e-9, atol=1e-12)
+    chex.assert_trees_all_close(parts, whole, rtol=1e-9, atol=1e-12)
 
 
 class Failing(Program):

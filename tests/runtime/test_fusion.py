@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from absl.testing import parameterized
 
 from jaxba.runtime.fusion import compute_in_one_loop, compute_unfused, computed_after, fast_compilation, fusion_barrier
 
@@ -21,13 +23,22 @@ def rows(dtype=np.float64) -> np.ndarray:
     return values
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["plain", "jit"])
-def test_a_barrier_changes_no_bit(dtype, wrap):
-    values = rows(dtype)
-    found = wrap(fusion_barrier)(jnp.asarray(values))
-    assert found.dtype == dtype
-    assert np.array_equal(found, values)
+class JittedAndNot(chex.TestCase):
+    """Every test runs twice: `self.variant` is `jax.jit`, or leaves a function as it is."""
+
+    @chex.variants(with_jit=True, without_jit=True)
+    @parameterized.parameters(np.float32, np.float64)
+    def test_a_barrier_changes_no_bit(self, dtype):
+        values = rows(dtype)
+        found = self.variant(fusion_barrier)(jnp.asarray(values))
+        assert found.dtype == dtype
+        assert np.array_equal(found, values)
+
+    @chex.variants(with_jit=True, without_jit=True)
+    def test_unfused_computation_changes_no_bit(self):
+        x, y = jnp.asarray(np.random.default_rng(0).normal(size=(5, 4))), jnp.asarray(0.5)
+        found = self.variant(lambda x, y, index: compute_unfused(squares, x, y, index=index))(x, y, INDEX)
+        assert np.array_equal(found, squares(x, y))
 
 
 def test_a_barrier_maps_over_a_batch():
@@ -61,13 +72,6 @@ INDEX = np.arange(3, dtype=np.int32)
 
 def squares(x, y):
     return x[:, :, None] * x[:, None, :] + y
-
-
-@pytest.mark.parametrize("wrap", [lambda f: f, jax.jit], ids=["plain", "jit"])
-def test_unfused_computation_changes_no_bit(wrap):
-    x, y = jnp.asarray(np.random.default_rng(0).normal(size=(5, 4))), jnp.asarray(0.5)
-    found = wrap(lambda x, y, index: compute_unfused(squares, x, y, index=index))(x, y, INDEX)
-    assert np.array_equal(found, squares(x, y))
 
 
 def test_unfused_computation_maps_over_a_batch():

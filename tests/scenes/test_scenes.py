@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import camera_centers, cost, depths, project, residuals
-from jaxba.scenes import LIKE, SceneConfig, like, random_scene, random_scene_with_truth
+from jaxba.scenes import LIKE, SceneConfig, random_scene, random_scene_with_truth, scene_like
 from jaxba.scenes.tracks import track_lengths
 
 DATA = os.environ.get("JAXBA_DATA")
@@ -34,7 +34,7 @@ def middle(trajectory: str, **changes) -> SceneConfig:
 
 @pytest.mark.parametrize("name", SMALL_NAMES)
 def test_a_named_scene_has_exactly_its_counts(name):
-    config = like(name)
+    config = scene_like(name)
     scene = random_scene(config, 0)
     assert scene.num_cameras == config.cameras
     assert scene.num_points == config.points
@@ -57,7 +57,7 @@ def test_the_named_scenes_have_the_sizes_of_bal():
 
 
 def test_a_scene_of_a_thousand_cameras_is_exact_and_whole():
-    config = like("ladybug-1197")
+    config = scene_like("ladybug-1197")
     start, truth = random_scene_with_truth(config, 0)
     assert (start.num_cameras, start.num_points, start.num_observations) == (1197, 126327, 563734)
     assert depths(truth).min() > 0
@@ -88,7 +88,7 @@ def test_every_camera_sees_four_points(trajectory):
 
 
 def test_every_point_of_the_paper_is_seen_by_every_camera():
-    scene = random_scene(like("paper"), 5)
+    scene = random_scene(scene_like("paper"), 5)
     assert len(np.unique(10 * scene.point_index + scene.camera_index)) == 100
 
 
@@ -131,7 +131,7 @@ def test_track_lengths_are_spread_as_in_the_real_problem(name, file):
     from jaxba.io import read_problem
 
     real = read_problem(Path(str(DATA)) / "bal" / f"{file}.txt.bz2")
-    scene = random_scene(like(name), 0)
+    scene = random_scene(scene_like(name), 0)
     expected, found = (np.bincount(problem.point_index) for problem in (real, scene))
     assert found.mean() == expected.mean()
     for low, high in ((2, 2), (3, 3), (4, 5), (6, 9), (10, 1000)):
@@ -144,7 +144,7 @@ def test_the_start_is_as_far_away_as_that_of_ladybug():
     from jaxba.io import read_problem
 
     real = read_problem(Path(str(DATA)) / "bal" / "problem-49-7776-pre.txt.bz2")
-    assert 0.2 < cost(random_scene(like("ladybug-49"), 0)) / cost(real) < 5
+    assert 0.2 < cost(random_scene(scene_like("ladybug-49"), 0)) / cost(real) < 5
 
 
 # Visibility
@@ -258,7 +258,7 @@ def test_each_knob_of_the_start_moves_it_further_away(knob):
 
 @pytest.mark.parametrize("name", [*SMALL_NAMES, "dubrovnik-356"])
 def test_the_start_is_as_far_as_bal_starts_are(name):
-    start, truth = random_scene_with_truth(like(name), 0)
+    start, truth = random_scene_with_truth(scene_like(name), 0)
     assert 10 < cost(start) / cost(truth) < 200
     assert np.mean(depths(start) <= 0) < 0.002
 
@@ -276,7 +276,7 @@ def test_drift_bends_the_path_but_hardly_the_neighbourhood():
 
 @pytest.mark.parametrize("name", ["tiny", "paper"])
 def test_a_solved_scene_ends_at_the_noise_floor(name):
-    config = like(name)
+    config = scene_like(name)
     freedom = 2 * config.total - (9 * config.cameras + 3 * config.points - 7)
     ratios = []
     for seed in range(2):
@@ -305,7 +305,7 @@ def solve(problem: BundleProblem) -> float:
 
 def test_an_unknown_name_lists_the_known_ones():
     with pytest.raises(ProblemError, match=r"ladybug-49.*final-13682"):
-        like("ladybug")
+        scene_like("ladybug")
 
 
 @pytest.mark.parametrize(

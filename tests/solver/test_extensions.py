@@ -90,7 +90,7 @@ def test_a_policy_written_by_hand_drives_a_solve(callback):
 
 
 def test_a_policy_written_by_hand_brings_a_plain_step():
-    assert jaxba.prepare(support.tiny(), policy=Steady()).options == jaxba.StepOptions()
+    assert jaxba.prepare(support.tiny(), Steady()).options == jaxba.StepOptions()
 
 
 class OnlyStarts:

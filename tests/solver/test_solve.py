@@ -20,9 +20,9 @@ from jaxba import (
     StepOptions,
     Termination,
     Tolerances,
-    like,
     make_policy,
     random_scene_with_truth,
+    scene_like,
     solve_loop,
 )
 from jaxba.methods.stba import StochasticClusters
@@ -158,7 +158,7 @@ def test_another_limit_compiles_nothing_and_is_kept_to():
 
 def test_the_gradient_vanishes_at_an_exact_optimum():
     """A noise-free scene started at its truth."""
-    _, truth = random_scene_with_truth(replace(like("tiny"), noise=0.0), 0)
+    _, truth = random_scene_with_truth(replace(scene_like("tiny"), noise=0.0), 0)
     solution = stepwise(truth, tolerances=Tolerances(0.0, 0.0, 1e-6))
     assert solution.initial_cost < 1e-18
     assert solution.termination == Termination.GRADIENT
@@ -188,7 +188,7 @@ def test_cameras_that_nobody_looks_through_make_no_step_short():
 
 
 def test_a_noise_free_scene_is_solved_to_zero():
-    problem, _ = random_scene_with_truth(replace(like("tiny"), noise=0.0), 0)
+    problem, _ = random_scene_with_truth(replace(scene_like("tiny"), noise=0.0), 0)
     solution = stepwise(problem)
     assert solution.converged
     assert solution.final_cost < 1e-9 * solution.initial_cost

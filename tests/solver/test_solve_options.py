@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import inspect
+import json
 from dataclasses import fields
 
+import chex
 import pytest
 import support
 
@@ -23,6 +25,7 @@ from jaxba import (
 from jaxba.cli.solve import Arguments, run, solve_options
 from jaxba.damping.policy import trained_step
 from jaxba.io import read_problem, write_problem
+from jaxba.solver.names import parse_solver
 
 # Defaults
 
@@ -33,7 +36,7 @@ def test_every_default_of_the_command_is_that_of_the_options():
     for name in plain:
         assert getattr(command, name) == getattr(options, name), name
     assert command.preconditioner == options.conjugate_gradients.preconditioner
-    assert (command.loss, command.loss_scale) == (options.loss.name, options.loss.scale)
+    assert (command.loss, command.loss_scale) == (options.loss.rho, options.loss.scale)
     assert (command.ftol, command.xtol, command.gtol) == options.tolerances[:3]
     assert options.refinement is command.refine_points is None
     assert options.coordinates is command.scaling is command.rotation is None
@@ -65,7 +68,7 @@ def test_a_solve_with_defaults_is_what_the_command_writes(tmp_path):
 def test_a_loss_leaves_the_step_that_the_policy_was_trained_with():
     trained = trained_step(make_policy("learned"))
     assert trained.refinement != Refinement()
-    found = prepare(support.tiny(), SolveOptions(loss=Loss("huber", 2.0)), policy="learned").options
+    found = prepare(support.tiny(), "learned", SolveOptions(loss=Loss("huber", 2.0))).options
     assert found.loss == Loss("huber", 2.0)
     assert (found.refinement, found.coordinates) == (trained.refinement, trained.coordinates)
 
@@ -74,21 +77,58 @@ def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
     trained, loss = trained_step(make_policy("learned")), Loss("huber", 2.0)
     spelled_out = SolveOptions(loss=loss, refinement=trained.refinement, coordinates=trained.coordinates)
     found, expected = (jaxba.solve(support.tiny(), "learned", o) for o in (SolveOptions(loss=loss), spelled_out))
-    assert support.same_bits(found.history, expected.history)
+    chex.assert_trees_all_equal(found.history, expected.history, strict=True)
 
 
 def test_what_is_asked_for_wins_over_what_the_policy_was_trained_with():
     refinement, coordinates = Refinement(points=1, trials=2), Coordinates(camera_damping=0.5, rotation="manifold")
     trained = trained_step(make_policy("learned"))
-    one = prepare(support.tiny(), SolveOptions(refinement=refinement)).options
+    one = prepare(support.tiny(), options=SolveOptions(refinement=refinement)).options
     assert (one.refinement, one.coordinates) == (refinement, trained.coordinates)
-    other = prepare(support.tiny(), SolveOptions(coordinates=coordinates)).options
+    other = prepare(support.tiny(), options=SolveOptions(coordinates=coordinates)).options
     assert (other.refinement, other.coordinates) == (trained.refinement, coordinates)
 
 
 def test_a_rule_brings_a_plain_step():
-    found = prepare(support.tiny(), policy="ceres").options
+    found = prepare(support.tiny(), "ceres").options
     assert (found.refinement, found.coordinates) == (Refinement(), Coordinates())
+
+
+# Embedded iterations in the name of the policy
+
+
+@pytest.mark.parametrize("name", ["ceres+embedded", "constant:1e-4+refine2", "learned+refine0"])
+def test_the_name_of_a_policy_brings_the_embedded_iterations_of_the_solver_of_that_name(name, tmp_path):
+    path, log = tmp_path / "problem.txt", tmp_path / "log.json"
+    write_problem(support.tiny(), path)
+    problem = read_problem(path)
+    expected = jaxba.solve(problem, *parse_solver(name).build()).history
+    chex.assert_trees_all_equal(jaxba.solve(problem, name).history, expected)
+    assert run([str(path), "--policy", name, "--log", str(log)]) == 0
+    record = json.loads(log.read_text())
+    assert record["solver"] == name
+    assert [point["lambda"] for point in record["trace"][1:]] == expected.damping.tolist()
+    assert [point["cost"] for point in record["trace"][1:]] == expected.cost.tolist()
+
+
+def test_the_name_of_a_policy_brings_the_coordinates_unless_they_are_given():
+    built = parse_solver("ceres+embedded").build()[1]
+    found = prepare(support.tiny(), "ceres+embedded").options
+    assert (found.refinement, found.coordinates) == (built.refinement, built.coordinates)
+    assert built.coordinates != Coordinates()
+    given = prepare(support.tiny(), "ceres+embedded", SolveOptions(coordinates=Coordinates())).options
+    assert (given.refinement, given.coordinates) == (built.refinement, Coordinates())
+
+
+def test_options_may_repeat_the_name_of_the_policy_and_not_contradict_it(capsys):
+    same = Refinement(points=3)
+    assert prepare(support.tiny(), "ceres+refine3", SolveOptions(refinement=same)).options.refinement == same
+    with pytest.raises(ValueError, match=r"policy 'ceres\+refine3' states its refinement"):
+        jaxba.solve(support.tiny(), "ceres+refine3", SolveOptions(refinement=Refinement(points=2)))
+    assert solve_options(Arguments(policy="ceres+refine3", refine_points=3))[1].refinement == same
+    for policy in ("ceres+refine3", "ceres+embedded"):
+        assert run(["--policy", policy, "--refine-points", "2"]) == 2
+        assert capsys.readouterr().err == f"error: --refine-points 2 contradicts --policy {policy}\n"
 
 
 # What is refused

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from math import prod
 
-import jax
+import chex
 import numpy as np
 import pytest
 import support
@@ -142,7 +142,7 @@ def test_the_order_of_the_observations_does_not_matter():
     )
     one, other = build_layout(problem), build_layout(shuffled)
     assert one.buckets == other.buckets
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
+    chex.assert_trees_all_equal(one, other, strict=True)
 
 
 def test_one_observation_is_enough():

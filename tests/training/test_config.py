@@ -9,8 +9,9 @@ import pytest
 
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.random_scenes import SceneClass
+from jaxba.io import settings
 from jaxba.problem.options import StepOptions
-from jaxba.training import config, settings
+from jaxba.training import config
 from jaxba.training.config import SettingsError, TrainConfig, load, to_yaml
 from jaxba.training.sac import SacConfig
 

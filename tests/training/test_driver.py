@@ -6,6 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -346,10 +347,7 @@ def test_banks_survive_their_file(tmp_path):
     splits = [Split(bank(5), bank(2)), Split(bank(3), bank(1))]
     task._write_banks(tmp_path / "bank.npz", splits)
     found = task.read_banks(tmp_path / "bank.npz")
-    assert jax.tree.structure(found) == jax.tree.structure(splits)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(splits), strict=True):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
+    chex.assert_trees_all_equal(found, splits, strict=True)
     assert [path.name for path in tmp_path.iterdir()] == ["bank.npz"]
     with np.load(tmp_path / "bank.npz") as file:
         older = {name: file[name] for name in file.files if not name.endswith("best_cost")}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -109,8 +110,7 @@ def test_everything_is_float32_and_the_members_differ() -> None:
     for leaf in jax.tree.leaves((learner.actor, learner.critic, learner.target, learner.log_temperature)):
         assert leaf.dtype == jnp.float32
     stepped, metrics = _update(SMALL, learner, batch())
-    same = lambda a, b: a.dtype == b.dtype and a.shape == b.shape
-    assert all(jax.tree.leaves(jax.tree.map(same, learner, stepped)))
+    chex.assert_trees_all_equal_shapes_and_dtypes(learner, stepped)
     assert all(value.dtype == jnp.float32 for value in metrics.values())
     first, second = (jax.tree.map(lambda x, i=i: x[i], learner.critic) for i in (0, 1))
     assert not equal(first, second)
@@ -143,7 +143,7 @@ def test_acting() -> None:
     drawn = [sac.act(SMALL, learner.actor, observation, jax.random.key(i)) for i in (0, 0, 1)]
     assert certain.shape == (32, ACTIONS)
     assert certain.dtype == jnp.float32
-    assert equal(drawn[0], drawn[1])
+    chex.assert_trees_all_equal(drawn[0], drawn[1])
     assert not equal(drawn[0], drawn[2])
     one = sac.act(SMALL, learner.actor, observation[3], None)
     np.testing.assert_allclose(one, certain[3], rtol=1e-5, atol=1e-7)
@@ -198,14 +198,14 @@ def test_the_target_follows_softly_or_now_and_then() -> None:
     learner = fresh(SMALL)
     after, _ = _update(SMALL, learner, batch())
     expected = jax.tree.map(lambda old, new: 0.995 * old + 0.005 * new, learner.target, after.critic)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), after.target, expected)
+    chex.assert_trees_all_close(after.target, expected, rtol=1e-5, atol=1e-7)
 
     learner = fresh(VALUE)
     start = learner.target
     for count in range(1, 7):
         before, (learner, _) = learner, _update(VALUE, learner, batch())
         assert int(learner.updates) == count
-        assert equal(learner.target, learner.value if count % 3 == 0 else before.target)
+        chex.assert_trees_all_equal(learner.target, learner.value if count % 3 == 0 else before.target)
         assert not equal(learner.value, before.value)
     assert not equal(learner.target, start)
 
@@ -223,7 +223,7 @@ def test_the_temperature_moves_towards_the_wanted_entropy(log_std: float, direct
 def test_a_fixed_temperature_stays() -> None:
     learner, metrics = _update(VALUE, fresh(VALUE), batch())
     np.testing.assert_allclose(metrics["temperature"], VALUE.initial_temperature, rtol=1e-6)
-    assert equal(learner.log_temperature, fresh(VALUE).log_temperature)
+    chex.assert_trees_all_equal(learner.log_temperature, fresh(VALUE).log_temperature)
 
 
 def test_long_gradients_are_shortened() -> None:
@@ -242,5 +242,4 @@ def test_presets() -> None:
     assert (paper.variant, paper.width, paper.target_every, paper.tau) == ("value", 256, 5, 1.0)
     assert not paper.learn_temperature
     assert (paper.log_std_min, paper.log_std_max) == (-20.0, 2.0)
-    assert SacConfig.default() == SacConfig()
     assert hash(paper) != hash(SacConfig())

@@ -64,10 +64,6 @@ def plain(tree):
     return jax.tree.map(lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree)
 
 
-def assert_equal(one, other) -> None:
-    jax.tree.map(np.testing.assert_array_equal, plain(one), plain(other))
-
-
 # games with a known answer
 
 both_agents = pytest.mark.parametrize("agent", AGENTS)
@@ -241,7 +237,7 @@ def test_the_same_key_gives_the_same_numbers_and_a_run_goes_on_from_its_state() 
         again,
     )
     again, _ = run_chunk(TWIN, LONG, toys.BOTH, restored)
-    assert_equal(one, again)
+    chex.assert_trees_all_equal(one, again)
     other = start(TWIN, LONG, toys.BOTH, jax.random.key(1))
     assert not np.array_equal(other.replay.rows, start(TWIN, LONG, toys.BOTH, jax.random.key(0)).replay.rows)
 

@@ -9,17 +9,12 @@ from pathlib import Path
 from jaxba.datasets.bal.catalog import Entry, find
 from jaxba.datasets.bal.problems import PROBLEMS
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.runtime.user_cache import user_cache
 
 FOLDER_VARIABLE = "JAXBA_BAL"
 """Environment variable: folder of downloaded problems, instead of `bal` in the user's cache folder."""
 
 _NAME = re.compile(rf"(?:{'|'.join(PROBLEMS)})-\d+", re.IGNORECASE)
-
-
-def user_cache(part: str) -> Path:
-    """A folder of this package within the user's cache folder, as the XDG base directory specification has it."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    return Path(base) / "jaxba" / part
 
 
 def data_folder() -> Path:
