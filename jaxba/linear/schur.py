@@ -99,19 +99,24 @@ def eliminate_points(
         options: scaling of the damping.
     """
     sums = point_sums(layout, normal_entries(linear.point_jacobian, linear.residual))
-    matrix, gradient = [sums[k] for k in range(6)], [sums[k] for k in range(6, 9)]
-    diagonal = [damping_diagonal(matrix[k], damping, options) for k in (0, 2, 5)]
-    for entry, extra in zip((0, 2, 5), diagonal, strict=True):
-        matrix[entry] = matrix[entry] + extra
-    factor = cholesky3(matrix)
-    solved = factor.forward(gradient)
+
+    def factored(sums: list[Array], damping: Array) -> list[Array]:
+        matrix, gradient = sums[:6], sums[6:]
+        diagonal = [damping_diagonal(matrix[k], damping, options) for k in (0, 2, 5)]
+        for entry, extra in zip((0, 2, 5), diagonal, strict=True):
+            matrix[entry] = matrix[entry] + extra
+        factor = cholesky3(matrix)
+        return [*factor, *factor.forward(gradient), *diagonal]
+
+    entries = compute_in_one_loop(factored, sums, jnp.broadcast_to(damping, sums[0].shape))
+    factor, solved, diagonal = Cholesky3(*entries[:6]), entries[6:9], entries[9:]
     at_slot = take(jnp.stack(factor), layout.slot_point)
 
     def projected(factor: Array, jacobian: list[list[Array]]) -> list[Array]:
         return [entry for row in jacobian for entry in Cholesky3(*factor).forward(row)]
 
     rows = compute_in_one_loop(projected, at_slot, linear.point_jacobian)
-    return PointSystem(factor, gradient, diagonal, solved, [rows[:3], rows[3:]])
+    return PointSystem(factor, sums[6:], diagonal, solved, [rows[:3], rows[3:]])
 
 
 def camera_system(

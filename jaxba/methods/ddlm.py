@@ -35,7 +35,7 @@ from jaxba.linear.schur import (
 from jaxba.linear.step import Step
 from jaxba.lm.method import Round
 from jaxba.methods.stba import solve_clusters
-from jaxba.model.linearize import Linearization, linearize, point_terms, slot_frames
+from jaxba.model.linearize import Linearization, Reference, linearize, point_terms, slot_frames
 from jaxba.model.observations import point_passes, view_terms
 from jaxba.problem.options import StepOptions, check_count
 from jaxba.refinement.acceptance import NEGLIGIBLE
@@ -203,8 +203,8 @@ def _step_shared_points(
     terms = lambda views: point_terms(views, options.loss)[:10]
     *entries, before = one_pass(points, terms)
     if options.refinement.points:
-        (inverse_depth,) = view_terms(layout, frames, points, lambda views: [views.projected().inverse_depth])
-        previous = PreviousPoints.of(layout, points, inverse_depth)
+        reference = Reference(*view_terms(layout, frames, points, lambda views: point_terms(views, options.loss)[9:]))
+        previous = PreviousPoints.of(layout, points, reference)
         refined, costs = refine_points(layout, frames, points, options.loss, options.refinement.points, previous)
         costs = jnp.where(partition.is_shared, costs, before)
         return jnp.where(partition.is_shared, refined, points), total(costs)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.runtime.fusion import fusion_barrier
+from jaxba.runtime.fusion import compute_unfused, fusion_barrier
 from jaxba.typing import AnyArray
 
 SMALL_ANGLE_SQUARED = 1e-6
@@ -34,25 +34,18 @@ class Frames(NamedTuple):
     k1: Float[Array, "..."]
     k2: Float[Array, "..."]
 
-    def materialized(self) -> Frames:
-        """The same frames, computed once and stored: a fusion barrier keeps XLA from recomputing them in every use."""
-        rotation, translation = jnp.asarray(self.rotation), jnp.asarray(self.translation)
-        table = fusion_barrier(jnp.stack([*rotation.reshape(9, -1), *translation, self.focal, self.k1, self.k2]))
-        return Frames(table[:9].reshape(rotation.shape), table[9:12], *table[12:])
+    def at(self, index: Int[AnyArray, " n"]) -> Frames:
+        """The frames of the cameras in `index`.
 
-    def at(self, index: Int[AnyArray, "..."]) -> Frames:
-        """The frames of the cameras in `index`, as lists of vectors, whose gathers XLA fuses into their uses.
-
-        Call it on `materialized` frames, or the rotation matrices are computed once per observation.
+        They are computed once per camera and stored: a fusion barrier keeps XLA from recomputing the rotation matrices
+        for every index.
         """
-        gather = lambda row: row.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
-        rotation = [[gather(entry) for entry in row] for row in self.rotation]
-        return Frames(rotation, [gather(row) for row in self.translation], *map(gather, self[2:]))
-
-    def stacked(self) -> Frames:
-        """The same with arrays in place of lists."""
-        rotation = jnp.stack([jnp.stack(list(row)) for row in self.rotation])
-        return self._replace(rotation=rotation, translation=jnp.stack(list(self.translation)))
+        rotation = jnp.asarray(self.rotation).reshape(9, -1)
+        table = fusion_barrier(jnp.stack([*rotation, *self.translation, self.focal, self.k1, self.k2]))
+        gather = lambda table, index: table.at[:, index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        # not fused with its uses, in which a gather keeps the compiler from vectorising
+        table = compute_unfused(gather, table, jnp.asarray(index), index=index)
+        return Frames(table[:9].reshape(3, 3, -1), table[9:12], *table[12:])
 
 
 class Projection(NamedTuple):

@@ -51,8 +51,8 @@ class Linearization(NamedTuple):
 
 @traced_once()
 def slot_frames(layout: Layout, cameras: Float[Array, "9 cameras"]) -> camera.Frames:
-    """The camera of every slot, materialised; rotation matrices are computed once per camera."""
-    return camera.frames(cameras).materialized().at(layout.slot_camera).stacked()
+    """The camera of every slot; rotation matrices are computed once per camera."""
+    return camera.frames(cameras).at(layout.slot_camera)
 
 
 def view_residuals(views: Views, projection: camera.Projection) -> list[Array]:

@@ -128,13 +128,14 @@ def comparison(
     if effort is not None:
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     predicted = step.predicted(jnp.ones_like(cost))
+    previous = PreviousPoints.of(parts.layout, points, reference)
     return Comparison(
         parts=parts,
         cameras=cameras,
         points=points,
         cost=cost,
-        terms=parts.terms(reference.costs, options),
-        previous=PreviousPoints.of(parts.layout, points, reference.inverse_depth),
+        terms=parts.terms(reference, previous, options),
+        previous=previous,
         step=step,
         options=options,
         min_gain=min_gain,

@@ -20,6 +20,7 @@ from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
 from jaxba.refinement.points import PreviousPoints, has_receded, refine_points
 from jaxba.runtime import loops
+from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 
@@ -40,8 +41,12 @@ def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDIST
     """
     zeros = jnp.zeros((3, layout.num_points), frames.focal.dtype)
     sums = point_passes(layout, frames)(zeros, functools.partial(_ray_terms, undistortions))
-    factor = cholesky3(sums[:6])
-    return jnp.stack(factor.backward(factor.forward(sums[6:])))
+
+    def solved(sums: list[Array]) -> list[Array]:
+        factor = cholesky3(sums[:6])
+        return factor.backward(factor.forward(sums[6:]))
+
+    return jnp.stack(compute_in_one_loop(solved, sums))
 
 
 def _ray_terms(undistortions: int, views: Views) -> list[Array]:

@@ -25,15 +25,15 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.cholesky3 import Cholesky3, cholesky3
+from jaxba.linear.cholesky3 import cholesky3
 from jaxba.model import camera
-from jaxba.model.linearize import point_terms
+from jaxba.model.linearize import Reference, point_terms
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.layout import Layout
-from jaxba.structure.segment_sums import point_sum
+from jaxba.structure.segment_sums import point_sums
 
 INITIAL_DAMPING = 1e-6
 """Relative damping of a point's first step: Gauss-Newton except for parallel rays."""
@@ -55,18 +55,23 @@ SMALL_DECREASE = 1e-2
 
 
 class PreviousPoints(NamedTuple):
-    """Positions of points before the step, to which diverged points return."""
+    """Points before the step. Diverged points return to their positions."""
 
     points: Float[Array, "3 points"]
-    front: Bool[Array, " slots"]  # whether the point was in front of the camera
-    inverse_depth_sum: Float[Array, " points"]  # over the cameras of a point, negative in front of them
+
+    front: Bool[Array, " slots"]
+    """Whether the point was in front of the camera."""
+
+    inverse_depth_sum: Float[Array, " points"]
+    """Sum over the cameras of a point, negative in front of them."""
+
+    costs: Float[Array, " points"]
+    """Cost of the observations of each point, pixels^2."""
 
     @classmethod
-    def of(
-        cls, layout: Layout, points: Float[Array, "3 points"], inverse_depth: Float[Array, " slots"]
-    ) -> PreviousPoints:
-        """From the positions of points and `Projection.inverse_depth` of every slot."""
-        return cls(points, inverse_depth < 0, point_sum(layout, inverse_depth[None])[0])
+    def of(cls, layout: Layout, points: Float[Array, "3 points"], reference: Reference) -> PreviousPoints:
+        """From the positions of points and the reference of every slot there."""
+        return cls(points, reference.inverse_depth < 0, *point_sums(layout, [reference.inverse_depth, reference.costs]))
 
 
 class _Carry(NamedTuple):
@@ -116,15 +121,12 @@ def refine_points(
         return [*found, *((seen & (found[-1] > 0)).astype(points.dtype) for seen in front)]
 
     def propose(best: _Carry) -> Float[Array, "3 points"]:
-        matrix = [best.system[k] for k in range(6)]
-        for k in (0, 2, 5):
-            matrix[k] = matrix[k] * (1 + best.damping)
+        def moved(points: Array, system: Array, damping: Array) -> list[Array]:
+            matrix = [entry * (1 + damping) if k in (0, 2, 5) else entry for k, entry in enumerate(system[:6])]
+            factor = cholesky3(matrix)
+            return [x - d for x, d in zip(points, factor.backward(factor.forward(list(system[6:]))), strict=True)]
 
-        def moved(points: Array, factor: Cholesky3, gradient: Array) -> list[Array]:
-            return [x - d for x, d in zip(points, factor.backward(factor.forward(list(gradient))), strict=True)]
-
-        factor = cholesky3(matrix)
-        return jnp.stack(compute_in_one_loop(moved, best.points, factor, best.system[6:]))
+        return jnp.stack(compute_in_one_loop(moved, best.points, best.system, best.damping))
 
     def body(carry: _Carry) -> _Carry:
         *system, costs, inverse_depth_sum = (found := one_pass(carry.trial, terms, *fronts))[:11]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.model.linearize import observation_costs, slot_frames
+from jaxba.model.linearize import Reference, observation_costs, slot_frames
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import refine_from_starts
 from jaxba.refinement.points import PreviousPoints, refine_points
@@ -38,8 +38,8 @@ class Subproblems(Protocol):
         """The problem's observations."""
         ...
 
-    def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " terms"]:
-        """The cost as terms that correspond one to one to those of `refine`: of observations, or of points."""
+    def terms(self, reference: Reference, previous: PreviousPoints, options: StepOptions) -> Float[Array, " terms"]:
+        """Terms of the cost before the step, one to one with those of `refine`: of observations, or of points."""
         ...
 
     def refine(
@@ -71,9 +71,9 @@ class Whole(NamedTuple):
 
     layout: Layout
 
-    def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " terms"]:
+    def terms(self, reference: Reference, previous: PreviousPoints, options: StepOptions) -> Float[Array, " terms"]:
         """See `Subproblems`."""
-        return point_sum(self.layout, costs[None])[0] if options.refinement.points else costs
+        return previous.costs if options.refinement.points else reference.costs
 
     def refine(
         self,
@@ -117,9 +117,9 @@ class Clusters(NamedTuple):
         sums = point_sum(layout, jnp.stack([labels, seen]))  # sums of equal integers: the quotient is exact
         return Clusters(layout, partition, (sums[0] / jnp.maximum(sums[1], 1)).astype(jnp.int32))
 
-    def terms(self, costs: Float[Array, " slots"], options: StepOptions) -> Float[Array, " slots"]:
+    def terms(self, reference: Reference, previous: PreviousPoints, options: StepOptions) -> Float[Array, " slots"]:
         """See `Subproblems`."""
-        return costs
+        return reference.costs
 
     def refine(
         self,

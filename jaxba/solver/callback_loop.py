@@ -33,6 +33,7 @@ from jaxba.runtime.compilation import (
     program,
 )
 from jaxba.solver.loop import Carry, History, advance, begin, history_of, problem_info
+from jaxba.solver.prepare import Arrangement
 from jaxba.structure.layout import Layout, num_partitions
 
 
@@ -59,7 +60,7 @@ class _Loop(NamedTuple):
     max_iterations: int
 
     def start(self, call: Callable[..., Any], state: LMState) -> Carry:
-        """The carry before the first iteration."""
+        """The carry before the first iteration, from the initial state."""
         info_program = program(problem_info, "options", "max_iterations", level="quick")
         info = call(info_program, self.layout, state, self.options, self.max_iterations)
         # without the parameters, whose shapes differ, the policy's program is compiled once for all problems
@@ -80,7 +81,8 @@ class _Loop(NamedTuple):
         if decides_effort(self.policy):
             effort = call(program(effort_of, level="quick"), self.policy, carry.policy)
         part = lambda name, function: program(function, "options", level=levels[name])
-        min_gain = jnp.asarray(self.policy.min_gain, state.cost.dtype)
+        # NumPy's: each conversion by JAX is a program
+        min_gain = np.asarray(self.policy.min_gain, state.cost.dtype)
         if options.single_solve:
             arguments = (self.layout, state, carry.damping)
             proposal = call(part("propose", propose), *arguments, options, carry.iteration, effort)
@@ -88,48 +90,56 @@ class _Loop(NamedTuple):
         else:
             arguments = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
             state, step = call(part("round", lm_step), *arguments)
-        limit = jnp.asarray(self.max_iterations, jnp.int32)
-        policy_arguments = (
-            carry._replace(state=None),
-            step,
-            self.policy,
-            self.tolerances,
-            limit,
-            jnp.asarray(num_partitions(self.layout)),
-        )
+        limit, partitions = np.int32(self.max_iterations), np.int32(num_partitions(self.layout))
+        policy_arguments = (carry._replace(state=None), step, self.policy, self.tolerances, limit, partitions)
         carry, report = call(program(_advance_and_pack, level="quick"), *policy_arguments)
         return carry._replace(state=state), step, report
 
 
+class Run(NamedTuple):
+    """What a solve came to."""
+
+    carry: Carry
+    """After the last iteration."""
+
+    history: History
+    """At least one entry per iteration."""
+
+    initial_cost: float
+    """Pixels^2."""
+
+    quick_iterations: int
+    """Iterations in which some program was not fully optimised."""
+
+    compile_s: float
+    """Seconds of compilation."""
+
+    total_s: float
+    """Seconds of everything else."""
+
+
 def run_stepwise(
-    layout: Layout,
-    state: LMState,
-    policy: DampingPolicy,
+    arranged: Arrangement,
     tolerances: Tolerances,
-    options: StepOptions,
     max_iterations: int,
     *,
     callback: Callable[[IterationRecord], bool | None],
     stages: Mapping[str, tuple[Stage, ...]],
-) -> tuple[Carry, History, int, float, float]:
+) -> Run:
     """Runs iterations until a stopping rule or the callback ends the solve.
 
     Args:
-        layout: the problem's observations.
-        state: start.
-        policy: chooses lambda.
+        arranged: the solve; the program of its initial state is compiled with the others.
         tolerances: convergence tests.
-        options: static options of the step.
         max_iterations: limit of linear solves.
         callback: called with every record; a true return value ends the solve.
         stages: stages of compilation of each part of a step, before it is fully optimised. The parts are `propose` and
             `try_step`, or `round`. A camera round or a further trial counts as `RUNS_PER_REPAIR` runs.
 
-    Returns:
-        Final carry; histories with one entry per iteration; number of iterations in which some part was not fully
-        optimised; seconds of compilation; seconds of everything else.
+    Raises:
+        ProblemError: the cost of the initial state is not finite.
     """
-    loop = _Loop(layout, policy, tolerances, options, max_iterations)
+    loop = _Loop(arranged.layout, arranged.policy, tolerances, arranged.options, max_iterations)
     runs = dict.fromkeys(stages, 0)
 
     def levels_now() -> dict[str, Level]:
@@ -139,8 +149,10 @@ def run_stepwise(
     levels = levels_now()
     started = time.perf_counter()
     with CompileClock() as clock, ParallelCompilation() as compile_programs:
-        loop.iterate(compile_programs, loop.start(compile_programs, state), levels)
+        loop.iterate(compile_programs, loop.start(compile_programs, arranged.initial(compile_programs)), levels)
     run = compile_programs.run
+    state = jax.block_until_ready(arranged.initial(run))
+    arranged.check_cost(state)
     carry = jax.block_until_ready(loop.start(run, state))
     compile_s = 0.0
     if clock.seconds > 0 or compile_programs.loaded:
@@ -170,7 +182,7 @@ def run_stepwise(
             break
     total_s = time.perf_counter() - started - waited
     history = jax.tree.map(lambda *values: np.array(values), *map(history_of, records))
-    return carry, history, quick_iterations, compile_s + waited, total_s
+    return Run(carry, history, float(state.cost), quick_iterations, compile_s + waited, total_s)
 
 
 def _advance_and_pack(

@@ -169,7 +169,7 @@ def solve_loop(
     tolerances: Tolerances,
     options: StepOptions,
     max_iterations: int,
-    limit: Int[Array, ""] | None = None,
+    limit: Int[AnyArray, ""] | None = None,
 ) -> tuple[Carry, History]:
     """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes.
 

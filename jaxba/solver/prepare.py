@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy
@@ -34,14 +36,14 @@ POLICY_PARTS = ("min_gain", "init", "propose")
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """Arguments of `jaxba.solve_loop` and `jaxba.lm_step` for a problem."""
+class Arrangement:
+    """A solve before its initial state is computed."""
+
+    problem: BundleProblem
+    """The problem as it was given."""
 
     layout: Layout
     """Observations and index arrays, on the device."""
-
-    state: LMState
-    """Initial parameters in layout order, on the device, and their cost."""
 
     options: StepOptions
     """Step options, with the chosen linear solver; static and hashable."""
@@ -49,26 +51,47 @@ class Prepared:
     policy: DampingPolicy
     """The damping policy."""
 
-    problem: BundleProblem
-    """The problem as it was given."""
-
     capacity: Capacity | None
     """Sizes to which the problem was padded; None if it was not."""
 
     offset: np.ndarray | None
     """Translation by which the scene was moved to the origin, scene units; None if it was not."""
 
+    start: BundleProblem
+    """The parameters at the start, shifted and padded."""
+
+    dtype: np.dtype[Any]
+    """Type of the parameters of the solve."""
+
     setup_s: float
     """Seconds for the layout and the transfer to the device."""
 
-    compile_s: float
-    """Seconds for the compilation of the program of the initial state."""
+    def initial(self, call: Callable[..., Any]) -> LMState:
+        """The initial state. `call` runs its program, or compiles it (`ParallelCompilation`)."""
+        initial = program(initial_state, "options", "dtype", level="quick")
+        return call(initial, self.layout, self.start, self.options, self.dtype)
+
+    def check_cost(self, state: LMState) -> None:
+        """Raises a ProblemError that names an observation if the cost of the initial state is not finite."""
+        if not np.isfinite(float(state.cost)):
+            raise ProblemError(explain_start(self.problem))
 
     def problem_at(self, state: LMState) -> BundleProblem:
         """The problem with the parameters of a state, as NumPy float64; what is not optimised is copied exactly."""
         if self.offset is None:
             return write_back(self.problem, self.layout, state, self.options)
         return shift(write_back(shift(self.problem, -self.offset), self.layout, state, self.options), self.offset)
+
+
+@dataclass(frozen=True)
+class Prepared(Arrangement):
+    """Arguments of `jaxba.solve_loop` and `jaxba.lm_step` for a problem."""
+
+    state: LMState
+    """Initial parameters in layout order, on the device, and their cost."""
+
+    compile_s: float
+    """Seconds for the compilation of the program of the initial state."""
 
 
 def prepare(
@@ -87,6 +110,24 @@ def prepare(
     Raises:
         ValueError, ProblemError: as `solve`.
     """
+    arranged = arrange(problem, policy, options)
+    with numerics(arranged.dtype), CompileClock() as clock:
+        state = jax.block_until_ready(arranged.initial(compile_and_run))
+    arranged.check_cost(state)
+    return Prepared(**vars(arranged), state=state, compile_s=clock.seconds)
+
+
+@contextmanager
+def numerics(dtype: np.dtype[Any]) -> Iterator[None]:
+    """In which the programs of a solve are compiled and run: 64 bits unless for float32, one thread for LAPACK."""
+    with jax.enable_x64(dtype != np.float32), process.single_blas_thread():
+        yield
+
+
+def arrange(
+    problem: BundleProblem, policy: str | DampingPolicy = DEFAULT_POLICY, options: SolveOptions | None = None
+) -> Arrangement:
+    """`prepare` without the initial state. Arguments and errors as there."""
     options = checked_options(options)
     if not isinstance(problem, BundleProblem):
         raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
@@ -99,20 +140,15 @@ def prepare(
     if options.pad:
         capacity, asked = with_padded_solver(capacity_of(problem, observations), step, asked)
     step = choose_linear_solver(problem, step, asked, observations)
-    dtype = jnp.dtype("float32" if options.dtype == "float32" else "float64")
-    with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
+    dtype = np.dtype("float32" if options.dtype == "float32" else "float64")
+    with numerics(dtype):
         started = time.perf_counter()
         offset = far_middle(problem)
         here = problem if offset is None else shift(problem, -offset)
-        with CompileClock() as clock:
-            layout = jax.device_put(layout_for(here, step, capacity, observations))
-            initial = program(initial_state, "options", "dtype", level="quick")
-            begin = here if capacity is None else padded_parameters(here, capacity)
-            state = jax.block_until_ready(compile_and_run(initial, layout, begin, step, dtype))
-        setup_s = max(0.0, time.perf_counter() - started - clock.seconds)
-        if not np.isfinite(float(state.cost)):
-            raise ProblemError(explain_start(problem))
-    return Prepared(layout, state, step, policy, problem, capacity, offset, setup_s, clock.seconds)
+        layout = jax.device_put(layout_for(here, step, capacity, observations))
+        start = here if capacity is None else padded_parameters(here, capacity)
+        setup_s = time.perf_counter() - started
+    return Arrangement(problem, layout, step, policy, capacity, offset, start, dtype, setup_s)
 
 
 def _check_policy(policy: object) -> None:

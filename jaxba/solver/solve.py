@@ -13,21 +13,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy
-from jaxba.lm.records import LMState
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
-from jaxba.runtime.compilation import CompileClock, Part, Stage, compiler_options, stages
-from jaxba.solver.callback_loop import IterationRecord, run_stepwise
-from jaxba.solver.loop import Carry, History, solve_loop
+from jaxba.runtime.compilation import CompileClock, Part, Stage, compile_and_run, compiler_options, stages
+from jaxba.solver.callback_loop import IterationRecord, Run, run_stepwise
+from jaxba.solver.loop import History, solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
-from jaxba.solver.prepare import DEFAULT_POLICY, prepare
-from jaxba.structure.layout import Layout
+from jaxba.solver.prepare import DEFAULT_POLICY, Arrangement, arrange, numerics
 from jaxba.structure.padding import Capacity
 
 MIN_HISTORY = 128
@@ -119,34 +116,33 @@ def solve(
             the linear solver or method does not support shared or partly fixed intrinsics.
     """
     options = checked_options(options)
-    with jax.enable_x64(options.dtype != "float32"), process.single_blas_thread():
-        prepared = prepare(problem, policy, options)
-        layout, state, step_options = prepared.layout, prepared.state, prepared.options
-        stages_of_parts = _stages(options.compilation, problem, step_options)
+    arranged = arrange(problem, policy, options)
+    with numerics(arranged.dtype):
+        stages_of_parts = _stages(options.compilation, problem, arranged.options)
         run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts)
         if callback is None and not any(stages_of_parts.values()):
             run = _run_compiled
-        final, history, quick_count, compile_s, total_s = run(
-            layout, state, prepared.policy, options.tolerances, step_options, options.max_iterations
+        carry, history, initial_cost, quick_iterations, compile_s, total_s = run(
+            arranged, options.tolerances, options.max_iterations
         )
-        if prepared.compile_s + compile_s > 0:
+        if compile_s > 0:
             process.release_programs()  # see above: too many programs end a process
-        count = int(final.iteration)
+        count = int(carry.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
         return Solution(
-            problem=prepared.problem_at(final.state),
-            initial_cost=float(state.cost),
-            final_cost=float(final.state.cost),
+            problem=arranged.problem_at(carry.state),
+            initial_cost=initial_cost,
+            final_cost=float(carry.state.cost),
             iterations=count,
             accepted=int(np.sum(history.accepted)),
-            termination=Termination(int(final.termination)),
+            termination=Termination(int(carry.termination)),
             history=history,
-            linear_solver=step_options.solver_name,
-            setup_s=prepared.setup_s,
-            compile_s=compile_s + prepared.compile_s,
+            linear_solver=arranged.options.solver_name,
+            setup_s=arranged.setup_s,
+            compile_s=compile_s,
             total_s=total_s,
-            capacity=prepared.capacity,
-            quick_iterations=quick_count,
+            capacity=arranged.capacity,
+            quick_iterations=quick_iterations,
         )
 
 
@@ -163,19 +159,15 @@ def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> d
     return {name: stages(part, problem.num_observations) for name, part in parts.items()}
 
 
-def _run_compiled(
-    layout: Layout,
-    state: LMState,
-    policy: DampingPolicy,
-    tolerances: Tolerances,
-    options: StepOptions,
-    max_iterations: int,
-) -> tuple[Carry, History, int, float, float]:
-    """Runs the loop as one optimised program. Arguments and results as for `run_stepwise`."""
+def _run_compiled(arranged: Arrangement, tolerances: Tolerances, max_iterations: int) -> Run:
+    """Runs the loop as one optimised program."""
     started = time.perf_counter()
     with CompileClock() as clock:
+        state = jax.block_until_ready(arranged.initial(compile_and_run))
+        arranged.check_cost(state)
         length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
-        limit = jnp.asarray(max_iterations, jnp.int32)
-        result = solve_loop(layout, state, policy, tolerances, options, length, limit)
+        limit = np.asarray(max_iterations, np.int32)  # a conversion by JAX is a program
+        result = solve_loop(arranged.layout, state, arranged.policy, tolerances, arranged.options, length, limit)
         carry, history = jax.block_until_ready(result)
-    return carry, history, 0, clock.seconds, time.perf_counter() - started - clock.seconds
+    total_s = time.perf_counter() - started - clock.seconds
+    return Run(carry, history, float(state.cost), 0, clock.seconds, total_s)

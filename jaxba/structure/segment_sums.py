@@ -71,8 +71,15 @@ def total(values: Float[Array, " n"]) -> Float[Array, ""]:
 
 
 def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
-    """Sums rows into targets along a summation tree (`sum_trees.sum_tree`)."""
+    """Sums rows into targets along a summation tree (`sum_trees.sum_tree`).
+
+    A level is summed as gathered vectors or, for rows of several axes, by a reduction: XLA compiles each to one loop
+    for these rows, and to one a column of the level for the others.
+    """
     for level in levels:
+        if rows.ndim > 2:
+            rows = jnp.sum(take_rows(rows, level), axis=1)
+            continue
         parts = [take_rows(rows, level[:, k]) for k in range(level.shape[1])]
         rows = functools.reduce(operator.add, parts)
     return rows

@@ -24,13 +24,13 @@ LOSS = Loss()
 
 @functools.partial(jax.jit, static_argnames=("loss",))
 def _starts(layout, cameras, before, points, loss):
-    previous = PreviousPoints.of(layout, before, linearize(layout, cameras, before, loss).inverse_depth)
+    previous = PreviousPoints.of(layout, before, linearize(layout, cameras, before, loss).reference)
     return choose_starts(layout, slot_frames(layout, cameras), points, loss, previous)
 
 
 def _there(layout, cameras, before):
-    depths = linearize(layout, cameras, before, LOSS).inverse_depth
-    return slot_frames(layout, cameras), PreviousPoints.of(layout, before, depths)
+    reference = linearize(layout, cameras, before, LOSS).reference
+    return slot_frames(layout, cameras), PreviousPoints.of(layout, before, reference)
 
 
 @jax.jit

@@ -180,9 +180,7 @@ def mirrored(problem: BundleProblem, which: np.ndarray) -> BundleProblem:
 @functools.partial(jax.jit, static_argnames=("loss", "iterations"))
 def _refined_after(layout, state, points, loss, iterations):
     """Points that a step took from those of the state to `points`, after point iterations."""
-    previous = PreviousPoints.of(
-        layout, state.points, linearize(layout, state.cameras, state.points, loss).inverse_depth
-    )
+    previous = PreviousPoints.of(layout, state.points, linearize(layout, state.cameras, state.points, loss).reference)
     return refine_points(layout, slot_frames(layout, state.cameras), points, loss, iterations, previous)
 
 
