@@ -4,7 +4,8 @@
 
 The rules, a grid of constant lambdas, random lambdas, the virtual best of the rules and constants, and the oracle (beam
 search and greedy search over lambda) are run with plain steps, with three point iterations, and with all embedded
-iterations. Learned policies are run with the step that they were trained with.
+iterations. Learned policies are run with the step that they were trained with. With several `--policy`, the first is
+compared with each of the others scene by scene.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.evaluate import Score, score, virtual_best
 from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.rollout import Trajectories, play
-from jaxba.game.scene_bank import select
+from jaxba.game.scene_bank import reach, select
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.names import parse_solver
@@ -108,11 +109,28 @@ def _report(bank, runs: dict[str, Trajectories], beams: dict[str, Trajectories],
                     rows[f"{other} ({size} scenes)"] = score([few], [best[:size]], tolerance, LIMIT)
         for name, row in rows.items():
             print(_row(name, row))
+        for other in policies[1:]:
+            print(f"\n{policies[0]} less {other}, scene by scene, mean ± 1.96 standard errors:")
+            counts = [_counts(runs[name], best, tolerance) for name in (policies[0], other)]
+            for goal, first, second in zip(("tolerance", "convergence"), *counts, strict=True):
+                print(f"to {goal} {_paired(first - second)}")
+
+
+def _counts(run: Trajectories, best: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Iterations of each scene to the tolerance and to convergence, counted as in `score`."""
+    reached = np.clip(reach(run.costs, best, tolerance), 1, LIMIT)
+    return reached, np.where(run.converged, run.iterations, LIMIT)
+
+
+def _paired(difference: np.ndarray) -> str:
+    """Mean of the differences, with its 95% interval."""
+    error = difference.std(ddof=1) / np.sqrt(len(difference))
+    return f"{difference.mean():+.2f} ± {1.96 * error:.2f}"
 
 
 def _row(name: str, s: Score) -> str:
-    numbers = f"{s.mean:.2f} | {s.geometric_mean:.2f} | {s.median:.0f} | {s.p90:.0f} | {s.failures:.1%}"
-    return f"| {name} | {numbers} | {s.to_convergence:.1f} |"
+    numbers = f"{s.mean:.2f} | {s.geometric_mean:.2f} | {s.median:g} | {s.p90:g} | {s.failures:.1%}"
+    return f"| {name} | {numbers} | {s.to_convergence:.2f} |"
 
 
 if __name__ == "__main__":
