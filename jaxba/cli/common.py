@@ -111,7 +111,7 @@ def discard_stdout() -> None:
 
 
 def prepare_process(*, untraced: bool = False) -> None:
-    """Makes the process keep freed memory, and enables the cache of compiled programs.
+    """Makes the process keep freed memory, loads LAPACK, and enables the cache of compiled programs.
 
     Args:
         untraced: which cache; see `use_compilation_cache`.
@@ -119,6 +119,7 @@ def prepare_process(*, untraced: bool = False) -> None:
     from jaxba.runtime import process
 
     process.keep_memory()
+    process.load_lapack()
     use_compilation_cache(untraced)
 
 
