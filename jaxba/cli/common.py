@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import stat
 import sys
@@ -102,6 +103,7 @@ def exit_with(status: int) -> NoReturn:
         sys.stdout.flush()
     except BrokenPipeError:
         discard_stdout()
+    gc.freeze()  # else Python looks at every object once more before it ends, for 0.04 s
     sys.exit(status)
 
 
