@@ -161,8 +161,8 @@ than many a problem takes to solve."""
 
 
 def test_the_command_loads_nothing_that_a_solve_does_not_need(tmp_path):
-    """With 70 cameras: the ordering for a band is looked for as well."""
-    scene = jaxba.random_scene(jaxba.SceneConfig(cameras=70, points=200, mean_track=3.5), 0)
+    """A factored system with 70 cameras: the ordering for a band is looked for as well."""
+    scene = jaxba.random_scene(jaxba.SceneConfig(cameras=70, points=3000, mean_track=6.0), 0)
     jaxba.write_bal(scene, tmp_path / "problem.txt")
     code = (
         "import sys, jaxba.cli.solve\n"
@@ -173,4 +173,5 @@ def test_the_command_loads_nothing_that_a_solve_does_not_need(tmp_path):
     )
     done = in_a_new_process(code, JAX_PLATFORMS="cpu", JAXBA_CACHE="off")
     assert done.returncode == 0, done.stderr
+    assert "linear solver explicit" in done.stdout
     assert done.stdout.splitlines()[-1].strip() == "loaded:"
