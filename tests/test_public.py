@@ -141,3 +141,37 @@ def test_help_starts_no_backend():
     assert done.returncode == 0, done.stderr
     assert "--policy" in done.stdout
     assert "--refine-points" in done.stdout
+
+
+UNNEEDED = (
+    *("flax", "optax", "orbax", "matplotlib", "PIL", "yaml", "rich", "pycolmap", "pyceres", "scipy.linalg"),
+    *(
+        "scipy.sparse",
+        "scipy.optimize",
+        "scipy.spatial",
+        "scipy.special",
+        "jaxba.bench",
+        "jaxba.game",
+        "jaxba.training",
+    ),
+    *("jaxba.training", "jaxba.paper", "jaxba.peers.ceres", "jaxba.structure.louvain", "jaxba.datasets.kitti"),
+)
+"""Modules that a solve of a BAL file with the default options does without. Together they would take longer to import
+than many a problem takes to solve."""
+
+
+def test_the_command_loads_nothing_that_a_solve_does_not_need(tmp_path):
+    """A factored system with 70 cameras: the ordering for a band is looked for as well."""
+    scene = jaxba.random_scene(jaxba.SceneConfig(cameras=70, points=3000, mean_track=6.0), 0)
+    jaxba.write_bal(scene, tmp_path / "problem.txt")
+    code = (
+        "import sys, jaxba.cli.solve\n"
+        f"assert jaxba.cli.solve.run([{str(tmp_path / 'problem.txt')!r}, '--max-iterations', '1']) == 0\n"
+        f"print('loaded:', *sorted(set(sys.modules) & set({UNNEEDED!r})))\n"
+        "import numpy as np, scipy.linalg\n"  # the whole of it can still be imported
+        "assert scipy.linalg.cholesky(np.eye(2))[0, 0] == 1\n"
+    )
+    done = in_a_new_process(code, JAX_PLATFORMS="cpu", JAXBA_CACHE="off")
+    assert done.returncode == 0, done.stderr
+    assert "linear solver explicit" in done.stdout
+    assert done.stdout.splitlines()[-1].strip() == "loaded:"

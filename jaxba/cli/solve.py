@@ -11,9 +11,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-from jaxba.bench.records import record_to_json
-from jaxba.bench.run import record_of
-from jaxba.bench.sources import default_sources
 from jaxba.cli import common, table
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.output import check_outputs, write_solution
@@ -221,7 +218,7 @@ def _solve(args: Arguments) -> int:
     policy, options = solve_options(args)
     path = None if args.problem is None else resolve(args.problem)
     check_outputs(args.output, args.log, path)
-    problem = default_sources()[0].read() if path is None else read_problem(path)
+    problem = _default_scene() if path is None else read_problem(path)
     common.prepare_process(untraced=True)
     name = args.problem or DEFAULT_SCENE
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
@@ -232,11 +229,20 @@ def _solve(args: Arguments) -> int:
     if args.output:
         write_solution(args.output, solution.problem, path)
     if args.log:
+        from jaxba.bench.records import record_to_json
+        from jaxba.bench.run import record_of
+
         record = record_of(solution, steps, name=name, family="", solver=solver_name(args))
         with open_output(args.log) as file:
             file.write(json.dumps(record_to_json(record), allow_nan=False).encode() + b"\n")
         common.print_line(f"wrote {args.log}")
     return 0
+
+
+def _default_scene() -> BundleProblem:
+    from jaxba.bench.sources import default_sources
+
+    return default_sources()[0].read()
 
 
 def _iterate(

@@ -28,6 +28,7 @@ import numpy as np
 from jax import monitoring
 from jax.experimental import serialize_executable
 
+from jaxba.runtime import process
 from jaxba.runtime.atomic import TEMPORARY, atomic_write
 
 SUFFIX = ".jaxba-program"
@@ -170,16 +171,10 @@ def watch_compilation() -> Iterator[Callable[[], bool]]:
 @functools.lru_cache(maxsize=IN_MEMORY)
 def _load(path: Path, given: Any) -> CachedExecutable:
     out, code = pickle.loads(zlib.decompress(path.read_bytes()))
-    _register_lapack()
+    process.register_lapack()
     devices = jax.devices()[:1]
     run = serialize_executable.deserialize_and_load(code, given, jax.tree.structure(out), execution_devices=devices)
     return CachedExecutable(run, out, path)
-
-
-@functools.cache
-def _register_lapack() -> None:
-    """jaxlib looks up LAPACK's routines when it first lowers a call of one; a program that calls one before crashes."""
-    jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), jnp.float32))
 
 
 class _UnknownSource(Exception):

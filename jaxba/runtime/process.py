@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import functools
 import gc
+import importlib.util
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -108,7 +110,35 @@ def single_blas_thread() -> Iterator[None]:
     XLA on a CPU factors matrices with SciPy's OpenBLAS, whose threads keep spinning after each call and take the
     processor from XLA's own threads; beside another busy process an iteration became ten times slower.
     """
-    import scipy.linalg.cython_lapack  # noqa: F401  # loads the library whose threads are limited
-
+    if "scipy.linalg.cython_lapack" not in sys.modules:  # loads the library whose threads are limited
+        importlib.import_module("scipy.linalg.cython_lapack")
     with ThreadpoolController().limit(limits=1, user_api="blas"):
         yield
+
+
+@functools.cache
+def register_lapack() -> None:
+    """Lets jaxlib look up LAPACK's routines in SciPy, which it does when it first lowers a call of one on a CPU. A
+    compiled program from a file that calls one before would crash."""
+    import jax
+
+    jax.jit(jax.lax.linalg.cholesky).lower(jax.ShapeDtypeStruct((1, 1), "float32"))
+
+
+def load_lapack() -> None:
+    """Loads the BLAS and LAPACK of SciPy that XLA on a CPU calls, without the rest of `scipy.linalg`.
+
+    The whole of it takes 0.15 s of a call that may take one second; jaxlib needs two of its modules, which take 0.01 s.
+    Meanwhile an empty module stands in the place of their package, so this is for a command that has started no thread.
+    """
+    name = "scipy.linalg"
+    spec = None if name in sys.modules else importlib.util.find_spec(name)
+    if spec is None:
+        return
+    sys.modules[name] = importlib.util.module_from_spec(spec)  # knows where its modules are; none is imported
+    try:
+        register_lapack()
+    except ImportError:  # a SciPy whose modules need more of the package; it is imported later, as usual
+        register_lapack.cache_clear()
+    finally:
+        del sys.modules[name]

@@ -10,8 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.sparse import csr_matrix
+from jaxtyping import Int
 
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
@@ -24,12 +23,6 @@ gradient iterations as with 4, and down to half of those with 16."""
 MAX_CLUSTERS = 128
 """At most 1280 coarse unknowns. Factoring these costs as much as two or three products with a system of that many
 clusters."""
-
-MAX_DENSE_ENTRIES = 1 << 20
-"""Cameras times points up to which common points are counted by a sparse-dense product, which takes half the time."""
-
-MAX_PRODUCTS = 2e7
-"""Most pairs of observations that are counted to find common points; a second's work."""
 
 
 @register_pytree
@@ -73,6 +66,8 @@ def cluster_layout(
         slot_point: point of each slot, in layout order.
         empty: an empty slot.
     """
+    from jaxba.structure.agglomeration import agglomerate, shared_points  # SciPy: its import takes 0.2 s
+
     num_clusters = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
     label = agglomerate(shared_points(camera, point, cameras, points)[0], cameras, num_clusters)
     clusters = int(label.max()) + 1
@@ -102,60 +97,3 @@ def cluster_members(
     counts = np.bincount(label, minlength=clusters)
     table[label[order], np.arange(len(label)) - np.repeat(np.cumsum(counts) - counts, counts)] = order
     return table
-
-
-def shared_points(
-    camera: Int[np.ndarray, " observations"], point: Int[np.ndarray, " observations"], cameras: int, points: int
-) -> tuple[csr_matrix, Float[np.ndarray, " cameras"]]:
-    """Number of common points of each pair of cameras, without the diagonal, and number of points of each camera."""
-    kept = np.ones(len(point), bool)
-    work = float(np.sum(np.bincount(point).astype(float) ** 2))
-    if work > MAX_PRODUCTS:  # a sample of the points is enough
-        kept = point % int(-(-work // MAX_PRODUCTS)) == 0
-    seen = csr_matrix((np.ones(kept.sum(), np.float32), (camera[kept], point[kept])), shape=(cameras, points))
-    few = cameras * points <= MAX_DENSE_ENTRIES
-    shared = csr_matrix(seen @ seen.T.toarray()) if few else (seen @ seen.T).tocsr()
-    own = shared.diagonal().astype(float)
-    shared.setdiag(0)
-    shared.eliminate_zeros()
-    return shared, own
-
-
-def agglomerate(shared: csr_matrix, nodes: int, clusters: int) -> Int[np.ndarray, " nodes"]:
-    """Agglomerative clustering of a graph.
-
-    In every round each group picks the group with the largest weight between them, divided by the product of their
-    sizes, and mutual picks are merged. Groups without common edges are merged arbitrarily at the end.
-
-    Args:
-        shared: symmetric edge weights without a diagonal, [nodes, nodes].
-        nodes: number of nodes.
-        clusters: largest number of groups.
-
-    Returns:
-        Label of each node, numbered from 0.
-    """
-    label, size, weight = np.arange(nodes), np.ones(nodes), shared
-    while (groups := len(size)) > clusters:
-        degree, column = np.diff(weight.indptr), weight.indices
-        row = np.repeat(np.arange(groups), degree)
-        best, strength = np.full(groups, -1), np.zeros(groups)
-        if len(row):
-            affinity = weight.data / (size[row] * size[column])
-            begin = weight.indptr[:-1][degree > 0]
-            strength[degree > 0] = np.maximum.reduceat(affinity, begin)
-            best[degree > 0] = np.minimum.reduceat(np.where(affinity == strength[row], column, groups), begin)
-        pair = np.flatnonzero(best >= 0)
-        pair = pair[(best[best[pair]] == pair) & (pair < best[pair])]
-        if not len(pair):
-            label = label * clusters // groups
-            break
-        pair = pair[np.argsort(-strength[pair], kind="stable")][: groups - clusters]
-        into = np.arange(groups)
-        into[best[pair]] = pair
-        kept, new = np.unique(into, return_inverse=True)
-        row, column = new[row], new[column]
-        between = row != column
-        weight = csr_matrix((weight.data[between], (row[between], column[between])), shape=(len(kept), len(kept)))
-        size, label = np.bincount(new, size), new[label]
-    return np.unique(label, return_inverse=True)[1]

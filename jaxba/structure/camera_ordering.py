@@ -9,9 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import reverse_cuthill_mckee
+from jaxtyping import Bool, Int
 
 from jaxba.typing import AnyArray, register_pytree
 
@@ -59,11 +57,32 @@ def camera_order(
     """
     given = np.arange(cameras)
     width = int(np.abs(rows - columns).max(initial=0))
-    graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(cameras, cameras))
+    linked = np.zeros((cameras, cameras), bool)
+    linked[rows, columns] = linked[columns, rows] = True
     rank = np.empty(cameras, np.int64)
-    rank[reverse_cuthill_mckee((graph + graph.T).tocsr(), symmetric_mode=True)] = given
+    rank[reverse_cuthill_mckee(linked)] = given
     other = int(np.abs(rank[rows] - rank[columns]).max(initial=0))
     return (rank, other) if other < width else (given, width)
+
+
+def reverse_cuthill_mckee(linked: Bool[np.ndarray, "nodes nodes"]) -> Int[np.ndarray, " nodes"]:
+    """The nodes of a symmetric graph in the reverse Cuthill-McKee ordering.
+
+    A breadth-first search from a node of least degree, which takes the new neighbours of a node by increasing degree;
+    reversed. The same order as SciPy's, whose import takes longer than this for a thousand cameras.
+    """
+    degree = (linked.sum(axis=1) + linked.diagonal()).astype(np.int32)
+    order, found, waiting = np.empty(len(linked), np.int64), 0, np.ones(len(linked), bool)
+    for seed in np.argsort(degree):
+        if not waiting[seed]:
+            continue
+        order[found], waiting[seed], done, found = seed, False, found, found + 1
+        while done < found:
+            new = np.flatnonzero(linked[order[done]] & waiting)
+            order[found : found + len(new)] = new[np.argsort(degree[new], kind="stable")]
+            waiting[new] = False
+            done, found = done + 1, found + len(new)
+    return order[::-1]
 
 
 def is_banded(cameras: int, width: int) -> bool:

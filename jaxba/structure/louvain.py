@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Int
 from scipy.sparse import csr_matrix
 
-from jaxba.structure.camera_clusters import shared_points
+from jaxba.structure.agglomeration import shared_points
 
 TEMPERATURE = 10.0
 """Inverse temperature of the softmax; larger is greedier. Source: the authors' code."""
@@ -32,7 +32,7 @@ def camera_graph(
 ) -> csr_matrix:
     """Edge weights `|P_i and P_j| / |P_i or P_j|` for the sets P_i of points that camera i sees, [cameras, cameras].
 
-    For a large problem they are estimated from a sample of the points (`camera_clusters.shared_points`).
+    For a large problem they are estimated from a sample of the points (`agglomeration.shared_points`).
     """
     shared, seen = shared_points(camera, point, cameras, points)
     edges = shared.tocoo()

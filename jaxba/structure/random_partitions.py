@@ -20,7 +20,6 @@ from jaxtyping import Bool, Int
 
 from jaxba.structure.camera_clusters import cluster_members
 from jaxba.structure.covisibility import PairLayout
-from jaxba.structure.louvain import camera_graph, clusterings
 from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
 from jaxba.typing import AnyArray, register_pytree
 
@@ -88,6 +87,8 @@ def partition_layout(
         largest: largest number of cameras in a cluster.
         count: number of partitions; only one is drawn if all cameras fit in one cluster.
     """
+    from jaxba.structure.louvain import camera_graph, clusterings  # SciPy: its import takes 0.2 s
+
     graph = camera_graph(camera, point, cameras, points)
     if cameras <= largest:
         labels = np.zeros((1, cameras), int)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Int
-from scipy.sparse import csr_matrix
 
 TREE_WIDTH = 8
 """Width of the chunks on all levels but the first."""
@@ -69,10 +68,17 @@ def sum_tree(
 
 
 def sorted_by(keys: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " n"]:
-    """Stable `argsort` of integers below `most` in linear time: a counting sort, by transposing a sparse matrix."""
-    ones = np.ones(len(keys), np.int8)
-    rows = csr_matrix((ones, keys, np.arange(len(keys) + 1, dtype=np.int32)), shape=(len(keys), most))
-    return rows.tocsc().indices
+    """Stable `argsort` of integers from 0 to below `most`.
+
+    NumPy sorts 16 bits in linear time, by radix; larger keys are sorted together with their positions in one integer,
+    for which its fastest sort need not be stable. Both take a tenth of the time of its stable sort of 32 bits.
+    """
+    if most <= 1 << 16:
+        return np.argsort(keys.astype(np.uint16), kind="stable").astype(np.int32)
+    bits = len(keys).bit_length()
+    pairs = (keys.astype(np.int64) << bits) | np.arange(len(keys))
+    pairs.sort()
+    return (pairs & ((1 << bits) - 1)).astype(np.int32)
 
 
 def with_spare_row(levels: tuple[np.ndarray, ...], empty: int) -> tuple[np.ndarray, ...]:

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 
 from jaxba import BundleProblem, ConjugateGradients, Layout, StepOptions, build_layout, make_method
-from jaxba.structure import camera_clusters
-from jaxba.structure.camera_clusters import CLUSTER_CAMERAS, ClusterLayout, agglomerate, shared_points
+from jaxba.structure import agglomeration, camera_clusters
+from jaxba.structure.agglomeration import agglomerate, shared_points
+from jaxba.structure.camera_clusters import CLUSTER_CAMERAS, ClusterLayout
 from jaxba.structure.layout import layout_for
 
 sizes = st.tuples(st.integers(1, 30), st.integers(1, 25), st.integers(0, 10**6))  # cameras, points, seed
@@ -67,7 +68,7 @@ def test_shared_points_are_those_that_two_cameras_both_see(size):
 def test_with_too_many_pairs_a_sample_of_the_points_is_counted(monkeypatch):
     """Every fourth point instead of all: a quarter of what each two share, since here all see all."""
     camera, point = np.tile(np.arange(5), 400), np.repeat(np.arange(400), 5)
-    monkeypatch.setattr(camera_clusters, "MAX_PRODUCTS", 400 * 25 / 4)
+    monkeypatch.setattr(agglomeration, "MAX_PRODUCTS", 400 * 25 / 4)
     found, _ = shared_points(camera, point, 5, 400)
     assert np.array_equal(found.toarray(), 100 * (1 - np.eye(5)))
 

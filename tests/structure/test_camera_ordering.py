@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import csgraph, csr_matrix
 
-from jaxba.structure.camera_ordering import MAX_BAND_FRACTION, MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
+from jaxba.structure.camera_ordering import (
+    MAX_BAND_FRACTION,
+    MIN_BAND_CAMERAS,
+    Band,
+    band_of,
+    camera_order,
+    is_banded,
+    reverse_cuthill_mckee,
+)
+from jaxba.structure.sum_trees import sorted_by
 
 graphs = st.tuples(st.integers(1, 40), st.sampled_from([0.0, 0.05, 0.2, 1.0]), st.integers(0, 10**6))
 
@@ -32,6 +42,26 @@ def reach_by_brute_force(rows, columns, rank) -> int:
 
 
 # The order
+
+
+@settings(max_examples=100, deadline=None)
+@given(graphs, st.booleans())
+def test_the_reverse_cuthill_mckee_ordering_is_that_of_scipy(graph, loops):
+    """Cameras of equal degree included, in connected graphs and others."""
+    cameras = graph[0]
+    linked = np.zeros((cameras, cameras), bool)
+    linked[random_graph(*graph)] = True
+    linked = linked | linked.T if loops else (linked | linked.T) & ~np.eye(cameras, dtype=bool)
+    expected = csgraph.reverse_cuthill_mckee(csr_matrix(linked), symmetric_mode=True)
+    assert np.array_equal(reverse_cuthill_mckee(linked), expected)
+
+
+@pytest.mark.parametrize("most", [1, 300, 1 << 16, (1 << 16) + 1, 10**6])
+def test_integers_are_sorted_stably(most):
+    keys = np.random.default_rng(0).integers(most, size=20_000).astype(np.int32)
+    keys[:2] = most - 1
+    assert np.array_equal(sorted_by(keys, most), np.argsort(keys, kind="stable"))
+    assert sorted_by(keys[:0], most).shape == (0,)
 
 
 @settings(max_examples=100, deadline=None)
