@@ -19,6 +19,7 @@ import jax
 import jaxtyping
 import pytest
 
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--compilation",
@@ -29,9 +30,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("compilation") == "quick":
-        if not hasattr(config, "workerinput"):  # a worker of pytest-xdist inherits the flags
-            os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flags_of_level_quick()}".strip()
+    # a worker of pytest-xdist inherits the flags
+    if config.getoption("compilation") == "quick" and not hasattr(config, "workerinput"):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flags_of_level_quick()}".strip()
     jax.config.update("jax_enable_x64", True)
     cache = getattr(config, "cache", None)
     if cache is not None:

@@ -40,8 +40,8 @@ COMPILER_OPTIONS: dict[Level, dict[str, bool | int]] = {
     "medium": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
     "quick": {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
 }
-"""XLA's options of the levels below full. With the newer emitters, the only ones that jaxlib 0.12 has, a lower level saves
-only half as much."""
+"""XLA's options of the levels below full, as far as a jaxlib knows them. With the newer emitters, the only ones that
+jaxlib 0.12 has, a lower level saves only half as much."""
 
 Part = Literal["factorization", "iterative", "acceptance", "decomposition"]
 """What is compiled by itself: a linear solve by factorisation or by an iterative method, the test whether its step is
@@ -104,7 +104,7 @@ def level_after(runs: int, before: tuple[Stage, ...]) -> Level:
 
 @functools.cache
 def compiler_options(level: Level) -> dict[str, bool | int] | None:
-    """Those of XLA's options for a level that this jaxlib knows; None for `full`, and where it knows none (on a GPU)."""
+    """Options of a level that this jaxlib knows; None for `full`, where it knows none, and on a GPU."""
     if level not in COMPILER_OPTIONS or jax.default_backend() != "cpu":
         return None
     return {name: value for name, value in COMPILER_OPTIONS[level].items() if _is_known(name, value)} or None
