@@ -55,7 +55,19 @@ def _flags_of_level_quick() -> str:
     return " ".join(f"--{name}={str(value).lower()}" for name, value in ast.literal_eval(told).items())
 
 
+WHOLE_ROOMS = ("linear", "refinement", "lm", "solver", "runtime", "cli")
+"""Of these rooms `sample` has each test, of the others one a file."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    seen = set()
+    for item in items:
+        whole = item.path.parent.name in WHOLE_ROOMS
+        test = (item.path, item.originalname if whole and isinstance(item, pytest.Function) else None)
+        if test not in seen and not item.get_closest_marker("slow"):
+            seen.add(test)
+            item.add_marker(pytest.mark.sample)
     if config.getoption("compilation") == "full":
         return
     for item in items:
