@@ -6,19 +6,18 @@ most of the time of all these tests is compilation. `.ci/run` has the slow ones,
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import os
 import platform
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
 import jax
 import jaxtyping
 import pytest
-
-QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-"""`jaxba.runtime.compilation.COMPILER_OPTIONS["quick"]`, for all programs of a process and its children; not imported,
-because it must be set before jaxba is imported."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -31,8 +30,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("compilation") == "quick":
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {QUICKLY}".strip()
+    # a worker of pytest-xdist inherits the flags
+    if config.getoption("compilation") == "quick" and not hasattr(config, "workerinput"):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flags_of_level_quick()}".strip()
     jax.config.update("jax_enable_x64", True)
     cache = getattr(config, "cache", None)
     if cache is not None:
@@ -44,7 +44,30 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
+def _flags_of_level_quick() -> str:
+    """XLA's flags that make `compiler_options("quick")` the options of all programs of a process and its children.
+
+    XLA ends a process whose flags it does not know, so another process asks which ones it knows. That one may import
+    jaxba, too: here it must not be imported before the import hook of jaxtyping is there.
+    """
+    code = "from jaxba.runtime.compilation import compiler_options; print(compiler_options('quick') or {})"
+    told = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True).stdout
+    return " ".join(f"--{name}={str(value).lower()}" for name, value in ast.literal_eval(told).items())
+
+
+WHOLE_ROOMS = ("linear", "refinement", "lm", "solver", "runtime", "cli")
+"""Of these rooms `sample` has each test, of the others one a file."""
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m selects
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    seen = set()
+    for item in items:
+        whole = item.path.parent.name in WHOLE_ROOMS
+        test = (item.path, item.originalname if whole and isinstance(item, pytest.Function) else None)
+        if test not in seen and not item.get_closest_marker("slow"):
+            seen.add(test)
+            item.add_marker(pytest.mark.sample)
     if config.getoption("compilation") == "full":
         return
     for item in items:

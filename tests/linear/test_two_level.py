@@ -24,6 +24,7 @@ from jaxba.linear.two_level import MODES, Anchor, camera_modes, cluster_sum, coa
 from jaxba.model import camera
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates
+from jaxba.runtime.compilation import compiler_options
 from jaxba.runtime.process import single_blas_thread
 from jaxba.structure import camera_clusters
 from jaxba.structure.layout import layout_for
@@ -99,7 +100,7 @@ class Case:
 
 
 # without LLVM's optimisations, which would take half of this file's time: the programs are run once or twice
-@functools.partial(jax.jit, static_argnames=("options",), compiler_options={"xla_backend_optimization_level": 0})
+@functools.partial(jax.jit, static_argnames=("options",), compiler_options=compiler_options("quick"))
 def everything(layout, problem, damping, more, options: StepOptions):
     """Modes, coarse system, two-level preconditioner and diagonal blocks, with `more` added to the camera blocks."""
     state = initial_state(layout, problem, options, jnp.float64)
