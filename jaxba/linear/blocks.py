@@ -5,13 +5,14 @@ A block of the reduced camera system is a sum over the points that two cameras b
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.covisibility import PairLayout
-from jaxba.structure.segment_sums import outer_sum, take_rows, tree_sum
+from jaxba.structure.segment_sums import outer_sum, prefix_sum, take_rows, tree_sum
 
 
 def pair_products(
@@ -32,8 +33,11 @@ def pair_products(
         return compute_unfused(lambda chunks: tree_sum(chunks, (sums,)), products, index=sums)
 
     # batch by batch, so that the gathered rows and their products stay in the cache
-    partial = loops.map_rows(batch, (pairs.left, pairs.right, pairs.sums)).reshape(-1, width * width)
-    return compute_unfused(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums)
+    partial = loops.map_rows(batch, (pairs.left, pairs.right, pairs.sums), pairs.used).reshape(-1, width * width)
+    if pairs.used is None:
+        return compute_unfused(lambda partial: tree_sum(partial, pairs.levels), partial, index=pairs.sums)
+    zeros = jnp.zeros((pairs.levels[0].shape[1], width * width), partial.dtype)
+    return compute_unfused(lambda partial: prefix_sum(zeros, partial, pairs.levels, 0), partial, index=pairs.sums)
 
 
 def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks square"], width: int) -> Float[Array, "n n"]:

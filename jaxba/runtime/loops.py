@@ -39,12 +39,13 @@ def fori_loop(
     return lax.while_loop(lambda loop: loop[0] < end, advance, (begin, start))[1]
 
 
-def map_rows(function: Callable[[Any], Any], rows: Any) -> Any:
+def map_rows(function: Callable[[Any], Any], rows: Any, used: Int[Array, ""] | None = None) -> Any:
     """`jax.lax.map`, never taken for a small loop: the results for the entries of a leading axis, one after the other.
 
     Args:
         function: of one entry.
         rows: a pytree of arrays with a common leading axis, at least one entry long.
+        used: number of entries to which the function is applied, the others giving zero; None for all.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
     at = lambda k: jax.tree.map(lambda all_: lax.dynamic_index_in_dim(all_, k, keepdims=False), rows)
@@ -55,7 +56,7 @@ def map_rows(function: Callable[[Any], Any], rows: Any) -> Any:
             lambda all_, one: lax.dynamic_update_index_in_dim(all_, one, k, 0), results, function(at(k))
         )
 
-    return fori_loop(0, count, body, results)
+    return fori_loop(0, count if used is None else used, body, results)
 
 
 def _next(counter: Int[Array, ""]) -> Int[Array, ""]:

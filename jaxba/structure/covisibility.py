@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int
 
 from jaxba.structure.camera_ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.structure.padding import Capacity, room_for
-from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, sorted_by, sum_tree
+from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, prefix_levels, sorted_by, sum_tree
 from jaxba.typing import AnyArray, register_pytree
 
 PAIR_CHUNKS = (4, 8)
@@ -28,6 +28,9 @@ cache."""
 MAX_COUNTED_BLOCKS = 1 << 18
 """Largest number of possible blocks, cameras squared, for which pairs are sorted by counting: the counts fit the
 cache."""
+
+USUAL_CHUNKS = 4
+"""Chunks per partial sum in a layout with fixed capacity, unless its blocks are small."""
 
 PAIR_ITEM_COST = 1.5
 """Cost of one partial 9 x 9 block in units of a pair, measured; it decides the chunk width."""
@@ -48,7 +51,12 @@ class PairLayout:
     """Chunks of a batch that belong to one block and are summed together. The last row of a batch is padding."""
 
     levels: tuple[Int[AnyArray, "_ _"], ...]
-    """Summation tree from the partial sums of all batches to blocks; the last block is always zero."""
+    """Summation tree from the partial sums of all batches to blocks; the last block is always zero. With fixed capacity
+    instead the ranks of partial sums that are added (`sum_trees.prefix_levels`), and blocks are sorted by their number
+    of partial sums."""
+
+    used: Int[AnyArray, ""] | None
+    """Number of batches that hold pairs, with fixed capacity; None for all."""
 
     block_camera: Int[AnyArray, " blocks"]
     """Camera of each diagonal block; the number of cameras for other blocks."""
@@ -138,20 +146,23 @@ def pair_layout(
     most = int(chunks.sum()) if room is None else number_of(width)  # largest number of chunks
     batches = max(1, -(-most // (PAIR_BATCH - 1)))
     batch = max(1, -(-most // batches))  # chunks of a batch, without the one that is padding
+    used = None if room is None else np.array(max(1, -(-int(chunks.sum()) // batch)), np.int32)
     position += position // (width * batch) * width
     padded = []
     for side in (left, right):
         array = np.full(batches * (batch + 1) * width, empty, np.int32)
         array[position] = row_index[side[order]]
         padded.append(array.reshape(batches, batch + 1, width))
-    sums, levels = _batch_sums(chunks, batches, batch, None if room is None else -(-room.most // width))
+    sums, levels, by_sums = _batch_sums(chunks, batches, batch, None if room is None else -(-room.most // width))
+    keys = keys[by_sums]
     table = None
     if factor and not banded:
         table = np.full(cameras * cameras, len(keys), np.int32)
         table[keys] = np.arange(len(keys))
         table = table.reshape(cameras, cameras)
     by_rank = np.argsort(rank)
-    on_diagonal = np.searchsorted(keys, diagonal)[rank]
+    in_order = np.argsort(keys)
+    on_diagonal = in_order[np.searchsorted(keys, diagonal, sorter=in_order)][rank]
     block_camera = np.full(len(keys) + 1, cameras, np.int32)
     block_camera[on_diagonal] = np.arange(cameras)
     block_row, block_column = (np.append(by_rank[part], 0).astype(np.int32) for part in np.divmod(keys, cameras))
@@ -164,6 +175,7 @@ def pair_layout(
         right=padded[1],
         sums=sums,
         levels=levels,
+        used=used,
         block_camera=block_camera,
         block_row=block_row,
         block_column=block_column,
@@ -196,8 +208,8 @@ def _pairs_of_tracks(
 
 def _batch_sums(
     chunks: Int[np.ndarray, " blocks"], batches: int, batch: int, most: int | None
-) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...]]:
-    """Partial sums within each batch, and the summation tree from these to the blocks and one more that is empty.
+) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...], Int[np.ndarray, " blocks"]]:
+    """Partial sums within each batch, how these are summed to the blocks and one more that is empty, and their order.
 
     Args:
         chunks: number of chunks of each block; those of one block are contiguous.
@@ -212,16 +224,22 @@ def _batch_sums(
     starts_sum = within % TREE_WIDTH == 0
     sum_batch, target = own_batch[starts_sum], block[starts_sum]  # batch and block of each partial sum
     counts = np.bincount(sum_batch, minlength=batches)
-    partial = int(counts.max()) if most is None else chunks_at_most(batch, len(chunks), TREE_WIDTH)
+    partial = int(counts.max())
+    if most is not None:  # nearly all problems have this many chunks a block; some need as many sums as chunks
+        usual = -(-batch // USUAL_CHUNKS)
+        partial = usual if partial <= usual else chunks_at_most(batch, len(chunks), TREE_WIDTH)
     number = _since(np.diff(sum_batch, prepend=-1) != 0)
     sums = np.full((batches, partial + 1, TREE_WIDTH), batch, np.int32)
     sums[own_batch, number[np.cumsum(starts_sum) - 1], within % TREE_WIDTH] = position
-    room = None
-    if most is not None:
-        touched = min(batches, (most - 1) // batch + 2)  # most batches over which the chunks of one block are spread
-        room = Room(batches * partial, chunks_at_most(most, touched, TREE_WIDTH))
+    items, empty = sum_batch * (partial + 1) + number, batches * (partial + 1) - 1
     counts = np.bincount(target, minlength=len(chunks) + 1)
-    return sums, sum_tree(sum_batch * (partial + 1) + number, counts, batches * (partial + 1) - 1, TREE_WIDTH, room)
+    if most is None:
+        return sums, sum_tree(items, counts, empty, TREE_WIDTH), np.arange(len(chunks))
+    touched = min(batches, (most - 1) // batch + 2)  # most batches over which the chunks of one block are spread
+    room = Room(batches * partial, chunks_at_most(most, touched, TREE_WIDTH))
+    order = np.argsort(-counts, kind="stable")
+    items = items[np.argsort(np.argsort(order)[target], kind="stable")]
+    return sums, prefix_levels(items, counts[order], empty, room), order[:-1]
 
 
 def _since(marks: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:

@@ -13,7 +13,10 @@ slot, whose values are exactly zero.
 The rows of the first level of the camera tree list the slots sorted by camera. The position of a slot in this list is
 its *camera-sorted index*.
 
-With a fixed capacity (structure/padding.py) there are no buckets, and sums over points are summation trees as well.
+With a fixed capacity (structure/padding.py) there are no buckets. Slots form chunks of two, which are summed densely;
+points are sorted by track length, so that those with an r-th chunk are the first ones, and sums over points are sums
+over r of gathered chunks.
+
 Everything is computed once per problem, on the host, with vectorised NumPy.
 """
 
@@ -65,7 +68,8 @@ class Layout:
     """Index in the problem of the points of each bucket; padding points have an index out of range."""
 
     point_levels: tuple[Int[AnyArray, "_ _"], ...] | None
-    """Summation tree from slots to points of a layout with fixed capacity; None for buckets."""
+    """In a layout with fixed capacity the ranks of chunks that are added to the first one of each point
+    (`sum_trees.prefix_levels`); None for buckets."""
 
     camera_levels: tuple[Int[AnyArray, "_ _"], ...]
     """Summation tree from slots to cameras. The flattened first level sorts the slots by camera and contains an empty
@@ -155,7 +159,7 @@ def build_layout(
     order, start = observations.order, observations.start
     seen = np.bincount(camera, minlength=cameras)
 
-    assignment = bucket_slots(tracks) if capacity is None else padded_slots(tracks, point, capacity)
+    assignment = bucket_slots(tracks) if capacity is None else padded_slots(tracks, capacity)
     slot, slot_point, empty = assignment.slot, assignment.point, assignment.empty
     slots = len(slot_point)
     mask = np.zeros(slots, bool)

@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from jaxba.runtime.fusion import fast_compilation, sum_in_one_loop
 from jaxba.structure.layout import Layout
+from jaxba.structure.padding import POINT_CHUNK
 from jaxba.typing import AnyArray
 
 
@@ -85,11 +86,43 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     return rows
 
 
+def prefix_sum(first: Array, values: Array, levels: tuple[Int[AnyArray, "ranks targets"], ...], axis: int) -> Array:
+    """Adds to the sums of targets the items of further ranks (`sum_trees.prefix_levels`).
+
+    Args:
+        first: sums of the targets over the ranks that are not listed, along `axis`.
+        values: the items along `axis`.
+        levels: index arrays of the listed ranks.
+        axis: 0 or -1.
+    """
+    gather = take_rows if axis == 0 else take
+    sums = None
+    for level in reversed(levels):
+        part = functools.reduce(operator.add, [gather(values, rank) for rank in level])
+        sums = part if sums is None else part + _lengthened(sums, part.shape[axis], axis)
+    return first if sums is None else first + _lengthened(sums, first.shape[axis], axis)
+
+
+def _lengthened(values: Array, length: int, axis: int) -> Array:
+    widths = [(0, 0)] * values.ndim
+    widths[axis] = (0, length - values.shape[axis])
+    return jnp.pad(values, widths)
+
+
+def _sum_of_chunks(layout: Layout, levels: tuple[Int[AnyArray, "_ _"], ...], chunks: Array) -> Array:
+    """Sums over the points of a padded layout, from the sums of chunks [k, chunks]."""
+    count = layout.num_points
+    # points read an empty chunk, of which a nan would spread to all of them
+    chunks = jnp.where(layout.slot_mask[: chunks.shape[1]], chunks, jnp.zeros_like(chunks))
+    own = layout.slot_point[:count] == jnp.arange(count, dtype=layout.slot_point.dtype)
+    return prefix_sum(jnp.where(own, chunks[:, :count], jnp.zeros_like(chunks[:, :count])), chunks, levels, -1)
+
+
 def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "k points"]:
-    """Sums over the slots of each point: a dense sum per bucket, or a summation tree in a padded layout."""
+    """Sums over the slots of each point: a dense sum per bucket, or over chunks and then ranks in a padded layout."""
     if layout.point_levels is not None:
-        # every point of the tree reads the empty slot; a nan there would spread to all points
-        return tree_sum(jnp.where(layout.slot_mask, values, jnp.zeros_like(values)).T, layout.point_levels).T
+        chunks = jnp.sum(values.reshape(values.shape[0], POINT_CHUNK, -1), axis=1)
+        return _sum_of_chunks(layout, layout.point_levels, chunks)
     parts, start = [], 0
     for bucket in layout.buckets:
         end = start + math.prod(bucket)
@@ -100,8 +133,11 @@ def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "
 
 def point_sums(layout: Layout, rows: list[Float[Array, " slots"]]) -> list[Float[Array, " points"]]:
     """`point_sum` of separate vectors, in one loop and without copying them into one array."""
-    if layout.point_levels is not None or fast_compilation.value:
+    if fast_compilation.value:
         return list(point_sum(layout, jnp.stack(rows)))
+    if layout.point_levels is not None:
+        chunks = sum_in_one_loop([row.reshape(POINT_CHUNK, -1) for row in rows], 0)
+        return list(_sum_of_chunks(layout, layout.point_levels, jnp.stack(chunks)))
     parts, start = [], 0
     for bucket in layout.buckets:
         end = start + math.prod(bucket)

@@ -67,6 +67,45 @@ def sum_tree(
         most, width = -(-most // width), TREE_WIDTH
 
 
+def prefix_levels(
+    items: np.ndarray, counts: np.ndarray, empty: int, room: Room, first: int = 0
+) -> tuple[Int[np.ndarray, "ranks targets"], ...]:
+    """Index arrays that sum the items of targets with descending counts: rank by rank, over prefixes of the targets.
+
+    The r-th items of all targets that have so many are those of a prefix of the targets. One level holds the ranks from
+    r to 2 r - 1, one row each; its first row lists at most `1 / (r + 1)` of all items. Lengths of prefixes follow from
+    the room: that bound or, from rank 2 on, half of it, which nearly all problems keep.
+
+    Args:
+        items: row indices, those of target 0 first, then those of target 1, ...
+        counts: number of items of each target, in descending order.
+        empty: index of a row of zeros, for padding.
+        room: bounds from which the shapes follow, together with the number of targets.
+        first: first rank that is listed.
+
+    Raises:
+        ValueError: the items exceed the room.
+    """
+    if len(items) > room.items or counts.max(initial=0) > room.most:
+        raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
+    start = np.cumsum(counts) - counts
+    ranks = [first]
+    while ranks[-1] < room.most:
+        ranks.append(max(1, 2 * ranks[-1]))
+    most = [min(len(counts), room.items // (rank + 1)) if rank else len(counts) for rank in ranks[:-1]]
+    lengths = [bound if rank < 2 else -(-bound // 2) for rank, bound in zip(ranks[:-1], most, strict=True)]
+    if any(np.count_nonzero(counts > rank) > length for rank, length in zip(ranks[:-1], lengths, strict=True)):
+        lengths = most
+    levels = []
+    for rank, end, length in zip(ranks[:-1], ranks[1:], lengths, strict=True):
+        at = np.arange(rank, end)[:, None]
+        listed = at < counts[:length]
+        level = np.full(listed.shape, empty, np.int32)
+        level[listed] = items[(start[:length] + at)[listed]]
+        levels.append(level)
+    return tuple(levels)
+
+
 def sorted_by(keys: Int[np.ndarray, " n"], most: int) -> Int[np.ndarray, " n"]:
     """Stable `argsort` of integers from 0 to below `most`.
 

@@ -1,4 +1,4 @@
-"""Assignment of observations to slots: buckets of points by track length, or a fixed number of slots.
+"""Assignment of observations to slots: buckets of points by track length, or chunks of a fixed capacity.
 
 The track length of a point is its number of observations. Slots of a bucket are arranged in tiles
 (structure/layout.py).
@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.structure.padding import Capacity, room_for
-from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
+from jaxba.structure.padding import POINT_CHUNK, Capacity, room_for
+from jaxba.structure.sum_trees import prefix_levels
 
 MAX_PADDING = 0.10
 """Largest number of empty slots relative to observations, besides one point of padding."""
@@ -51,10 +51,10 @@ class Slots(NamedTuple):
     """Index in the problem of the points in layout order, by bucket; padding points have an index out of range."""
 
     buckets: tuple[Bucket, ...]
-    """Shape of each bucket; empty if points are summed by a tree."""
+    """Shape of each bucket; empty for a layout with fixed capacity."""
 
     levels: tuple[Int[np.ndarray, "_ _"], ...] | None
-    """Summation tree from slots to points in layout order; None for buckets."""
+    """Ranks of chunks that are added to the first one of each point (`sum_trees.prefix_levels`); None for buckets."""
 
     empty: int
     """An empty slot."""
@@ -101,37 +101,45 @@ def bucket_slots(tracks: Int[np.ndarray, " points"]) -> Slots:
     )
 
 
-def padded_slots(
-    tracks: Int[np.ndarray, " points"], point: Int[np.ndarray, " observations"], capacity: Capacity
-) -> Slots:
-    """Observations in their order, then empty slots up to the capacity; likewise for the observed points.
+def padded_slots(tracks: Int[np.ndarray, " points"], capacity: Capacity) -> Slots:
+    """Puts points by descending track length into chunks of `POINT_CHUNK` slots, up to the capacity.
+
+    The c-th chunk has slots c, c + chunks, ..., so that the sums of all chunks are dense. First come the first chunks of
+    all points, then the second chunks of those that have one, and so on.
 
     Args:
-        tracks: number of observations of each point.
-        point: point of each observation, sorted.
+        tracks: number of observations of each point; observations are sorted by point.
         capacity: sizes to pad to.
     """
-    seen = np.flatnonzero(tracks)
-    column = np.zeros(len(tracks), np.int32)
-    column[seen] = np.arange(len(seen))
+    order = np.argsort(-tracks, kind="stable")[: np.count_nonzero(tracks)]
     members = np.full(capacity.points, capacity.points, np.int32)
-    members[: len(seen)] = seen
+    members[: len(order)] = order
+    counts = -(-tracks[order] // POINT_CHUNK)
+    column = np.arange(counts.sum())
+    rank = column - np.repeat(np.cumsum(counts) - counts, counts)
+    of_point = np.repeat(np.arange(len(order)), counts)  # sorted by point
+    before = np.cumsum(np.bincount(rank)) - np.bincount(rank)  # chunks of lower ranks
+    chunk = before[rank] + of_point
+    chunks = capacity.observations // POINT_CHUNK
     # empty slots belong to an observed point, whose block can be factored
-    slot_point = np.zeros(capacity.observations, np.int32)
-    slot_point[: len(point)] = column[point]
-    slot, empty = np.arange(len(point)), capacity.observations - 1
-    counts = np.zeros(capacity.points, np.int64)
-    counts[: len(seen)] = tracks[seen]
-    room = room_for(counts, capacity.observations, capacity.cameras)
-    levels = sum_tree(slot, counts, empty, _first_width(room.most), room)
-    return Slots(slot, slot_point, (members,), (), levels, empty)
-
-
-def _first_width(most: int) -> int:
-    """Chunk width of the first level, chosen for few levels: each has a row for every point."""
-    if most <= TREE_WIDTH:
-        return most
-    return min(max(TREE_WIDTH // 2, -(-most // TREE_WIDTH)), 2 * TREE_WIDTH)
+    chunk_point = np.zeros(chunks, np.int32)
+    chunk_point[chunk] = of_point
+    first = np.zeros(len(tracks), np.int64)  # position of each point's first chunk in `chunk`
+    first[order] = np.cumsum(counts) - counts
+    start = np.cumsum(tracks) - tracks
+    within = np.arange(int(tracks.sum())) - np.repeat(start, tracks)
+    at, row = np.divmod(within, POINT_CHUNK)
+    all_counts = np.zeros(capacity.points, np.int64)
+    all_counts[: len(order)] = counts
+    room = room_for(all_counts, chunks, -(-capacity.cameras // POINT_CHUNK))
+    return Slots(
+        slot=row * chunks + chunk[np.repeat(first, tracks) + at],
+        point=np.tile(chunk_point, POINT_CHUNK),
+        members=(members,),
+        buckets=(),
+        levels=prefix_levels(chunk, all_counts, chunks - 1, room, first=1),
+        empty=chunks - 1,
+    )
 
 
 def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
