@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from jaxba.model import camera
 from jaxba.runtime.fusion import compute_in_one_loop, fast_compilation, fusion_barrier
 from jaxba.structure.layout import Layout
-from jaxba.structure.segment_sums import point_sums, take_each
+from jaxba.structure.segment_sums import point_sums_of, take_each
 from jaxba.typing import AnyArray
 
 
@@ -60,10 +60,12 @@ def view_terms(
     Returns:
         A vector over slots for each term.
     """
+    return compute_in_one_loop(terms, _views(layout, frames, points), *slots)
+
+
+def _views(layout: Layout, frames: camera.Frames, points: Float[Array, "3 points"]) -> Views:
     at_slots = jnp.stack(take_each(points, layout.slot_point))
-    return compute_in_one_loop(
-        terms, Views(frames, at_slots, layout.slot_mask, layout.pixels, layout.whitening), *slots
-    )
+    return Views(frames, at_slots, layout.slot_mask, layout.pixels, layout.whitening)
 
 
 def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Float[Array, " points"]]]:
@@ -78,6 +80,6 @@ def point_passes(layout: Layout, frames: camera.Frames) -> Callable[..., list[Fl
     """
 
     def one_pass(points: Float[Array, "3 points"], terms: Terms, *slots: Array) -> list[Float[Array, " points"]]:
-        return point_sums(layout, view_terms(layout, frames, points, terms, *slots))
+        return point_sums_of(layout, terms, _views(layout, frames, points), *slots)
 
     return one_pass

@@ -76,7 +76,7 @@ class Capacity:
 def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = None) -> Capacity | None:
     """The capacity of a problem: its sizes rounded up to the grid.
 
-    Cameras are rounded up to `CAMERAS`, slots to four sizes an octave. Points and pairs get a fixed multiple of the
+    Cameras are rounded up to `CAMERAS`, slots to eight sizes an octave. Points and pairs get a fixed multiple of the
     slots, or the next larger one if that is not enough: rounding each on its own would give more programs.
 
     Args:
@@ -95,7 +95,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
     pairs = observations.num_pairs + observations.num_repeated_pairs
     if needed > MAX_OBSERVATIONS or pairs > MAX_PAIRS:
         return None
-    slots = max(MIN_OBSERVATIONS, _quarter_octave(needed))
+    slots = max(MIN_OBSERVATIONS, _eighth_octave(needed))
     chunks, points = slots // POINT_CHUNK, problem.num_points
     return Capacity(
         cameras=next(size for size in CAMERAS if size >= problem.num_cameras),
@@ -161,7 +161,7 @@ def _power(count: int) -> int:
     return 1 << max(0, count - 1).bit_length()
 
 
-def _quarter_octave(count: int) -> int:
-    """The smallest 4, 5, 6 or 7 times a power of two at or above a count of at least 8."""
-    step = _power(count) // 8
+def _eighth_octave(count: int) -> int:
+    """The smallest product of 8, 9, ..., 15 and a power of two at or above a count of at least 16."""
+    step = _power(count) // 16
     return -(-count // step) * step

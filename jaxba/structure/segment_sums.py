@@ -8,13 +8,16 @@ from __future__ import annotations
 import functools
 import math
 import operator
+from collections.abc import Callable
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxba.runtime.fusion import fast_compilation, sum_in_one_loop
+from jaxba.runtime.fusion import compute_in_one_loop, compute_unfused, fast_compilation, sum_in_one_loop
 from jaxba.structure.layout import Layout
 from jaxba.structure.padding import POINT_CHUNK
 from jaxba.typing import AnyArray
@@ -112,15 +115,19 @@ def _lengthened(values: Array, length: int, axis: int) -> Array:
 def _sum_of_chunks(layout: Layout, levels: tuple[Int[AnyArray, "_ _"], ...], chunks: Array) -> Array:
     """Sums over the points of a padded layout, from the sums of chunks [k, chunks]."""
     count = layout.num_points
-    # points read an empty chunk, of which a nan would spread to all of them
-    chunks = jnp.where(layout.slot_mask[: chunks.shape[1]], chunks, jnp.zeros_like(chunks))
-    own = layout.slot_point[:count] == jnp.arange(count, dtype=layout.slot_point.dtype)
-    return prefix_sum(jnp.where(own, chunks[:, :count], jnp.zeros_like(chunks[:, :count])), chunks, levels, -1)
+
+    def over_ranks(chunks: Array) -> Array:
+        own = layout.slot_point[:count] == jnp.arange(count, dtype=layout.slot_point.dtype)
+        first = jnp.where(own, chunks[:, :count], jnp.zeros_like(chunks[:, :count]))
+        return prefix_sum(first, chunks, levels, -1)
+
+    return compute_unfused(over_ranks, chunks, index=layout.slot_point)
 
 
 def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "k points"]:
     """Sums over the slots of each point: a dense sum per bucket, or over chunks and then ranks in a padded layout."""
     if layout.point_levels is not None:
+        values = jnp.where(layout.slot_mask, values, jnp.zeros_like(values))
         chunks = jnp.sum(values.reshape(values.shape[0], POINT_CHUNK, -1), axis=1)
         return _sum_of_chunks(layout, layout.point_levels, chunks)
     parts, start = [], 0
@@ -136,8 +143,7 @@ def point_sums(layout: Layout, rows: list[Float[Array, " slots"]]) -> list[Float
     if fast_compilation.value:
         return list(point_sum(layout, jnp.stack(rows)))
     if layout.point_levels is not None:
-        chunks = sum_in_one_loop([row.reshape(POINT_CHUNK, -1) for row in rows], 0)
-        return list(_sum_of_chunks(layout, layout.point_levels, jnp.stack(chunks)))
+        return point_sums_of(layout, lambda rows: rows, rows)
     parts, start = [], 0
     for bucket in layout.buckets:
         end = start + math.prod(bucket)
@@ -146,3 +152,23 @@ def point_sums(layout: Layout, rows: list[Float[Array, " slots"]]) -> list[Float
         )
         start = end
     return [jnp.concatenate(pieces) for pieces in zip(*parts, strict=True)]
+
+
+def point_sums_of(layout: Layout, function: Callable[..., list[Array]], *operands: Any) -> list[Float[Array, " points"]]:
+    """`point_sums` of what `compute_in_one_loop(function, *operands)` returns.
+
+    With chunks it is summed over these in the loop that computes it, and never stored.
+    """
+    if layout.point_levels is None or fast_compilation.value:
+        return point_sums(layout, compute_in_one_loop(function, *operands))
+
+    def summed(*halves: Any) -> list[Array]:
+        # points read an empty chunk, of which a nan would spread to all of them
+        terms = [[jnp.where(mask, row, jnp.zeros_like(row)) for row in function(*half)] for mask, *half in halves]
+        return [functools.reduce(operator.add, rows) for rows in zip(*terms, strict=True)]
+
+    halves = [
+        jax.tree.map(lambda x, k=k: x.reshape(*x.shape[:-1], POINT_CHUNK, -1)[..., k, :], (layout.slot_mask, *operands))
+        for k in range(POINT_CHUNK)
+    ]
+    return list(_sum_of_chunks(layout, layout.point_levels, jnp.stack(compute_in_one_loop(summed, *halves))))

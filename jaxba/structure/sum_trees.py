@@ -67,41 +67,52 @@ def sum_tree(
         most, width = -(-most // width), TREE_WIDTH
 
 
+PREFIX_SHARES = (
+    lambda rank: min(1 / (2 * rank + 2), 1 / rank**2) if rank > 1 else 1 / (rank + 1),
+    lambda rank: 1 / (2 * rank + 2) if rank > 1 else 1 / (rank + 1),
+    lambda rank: 1 / (rank + 1),
+)
+"""Targets that have an item of a rank, relative to all items: at most what the last of these functions says. On real
+problems the first one suffices, or the second where tracks are long."""
+
+
 def prefix_levels(
     items: np.ndarray, counts: np.ndarray, empty: int, room: Room, first: int = 0
 ) -> tuple[Int[np.ndarray, "ranks targets"], ...]:
     """Index arrays that sum the items of targets with descending counts: rank by rank, over prefixes of the targets.
 
-    The r-th items of all targets that have so many are those of a prefix of the targets. One level holds the ranks from
-    r to 2 r - 1, one row each; its first row lists at most `1 / (r + 1)` of all items. Lengths of prefixes follow from
-    the room: that bound or, from rank 2 on, half of it, which nearly all problems keep.
+    The targets that have an r-th item are a prefix of the targets. A level holds ranks r, r + 1, ..., 2 r - 1, a row
+    each, for the prefix of rank r. The lengths of prefixes follow from the room, by the first of `PREFIX_SHARES` that
+    suffices.
 
     Args:
         items: row indices, those of target 0 first, then those of target 1, ...
         counts: number of items of each target, in descending order.
         empty: index of a row of zeros, for padding.
         room: bounds from which the shapes follow, together with the number of targets.
-        first: first rank that is listed.
+        first: first rank that is listed. Rank 0 is listed for all targets.
 
     Raises:
         ValueError: the items exceed the room.
     """
     if len(items) > room.items or counts.max(initial=0) > room.most:
         raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
-    start = np.cumsum(counts) - counts
     ranks = [first]
     while ranks[-1] < room.most:
         ranks.append(max(1, 2 * ranks[-1]))
-    most = [min(len(counts), room.items // (rank + 1)) if rank else len(counts) for rank in ranks[:-1]]
-    lengths = [bound if rank < 2 else -(-bound // 2) for rank, bound in zip(ranks[:-1], most, strict=True)]
-    if any(np.count_nonzero(counts > rank) > length for rank, length in zip(ranks[:-1], lengths, strict=True)):
-        lengths = most
+    begins, ends = ranks[:-1], ranks[1:]
+    present = [np.count_nonzero(counts > rank) for rank in begins]
+    for share in PREFIX_SHARES:
+        lengths = [min(len(counts), int(room.items * share(rank))) if rank else len(counts) for rank in begins]
+        if all(n <= length for n, length in zip(present, lengths, strict=True)):
+            break
+    start = np.cumsum(counts) - counts
     levels = []
-    for rank, end, length in zip(ranks[:-1], ranks[1:], lengths, strict=True):
-        at = np.arange(rank, end)[:, None]
-        listed = at < counts[:length]
+    for begin, end, length in zip(begins, ends, lengths, strict=True):
+        rank = np.arange(begin, end)[:, None]
+        listed = rank < counts[:length]
         level = np.full(listed.shape, empty, np.int32)
-        level[listed] = items[(start[:length] + at)[listed]]
+        level[listed] = items[(start[:length] + rank)[listed]]
         levels.append(level)
     return tuple(levels)
 
