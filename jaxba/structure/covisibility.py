@@ -29,9 +29,6 @@ MAX_COUNTED_BLOCKS = 1 << 18
 """Largest number of possible blocks, cameras squared, for which pairs are sorted by counting: the counts fit the
 cache."""
 
-USUAL_CHUNKS = 4
-"""Chunks per partial sum in a layout with fixed capacity, unless its blocks are small."""
-
 PAIR_ITEM_COST = 1.5
 """Cost of one partial 9 x 9 block in units of a pair, measured; it decides the chunk width."""
 
@@ -225,9 +222,9 @@ def _batch_sums(
     sum_batch, target = own_batch[starts_sum], block[starts_sum]  # batch and block of each partial sum
     counts = np.bincount(sum_batch, minlength=batches)
     partial = int(counts.max())
-    if most is not None:  # nearly all problems have this many chunks a block; some need as many sums as chunks
-        usual = -(-batch // USUAL_CHUNKS)
-        partial = usual if partial <= usual else chunks_at_most(batch, len(chunks), TREE_WIDTH)
+    if most is not None:  # nearly always a batch has sums of few blocks; at worst it has as many sums as chunks
+        usual, bound = batch // TREE_WIDTH + 1 + 3 * len(chunks) // (2 * batches), chunks_at_most(batch, len(chunks), TREE_WIDTH)
+        partial = min(usual, bound) if partial <= usual else bound
     number = _since(np.diff(sum_batch, prepend=-1) != 0)
     sums = np.full((batches, partial + 1, TREE_WIDTH), batch, np.int32)
     sums[own_batch, number[np.cumsum(starts_sum) - 1], within % TREE_WIDTH] = position

@@ -33,7 +33,7 @@ the slots of such chunks are empty; with three it is 11 to 28%."""
 MIN_OBSERVATIONS = 1024
 """Smallest number of slots. Measured on Ladybug-49: a step takes 0.2 us per slot, so that this many cost no time."""
 
-POINTS_PER_CHUNK = (5 / 8, 1)
+POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)
 """Points per chunk in the capacity, as few as suffice. Real problems have 0.2 to 0.6, and every point has a chunk. A
 padding point without slots costs little."""
 

@@ -127,8 +127,10 @@ def _sum_of_chunks(layout: Layout, levels: tuple[Int[AnyArray, "_ _"], ...], chu
 def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "k points"]:
     """Sums over the slots of each point: a dense sum per bucket, or over chunks and then ranks in a padded layout."""
     if layout.point_levels is not None:
-        values = jnp.where(layout.slot_mask, values, jnp.zeros_like(values))
-        chunks = jnp.sum(values.reshape(values.shape[0], POINT_CHUNK, -1), axis=1)
+        count = layout.num_slots // POINT_CHUNK
+        chunks = functools.reduce(operator.add, [values[:, k * count : (k + 1) * count] for k in range(POINT_CHUNK)])
+        # points read an empty chunk, of which a nan would spread to all of them
+        chunks = jnp.where(layout.slot_mask[:count], chunks, jnp.zeros_like(chunks))
         return _sum_of_chunks(layout, layout.point_levels, chunks)
     parts, start = [], 0
     for bucket in layout.buckets:
