@@ -43,7 +43,6 @@ from jaxba.structure.segment_sums import (
     as_rows,
     outer_sum,
     point_sums,
-    point_sums_of,
     take,
     take_each,
     take_rows,
@@ -225,7 +224,7 @@ def project_to_points(
         over, under = (sum(row[a] * at_slot[a] for a in range(9)) for row in jacobian)
         return [projected[0][i] * over + projected[1][i] * under for i in range(3)]
 
-    return point_sums_of(layout, inner, at_slot, points.projected, linear.camera_jacobian)
+    return point_sums(layout, compute_in_one_loop(inner, at_slot, points.projected, linear.camera_jacobian))
 
 
 def jacobian_product(
