@@ -172,7 +172,7 @@ def build_layout(
     if problem.whitening is not None:
         whitening = np.zeros((2, 2, slots))
         whitening[:, :, slot] = np.moveaxis(np.asarray(problem.whitening)[order], 0, -1)
-    room = None if capacity is None else room_for(seen, capacity.observations, capacity.points)
+    room = None if capacity is None else room_for(seen, capacity.usual_observations(len(camera)), capacity.points)
     by_camera = sorted_by(camera, cameras)
     camera_levels = with_spare_row(sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room), empty)
     slot_grid = None

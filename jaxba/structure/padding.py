@@ -69,6 +69,11 @@ class Capacity:
         counts = problem.num_cameras, problem.num_points, slots_for(tracks)
         return all(n <= most for n, most in zip(counts, (self.cameras, self.points, self.observations), strict=True))
 
+    def usual_observations(self, count: int) -> int:
+        """Room for the observations of a problem: 15/16 of the slots or, where points have few single slots, all."""
+        usual = self.observations * 15 // 16
+        return usual if count <= usual else self.observations
+
     def __str__(self) -> str:
         return f"{self.cameras} cameras, {self.points} points, {self.observations} observations, {self.pairs} pairs"
 
