@@ -141,7 +141,8 @@ def pair_layout(
     shift = width * (np.cumsum(chunks) - chunks) - (np.cumsum(counts) - counts)
     position = np.repeat(shift.astype(np.int32), counts) + np.arange(len(left), dtype=np.int32)
     most = int(chunks.sum()) if room is None else number_of(width)  # largest number of chunks
-    batches = max(1, -(-most // (PAIR_BATCH - 1)))
+    largest = PAIR_BATCH if room is None else -(-PAIR_BATCH // 2)  # smaller ones, of which the last is rarely full
+    batches = max(1, -(-most // (largest - 1)))
     batch = max(1, -(-most // batches))  # chunks of a batch, without the one that is padding
     used = None if room is None else np.array(max(1, -(-int(chunks.sum()) // batch)), np.int32)
     position += position // (width * batch) * width
@@ -223,8 +224,9 @@ def _batch_sums(
     counts = np.bincount(sum_batch, minlength=batches)
     partial = int(counts.max())
     if most is not None:  # nearly always a batch has sums of few blocks; at worst it has as many sums as chunks
-        usual, bound = batch // TREE_WIDTH + 1 + 3 * len(chunks) // (2 * batches), chunks_at_most(batch, len(chunks), TREE_WIDTH)
-        partial = min(usual, bound) if partial <= usual else bound
+        bound = chunks_at_most(batch, len(chunks), TREE_WIDTH)
+        usual = min(bound, batch // TREE_WIDTH + 5 * len(chunks) // (2 * batches) + 1)
+        partial = usual if partial <= usual else bound
     number = _since(np.diff(sum_batch, prepend=-1) != 0)
     sums = np.full((batches, partial + 1, TREE_WIDTH), batch, np.int32)
     sums[own_batch, number[np.cumsum(starts_sum) - 1], within % TREE_WIDTH] = position

@@ -37,9 +37,9 @@ POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)
 """Points per chunk in the capacity, as few as suffice. Real problems have 0.2 to 0.6, and every point has a chunk. A
 padding point without slots costs little."""
 
-PAIRS_PER_SLOT = 4
-"""Pairs per slot in the capacity, or a power of two as much. Windows of 20 cameras of the KITTI sequence kitti00vo have
-3.4 per observation. Only those batches of pairs are multiplied that hold some, so that spare pairs cost little."""
+PAIRS_PER_SLOT = 6
+"""Pairs per slot in the capacity, or 2, 4, ... times as many. Windows of 20 cameras of the KITTI sequence kitti00vo have
+2.9 to 3.6. Only those batches of pairs are multiplied that hold some, so that spare pairs cost little."""
 
 MAX_CAMERAS = CAMERAS[-1]
 """Most cameras of a padded problem."""
@@ -106,7 +106,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
         cameras=next(size for size in CAMERAS if size >= problem.num_cameras),
         points=next(room for share in POINTS_PER_CHUNK if (room := int(share * chunks)) >= points),
         observations=slots,
-        pairs=slots * max(PAIRS_PER_SLOT, _power(-(-pairs // slots))),
+        pairs=slots * PAIRS_PER_SLOT * _power(-(-pairs // (slots * PAIRS_PER_SLOT))),
     )
 
 
