@@ -100,7 +100,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
     pairs = observations.num_pairs + observations.num_repeated_pairs
     if needed > MAX_OBSERVATIONS or pairs > MAX_PAIRS:
         return None
-    slots = max(MIN_OBSERVATIONS, _eighth_octave(needed))
+    slots = _eighth_octave(max(MIN_OBSERVATIONS, needed))
     chunks, points = slots // POINT_CHUNK, problem.num_points
     return Capacity(
         cameras=next(size for size in CAMERAS if size >= problem.num_cameras),

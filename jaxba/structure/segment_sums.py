@@ -89,7 +89,7 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     return rows
 
 
-def prefix_sum(first: Array, values: Array, levels: tuple[Int[AnyArray, "ranks targets"], ...], axis: int) -> Array:
+def prefix_sum(first: Array, values: Array, levels: tuple[Int[AnyArray, "_ _"], ...], axis: int) -> Array:
     """Adds to the sums of targets the items of further ranks (`sum_trees.prefix_levels`).
 
     Args:
@@ -127,10 +127,10 @@ def _sum_of_chunks(layout: Layout, levels: tuple[Int[AnyArray, "_ _"], ...], chu
 def point_sum(layout: Layout, values: Float[Array, "k slots"]) -> Float[Array, "k points"]:
     """Sums over the slots of each point: a dense sum per bucket, or over chunks and then ranks in a padded layout."""
     if layout.point_levels is not None:
-        count = layout.num_slots // POINT_CHUNK
-        chunks = functools.reduce(operator.add, [values[:, k * count : (k + 1) * count] for k in range(POINT_CHUNK)])
         # points read an empty chunk, of which a nan would spread to all of them
-        chunks = jnp.where(layout.slot_mask[:count], chunks, jnp.zeros_like(chunks))
+        seen = jnp.where(layout.slot_mask, values, jnp.zeros_like(values))
+        count = layout.num_slots // POINT_CHUNK
+        chunks = functools.reduce(operator.add, [seen[:, k * count : (k + 1) * count] for k in range(POINT_CHUNK)])
         return _sum_of_chunks(layout, layout.point_levels, chunks)
     parts, start = [], 0
     for bucket in layout.buckets:
@@ -156,7 +156,9 @@ def point_sums(layout: Layout, rows: list[Float[Array, " slots"]]) -> list[Float
     return [jnp.concatenate(pieces) for pieces in zip(*parts, strict=True)]
 
 
-def point_sums_of(layout: Layout, function: Callable[..., list[Array]], *operands: Any) -> list[Float[Array, " points"]]:
+def point_sums_of(
+    layout: Layout, function: Callable[..., list[Array]], *operands: Any
+) -> list[Float[Array, " points"]]:
     """`point_sums` of what `compute_in_one_loop(function, *operands)` returns.
 
     With chunks it is summed over these in the loop that computes it, and never stored.

@@ -78,7 +78,7 @@ problems the first one suffices, or the second where tracks are long."""
 
 def prefix_levels(
     items: np.ndarray, counts: np.ndarray, empty: int, room: Room, first: int = 0
-) -> tuple[Int[np.ndarray, "ranks targets"], ...]:
+) -> tuple[Int[np.ndarray, "_ _"], ...]:
     """Index arrays that sum the items of targets with descending counts: rank by rank, over prefixes of the targets.
 
     The targets that have an r-th item are a prefix of the targets. A level holds ranks r, r + 1, ..., 2 r - 1, a row

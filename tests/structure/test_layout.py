@@ -174,6 +174,13 @@ def sum_by_levels(rows: np.ndarray, levels) -> np.ndarray:
     return rows
 
 
+def sum_by_ranks(rows: np.ndarray, levels) -> np.ndarray:
+    total = np.zeros(levels[0].shape[1], rows.dtype)
+    for level in levels:
+        total[: level.shape[1]] += rows[np.asarray(level)].sum(axis=0)
+    return total
+
+
 sizes = st.one_of(st.just(0), st.integers(0, 12), st.integers(60, 70), st.integers(0, 1500))
 
 
@@ -239,7 +246,9 @@ def blocks_by_layout(layout: Layout, weights: np.ndarray) -> np.ndarray:
     covisibility = layout.pairs
     weights = support.by_camera(layout, np.where(layout.slot_mask, weights, 0))
     chunks = (weights[covisibility.left] * weights[covisibility.right]).sum(axis=-1)
-    return sum_by_levels(support.batch_sums(covisibility, chunks), covisibility.levels)[np.asarray(covisibility.table)]
+    partial = support.batch_sums(covisibility, chunks)
+    summed = sum_by_levels if covisibility.used is None else sum_by_ranks
+    return summed(partial, covisibility.levels)[np.asarray(covisibility.table)]
 
 
 def blocks_by_brute_force(problem: BundleProblem, layout: Layout, weights: np.ndarray) -> np.ndarray:
