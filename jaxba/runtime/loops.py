@@ -17,6 +17,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Int
 
+from jaxba.typing import AnyArray
+
 Carry = TypeVar("Carry")
 
 
@@ -28,7 +30,7 @@ def while_loop(condition: Callable[[Carry], Any], body: Callable[[Carry], Carry]
 
 
 def fori_loop(
-    first: int | Int[Array, ""], end: int | Int[Array, ""], body: Callable[[Any, Carry], Carry], start: Carry
+    first: int | Int[Array, ""], end: int | Int[AnyArray, ""], body: Callable[[Any, Carry], Carry], start: Carry
 ) -> Carry:
     """`jax.lax.fori_loop`, never taken for a small loop."""
 
@@ -39,7 +41,7 @@ def fori_loop(
     return lax.while_loop(lambda loop: loop[0] < end, advance, (begin, start))[1]
 
 
-def map_rows(function: Callable[[Any], Any], rows: Any, used: Int[Array, ""] | None = None) -> Any:
+def map_rows(function: Callable[[Any], Any], rows: Any, used: Int[AnyArray, ""] | None = None) -> Any:
     """`jax.lax.map`, never taken for a small loop: the results for the entries of a leading axis, one after the other.
 
     Args:

@@ -85,7 +85,7 @@ class SolveOptions:
     float32."""
 
     pad: bool = False
-    """Whether array sizes are rounded up to a coarse grid, so that similar problems share one compiled program, also in
+    """Whether array sizes are rounded up to a grid, so that similar problems share one compiled program, also in
     a persistent compilation cache. Results differ by rounding only. For many small problems with the explicit solver,
     which `auto` then means; with other solvers and for larger problems nothing is padded, and `Solution.capacity` is
     None."""

@@ -143,8 +143,8 @@ def build_layout(
     Returns:
         A pytree of NumPy arrays. Without a capacity, its shapes follow from the sizes and track lengths of the problem.
         With one they follow from the capacity, from whether there is whitening, from whether the system is one dense
-        product (`is_dense`), and from whether cameras see points twice so often that a tree needs more levels
-        (`room_for`).
+        product (`is_dense`), and from whether usual bounds hold: on tracks and blocks (`prefix_levels`), on half-filled
+        chunks (`Capacity.usual_observations`), and on how often cameras see points twice (`room_for`).
 
     Raises:
         ValueError: arguments that exclude each other, or a problem larger than the capacity.

@@ -2,12 +2,14 @@
 
 A compiled program fits one set of array shapes. Without padding these follow from the data (buckets by track length,
 summation trees, pairs), so that every problem compiles its own program, which takes seconds where the solve may take a
-fraction of one. With padding all shapes follow from a `Capacity`, four numbers on a coarse grid. Padding contains no
-observations: it adds exact zeros to sums, and its cameras and points never change.
+fraction of one. With padding all shapes follow from a `Capacity`, four numbers on a grid, but for few problems with
+unusually long tracks or many small blocks (`sum_trees.prefix_levels`). Padding contains no observations: it adds exact
+zeros to sums, and its cameras and points never change.
 
-Up to half of the slots are padding, which makes an iteration up to about twice as long. That pays while a solve is
-faster than a compilation, so larger problems are not padded (`capacity_of`). A problem with few points loses more: with
-padding it has too many of them for Woodbury's identity (structure/density.py).
+A tenth to a quarter of the slots are padding: up to a ninth from rounding, the others in half-filled chunks of slots.
+Larger problems are not padded (`capacity_of`), since their iterations take as long as compiling does. A problem with
+few points may lose more than others: with padding it may have too many of them for Woodbury's identity
+(structure/density.py).
 """
 
 from __future__ import annotations
@@ -38,8 +40,8 @@ POINTS_PER_CHUNK = (1 / 4, 1 / 2, 5 / 8, 1)
 padding point without slots costs little."""
 
 PAIRS_PER_SLOT = 6
-"""Pairs per slot in the capacity, or 2, 4, ... times as many. Windows of 20 cameras of the KITTI sequence kitti00vo have
-2.9 to 3.6. Only those batches of pairs are multiplied that hold some, so that spare pairs cost little."""
+"""Pairs per slot in the capacity, or 2, 4, ... times as many. Windows of the KITTI sequence kitti00vo have 2.9 to 4.2.
+Only those batches of pairs are multiplied that hold some, so that spare pairs cost little."""
 
 MAX_CAMERAS = CAMERAS[-1]
 """Most cameras of a padded problem."""

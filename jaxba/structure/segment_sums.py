@@ -89,6 +89,10 @@ def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     return rows
 
 
+UNROLLED_RANKS = 4
+"""Ranks of a level up to which each is gathered by itself. More of them are few rows each, and take long to compile."""
+
+
 def prefix_sum(first: Array, values: Array, levels: tuple[Int[AnyArray, "_ _"], ...], axis: int) -> Array:
     """Adds to the sums of targets the items of further ranks (`sum_trees.prefix_levels`).
 
@@ -101,7 +105,10 @@ def prefix_sum(first: Array, values: Array, levels: tuple[Int[AnyArray, "_ _"], 
     gather = take_rows if axis == 0 else take
     sums = None
     for level in reversed(levels):
-        part = functools.reduce(operator.add, [gather(values, rank) for rank in level])
+        if level.shape[0] > UNROLLED_RANKS:
+            part = jnp.sum(gather(values, level), axis=axis + min(axis, 0))
+        else:
+            part = functools.reduce(operator.add, [gather(values, rank) for rank in level])
         sums = part if sums is None else part + _lengthened(sums, part.shape[axis], axis)
     return first if sums is None else first + _lengthened(sums, first.shape[axis], axis)
 

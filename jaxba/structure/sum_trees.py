@@ -109,6 +109,8 @@ def prefix_levels(
     start = np.cumsum(counts) - counts
     levels = []
     for begin, end, length in zip(begins, ends, lengths, strict=True):
+        if not length:  # and so are all further ones
+            break
         rank = np.arange(begin, end)[:, None]
         listed = rank < counts[:length]
         level = np.full(listed.shape, empty, np.int32)

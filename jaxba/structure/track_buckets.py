@@ -104,8 +104,8 @@ def bucket_slots(tracks: Int[np.ndarray, " points"]) -> Slots:
 def padded_slots(tracks: Int[np.ndarray, " points"], capacity: Capacity) -> Slots:
     """Puts points by descending track length into chunks of `POINT_CHUNK` slots, up to the capacity.
 
-    The c-th chunk has slots c, c + chunks, ..., so that the sums of all chunks are dense. First come the first chunks of
-    all points, then the second chunks of those that have one, and so on.
+    The c-th chunk has slots c, c + chunks, ..., so that the sums of all chunks are dense. First come the first chunks
+    of all points, then the second chunks of those that have one, and so on.
 
     Args:
         tracks: number of observations of each point; observations are sorted by point.
