@@ -41,7 +41,11 @@ COMPILER_OPTIONS: dict[Level, dict[str, bool | int]] = {
     "quick": {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
 }
 """XLA's options of the levels below full, as far as a jaxlib knows them. With the newer emitters a lower level saves
-only half as much: on jaxlib 0.12, which has no others, quick takes two thirds of the time of full and medium all."""
+only half as much: on jaxlib 0.12, which has no others, quick takes two thirds of the time of full and medium all, so
+that medium is left out there."""
+
+OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
+"""The option that switches XLA's newer kernel emitters off."""
 
 Part = Literal["factorization", "iterative", "acceptance", "decomposition"]
 """What is compiled by itself: a linear solve by factorisation or by an iterative method, the test whether its step is
@@ -88,8 +92,8 @@ takes 0.6 us longer per observation than at level full, the test without any 0.1
 def stages(part: Part, observations: int) -> tuple[Stage, ...]:
     """Levels at which a part of a step is compiled, one after the other, before it is compiled fully."""
     typical, *break_even = BREAK_EVEN[part]
-    levels: tuple[Level, ...] = ("quick", "medium")
-    found = [Stage(level, count // max(1, observations)) for level, count in zip(levels, break_even, strict=True)]
+    levels: tuple[Level, ...] = ("quick", "medium") if uses_older_emitters("medium") else ("quick",)
+    found = [Stage(level, count // max(1, observations)) for level, count in zip(levels, break_even, strict=False)]
     return tuple(stage for stage in found if stage.runs >= typical)
 
 
@@ -107,15 +111,23 @@ def compiler_options(level: Level) -> dict[str, bool | int] | None:
     """Options of a level that this jaxlib knows; None for `full`, where it knows none, and on a GPU."""
     if level not in COMPILER_OPTIONS or jax.default_backend() != "cpu":
         return None
-    return {name: value for name, value in COMPILER_OPTIONS[level].items() if _is_known(name, value)} or None
+    wanted = COMPILER_OPTIONS[level]
+    if _are_known(wanted):
+        return dict(wanted)
+    return {name: value for name, value in wanted.items() if _are_known({name: value})} or None
 
 
-def _is_known(option: str, value: bool | int) -> bool:
+def _are_known(options: dict[str, bool | int]) -> bool:
     try:
-        jax.jit(lambda: 0, compiler_options={option: value}).lower().compile()
+        jax.jit(lambda: 0, compiler_options=options).lower().compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True
+
+
+def uses_older_emitters(level: Level) -> bool:
+    """Whether programs of a level are compiled by XLA's older kernel emitters, for which `fast_compilation` is made."""
+    return OLDER_EMITTERS in (compiler_options(level) or {})
 
 
 class Program:
@@ -124,16 +136,17 @@ class Program:
     def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
         self.options: Any = compiler_options(level)
+        self.fast = uses_older_emitters(level)
         self.jitted = jax.jit(function, static_argnames=static, compiler_options=self.options)
         self._static = [name if name in static else None for name in inspect.signature(function).parameters]
 
     def __call__(self, *arguments: Any) -> Any:
-        with fast_compilation(self.options is not None):
+        with fast_compilation(self.fast):
             return self.jitted(*arguments)
 
     def lower(self, *arguments: Any) -> tuple[Any, Any]:
         """The lowered program, not yet compiled, and shapes and types of its results."""
-        with fast_compilation(self.options is not None):
+        with fast_compilation(self.fast):
             traced = self.jitted.trace(*arguments)
             return traced.lower(), traced.out_info
 
