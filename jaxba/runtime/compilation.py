@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
 
 import jax
+import jax.numpy as jnp
 from jax import monitoring
 
 from jaxba.runtime.executable_cache import CachedExecutable, ExecutableCache, watch_compilation
@@ -137,7 +138,9 @@ class Program:
         self.function = function
         self.options: Any = compiler_options(level)
         self.fast = uses_older_emitters(level)
-        self.jitted = jax.jit(function, static_argnames=static, compiler_options=self.options)
+        self.jitted = jax.jit(
+            _strongly_typed(function), static_argnames=static, compiler_options=self.options, keep_unused=True
+        )
         self._static = [name if name in static else None for name in inspect.signature(function).parameters]
 
     def __call__(self, *arguments: Any) -> Any:
@@ -154,6 +157,17 @@ class Program:
         """Static arguments by name, and the others."""
         named = list(zip(self._static, arguments, strict=False))
         return {name: x for name, x in named if name}, tuple(x for name, x in named if not name)
+
+
+def _strongly_typed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function without weakly typed results, which a program on disk does not have."""
+
+    @functools.wraps(function)
+    def strong(*arguments: Any, **named: Any) -> Any:
+        results = function(*arguments, **named)
+        return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), results)
+
+    return strong
 
 
 @functools.cache
@@ -197,6 +211,8 @@ class ParallelCompilation:
         self.loaded: dict[Program, CachedExecutable] = {}
         """Programs that were read from disk."""
         self._verified: set[Program] = set()  # of these, the ones that have run once
+        self._compiled: dict[Program, jax.stages.Compiled] = {}  # beside them: `jit` would compile these once more for
+        # results of programs that were read, which are bound to a device
         self._results: dict[Program, Any] = {}  # shapes and types of results
 
     def __enter__(self) -> ParallelCompilation:
@@ -224,7 +240,7 @@ class ParallelCompilation:
         if cache is not None:
             static, given = function.split(arguments)
             path = cache.path_for(function.function, static, given, function.options)
-            if (stored := cache.load(path, given)) is not None:
+            if (stored := cache.load(path)) is not None:
                 self.loaded[function] = stored
                 return stored.out
         lowered, out = function.lower(*arguments)
@@ -234,7 +250,7 @@ class ParallelCompilation:
                 lowered.compile()
                 return
             with watch_compilation() as was_compiled:
-                compiled = lowered.compile()
+                self._compiled[function] = compiled = lowered.compile()
             if was_compiled():
                 cache.save(path, compiled, out)
 
@@ -244,10 +260,12 @@ class ParallelCompilation:
 
     def run(self, function: Program, *arguments: Any) -> Any:
         """What the program computes."""
+        given = function.split(arguments)[1]
+        if function in self._compiled:
+            return self._compiled[function](*given)
         stored = self.loaded.get(function)
         if stored is None:
             return function(*arguments)
-        given = function.split(arguments)[1]
         if function in self._verified:
             return stored.run(*given)
         try:
