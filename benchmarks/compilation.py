@@ -32,7 +32,7 @@ from jaxba.lm import step
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.options import LinearSolverChoice
 from jaxba.runtime import process
-from jaxba.runtime.compilation import Level, compiler_options
+from jaxba.runtime.compilation import Level, compiler_options, uses_older_emitters
 from jaxba.runtime.fusion import fast_compilation
 from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.names import parse_solver
@@ -58,7 +58,7 @@ def measure(step: Any, arguments: tuple[Any, ...], level: Level, repeats: int) -
     """Seconds of compilation including tracing, and median seconds of a run."""
     options: Any = compiler_options(level)
     started = time.perf_counter()
-    with fast_compilation(options is not None):
+    with fast_compilation(uses_older_emitters(level)):
         lowered = jax.jit(step).lower(*arguments)
     compiled = lowered.compile(options)
     compile_s = time.perf_counter() - started

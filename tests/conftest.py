@@ -55,8 +55,8 @@ def _flags_of_level_quick() -> str:
     return " ".join(f"--{name}={str(value).lower()}" for name, value in ast.literal_eval(told).items())
 
 
-WHOLE_ROOMS = ("linear", "refinement", "lm", "solver", "runtime", "cli")
-"""Of these rooms `sample` has each test, of the others one a file."""
+WHOLE_ROOMS = ("lm", "solver", "runtime")
+"""Of these rooms `-m sample` has the first case of each test, of the others the first test of each file."""
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
 
 import jax
+import jax.numpy as jnp
 from jax import monitoring
 
 from jaxba.runtime.executable_cache import CachedExecutable, ExecutableCache, watch_compilation
@@ -41,7 +42,11 @@ COMPILER_OPTIONS: dict[Level, dict[str, bool | int]] = {
     "quick": {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
 }
 """XLA's options of the levels below full, as far as a jaxlib knows them. With the newer emitters a lower level saves
-only half as much: on jaxlib 0.12, which has no others, quick takes two thirds of the time of full and medium all."""
+only half as much: on jaxlib 0.12, which has no others, quick takes two thirds of the time of full and medium all, so
+that medium is left out there."""
+
+OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
+"""The option that switches XLA's newer kernel emitters off."""
 
 Part = Literal["factorization", "iterative", "acceptance", "decomposition"]
 """What is compiled by itself: a linear solve by factorisation or by an iterative method, the test whether its step is
@@ -88,8 +93,8 @@ takes 0.6 us longer per observation than at level full, the test without any 0.1
 def stages(part: Part, observations: int) -> tuple[Stage, ...]:
     """Levels at which a part of a step is compiled, one after the other, before it is compiled fully."""
     typical, *break_even = BREAK_EVEN[part]
-    levels: tuple[Level, ...] = ("quick", "medium")
-    found = [Stage(level, count // max(1, observations)) for level, count in zip(levels, break_even, strict=True)]
+    levels: tuple[Level, ...] = ("quick", "medium") if uses_older_emitters("medium") else ("quick",)
+    found = [Stage(level, count // max(1, observations)) for level, count in zip(levels, break_even, strict=False)]
     return tuple(stage for stage in found if stage.runs >= typical)
 
 
@@ -107,15 +112,23 @@ def compiler_options(level: Level) -> dict[str, bool | int] | None:
     """Options of a level that this jaxlib knows; None for `full`, where it knows none, and on a GPU."""
     if level not in COMPILER_OPTIONS or jax.default_backend() != "cpu":
         return None
-    return {name: value for name, value in COMPILER_OPTIONS[level].items() if _is_known(name, value)} or None
+    wanted = COMPILER_OPTIONS[level]
+    if _are_known(wanted):
+        return dict(wanted)
+    return {name: value for name, value in wanted.items() if _are_known({name: value})} or None
 
 
-def _is_known(option: str, value: bool | int) -> bool:
+def _are_known(options: dict[str, bool | int]) -> bool:
     try:
-        jax.jit(lambda: 0, compiler_options={option: value}).lower().compile()
+        jax.jit(lambda: 0, compiler_options=options).lower().compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True
+
+
+def uses_older_emitters(level: Level) -> bool:
+    """Whether programs of a level are compiled by XLA's older kernel emitters, for which `fast_compilation` is made."""
+    return OLDER_EMITTERS in (compiler_options(level) or {})
 
 
 class Program:
@@ -124,16 +137,19 @@ class Program:
     def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
         self.options: Any = compiler_options(level)
-        self.jitted = jax.jit(function, static_argnames=static, compiler_options=self.options)
+        self.fast = uses_older_emitters(level)
+        self.jitted = jax.jit(
+            _strongly_typed(function), static_argnames=static, compiler_options=self.options, keep_unused=True
+        )
         self._static = [name if name in static else None for name in inspect.signature(function).parameters]
 
     def __call__(self, *arguments: Any) -> Any:
-        with fast_compilation(self.options is not None):
+        with fast_compilation(self.fast):
             return self.jitted(*arguments)
 
     def lower(self, *arguments: Any) -> tuple[Any, Any]:
         """The lowered program, not yet compiled, and shapes and types of its results."""
-        with fast_compilation(self.options is not None):
+        with fast_compilation(self.fast):
             traced = self.jitted.trace(*arguments)
             return traced.lower(), traced.out_info
 
@@ -141,6 +157,17 @@ class Program:
         """Static arguments by name, and the others."""
         named = list(zip(self._static, arguments, strict=False))
         return {name: x for name, x in named if name}, tuple(x for name, x in named if not name)
+
+
+def _strongly_typed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function without weakly typed results, which a program on disk does not have."""
+
+    @functools.wraps(function)
+    def strong(*arguments: Any, **named: Any) -> Any:
+        results = function(*arguments, **named)
+        return jax.tree.map(lambda x: jax.lax.convert_element_type(x, jnp.result_type(x)), results)
+
+    return strong
 
 
 @functools.cache
@@ -184,6 +211,8 @@ class ParallelCompilation:
         self.loaded: dict[Program, CachedExecutable] = {}
         """Programs that were read from disk."""
         self._verified: set[Program] = set()  # of these, the ones that have run once
+        self._compiled: dict[Program, jax.stages.Compiled] = {}  # beside them: `jit` would compile these once more for
+        # results of programs that were read, which are bound to a device
         self._results: dict[Program, Any] = {}  # shapes and types of results
 
     def __enter__(self) -> ParallelCompilation:
@@ -211,7 +240,7 @@ class ParallelCompilation:
         if cache is not None:
             static, given = function.split(arguments)
             path = cache.path_for(function.function, static, given, function.options)
-            if (stored := cache.load(path, given)) is not None:
+            if (stored := cache.load(path)) is not None:
                 self.loaded[function] = stored
                 return stored.out
         lowered, out = function.lower(*arguments)
@@ -221,7 +250,7 @@ class ParallelCompilation:
                 lowered.compile()
                 return
             with watch_compilation() as was_compiled:
-                compiled = lowered.compile()
+                self._compiled[function] = compiled = lowered.compile()
             if was_compiled():
                 cache.save(path, compiled, out)
 
@@ -231,10 +260,12 @@ class ParallelCompilation:
 
     def run(self, function: Program, *arguments: Any) -> Any:
         """What the program computes."""
+        given = function.split(arguments)[1]
+        if function in self._compiled:
+            return self._compiled[function](*given)
         stored = self.loaded.get(function)
         if stored is None:
             return function(*arguments)
-        given = function.split(arguments)[1]
         if function in self._verified:
             return stored.run(*given)
         try:

@@ -2,7 +2,8 @@
 
 JAX's own compilation cache needs a program's text, which takes tracing and lowering: two thirds of what is left of
 compilation where every program is cached. Here the key is what the text follows from: the function, the types of its
-arguments, its static arguments, this package's source, JAX, and the machine.
+arguments, its static arguments, this package's source, JAX, and the machine. A file has one line of JSON with the
+types of the results, and the executable as XLA writes and reads it; nothing else in it is ever run.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import importlib
+import json
 import os
-import pickle
 import platform
 import threading
 import time
@@ -26,7 +28,7 @@ import jax.numpy as jnp
 import jaxlib
 import numpy as np
 from jax import monitoring
-from jax.experimental import serialize_executable
+from jaxlib import xla_client
 
 from jaxba.runtime import process
 from jaxba.runtime.atomic import TEMPORARY, atomic_write
@@ -88,17 +90,12 @@ class ExecutableCache:
         digest = hashlib.sha256("\n".join([*key, _environment(), self._source]).encode()).hexdigest()
         return self.folder / f"{function.__name__}-{digest[:40]}{SUFFIX}"
 
-    def load(self, path: Path | None, arguments: tuple[Any, ...]) -> CachedExecutable | None:
-        """The program of a file; None where there is none, or none that can be read.
-
-        Args:
-            path: what `path_for` returned.
-            arguments: those that are not static, as given there.
-        """
+    def load(self, path: Path | None) -> CachedExecutable | None:
+        """The program of a file, which `path_for` returned; None where there is none, or none that can be read."""
         if path is None or not path.is_file():
             return None
         try:
-            stored = _load(path, jax.tree.structure((arguments, {})))
+            stored = _load(path)
         except Exception:  # of another version, damaged, or gone: it is compiled anew and overwritten
             return None
         with contextlib.suppress(OSError):  # the folder may belong to another user
@@ -117,9 +114,11 @@ class ExecutableCache:
         if path is None:
             return
         try:
-            code, _, _ = serialize_executable.serialize(compiled)
-            shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type), out)
-            content = zlib.compress(pickle.dumps((shapes, code)), 1)
+            executable: Any = compiled.runtime_executable()
+            if len(executable.get_parameter_layouts()) != len(jax.tree.leaves(compiled.args_info)):
+                return  # it has constants that are not in its text
+            header = json.dumps(_to_json(out)).encode()
+            content = zlib.compress(header + b"\n" + executable.client.serialize_executable(executable), 1)
         except Exception:  # one that calls Python, for instance, exists in its process alone
             return
         with contextlib.suppress(OSError):
@@ -169,12 +168,47 @@ def watch_compilation() -> Iterator[Callable[[], bool]]:
 
 
 @functools.lru_cache(maxsize=IN_MEMORY)
-def _load(path: Path, given: Any) -> CachedExecutable:
-    out, code = pickle.loads(zlib.decompress(path.read_bytes()))
+def _load(path: Path) -> CachedExecutable:
+    header, _, code = zlib.decompress(path.read_bytes()).partition(b"\n")
+    out = _from_json(json.loads(header))
     process.register_lapack()
-    devices = jax.devices()[:1]
-    run = serialize_executable.deserialize_and_load(code, given, jax.tree.structure(out), execution_devices=devices)
+    device = jax.devices()[0]
+    devices = xla_client.DeviceList((device,))
+    executable = device.client.deserialize_executable(code, executable_devices=devices)
+
+    def run(*arguments: Any) -> Any:
+        results = executable.execute_sharded(jax.device_put(jax.tree.leaves(arguments), device))
+        arrays = [array for (array,) in results.disassemble_into_single_device_arrays()]
+        return jax.tree.unflatten(jax.tree.structure(out), arrays)
+
     return CachedExecutable(run, out, path)
+
+
+def _to_json(out: Any) -> Any:
+    """Shapes and types of arrays in tuples of this package, as JSON."""
+    if out is None:
+        return None
+    if isinstance(out, tuple):
+        return {"class": _name(type(out)), "parts": [_to_json(part) for part in out]}
+    if not hasattr(out, "dtype"):
+        raise _UnknownSource(repr(out))
+    return [str(out.dtype), *out.shape]
+
+
+def _from_json(value: Any) -> Any:
+    """The reverse. Makes nothing but tuples of this package."""
+    if value is None:
+        return None
+    if isinstance(value, list):
+        return jax.ShapeDtypeStruct(tuple(value[1:]), np.dtype(value[0]))
+    parts = [_from_json(part) for part in value["parts"]]
+    if value["class"] == "builtins.tuple":
+        return tuple(parts)
+    module, _, name = value["class"].rpartition(".")
+    kind = getattr(importlib.import_module(module), name) if module.startswith("jaxba.") else None
+    if not (isinstance(kind, type) and issubclass(kind, tuple)):
+        raise _UnknownSource(value["class"])
+    return kind(*parts)
 
 
 class _UnknownSource(Exception):

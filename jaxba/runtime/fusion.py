@@ -17,8 +17,9 @@ from jaxtyping import Float, Int
 from jaxba.typing import AnyArray
 
 fast_compilation = jax.make_user_context(False)
-"""Whether what is traced will be compiled with less optimisation (`jaxba.runtime.compilation`). Without LLVM's
-optimisation `compute_in_one_loop` would do twice the work and take longer to compile, so it does nothing then."""
+"""Whether what is traced will be compiled by XLA's older kernel emitters with less optimisation
+(`jaxba.runtime.compilation`). `compute_in_one_loop` would do twice the work there and take longer to compile, so it
+does nothing then. With the newer emitters it pays without optimisation, too."""
 
 
 def fusion_barrier(rows: Float[Array, "k n"]) -> Float[Array, "k n"]:

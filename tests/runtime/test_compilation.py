@@ -39,7 +39,8 @@ on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU
 
 
 @pytest.mark.parametrize("part", get_args(Part))
-def test_more_observations_mean_better_levels_and_shorter_stages(part):
+def test_more_observations_mean_better_levels_and_shorter_stages(part, monkeypatch):
+    monkeypatch.setattr(compilation, "uses_older_emitters", lambda _: True)
     typical, quick, medium = BREAK_EVEN[part]
     assert stages(part, 1) == (("quick", quick), ("medium", medium))
     assert stages(part, 100) == (("quick", quick // 100), ("medium", medium // 100))
@@ -48,6 +49,13 @@ def test_more_observations_mean_better_levels_and_shorter_stages(part):
     assert stages(part, medium // typical) == (("medium", typical),)
     assert stages(part, medium // (typical - 1)) == stages(part, 10**9) == ()
     assert sum(runs for _, runs in stages(part, 31_843)) > 100, "Ladybug-49 converges before that"
+
+
+@pytest.mark.parametrize("part", BREAK_EVEN)
+def test_without_the_older_emitters_there_is_no_medium_level(part, monkeypatch):
+    monkeypatch.setattr(compilation, "uses_older_emitters", lambda _: False)
+    assert stages(part, 1) == (("quick", BREAK_EVEN[part].quick),)
+    assert stages(part, BREAK_EVEN[part].quick) == ()
 
 
 def test_a_program_is_replaced_by_a_better_one_after_its_runs():

@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
+import json
 import os
+import pickle
 import subprocess
 import sys
+import zlib
 from typing import NamedTuple
 
 import chex
@@ -122,6 +125,33 @@ def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how
     assert len(kept(folder)) == count
     assert support.same_bits(first.history, again.history)
     assert support.same_bits(first.problem, again.problem)
+
+
+def test_nothing_that_is_read_can_run_code_of_its_own(folder, monkeypatch):
+    once = lambda: solve(support.tiny(), "ceres", max_iterations=2, callback=lambda record: None)
+    expected = once().history
+    forget()
+    for name in ("load", "loads", "Unpickler"):
+        monkeypatch.setattr(pickle, name, None)
+    with Compilations() as seen:
+        chex.assert_trees_all_equal(once().history, expected)
+    assert not {"propose", "try_step"} & set(seen.names)
+    file = kept(folder)[0]
+    for kind in ("builtins.print", "os.system", "jaxba.solver.solve.solve"):
+        header = json.dumps({"class": kind, "parts": []}).encode()
+        file.write_bytes(zlib.compress(header + b"\n", 1))
+        forget()
+        assert executable_cache.ExecutableCache(folder).load(file) is None
+
+
+def test_a_problem_that_shares_some_programs_compiles_each_other_one_once(folder):
+    once = lambda problem: solve(problem, "ceres", max_iterations=2, callback=lambda record: None)
+    once(support.tiny())
+    forget()
+    with Compilations() as seen:
+        once(support.paper(1))
+    compiled = [name for name in seen.names if name in ("begin", "_advance_and_pack", "propose", "try_step")]
+    assert sorted(compiled) == ["propose", "try_step"]
 
 
 def test_retriangulation_is_stored_too(folder):
