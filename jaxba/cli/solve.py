@@ -86,10 +86,11 @@ class Arguments:
     dtype: Dtype = DEFAULTS.dtype
     """Floating point type. mixed: float64, but the reduced camera system in float32."""
 
-    pad: bool = DEFAULTS.pad
-    """Pad sizes to a coarse grid, so that problems of similar size share one compiled program, also between calls of
-    this command. auto then means explicit. This is for many small problems; large problems, and those for other linear
-    solvers, are not padded."""
+    pad: Literal["auto", "yes", "no"] = "auto"
+    """Pad sizes to a grid, so that problems of about the same size share one compiled program, also between calls of
+    this command. auto: for at most 64 cameras and 60,000 observations, unless --compilation is full. Only for the
+    explicit solver, which auto then means; large problems, those with lenses and those for other linear solvers are not
+    padded."""
 
     compilation: Compilation = DEFAULTS.compilation
     """quick: compile in a third of the time, with iterations that take two to six times as long. full: compile with all
@@ -187,7 +188,7 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
             loss=Loss(args.loss, args.loss_scale),
             tolerances=Tolerances(args.ftol, args.xtol, args.gtol),
             max_iterations=args.max_iterations,
-            pad=args.pad,
+            pad={"auto": None, "yes": True, "no": False}[args.pad],
             compilation=args.compilation,
         )
         options.step_options(policy)  # raises an error for incompatible options
@@ -224,7 +225,7 @@ def _solve(args: Arguments) -> int:
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     solution, steps = _iterate(args, problem, policy, options)
     common.print_line(table.summary(problem, solution))
-    if args.pad:
+    if args.pad == "yes" or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
     if args.output:
         write_solution(args.output, solution.problem, path)

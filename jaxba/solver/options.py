@@ -84,11 +84,12 @@ class SolveOptions:
     """`float64` or `float32`, the type of all arithmetic; `mixed` is float64 with the reduced camera system in
     float32."""
 
-    pad: bool = False
-    """Whether array sizes are rounded up to a grid, so that similar problems share one compiled program, also in
-    a persistent compilation cache. Results differ by rounding only. For many small problems with the explicit solver,
-    which `auto` then means; with other solvers and for larger problems nothing is padded, and `Solution.capacity` is
-    None."""
+    pad: bool | None = None
+    """Whether array sizes are rounded up to a grid, so that problems of about the same size share one compiled program,
+    also in a persistent compilation cache. Results differ by rounding only, iterations take up to 1.3 times as long.
+    None: for at most 64 cameras and 60,000 observations, unless compilation is `full`. Padding is for the explicit
+    solver, which `auto` then means; with other solvers, with lenses and for larger problems nothing is padded, and
+    `Solution.capacity` is None."""
 
     compilation: Compilation = "auto"
     """Optimisation level of compilation. `full`: fully optimised; for many solves of one shape, and for timing of

@@ -33,8 +33,9 @@ from jaxba.solver.names import parse_solver
 def test_every_default_of_the_command_is_that_of_the_options():
     command, options = Arguments(), SolveOptions()
     plain = {field.name for field in fields(Arguments)} & {field.name for field in fields(SolveOptions)} - {"loss"}
-    for name in plain:
+    for name in plain - {"pad"}:
         assert getattr(command, name) == getattr(options, name), name
+    assert (command.pad, options.pad) == ("auto", None)
     assert command.preconditioner == options.conjugate_gradients.preconditioner
     assert (command.loss, command.loss_scale) == (options.loss.rho, options.loss.scale)
     assert (command.ftol, command.xtol, command.gtol) == options.tolerances[:3]
