@@ -144,4 +144,7 @@ def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 poin
     starts = [origin + factor * (start - origin) for factor in START_DISTANCES] + [midpoints(layout, frames)]
     (points, costs), _ = lax.scan(try_start, (start, own), jnp.stack(starts))
     moved = own - costs > jnp.maximum(MIN_RELATIVE_GAIN * own, MIN_GAIN * jnp.mean(costs))
-    return _Found(points, moved, jnp.sum(own), jnp.sum(jnp.where(moved, costs, own)))
+    before = jnp.sum(own)
+    # XLA may sum the same numbers in two orders: where nothing moves the cost stays to the last digit
+    after = jnp.where(jnp.any(moved), jnp.sum(jnp.where(moved, costs, own)), before)
+    return _Found(points, moved, before, after)
