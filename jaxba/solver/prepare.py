@@ -32,7 +32,7 @@ DEFAULT_POLICY = "learned"
 """Name of the default damping policy."""
 
 PADDED_CAMERAS, PADDED_OBSERVATIONS = 64, 60_000
-"""Largest problem that is padded by default. Measured up to there: iterations take 1.1 to 1.3 times as long; with 77
+"""Largest problem that is padded by default. Measured up to there: iterations take 1.1 to 1.4 times as long; with 77
 cameras 1.5 times, since their reduced camera system is no longer factored as a band."""
 
 POLICY_PARTS = ("min_gain", "init", "propose")
