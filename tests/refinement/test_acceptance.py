@@ -293,9 +293,10 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
         better += bool(mended.candidate_cost < 0.9 * plain.candidate_cost)
         if plain.gain_ratio > GOOD_GAIN or plain.candidate_cost > MAX_COST_RATIO * before.cost:
             trusted += 1  # the model was right, or it is past mending
-            assert mended.candidate_cost == plain.candidate_cost
-        # rounds, and nothing else, make a candidate better here
-        assert (mended.repairs > 0) >= (mended.candidate_cost < plain.candidate_cost)
+            assert mended.repairs == 0
+        # rounds, and nothing else, make a candidate better or worse here; two programs round the same cost differently
+        if mended.repairs == 0:
+            np.testing.assert_allclose(mended.candidate_cost, plain.candidate_cost, rtol=1e-12)
         assert 0 <= mended.repairs <= 3
     assert better >= 1
     assert trusted >= 5
