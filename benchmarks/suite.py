@@ -228,7 +228,7 @@ def time_to_tolerance(
         yield Metric(f"{part}/problems that {name} and ceres reached", len(both), "count", "higher")
 
 
-def _cost_and_seconds(problem: BundleProblem, name: str, target: float = -math.inf) -> tuple[float, float]:
+def _cost_and_seconds(problem: BundleProblem, name: str, target: float = 0.0) -> tuple[float, float]:
     """Final cost, evaluated in float64, and seconds of a solve in one program that ends at the target cost."""
     import jaxba
     from jaxba.problem import geometry

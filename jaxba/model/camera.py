@@ -19,6 +19,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.runtime.fusion import compute_unfused, fusion_barrier
+from jaxba.structure.segment_sums import take
 from jaxba.typing import AnyArray
 
 SMALL_ANGLE_SQUARED = 1e-6
@@ -42,9 +43,8 @@ class Frames(NamedTuple):
         """
         rotation = jnp.asarray(self.rotation).reshape(9, -1)
         table = fusion_barrier(jnp.stack([*rotation, *self.translation, self.focal, self.k1, self.k2]))
-        gather = lambda table, index: table.at[:, index].get(mode="promise_in_bounds", wrap_negative_indices=False)
         # not fused with its uses, in which a gather keeps the compiler from vectorising
-        table = compute_unfused(gather, table, jnp.asarray(index), index=index)
+        table = compute_unfused(take, table, jnp.asarray(index), index=index)
         return Frames(table[:9].reshape(3, 3, -1), table[9:12], *table[12:])
 
 

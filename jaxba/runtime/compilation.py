@@ -211,8 +211,9 @@ class ParallelCompilation:
         self.loaded: dict[Program, CachedExecutable] = {}
         """Programs that were read from disk."""
         self._verified: set[Program] = set()  # of these, the ones that have run once
-        self._compiled: dict[Program, jax.stages.Compiled] = {}  # beside them: `jit` would compile these once more for
-        # results of programs that were read, which are bound to a device
+        # called as compiled, not by `jit`: that would compile once more for results of programs that were read from
+        # disk, which are bound to a device
+        self._compiled: dict[Program, jax.stages.Compiled] = {}
         self._results: dict[Program, Any] = {}  # shapes and types of results
 
     def __enter__(self) -> ParallelCompilation:

@@ -33,7 +33,7 @@ from jaxba.runtime.compilation import (
     program,
 )
 from jaxba.solver.loop import Carry, History, advance, begin, history_of, problem_info
-from jaxba.solver.prepare import Arrangement
+from jaxba.solver.prepare import Setup
 from jaxba.structure.layout import Layout, num_partitions
 
 
@@ -119,7 +119,7 @@ class Run(NamedTuple):
 
 
 def run_stepwise(
-    arranged: Arrangement,
+    setup: Setup,
     tolerances: Tolerances,
     max_iterations: int,
     *,
@@ -129,7 +129,7 @@ def run_stepwise(
     """Runs iterations until a stopping rule or the callback ends the solve.
 
     Args:
-        arranged: the solve; the program of its initial state is compiled with the others.
+        setup: the solve; the program of its initial state is compiled with the others.
         tolerances: convergence tests.
         max_iterations: limit of linear solves.
         callback: called with every record; a true return value ends the solve.
@@ -139,7 +139,7 @@ def run_stepwise(
     Raises:
         ProblemError: the cost of the initial state is not finite.
     """
-    loop = _Loop(arranged.layout, arranged.policy, tolerances, arranged.options, max_iterations)
+    loop = _Loop(setup.layout, setup.policy, tolerances, setup.options, max_iterations)
     runs = dict.fromkeys(stages, 0)
 
     def levels_now() -> dict[str, Level]:
@@ -149,10 +149,10 @@ def run_stepwise(
     levels = levels_now()
     started = time.perf_counter()
     with CompileClock() as clock, ParallelCompilation() as compile_programs:
-        loop.iterate(compile_programs, loop.start(compile_programs, arranged.initial(compile_programs)), levels)
+        loop.iterate(compile_programs, loop.start(compile_programs, setup.initial(compile_programs)), levels)
     run = compile_programs.run
-    state = jax.block_until_ready(arranged.initial(run))
-    arranged.check_cost(state)
+    state = jax.block_until_ready(setup.initial(run))
+    setup.check_cost(state)
     carry = jax.block_until_ready(loop.start(run, state))
     compile_s = 0.0
     if clock.seconds > 0 or compile_programs.loaded:

@@ -24,7 +24,7 @@ from jaxba.runtime.compilation import CompileClock, Part, Stage, compile_and_run
 from jaxba.solver.callback_loop import IterationRecord, Run, run_stepwise
 from jaxba.solver.loop import History, solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
-from jaxba.solver.prepare import DEFAULT_POLICY, Arrangement, arrange, numerics
+from jaxba.solver.prepare import DEFAULT_POLICY, Setup, numerics, set_up
 from jaxba.structure.padding import Capacity
 
 MIN_HISTORY = 128
@@ -116,32 +116,32 @@ def solve(
             the linear solver or method does not support shared or partly fixed intrinsics.
     """
     options = checked_options(options)
-    arranged = arrange(problem, policy, options)
-    with numerics(arranged.dtype):
-        stages_of_parts = _stages(options.compilation, problem, arranged.options)
+    setup = set_up(problem, policy, options)
+    with numerics(setup.dtype):
+        stages_of_parts = _stages(options.compilation, problem, setup.options)
         run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts)
         if callback is None and not any(stages_of_parts.values()):
             run = _run_compiled
         carry, history, initial_cost, quick_iterations, compile_s, total_s = run(
-            arranged, options.tolerances, options.max_iterations
+            setup, options.tolerances, options.max_iterations
         )
         if compile_s > 0:
             process.release_programs()  # see above: too many programs end a process
         count = int(carry.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
         return Solution(
-            problem=arranged.problem_at(carry.state),
+            problem=setup.problem_at(carry.state),
             initial_cost=initial_cost,
             final_cost=float(carry.state.cost),
             iterations=count,
             accepted=int(np.sum(history.accepted)),
             termination=Termination(int(carry.termination)),
             history=history,
-            linear_solver=arranged.options.solver_name,
-            setup_s=arranged.setup_s,
+            linear_solver=setup.options.solver_name,
+            setup_s=setup.setup_s,
             compile_s=compile_s,
             total_s=total_s,
-            capacity=arranged.capacity,
+            capacity=setup.capacity,
             quick_iterations=quick_iterations,
         )
 
@@ -159,15 +159,15 @@ def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> d
     return {name: stages(part, problem.num_observations) for name, part in parts.items()}
 
 
-def _run_compiled(arranged: Arrangement, tolerances: Tolerances, max_iterations: int) -> Run:
+def _run_compiled(setup: Setup, tolerances: Tolerances, max_iterations: int) -> Run:
     """Runs the loop as one optimised program."""
     started = time.perf_counter()
     with CompileClock() as clock:
-        state = jax.block_until_ready(arranged.initial(compile_and_run))
-        arranged.check_cost(state)
+        state = jax.block_until_ready(setup.initial(compile_and_run))
+        setup.check_cost(state)
         length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
         limit = np.asarray(max_iterations, np.int32)  # a conversion by JAX is a program
-        result = solve_loop(arranged.layout, state, arranged.policy, tolerances, arranged.options, length, limit)
+        result = solve_loop(setup.layout, state, setup.policy, tolerances, setup.options, length, limit)
         carry, history = jax.block_until_ready(result)
     total_s = time.perf_counter() - started - clock.seconds
     return Run(carry, history, float(state.cost), 0, clock.seconds, total_s)

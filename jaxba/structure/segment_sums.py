@@ -65,9 +65,9 @@ def as_rows(columns: list[Float[Array, " n"]]) -> Float[Array, "n k"]:
 def outer_sum(left: Float[Array, "n terms a"], right: Float[Array, "n terms b"]) -> Float[Array, "n a b"]:
     """`sum_k left[:, k]^T right[:, k]` for many small items, unrolled over k.
 
-    XLA compiles this to one fused loop, vectorised and multi-threaded. Its batched matrix product, a call of a library,
-    takes 1.7 times as long for blocks of this size on a CPU, but as long without optimisation, which makes the loop 16
-    times as slow.
+    XLA on a CPU compiles this to one fused loop, vectorised and multi-threaded. Its batched matrix product takes 1.7
+    times as long for blocks of this size. But it is a call of a library, as fast when compiled without optimisation,
+    and that makes the loop 16 times as slow: so under `fast_compilation` it is the product.
     """
     if fast_compilation.value:
         return lax.dot_general(left, right, (((1,), (1,)), ((0,), (0,))), precision="highest")
@@ -87,8 +87,8 @@ def total(values: Float[Array, " n"]) -> Float[Array, ""]:
 def tree_sum(rows: Array, levels: tuple[Int[AnyArray, "_ _"], ...]) -> Array:
     """Sums rows into targets along a summation tree (`sum_trees.sum_tree`).
 
-    A level is summed as gathered vectors or, for rows of several axes, by a reduction: XLA compiles each to one loop
-    for these rows, and to one a column of the level for the others.
+    For fewer kernels the rows of a level are gathered one by one and added if they have one axis, and gathered together
+    and reduced if they have more: each of the two is one kernel there, and many in the other case.
     """
     for level in levels:
         if rows.ndim > 2:
