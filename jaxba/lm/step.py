@@ -130,15 +130,20 @@ def try_step(
     effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
-    damping = jnp.asarray(damping, state.cost.dtype)
-    step = proposal.step
-    candidate = best_candidate(Whole(layout), *state[:3], proposal.reference, step, options, min_gain, effort)
+    candidate = best_candidate(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    return take_step(layout, state, damping, proposal.step, candidate)
+
+
+def take_step(
+    layout: Layout, state: LMState, damping: Float[Array, ""], step: Step, candidate: Candidate
+) -> tuple[LMState, StepInfo]:
+    """End of `try_step`: the state after the accept decision on a candidate, and the record. Arguments as there."""
     tried_step = [candidate.step_fraction * step.cameras, candidate.points - state.points]
     return _advance(
         state,
         candidate,
         tried_step,
-        damping,
+        jnp.asarray(damping, state.cost.dtype),
         layout.camera_seen,
         gradient_max=step.gradient_max,
         cg_iterations=step.cg_iterations,

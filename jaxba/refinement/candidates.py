@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
@@ -34,9 +35,10 @@ from jaxba.refinement.pattern_move import should_extend, should_repeat
 from jaxba.refinement.retraction import move_cameras, step_between
 from jaxba.refinement.subproblems import Subproblems
 from jaxba.runtime import loops
+from jaxba.typing import AnyArray
 
 
-class _Search(NamedTuple):
+class Search(NamedTuple):
     """The candidates of every subproblem: shorter steps until one is accepted, then pattern moves; after each of them
     its camera rounds."""
 
@@ -94,21 +96,43 @@ def best_candidate(
         effort: overrides the number of point iterations of the options.
     """
     against = comparison(parts, cameras, points, cost, reference, step, options, min_gain, effort)
-    ones, true = jnp.ones_like(cost), jnp.ones(cost.shape, bool)
-    infinite, zeros = jnp.full_like(cost, jnp.inf), jnp.zeros(cost.shape, jnp.int32)
-    initial = Candidate(cameras, points, infinite, -ones, -infinite, ~true, ones, zeros - 1)
-    direction = step.cameras, step.points
-    start = _Search(initial, cameras, points, direction, ones, true, initial, zeros, ~true)
-    refinement = options.refinement
-    if refinement.trials == 1 and not refinement.pattern_moves and not refinement.camera_rounds:
-        return _assess_next(against, start)
+    start = first_search(cameras, points, cost, step)
+    if not has_repairs(options):
+        return _assess_next(against, start, start.cameras)
+
+    def advance(search: Search) -> Search:
+        if not options.refinement.camera_rounds:
+            return next_search(against, search, search.cameras)
+        # a loop of at most one iteration: under vmap both branches of a condition would be computed
+        last, refining = search.candidate, jnp.any(search.refining).astype(jnp.int32)
+        refine = lambda _, __: refine_cameras(parts.layout, last.cameras, last.points, options)
+        return next_search(against, search, loops.fori_loop(0, refining, refine, last.cameras))
+
     # full step, shorter steps, pattern moves and camera rounds are iterations of one loop, so that the program contains
     # the evaluation of a candidate only once
-    advance = lambda search: _advance(against, search)
     return loops.while_loop(lambda search: jnp.any(search.active), advance, start).best
 
 
-def _assess_next(against: Comparison, search: _Search) -> Candidate:
+def has_repairs(options: StepOptions) -> bool:
+    """Whether there may be more than one candidate."""
+    refinement = options.refinement
+    return refinement.trials > 1 or bool(refinement.pattern_moves) or bool(refinement.camera_rounds)
+
+
+def first_search(
+    cameras: Float[AnyArray, "9 cameras"],
+    points: Float[AnyArray, "3 points"],
+    cost: Float[AnyArray, "*parts"],
+    step: Step,
+) -> Search:
+    """The search whose next candidate is the full step. Its new arrays are NumPy's, whether it is traced or not."""
+    ones, true = np.ones(cost.shape, cost.dtype), np.ones(cost.shape, bool)
+    infinite, zeros = np.full(cost.shape, np.inf, cost.dtype), np.zeros(cost.shape, np.int32)
+    initial = Candidate(cameras, points, infinite, -ones, -infinite, ~true, ones, zeros - 1)
+    return Search(initial, cameras, points, (step.cameras, step.points), ones, true, initial, zeros, ~true)
+
+
+def _assess_next(against: Comparison, search: Search, refined: Float[Array, "9 cameras"]) -> Candidate:
     """Evaluates the next candidate or, where that is due, a camera round of the last one."""
     parts, best = against.parts, search.best
     lengths = parts.of_cameras(search.length)
@@ -121,9 +145,7 @@ def _assess_next(against: Comparison, search: _Search) -> Candidate:
     repairs = best.repairs + 1
     if against.options.refinement.camera_rounds:
         last, refining = search.candidate, jnp.any(search.refining)
-        refine = lambda _, __: refine_cameras(parts.layout, last.cameras, last.points, against.options)
-        # a loop of at most one iteration: under vmap both branches of a condition would be computed
-        cameras = loops.fori_loop(0, refining.astype(jnp.int32), refine, cameras)
+        cameras = jnp.where(refining, refined, cameras)
         points = jnp.where(refining, last.points, points)
         fraction = jnp.where(refining, last.step_fraction, fraction)
         repairs = jnp.where(refining, last.repairs + 1, repairs)
@@ -131,13 +153,19 @@ def _assess_next(against: Comparison, search: _Search) -> Candidate:
     return assess(against, cameras, points, fraction, repairs, full_step)
 
 
-def _is_full_step(search: _Search) -> Bool[Array, "*parts"]:
+def _is_full_step(search: Search) -> Bool[Array, "*parts"]:
     return ~search.best.accepted & (search.length == 1)
 
 
-def _advance(against: Comparison, search: _Search) -> _Search:
-    """Evaluates a candidate or a camera round, and decides what comes after it."""
-    candidate = _assess_next(against, search)
+def next_search(against: Comparison, search: Search, refined: Float[Array, "9 cameras"]) -> Search:
+    """Evaluates a candidate or a camera round, and decides what comes after it.
+
+    Args:
+        against: data of the step.
+        search: what to evaluate.
+        refined: the cameras after a camera round of `search.candidate`, where `search.refining`; else any.
+    """
+    candidate = _assess_next(against, search, refined)
     if not against.options.refinement.camera_rounds:
         return _after_candidate(against, search._replace(candidate=candidate))
     refined = jnp.any(search.refining)
@@ -150,7 +178,7 @@ def _advance(against: Comparison, search: _Search) -> _Search:
     return jax.tree.map(choose, _after_candidate(against, same), same)
 
 
-def _after_candidate(against: Comparison, search: _Search) -> _Search:
+def _after_candidate(against: Comparison, search: Search) -> Search:
     """What to try after a candidate that has had its camera rounds."""
     parts, best, candidate = against.parts, search.best, search.candidate
     first = candidate.accepted & ~best.accepted

@@ -9,6 +9,7 @@ optimisation.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -23,15 +24,18 @@ from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.options import StepOptions
+from jaxba.refinement.candidates import has_repairs
 from jaxba.runtime.compilation import (
-    RUNS_PER_REPAIR,
     CompileClock,
     Level,
     ParallelCompilation,
+    Part,
+    Program,
     Stage,
     level_after,
     program,
 )
+from jaxba.solver.candidate_loop import camera_round, try_candidate, try_step_by_parts
 from jaxba.solver.loop import Carry, History, advance, begin, history_of, problem_info
 from jaxba.solver.prepare import Setup
 from jaxba.structure.layout import Layout, num_partitions
@@ -74,26 +78,42 @@ class _Loop(NamedTuple):
         Args:
             call: runs or compiles a program.
             carry: before the iteration.
-            levels: level of compilation of each part of the step.
+            levels: level of compilation of each part of the step, by the name of its function.
         """
         state, options = carry.state, self.options
         effort = None
         if decides_effort(self.policy):
             effort = call(program(effort_of, level="quick"), self.policy, carry.policy)
-        part = lambda name, function: program(function, "options", level=levels[name])
+        part = lambda function: program(function, "options", level=levels[function.__name__])
         # NumPy's: each conversion by JAX is a program
         min_gain = np.asarray(self.policy.min_gain, state.cost.dtype)
         if options.single_solve:
             arguments = (self.layout, state, carry.damping)
-            proposal = call(part("propose", propose), *arguments, options, carry.iteration, effort)
-            state, step = call(part("try_step", try_step), *arguments, proposal, options, min_gain, effort)
+            proposal = call(part(propose), *arguments, options, carry.iteration, effort)
+            arguments = (*arguments, proposal, options, min_gain, effort)
+            if has_repairs(options):
+                state, step = try_step_by_parts(call, part, *arguments)
+            else:
+                state, step = call(part(try_step), *arguments)
         else:
             arguments = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
-            state, step = call(part("round", lm_step), *arguments)
+            state, step = call(part(lm_step), *arguments)
         limit, partitions = np.int32(self.max_iterations), np.int32(num_partitions(self.layout))
         policy_arguments = (carry._replace(state=None), step, self.policy, self.tolerances, limit, partitions)
         carry, report = call(program(_advance_and_pack, level="quick"), *policy_arguments)
         return carry._replace(state=state), step, report
+
+
+def parts_of(options: StepOptions) -> dict[str, Part]:
+    """The parts into which a step with these options is compiled, by the names of their functions."""
+    if not options.single_solve:
+        return {lm_step.__name__: "decomposition"}
+    factors = options.forms_reduced_system and options.truncated is None
+    found: dict[str, Part] = {propose.__name__: "factorization" if factors else "iterative"}
+    if not has_repairs(options):
+        return found | {try_step.__name__: "acceptance"}
+    found[try_candidate.__name__] = "acceptance"
+    return found | ({camera_round.__name__: "cameras"} if options.refinement.camera_rounds else {})
 
 
 class Run(NamedTuple):
@@ -133,14 +153,14 @@ def run_stepwise(
         tolerances: convergence tests.
         max_iterations: limit of linear solves.
         callback: called with every record; a true return value ends the solve.
-        stages: stages of compilation of each part of a step, before it is fully optimised. The parts are `propose` and
-            `try_step`, or `round`. A camera round or a further trial counts as `RUNS_PER_REPAIR` runs.
+        stages: stages of compilation of each part of a step, by the name of its function, before it is fully optimised
+            (`parts_of`).
 
     Raises:
         ProblemError: the cost of the initial state is not finite.
     """
     loop = _Loop(setup.layout, setup.policy, tolerances, setup.options, max_iterations)
-    runs = dict.fromkeys(stages, 0)
+    runs: Counter[str] = Counter()
 
     def levels_now() -> dict[str, Level]:
         return {name: level_after(runs[name], of_part) for name, of_part in stages.items()}
@@ -150,7 +170,11 @@ def run_stepwise(
     started = time.perf_counter()
     with CompileClock() as clock, ParallelCompilation() as compile_programs:
         loop.iterate(compile_programs, loop.start(compile_programs, setup.initial(compile_programs)), levels)
-    run = compile_programs.run
+
+    def run(function: Program, *arguments: Any) -> Any:
+        runs[function.function.__name__] += 1
+        return compile_programs.run(function, *arguments)
+
     state = jax.block_until_ready(setup.initial(run))
     setup.check_cost(state)
     carry = jax.block_until_ready(loop.start(run, state))
@@ -161,7 +185,7 @@ def run_stepwise(
             jax.block_until_ready(loop.iterate(run, carry, levels)[2])
         compile_s = time.perf_counter() - started
     records, quick_iterations = [], 0
-    started, waited = time.perf_counter(), 0.0
+    started, waited, late_s = time.perf_counter(), 0.0, compile_programs.late_s
     while True:
         if levels != (now := levels_now()):
             levels, began = now, time.perf_counter()
@@ -169,11 +193,10 @@ def run_stepwise(
                 loop.iterate(compile_programs, carry, levels)
             waited += time.perf_counter() - began
         carry, step, report = loop.iterate(run, carry, levels)
+        waited, late_s = waited + compile_programs.late_s - late_s, compile_programs.late_s
         step, end = _unpack(report, step)
         records.append(step)
         quick_iterations += not optimised(levels)
-        for name in runs:
-            runs[name] += 1 + RUNS_PER_REPAIR * int(step.repairs) if name == "try_step" else 1
         wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - waited, step))
         if end != Termination.RUNNING:
             break

@@ -20,8 +20,8 @@ from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
-from jaxba.runtime.compilation import CompileClock, Part, Stage, compile_and_run, compiler_options, stages
-from jaxba.solver.callback_loop import IterationRecord, Run, run_stepwise
+from jaxba.runtime.compilation import CompileClock, Stage, compile_and_run, compiler_options, stages
+from jaxba.solver.callback_loop import IterationRecord, Run, parts_of, run_stepwise
 from jaxba.solver.loop import History, solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, numerics, set_up
@@ -148,10 +148,7 @@ def solve(
 
 def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
     """The stages of compilation of each part of a step, before it is fully optimised."""
-    parts: dict[str, Part] = {"round": "decomposition"}
-    if options.single_solve:
-        factors = options.forms_reduced_system and options.truncated is None
-        parts = {"propose": "factorization" if factors else "iterative", "try_step": "acceptance"}
+    parts = parts_of(options)
     if compilation == "full" or compiler_options("quick") is None:
         return dict.fromkeys(parts, ())
     if compilation == "quick":
