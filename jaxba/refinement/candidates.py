@@ -16,7 +16,7 @@ None of these takes another linear solve, so all of them belong to one iteration
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,6 @@ from jaxba.refinement.pattern_move import should_extend, should_repeat
 from jaxba.refinement.retraction import move_cameras, step_between
 from jaxba.refinement.subproblems import Subproblems
 from jaxba.runtime import loops
-from jaxba.typing import AnyArray
 
 
 class Search(NamedTuple):
@@ -96,7 +95,7 @@ def best_candidate(
         effort: overrides the number of point iterations of the options.
     """
     against = comparison(parts, cameras, points, cost, reference, step, options, min_gain, effort)
-    start = first_search(cameras, points, cost, step)
+    start = jax.tree.map(jnp.asarray, first_search(cameras, points, cost, step))
     if not has_repairs(options):
         return _assess_next(against, start, start.cameras)
 
@@ -119,17 +118,27 @@ def has_repairs(options: StepOptions) -> bool:
     return refinement.trials > 1 or bool(refinement.pattern_moves) or bool(refinement.camera_rounds)
 
 
-def first_search(
-    cameras: Float[AnyArray, "9 cameras"],
-    points: Float[AnyArray, "3 points"],
-    cost: Float[AnyArray, "*parts"],
-    step: Step,
-) -> Search:
-    """The search whose next candidate is the full step. Its new arrays are NumPy's, whether it is traced or not."""
-    ones, true = np.ones(cost.shape, cost.dtype), np.ones(cost.shape, bool)
-    infinite, zeros = np.full(cost.shape, np.inf, cost.dtype), np.zeros(cost.shape, np.int32)
-    initial = Candidate(cameras, points, infinite, -ones, -infinite, ~true, ones, zeros - 1)
-    return Search(initial, cameras, points, (step.cameras, step.points), ones, true, initial, zeros, ~true)
+def first_search(cameras: Any, points: Any, cost: Any, step: Step) -> Search:
+    """The search whose next candidate is the full step.
+
+    What it adds are NumPy's arrays: outside of a program each conversion by JAX is a program.
+
+    Args:
+        cameras: current cameras [9, cameras]. Arrays, or their shapes and types.
+        points: current points [3, points].
+        cost: their cost, pixels^2, of every subproblem.
+        step: solution of the damped system.
+    """
+    constant = lambda value, dtype: cast(Array, np.full(cost.shape, value, dtype))
+    one, infinite, yes, no = (
+        constant(1, cost.dtype),
+        constant(np.inf, cost.dtype),
+        constant(1, bool),
+        constant(0, bool),
+    )
+    none, before = constant(0, np.int32), constant(-1, np.int32)
+    initial = Candidate(cameras, points, infinite, -one, -infinite, no, one, before)
+    return Search(initial, cameras, points, (step.cameras, step.points), one, yes, initial, none, no)
 
 
 def _assess_next(against: Comparison, search: Search, refined: Float[Array, "9 cameras"]) -> Candidate:

@@ -68,9 +68,8 @@ class BreakEven(NamedTuple):
     """When a better program pays for its compilation, as `python -m benchmarks.compilation` measures it."""
 
     typical: int
-    """Runs, counted with `RUNS_PER_REPAIR`, that a solve may well take: a level that would not last so long is left
-    out. Of fifteen real problems nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with
-    one to three repairs each. Chosen by the time of whole solves of eight problems."""
+    """Runs that a solve may well take: a level that would not last so long is left out. Of fifteen real problems nine
+    converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one to three repairs each."""
 
     quick: int
     """Observations times runs at level quick after which compiling at level medium has paid."""
@@ -80,10 +79,10 @@ class BreakEven(NamedTuple):
 
 
 BREAK_EVEN: dict[Part, BreakEven] = {
-    "factorization": BreakEven(typical=5, quick=220_000, medium=4_000_000),
+    "factorization": BreakEven(typical=5, quick=1_200_000, medium=5_000_000),
     "iterative": BreakEven(typical=8, quick=1_000_000, medium=15_000_000),
-    "acceptance": BreakEven(typical=80, quick=7_000_000, medium=30_000_000),
-    "cameras": BreakEven(typical=40, quick=7_000_000, medium=30_000_000),
+    "acceptance": BreakEven(typical=20, quick=3_000_000, medium=8_000_000),
+    "cameras": BreakEven(typical=20, quick=3_000_000, medium=8_000_000),
     "decomposition": BreakEven(typical=8, quick=1_600_000, medium=8_000_000),
 }
 

@@ -106,14 +106,16 @@ class _Loop(NamedTuple):
 
 def parts_of(options: StepOptions) -> dict[str, Part]:
     """The parts into which a step with these options is compiled, by the names of their functions."""
+    found: dict[str, Part] = {}
     if not options.single_solve:
-        return {lm_step.__name__: "decomposition"}
+        found[lm_step.__name__] = "decomposition"
+        return found
     factors = options.forms_reduced_system and options.truncated is None
-    found: dict[str, Part] = {propose.__name__: "factorization" if factors else "iterative"}
-    if not has_repairs(options):
-        return found | {try_step.__name__: "acceptance"}
-    found[try_candidate.__name__] = "acceptance"
-    return found | ({camera_round.__name__: "cameras"} if options.refinement.camera_rounds else {})
+    found[propose.__name__] = "factorization" if factors else "iterative"
+    found[(try_candidate if has_repairs(options) else try_step).__name__] = "acceptance"
+    if options.refinement.camera_rounds:
+        found[camera_round.__name__] = "cameras"
+    return found
 
 
 class Run(NamedTuple):

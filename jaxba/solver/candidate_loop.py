@@ -12,7 +12,6 @@ from enum import IntEnum
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
@@ -63,13 +62,13 @@ def try_step_by_parts(
     part: Callable[[Callable[..., Any]], Program],
     layout: Layout,
     state: LMState,
-    damping: Float[Array, ""],
+    damping: Any,
     proposal: Proposal,
     options: StepOptions,
-    min_gain: np.ndarray,
+    min_gain: Any,
     effort: Effort | None,
 ) -> tuple[LMState, StepInfo]:
-    """`try_step`, with the same arguments, by programs that `call` runs or compiles.
+    """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs or compiles.
 
     Camera rounds are not compiled before they are run.
 

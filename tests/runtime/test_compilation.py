@@ -32,6 +32,7 @@ from jaxba.runtime.compilation import (
     program,
     stages,
 )
+from jaxba.solver.candidate_loop import try_step_by_parts
 
 pytestmark = pytest.mark.step
 
@@ -126,12 +127,13 @@ def test_every_program_is_compiled_once_before_the_first_iteration(how):
     problem, late = random_scene(SceneConfig(7, 50, 250), 0), []
     jax.clear_caches()
     with Compilations() as seen:
-        watch = lambda record: late.append(len(seen.names))
+        watch = lambda record: late.append(len(set(seen.names) - {"camera_round"}))
         solved = solve(problem, "learned", **how, max_iterations=4, callback=watch)
     assert solved.iterations == 4
-    assert late == [len(seen.names)] * 4
-    step = ["lm_step"] if how.get("method") == "ddlm" else ["propose", "try_step"]
-    assert sorted(name for name in seen.names if name in ("lm_step", "try_step", "propose")) == step
+    assert late == [len(set(seen.names) - {"camera_round"})] * 4
+    step = ["lm_step"] if how.get("method") == "ddlm" else ["propose", "take_step", "try_candidate"]
+    assert sorted({"lm_step", "propose", "take_step", "try_candidate"} & set(seen.names)) == step
+    assert len(seen.names) == len(set(seen.names))
     assert seen.names.count("_advance_and_pack") == 1
 
 
@@ -145,6 +147,37 @@ def test_the_two_parts_are_the_step():
     whole = jax.jit(lm_step, static_argnums=3)(layout, state, damping, options)
     assert whole[1].accepted
     chex.assert_trees_all_close(parts, whole, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("level", ["quick", "full"])
+def test_candidates_one_by_one_are_those_of_the_loop(level):
+    layout, state = support.start(support.tiny())
+    options = StepOptions(refinement=Refinement(points=3, camera_rounds=3, trials=4, pattern_moves=1))
+    seen = set()
+    for damping in (1e-9, 1e-6, 1e-2):
+        proposal = propose(layout, state, jax.numpy.asarray(damping), options)
+        for length in (1.0, 30.0, -1.0, np.nan):  # a good step, one too long, one uphill and none
+            step = proposal.step._replace(cameras=length * proposal.step.cameras, points=length * proposal.step.points)
+            given = (layout, state, jax.numpy.asarray(damping), proposal._replace(step=step), options)
+            call = lambda function, *arguments: function(*arguments)
+            part = lambda function: program(function, "options", level=level)
+            parts = try_step_by_parts(call, part, *given, np.asarray(0.0), None)
+            whole = jax.jit(try_step, static_argnums=4)(*given)
+            chex.assert_trees_all_close(parts, whole, rtol=1e-7, atol=1e-10)
+            seen.add((bool(whole[1].accepted), int(whole[1].repairs) > 0))
+    assert {accepted for accepted, _ in seen} == {repaired for _, repaired in seen} == {True, False}
+
+
+@pytest.mark.xla
+def test_camera_rounds_are_compiled_where_a_step_has_some():
+    jax.clear_caches()
+    with Compilations() as seen:
+        solved = solve(support.tiny(), "learned", compilation="quick")
+        assert "camera_round" not in seen.names
+        hard = solve(support.strayed(50.0), "learned", compilation="quick")
+    assert solved.converged
+    assert hard.accepted
+    assert seen.names.count("camera_round") == 1
 
 
 class Failing(Program):
