@@ -31,9 +31,12 @@ from jaxba.bench.sources import sources
 from jaxba.lm import step
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.options import LinearSolverChoice
+from jaxba.refinement.cameras import refine_cameras
+from jaxba.refinement.candidates import first_search, has_repairs
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Level, compiler_options, uses_older_emitters
 from jaxba.runtime.fusion import fast_compilation
+from jaxba.solver.candidate_loop import try_candidate
 from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.names import parse_solver
 from jaxba.structure.layout import layout_for
@@ -48,7 +51,7 @@ REPAID = (("quick", "medium"), ("quick", "full"), ("medium", "full"))
 """Pairs of levels in the last columns, the better one second."""
 
 HEADING = (
-    f"{'problem':28s} {'linear solver':13s} {'part':7s}"
+    f"{'problem':28s} {'linear solver':13s} {'part':9s}"
     + "".join(f" {level + ': compile s':>17s} {'run ms':>8s}" for level in LEVELS)
     + "".join(f" {worse + '->' + better:>13s}" for worse, better in REPAID)
 )
@@ -93,9 +96,17 @@ def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats:
                 "propose": (propose, given),
                 "try_step": (lambda la, s, d, p: step.try_step(la, s, d, p, options), (*given, proposal)),
             }
+            if has_repairs(options):
+                del parts["try_step"]
+                search = first_search(state.cameras, state.points, state.cost, proposal.step)
+                candidate = lambda la, s, p, *rest: try_candidate(la, s, p, options, jnp.zeros((), dtype), None, *rest)
+                parts["candidate"] = (candidate, (layout, state, proposal, search, state.cameras))
+            if options.refinement.camera_rounds:
+                cameras = lambda la, c, p: refine_cameras(la, c, p, options)
+                parts["cameras"] = (cameras, (layout, state.cameras, state.points))
         for part, (function, arguments) in parts.items():
             measured = {level: measure(function, arguments, level, repeats) for level in LEVELS}
-            line = f"{source.name[:28]:28s} {options.solver_name:13s} {part:7s}"
+            line = f"{source.name[:28]:28s} {options.solver_name:13s} {part:9s}"
             for compile_s, run_s in measured.values():
                 line += f" {compile_s:17.2f} {1e3 * run_s:8.1f}"
             for worse, better in REPAID:

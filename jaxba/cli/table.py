@@ -11,6 +11,7 @@ from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.compilation import Part, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import split_refinement
 from jaxba.solver.retriangulate import Retriangulation
@@ -45,7 +46,19 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
         for kind, number in Counter(map(tuple, free.tolist())).most_common():
             names = [one for one, used in zip(("f", "k1", "k2"), kind, strict=True) if used]
             sizes += f", {number} lens{'es' * (number > 1)} ({', '.join(names) or 'fixed'})"
-    return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {args.dtype}, {solver}"
+    how = f"{args.dtype}, {solver}, {compiled(args.compilation, problem)}"
+    return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {how}"
+
+
+def compiled(compilation: str, problem: BundleProblem) -> str:
+    """How the step of a solve is compiled, as text."""
+    if compilation == "full" or compiler_options("quick") is None:
+        return "compiled fully"
+    if compilation == "quick":
+        return "compiled quickly"
+    parts: tuple[Part, ...] = ("factorization", "acceptance")
+    later = any(stages(part, problem.num_observations) for part in parts)
+    return "compiled quickly at first" if later else "compiled fully"
 
 
 def _counted(count: int, noun: str) -> str:
