@@ -476,6 +476,6 @@ def test_the_parser_proposes_the_nearest_option(capsys):
 
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])
 def test_the_heading_reports_a_different_damping_of_cameras(factor, said):
-    args = SimpleNamespace(policy="mine.safetensors", dtype="float64", method="lm", linear_solver="auto")
+    args = SimpleNamespace(policy="mine.safetensors", dtype="float64", method="lm", linear_solver="auto", compilation="full")
     text = table.heading("scene", support.tiny(), args, StepOptions(coordinates=Coordinates(camera_damping=factor)))
     assert ("cameras damped by 0.01 lambda" in text) == said
