@@ -10,6 +10,7 @@ import numpy as np
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import split_refinement
@@ -78,8 +79,8 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
     return f"   search for points at other depths: {count}, {costs}{dropped}"
 
 
-def summary(problem: BundleProblem, solution: Solution) -> str:
-    """The result of a solve in a few lines."""
+def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None) -> str:
+    """The result of a solve in a few lines. `loss` is that of the solve; None: squared residuals."""
     state = "converged" if solution.converged else "not converged"
     # from the residuals, since the cost may be that of a robust loss
     rms = [np.sqrt(2 * geometry.cost(p) / p.num_observations) for p in (problem, solution.problem)]
@@ -91,7 +92,25 @@ def summary(problem: BundleProblem, solution: Solution) -> str:
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
         f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
     ]
-    return "\n".join([*lines, *remarks(problem, solution)])
+    return "\n".join([*lines, *remarks(problem, solution), *without_weight(solution, loss or Loss())])
+
+
+def without_weight(solution: Solution, loss: Loss) -> list[str]:
+    """A note on observations that the loss ignored at the end, with what to do if those are most of them."""
+    if loss.rho != "tukey":
+        return []
+    norms = np.linalg.norm(geometry.residuals(solution.problem), axis=1)
+    beyond = int(np.sum(norms >= loss.scale))
+    if not beyond:
+        return []
+    line = (
+        f"note: {_counted(beyond, 'observation')} of {len(norms)} beyond --loss-scale {loss.scale:g} px had no weight"
+    )
+    if 2 * beyond < len(norms):
+        return [line]
+    return [
+        f"{line}: choose a larger one (half of the residuals lie above {np.median(norms):.3g} px), or another --loss"
+    ]
 
 
 def _how_compiled(solution: Solution) -> str:
