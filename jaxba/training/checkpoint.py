@@ -73,7 +73,7 @@ def steps(folder: Path) -> list[int]:
 
 
 def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any], keep: int) -> None:
-    """Writes a checkpoint, then removes all but the last `keep`, and incomplete ones of a killed process.
+    """Writes a checkpoint, then removes all but the last `keep` up to it, and incomplete ones of a killed process.
 
     Args:
         folder: of all checkpoints; created if missing.
@@ -89,7 +89,7 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
     with ocp.StandardCheckpointer() as checkpointer:
         checkpointer.save((folder / f"{_PREFIX}{step}").absolute(), content, force=True)
         checkpointer.wait_until_finished()
-    complete = {f"{_PREFIX}{number}" for number in steps(folder)[-keep:]}
+    complete = {f"{_PREFIX}{number}" for number in [n for n in steps(folder) if n <= step][-keep:]}
     for item in folder.iterdir():
         if item.name.startswith(_PREFIX) and item.name not in complete:
             shutil.rmtree(item, ignore_errors=True)
@@ -107,8 +107,8 @@ def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, A
     try:
         with ocp.PyTreeCheckpointer() as checkpointer:
             content = checkpointer.restore(path)
-    except (OSError, ValueError, KeyError) as error:
-        raise CheckpointError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
-    arrays = {name: np.asarray(value) for name, value in content.items()}
-    metadata = json.loads(arrays.pop(_METADATA).tobytes())
-    return arrays, metadata
+        arrays = {name: np.asarray(value) for name, value in content.items()}
+        return arrays, dict(json.loads(arrays.pop(_METADATA).tobytes()))
+    except Exception as error:  # Orbax names no set of errors for damaged files
+        reason = next(iter(str(error).splitlines()), "") or type(error).__name__
+        raise CheckpointError(f"{path} cannot be read: {reason}") from None

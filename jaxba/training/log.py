@@ -4,43 +4,48 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from jaxba.runtime.atomic import atomic_write
+
 FILE = "metrics.jsonl"
 BOARD = "tensorboard"
+
+ORDER = ("seed", "chunk", "updates")
+"""Integers by which rows are ordered and drawn: every row has them."""
 
 Row = dict[str, Any]
 """Metrics of one chunk by name; None if not finite."""
 
 
 class Log:
-    """Appends rows, after removing those that a killed run wrote after its last checkpoint."""
+    """Appends rows, after removing those that a killed run wrote after its last checkpoint, and damaged ones."""
 
-    def __init__(self, folder: Path, size: int, seed: int, chunk: int) -> None:
+    def __init__(self, folder: Path, seed: int, chunk: int, report: Callable[[str], None] = lambda _: None) -> None:
         """Opens the log of a run.
 
         Args:
             folder: of the run.
-            size: length to which the file is cut, bytes.
-            seed: number of the agent that is trained next, for TensorBoard.
+            seed: number of the agent that is trained next.
             chunk: chunks that this agent has done.
+            report: called with a line of text if damaged lines are dropped.
+
+        Raises:
+            OSError: the file cannot be read or written.
         """
         self.path = folder / FILE
         self._boards = folder / BOARD
         self._board: tuple[int, Any] | None = None
-        self._purge = {seed: chunk + 1} if size else {}
-        self.path.touch()
-        with self.path.open("r+b") as file:
-            file.truncate(min(size, os.fstat(file.fileno()).st_size))
+        self._purge = {seed: chunk + 1} if seed or chunk else {}
+        lines, damaged = _lines(self.path)
+        kept = [line for line, row in lines if (row["seed"], row["chunk"]) <= (seed, chunk)]
+        if damaged and kept:
+            report(f"{self.path}: {damaged} damaged line{'s' * (damaged > 1)} dropped")
+        with atomic_write(self.path) as file:
+            file.writelines(kept)
         self._file = self.path.open("a", encoding="utf-8")
-
-    @property
-    def size(self) -> int:
-        """Bytes written and flushed."""
-        return self._file.tell()
 
     def write(self, row: Mapping[str, Any]) -> Row:
         """Appends a row and returns it as `read` does."""
@@ -73,9 +78,21 @@ class Log:
 
 
 def read(folder: Path) -> list[Row]:
-    """All rows of a run, without an incomplete last line."""
-    path = folder / FILE
+    """All rows of a run, without damaged lines."""
+    return [row for _, row in _lines(folder / FILE)[0]]
+
+
+def _lines(path: Path) -> tuple[list[tuple[bytes, Row]], int]:
+    """The lines that hold a row, with that row, and how many do not: cut short, or zeros after a power failure."""
+    found: list[tuple[bytes, Row]] = []
     if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1]
-    return [json.loads(line) for line in lines]
+        return found, 0
+    lines = path.read_bytes().splitlines(keepends=True)
+    for line in lines:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if line.endswith(b"\n") and isinstance(row, dict) and all(isinstance(row.get(key), int) for key in ORDER):
+            found.append((line, row))
+    return found, len(lines) - len(found)
