@@ -70,8 +70,10 @@ class Trainings:
         arguments = ["--out", str(run)]
         arguments += ["--resume"] if (run / CONFIG).is_file() else ["--config", "fast", "--set", *SETTINGS]
         command = [sys.executable, "-c", COMMAND, *arguments]
-        both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-        return subprocess.Popen(command, env=self.environment, text=True, start_new_session=True, **both)
+        pipe, both = subprocess.PIPE, subprocess.STDOUT
+        return subprocess.Popen(
+            command, env=self.environment, text=True, start_new_session=True, stdout=pipe, stderr=both
+        )
 
     def finish(self, run: Path) -> list[float]:
         """Lets a training end; the seconds after which it printed its lines.

@@ -214,7 +214,7 @@ class _Run:
             tree["best"] = self.best.actor
         best = None if self.best is None else {k: getattr(self.best, k) for k in ("score", "seed", "chunk")}
         values = self.seed, self.chunk, self.wall_s, self.evaluated, best
-        metadata = dict(zip(_METADATA, values, strict=True))
+        metadata: dict[str, Any] = dict(zip(_METADATA, values, strict=True))
         checkpoint.save(self.folder, self.step, checkpoint.pack(tree), metadata, self.config.keep)
 
     def finish(self) -> Outcome:

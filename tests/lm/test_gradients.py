@@ -143,7 +143,7 @@ def check_forward(function, at) -> None:
     forward = jax.jit(lambda at, direction: jax.jvp(function, at, direction)[1])
     values = function(*at)
     for direction in directions(at):
-        found, expected = forward(at, direction), differences(function, at, direction, 1e-6)
+        found, expected = forward(at, direction), differences(function, at, direction, 3e-7)
         for name, slope in found.items():
             assert np.isfinite(slope).all(), name
             # differences know no more than the rounding of the value over their width
