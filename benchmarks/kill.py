@@ -28,7 +28,7 @@ from jaxba.training import checkpoint, log
 from jaxba.training.driver import CHECKPOINTS, CONFIG
 
 SETTINGS = [
-    *("chunks=24", "evaluate_every=4", "checkpoint_every=1", "envs=[8]", "keep=2"),
+    *("chunks=48", "evaluate_every=4", "checkpoint_every=1", "envs=[8]", "keep=2"),
     *("bank.classes=[{cameras: 4, points: 12, family: paper}]", "bank.scenes=[160]", "bank.refine_points=0"),
     *("game.max_iterations=12", "game.agent.refine_points=0", "game.agent.trials=1", "game.agent.camera_rounds=0"),
     "game.agent.pattern_moves=0",
@@ -38,6 +38,9 @@ SETTINGS = [
 
 CLOCKS = ("wall_s", "chunk_s", "steps_per_s", "updates_per_s", "cpu_per_wall", "evaluate_s")
 """Fields of the log that no two trainings have in common."""
+
+FEWEST_LINES = 3
+"""Lines that a resumed training prints before its first chunk and after its last one."""
 
 POLICY = "policy.safetensors"
 
@@ -129,15 +132,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if result(Path(name) / "first") != expected:
             print("two unbroken trainings differ")
             return 1
+        last = len(expected[1])
         kills, runs, stages = 0, 0, Counter[str]()
         while kills < args.times:
             run, runs = Path(name) / f"run-{runs}", runs + 1
             for _ in range(min(args.per_run, args.times - kills)):
-                line, part = int(rng.integers(len(times) - 1)), rng.uniform()
-                if not trainings.kill(run, line, part * (times[line + 1] - times[line])):
+                left = last - max(checkpoint.steps(run / CHECKPOINTS), default=0)
+                line = int(rng.integers(FEWEST_LINES + (len(times) - FEWEST_LINES - 1) * left // last))
+                if not trainings.kill(run, line, rng.uniform() * (times[line + 1] - times[line])):
                     break  # less was left
                 kills += 1
-                done, last = max(checkpoint.steps(run / CHECKPOINTS), default=0), len(expected[1])
+                done = max(checkpoint.steps(run / CHECKPOINTS), default=0)
                 stages["between chunks" if 0 < done < last else "at the end" if done else "before a checkpoint"] += 1
             trainings.finish(run)
             if result(run) != expected:
