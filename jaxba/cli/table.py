@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxba.cli.common import counted
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
@@ -23,34 +24,30 @@ _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      la
 
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
     """Size of the problem, and the policy and options of the solve."""
-    refine = f" + {_counted(options.refinement.points, 'point iteration')}" if options.refinement.points else ""
+    refine = f" + {counted(options.refinement.points, 'point iteration')}" if options.refinement.points else ""
     if refine and options.refinement.starts == "rays":
         refine += " from the better of step and rays"
     if options.refinement.camera_rounds:
-        refine += f", up to {_counted(options.refinement.camera_rounds, 'camera round')}"
+        refine += f", up to {counted(options.refinement.camera_rounds, 'camera round')}"
     if options.refinement.trials > 1:
         refine += f", up to {options.refinement.trials} trials"
     if options.refinement.pattern_moves:
-        refine += f", up to {_counted(options.refinement.pattern_moves, 'pattern move')}"
+        refine += f", up to {counted(options.refinement.pattern_moves, 'pattern move')}"
     if options.coordinates.lens_step == "pixels":
         refine += ", distortion per pixel"
     if options.kept_steps:
-        refine += f", {_counted(options.kept_steps, 'previous step')}"
+        refine += f", {counted(options.kept_steps, 'previous step')}"
     if options.coordinates.camera_damping != 1:
         refine += f", cameras damped by {options.coordinates.camera_damping:g} lambda"
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     counts = ("camera", problem.num_cameras), ("point", problem.num_points), ("observation", problem.num_observations)
-    sizes = ", ".join(_counted(count, noun) for noun, count in counts)
+    sizes = ", ".join(counted(count, noun) for noun, count in counts)
     if problem.lenses is not None:
         free = np.asarray(problem.lenses.free) & (options.intrinsics == "free")
         for kind, number in Counter(map(tuple, free.tolist())).most_common():
             names = [one for one, used in zip(("f", "k1", "k2"), kind, strict=True) if used]
             sizes += f", {number} lens{'es' * (number > 1)} ({', '.join(names) or 'fixed'})"
     return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {args.dtype}, {solver}"
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def header(initial_cost: float) -> str:
@@ -87,7 +84,7 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     lines = [
         f"{state}: {solution.termination.reason}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e} (rms {rms[0]:.4g} -> {rms[1]:.4g} px)",
-        f"{_counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
+        f"{counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
         f"linear solver {solution.linear_solver}",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
         f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
@@ -103,9 +100,7 @@ def without_weight(solution: Solution, loss: Loss) -> list[str]:
     beyond = int(np.sum(norms >= loss.scale))
     if not beyond:
         return []
-    line = (
-        f"note: {_counted(beyond, 'observation')} of {len(norms)} beyond --loss-scale {loss.scale:g} px had no weight"
-    )
+    line = f"note: {counted(beyond, 'observation')} of {len(norms)} beyond --loss-scale {loss.scale:g} px had no weight"
     if 2 * beyond < len(norms):
         return [line]
     return [
@@ -156,7 +151,7 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
         (int(np.sum(points == 0)), "point", "without observations; positions stay as they are"),
         (int(np.sum(points == 1)), "point", "seen once; damping alone fixes the depth"),
     ]
-    lines = [f"note: {_counted(count, noun)} {text}" for count, noun, text in found if count]
+    lines = [f"note: {counted(count, noun)} {text}" for count, noun, text in found if count]
     if before or after:
         lines.append(f"note: observations behind their camera: {before} at the start, {after} at the end")
     return lines

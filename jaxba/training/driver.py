@@ -140,7 +140,7 @@ def train(
         hooks: callbacks.
 
     Raises:
-        TrainError: the losses are not finite any more, or no checkpoint can be used.
+        TrainError: the losses are not finite any more, or no checkpoint can be used or written.
     """
     run = _Run(config, env, evaluate, folder, hooks or Hooks())
     try:
@@ -215,7 +215,10 @@ class _Run:
         best = None if self.best is None else {k: getattr(self.best, k) for k in ("score", "seed", "chunk")}
         values = self.seed, self.chunk, self.wall_s, self.evaluated, best
         metadata: dict[str, Any] = dict(zip(_METADATA, values, strict=True))
-        checkpoint.save(self.folder, self.step, checkpoint.pack(tree), metadata, self.config.keep)
+        try:
+            checkpoint.save(self.folder, self.step, checkpoint.pack(tree), metadata, self.config.keep)
+        except checkpoint.CheckpointError as error:
+            raise TrainError(f"{error}; --resume goes on from the one before") from None
 
     def finish(self) -> Outcome:
         """Trains the remaining chunks of all agents."""

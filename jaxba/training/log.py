@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ class Log:
         """
         self.path = folder / FILE
         self._boards = folder / BOARD
-        self._board: tuple[int, Any] | None = None
+        self._board: tuple[int, _Board] | None = None
         self._purge = {seed: chunk + 1} if seed or chunk else {}
         lines, damaged = _lines(self.path)
         kept = [line for line, row in lines if (row["seed"], row["chunk"]) <= (seed, chunk)]
@@ -59,15 +60,11 @@ class Log:
         board.flush()
         return clean
 
-    def _writer(self, seed: int) -> Any:
+    def _writer(self, seed: int) -> _Board:
         if self._board is None or self._board[0] != seed:
-            from tensorboardX import SummaryWriter
-
             if self._board:
                 self._board[1].close()
-            folder = self._boards / f"seed{seed}"
-            # with `purge_step` TensorBoard ignores what a killed run wrote after its last checkpoint
-            self._board = seed, SummaryWriter(str(folder), purge_step=self._purge.pop(seed, 0))
+            self._board = seed, _Board(self._boards / f"seed{seed}", self._purge.pop(seed, 0))
         return self._board[1]
 
     def close(self) -> None:
@@ -75,6 +72,45 @@ class Log:
         self._file.close()
         if self._board:
             self._board[1].close()
+
+
+class _Board:
+    """A file for TensorBoard, written by the thread that calls: that of tensorboardX's `SummaryWriter` ends when
+    the disk is full, and is then waited for for ever."""
+
+    def __init__(self, folder: Path, purge: int) -> None:
+        """
+        Args:
+            folder: created if missing.
+            purge: TensorBoard ignores what earlier files have from this step on, which a killed run wrote; 0: nothing.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+        folder.mkdir(parents=True, exist_ok=True)
+        self._writer, self._event = EventsWriter(str(folder / "events")), Event
+        if purge:
+            self._write(purge, session_log=SessionLog(status=SessionLog.START))
+
+    def _write(self, step: int, **content: Any) -> None:
+        self._writer.write_event(self._event(wall_time=time.time(), step=step, **content))
+
+    def add_scalar(self, name: str, value: float | int, step: int) -> None:
+        """Adds a number. Raises OSError."""
+        from tensorboardX.summary import scalar
+
+        self._write(step, summary=scalar(name, value))
+
+    def flush(self) -> None:
+        """Raises OSError."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Raises OSError."""
+        self._writer.close()
 
 
 def read(folder: Path) -> list[Row]:
