@@ -71,11 +71,11 @@ class _Compiled:
         if forked_from_jax():
             raise RuntimeError(FORKED)
         with jax.enable_x64(self.x64):
-            action = jnp.asarray(action, jnp.float32)
+            given = jnp.asarray(action, jnp.float32)
             if waiting is None:
-                self.state, step = _step(self.game, self.state, action)
+                self.state, step = _step(self.game, self.state, given)
             else:
-                self.state, step = _step_some(self.game, self.state, action, ~waiting)
+                self.state, step = _step_some(self.game, self.state, given, ~waiting)
             return jax.tree.map(np.array, step)  # copies, which callers may keep and write to
 
 

@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from jaxba.runtime.atomic import atomic_write
 
@@ -88,15 +88,15 @@ class _Board:
             OSError: the file cannot be written.
         """
         from tensorboardX.event_file_writer import EventsWriter
-        from tensorboardX.proto.event_pb2 import Event, SessionLog
+        from tensorboardX.proto import event_pb2 as messages
 
         folder.mkdir(parents=True, exist_ok=True)
-        self._writer, self._event = EventsWriter(str(folder / "events")), Event
+        self._writer, self._messages = EventsWriter(str(folder / "events")), cast(Any, messages)
         if purge:
-            self._write(purge, session_log=SessionLog(status=SessionLog.START))
+            self._write(purge, session_log=self._messages.SessionLog(status=self._messages.SessionLog.START))
 
     def _write(self, step: int, **content: Any) -> None:
-        self._writer.write_event(self._event(wall_time=time.time(), step=step, **content))
+        self._writer.write_event(self._messages.Event(wall_time=time.time(), step=step, **content))
 
     def add_scalar(self, name: str, value: float | int, step: int) -> None:
         """Adds a number. Raises OSError."""

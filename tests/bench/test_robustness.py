@@ -1,4 +1,4 @@
-"""Short runs of the benchmarks that look for what must not happen; their long runs are in docs/results/robustness.md."""
+"""Short runs of the benchmarks that look for what must not happen; docs/results/robustness.md has long ones."""
 
 from __future__ import annotations
 

@@ -290,7 +290,7 @@ def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undraw
     argv = [str(path), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "1"]
     assert bench(tmp_path / "run[bold]", *argv) == 0
     out = capsys.readouterr().out
-    assert "\nseq[red]:cat: ceres #1: 1 iterations" in f"\n{out}"
+    assert "\nseq[red]:cat: ceres #1: 1 iteration," in f"\n{out}"
     assert f"see {tmp_path / 'run[bold]' / 'report.html'}" in out.replace("\n", "")
 
 
