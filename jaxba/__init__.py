@@ -1,5 +1,10 @@
 """Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or written."""
 
+from jaxba.runtime.startup import quiet_interrupt as _quiet_interrupt
+
+_quiet_interrupt()  # before the imports that take long
+
+# ruff: noqa: E402
 from jaxba.damping import (
     POLICIES,
     Ceres,

@@ -202,6 +202,7 @@ def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp
     return StepInfo(
         **{name: number(value) for name, value in values.items()},
         accepted=jnp.asarray(accepted),
+        weightless=jnp.asarray(False),
         cg_iterations=jnp.asarray(0, jnp.int32),
         repairs=jnp.asarray(0, jnp.int32),
     )

@@ -114,7 +114,7 @@ def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float) -> in
     wanted = {(job.source.name, str(job.solver), job.repeat) for job in jobs}
     records: list[Record] = [r for r in done if (r.problem, r.solver, r.repeat) in wanted]
     if records:
-        console.print(f"{len(records)} of {len(jobs)} runs are already in {folder}", highlight=False)
+        console.print(f"{len(records)} of {common.counted(len(jobs), 'run')} already in {folder}", highlight=False)
     status = 0
     try:
         status = _execute(jobs, done, folder, settings, console, records)
@@ -160,8 +160,9 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
             records.append(record)
             progress.advance(task)
             if not console.is_terminal:
+                iterations = common.counted(record.iterations, "iteration")
                 console.print(
-                    f"{record.problem} {record.solver} #{record.repeat + 1}: {record.iterations} iterations, "
+                    f"{record.problem} {record.solver} #{record.repeat + 1}: {iterations}, "
                     f"cost {record.final_cost:.8g}, {record.total_s:.2f} s, {record.termination}",
                     highlight=False,
                     soft_wrap=True,

@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
+import _thread
+import errno
 import gc
 import os
 import re
+import signal
 import stat
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr
-from io import StringIO, TextIOWrapper
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
+from io import StringIO
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
+
+from jaxba.cli.streams import UnwritableStreamError, tolerant_streams
+from jaxba.runtime.startup import INTERRUPTED, on_early_interrupt
 
 Arguments = TypeVar("Arguments")
 
 BAD_INPUT = 2
 """Exit status for invalid input."""
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells define it."""
+DEFAULTS = (signal.default_int_handler, on_early_interrupt)
+"""Handlers of Ctrl-C that a command may replace: Python's own, and that of a command which is starting."""
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Errors of a disk that is full or may not be written: no fault of the program, wherever they come up."""
 
 CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable with the folder of compiled programs; `off` disables the cache."""
 
+
+RAISE_AGAIN_S = 0.01
+"""Seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended."""
 
 _COLORS = re.compile(r"\x1b\[[\d;]*m")
 """Control sequences that colour text on a terminal."""
@@ -52,35 +65,86 @@ def run_command(
     Returns:
         The exit status: that of `main`, 2 after an error, or 130 after Ctrl-C.
     """
-    escape_unencodable_output()
-    try:
-        parsed = _parse(arguments, description, argv)
-        if isinstance(parsed, str):
-            return print_error(parsed)
-        from jaxba.damping.policy_file import PolicyFileError
-        from jaxba.damping.registry import UnknownPolicyError
-        from jaxba.methods.registry import UnknownMethodError
-        from jaxba.problem.bundle_problem import ProblemError
-        from jaxba.solver.names import SolverNameError
-
-        names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
+    with catch_interrupts() as interrupted, tolerant_streams():
         try:
-            return main(parsed)
-        except (ProblemError, UsageError, PolicyFileError, *names) as error:
-            return print_error(str(error))
-        except Exception as error:
-            from jaxba.runtime.process import out_of_memory
+            status = _parse_and_run(arguments, main, description, argv)
+            print(end="", flush=True)
+            return status
+        except (KeyboardInterrupt, Exception) as error:
+            # inside libraries Ctrl-C may have become another error
+            if isinstance(error, KeyboardInterrupt) or interrupted():
+                print("interrupted", file=sys.stderr)
+                return INTERRUPTED
+            if isinstance(error, UnwritableStreamError):
+                return print_error(str(error))
+            raise
 
-            if not out_of_memory(error):
-                raise
+
+def _parse_and_run(
+    arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
+) -> int:
+    parsed = _parse(arguments, description, argv)
+    if parsed is None:
+        return 0
+    if isinstance(parsed, str):
+        return print_error(parsed)
+    from jaxba.damping.policy_file import PolicyFileError
+    from jaxba.damping.registry import UnknownPolicyError
+    from jaxba.methods.registry import UnknownMethodError
+    from jaxba.problem.bundle_problem import ProblemError
+    from jaxba.solver.names import SolverNameError
+
+    names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
+    try:
+        return main(parsed)
+    except (ProblemError, UsageError, PolicyFileError, *names) as error:
+        return print_error(str(error))
+    except Exception as error:
+        from jaxba.runtime.process import out_of_memory
+
+        if out_of_memory(error):
             return print_error("not enough memory")
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+        if isinstance(error, OSError) and error.errno in FULL:
+            return print_error(f"{error.filename or 'a file'}: {error.strerror}")
+        raise
 
 
-def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str:
-    """The parsed command line, or what is wrong with it, in one line."""
+@contextmanager
+def catch_interrupts() -> Iterator[Callable[[], bool]]:
+    """A context in which Ctrl-C raises KeyboardInterrupt; its value tells whether that has happened.
+
+    Nothing is changed in a thread other than the first, where signals are not handled, nor where Ctrl-C is ignored or
+    has a handler already.
+    """
+    seen: list[int] = []
+
+    def handle(*_: Any) -> None:
+        seen.append(1)
+        raise KeyboardInterrupt
+
+    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) in DEFAULTS
+    if not ours:
+        yield lambda: False
+        return
+
+    def again(lost: Any) -> None:
+        """Python drops an exception in a callback of the garbage collector, of which JAX has one: raise it later."""
+        if lost.exc_type is KeyboardInterrupt:
+            threading.Timer(RAISE_AGAIN_S, _thread.interrupt_main).start()
+        else:
+            hook(lost)
+
+    before, hook = signal.signal(signal.SIGINT, handle), sys.unraisablehook
+    sys.unraisablehook = again
+    try:
+        yield lambda: bool(seen)
+    finally:
+        sys.unraisablehook = hook
+        signal.signal(signal.SIGINT, before)
+
+
+def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str | None:
+    """The parsed command line, or what is wrong with it, in one line; None after `--help`."""
     import tyro
 
     drawn = StringIO()
@@ -88,8 +152,8 @@ def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | N
         with redirect_stderr(drawn):
             return tyro.cli(arguments, args=argv, description=description)
     except SystemExit as end:
-        if end.code != BAD_INPUT:  # after --help
-            raise
+        if end.code != BAD_INPUT:
+            return None
     # a box: the title, a rule, the message, a rule, help on the option or options with a similar name, a rule, and how
     # to get help; in an encoding that has lines the title stands in the first rule, and lines are its border
     text = _COLORS.sub("", drawn.getvalue())
@@ -99,12 +163,9 @@ def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | N
     return f"{message}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
 
 
-def escape_unencodable_output() -> None:
-    """Lets stdout and stderr escape characters that their encoding lacks, instead of raising an error. File names may
-    have such characters."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+def counted(count: int, noun: str) -> str:
+    """The count with the noun, in the plural unless it is one."""
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def print_error(message: str) -> int:
@@ -114,27 +175,15 @@ def print_error(message: str) -> int:
 
 
 def print_line(text: str) -> None:
-    """Prints a line to stdout and flushes. If the reader of stdout has closed it, this and later output is
-    discarded."""
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        discard_stdout()
+    """Prints a line to stdout and flushes, so that it is read while the work goes on."""
+    print(text, flush=True)
 
 
 def exit_with(status: int) -> NoReturn:
-    """Flushes stdout and ends the process. A closed pipe on stdout is not an error."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        discard_stdout()
+    """Ends the process. From here on Ctrl-C changes nothing."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()  # else Python looks at every object once more before it ends, for 0.04 s
     sys.exit(status)
-
-
-def discard_stdout() -> None:
-    """Redirects stdout, including its buffer, to the null device."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def prepare_process(*, untraced: bool = False) -> None:

@@ -139,7 +139,7 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
                         wall, busy = seconds.get(entry.name, (0.0, 0.0))
                         seconds[entry.name] = wall + spent, busy + cpu
                         _write_times(folder, seconds)
-                console.print(f"  {runner.done - before} runs, {spent:.1f} s")
+                console.print(f"  {common.counted(runner.done - before, 'run')}, {spent:.1f} s")
         except KeyboardInterrupt:
             console.print("interrupted; what is done is kept, run the same command again to continue")
             status = common.INTERRUPTED

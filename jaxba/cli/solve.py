@@ -224,7 +224,7 @@ def _solve(args: Arguments) -> int:
     name = args.problem or DEFAULT_SCENE
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     solution, steps = _iterate(args, problem, policy, options)
-    common.print_line(table.summary(problem, solution))
+    common.print_line(table.summary(problem, solution, options.loss))
     if args.pad == "yes" or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
     if args.output:

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from jaxba.cli.common import counted
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.compilation import Part, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord
@@ -23,24 +25,24 @@ _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      la
 
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
     """Size of the problem, and the policy and options of the solve."""
-    refine = f" + {_counted(options.refinement.points, 'point iteration')}" if options.refinement.points else ""
+    refine = f" + {counted(options.refinement.points, 'point iteration')}" if options.refinement.points else ""
     if refine and options.refinement.starts == "rays":
         refine += " from the better of step and rays"
     if options.refinement.camera_rounds:
-        refine += f", up to {_counted(options.refinement.camera_rounds, 'camera round')}"
+        refine += f", up to {counted(options.refinement.camera_rounds, 'camera round')}"
     if options.refinement.trials > 1:
         refine += f", up to {options.refinement.trials} trials"
     if options.refinement.pattern_moves:
-        refine += f", up to {_counted(options.refinement.pattern_moves, 'pattern move')}"
+        refine += f", up to {counted(options.refinement.pattern_moves, 'pattern move')}"
     if options.coordinates.lens_step == "pixels":
         refine += ", distortion per pixel"
     if options.kept_steps:
-        refine += f", {_counted(options.kept_steps, 'previous step')}"
+        refine += f", {counted(options.kept_steps, 'previous step')}"
     if options.coordinates.camera_damping != 1:
         refine += f", cameras damped by {options.coordinates.camera_damping:g} lambda"
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     counts = ("camera", problem.num_cameras), ("point", problem.num_points), ("observation", problem.num_observations)
-    sizes = ", ".join(_counted(count, noun) for noun, count in counts)
+    sizes = ", ".join(counted(count, noun) for noun, count in counts)
     if problem.lenses is not None:
         free = np.asarray(problem.lenses.free) & (options.intrinsics == "free")
         for kind, number in Counter(map(tuple, free.tolist())).most_common():
@@ -59,10 +61,6 @@ def compiled(compilation: str, problem: BundleProblem) -> str:
     parts: tuple[Part, ...] = ("factorization", "acceptance")
     later = any(stages(part, problem.num_observations) for part in parts)
     return "compiled quickly at first" if later else "compiled fully"
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def header(initial_cost: float) -> str:
@@ -91,20 +89,36 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
     return f"   search for points at other depths: {count}, {costs}{dropped}"
 
 
-def summary(problem: BundleProblem, solution: Solution) -> str:
-    """The result of a solve in a few lines."""
+def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None) -> str:
+    """The result of a solve in a few lines. `loss` is that of the solve; None: squared residuals."""
     state = "converged" if solution.converged else "not converged"
     # from the residuals, since the cost may be that of a robust loss
     rms = [np.sqrt(2 * geometry.cost(p) / p.num_observations) for p in (problem, solution.problem)]
     lines = [
         f"{state}: {solution.termination.reason}",
         f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e} (rms {rms[0]:.4g} -> {rms[1]:.4g} px)",
-        f"{_counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
+        f"{counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
         f"linear solver {solution.linear_solver}",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
         f"iterations {solution.total_s:.2f} s" + _how_compiled(solution),
     ]
-    return "\n".join([*lines, *remarks(problem, solution)])
+    return "\n".join([*lines, *remarks(problem, solution), *without_weight(solution, loss or Loss())])
+
+
+def without_weight(solution: Solution, loss: Loss) -> list[str]:
+    """A note on observations that the loss ignored at the end, with what to do if those are most of them."""
+    if loss.rho != "tukey":
+        return []
+    norms = np.linalg.norm(geometry.residuals(solution.problem), axis=1)
+    beyond = int(np.sum(norms >= loss.scale))
+    if not beyond:
+        return []
+    line = f"note: {counted(beyond, 'observation')} of {len(norms)} beyond --loss-scale {loss.scale:g} px had no weight"
+    if 2 * beyond < len(norms):
+        return [line]
+    return [
+        f"{line}: choose a larger one (half of the residuals lie above {np.median(norms):.3g} px), or another --loss"
+    ]
 
 
 def _how_compiled(solution: Solution) -> str:
@@ -150,7 +164,7 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
         (int(np.sum(points == 0)), "point", "without observations; positions stay as they are"),
         (int(np.sum(points == 1)), "point", "seen once; damping alone fixes the depth"),
     ]
-    lines = [f"note: {_counted(count, noun)} {text}" for count, noun, text in found if count]
+    lines = [f"note: {counted(count, noun)} {text}" for count, noun, text in found if count]
     if before or after:
         lines.append(f"note: observations behind their camera: {before} at the start, {after} at the end")
     return lines

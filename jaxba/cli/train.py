@@ -108,17 +108,12 @@ def _train(args: Arguments) -> int:
 
 
 def _console() -> Any:
-    """A console for the progress. The training continues if the reader of stdout closes it, and brackets in names are
-    not interpreted as markup."""
+    """A console for the progress. Brackets in names are not interpreted as markup."""
     from rich.console import Console
 
-    class PipeTolerantConsole(Console):
-        def on_broken_pipe(self) -> None:
-            common.discard_stdout()
-
     options: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
-    console = PipeTolerantConsole(**options)
-    return console if console.is_terminal else PipeTolerantConsole(**options, width=FILE_WIDTH)
+    console = Console(**options)
+    return console if console.is_terminal else Console(**options, width=FILE_WIDTH)
 
 
 def _again(folder: Path) -> str:

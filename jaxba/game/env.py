@@ -147,11 +147,22 @@ class Game:
             jax.vmap(lambda k, bank=bank: self._fresh(bank, k))(jax.random.split(k, count))
             for bank, k, count in zip(self.banks, keys, self.envs, strict=True)
         )
-        return GameState(episodes, key), self._observe(episodes)
+        state = GameState(episodes, key)
+        return state, self.observations(state)
 
-    def _observe(self, episodes: tuple[Episode, ...]) -> Array:
+    def observations(self, state: GameState) -> Float[Array, "envs features"]:
+        """What is observed everywhere, for the next actions."""
         observe_all = jax.vmap(lambda episode: observe(self.config.agent, episode.memory))
-        return jnp.concatenate([observe_all(part) for part in episodes])
+        return jnp.concatenate([observe_all(part) for part in state.episodes])
+
+    def merged(self, chosen: Bool[Array, " envs"], one: GameState, other: GameState) -> GameState:
+        """The state with the episodes of `one` where chosen, those of `other` elsewhere, and the key of `one`."""
+        parts, start = [], 0
+        for first, second, count in zip(one.episodes, other.episodes, self.envs, strict=True):
+            own, start = chosen[start : start + count], start + count
+            pick = lambda a, b, own=own: jnp.where(own.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+            parts.append(jax.tree.map(pick, first, second))
+        return GameState(tuple(parts), one.key)
 
     def _fresh(self, bank: Bank, key: Array) -> Episode:
         count = bank.initial_cost.shape[0]

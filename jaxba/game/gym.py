@@ -1,7 +1,7 @@
 """The game as Gymnasium environments, for trainers that speak NumPy. Needs the extra `gym`.
 
-`GymVectorGame` steps all scenes of a `Game` in one compiled call and resets those that ended in the same step.
-`GymGame` is a game of one scene at a time, which its trainer resets.
+`GymVectorGame` steps all scenes of a `Game` in one compiled call and resets those that ended. `GymGame` is a game of
+one scene at a time, which its trainer resets.
 """
 
 from __future__ import annotations
@@ -11,9 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from jaxba.damping.features import FEATURE_LIMIT
-from jaxba.game.env import Game
+from jaxba.game.env import Game, GameState
+from jaxba.game.protocol import Step
+from jaxba.runtime.process import forked_from_jax
 
 try:
     import gymnasium
@@ -36,6 +39,13 @@ def action_space(game: Game) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (game.action_size,), np.float32)
 
 
+FORKED = (
+    "this process was forked from one in which JAX had started, and would wait for its threads for ever: "
+    'use gymnasium.vector.AsyncVectorEnv(..., context="spawn"), which begins processes anew, or GymVectorGame'
+)
+"""What is said where JAX cannot run."""
+
+
 class _Compiled:
     """`reset` and `step` of a game with NumPy arrays. The game is an argument of the compiled functions, so that its
     banks are not constants in them."""
@@ -44,17 +54,28 @@ class _Compiled:
         self.game = game
         self.x64 = game.banks[0].initial_cost.dtype == np.float64
 
-    def reset(self, random: np.random.Generator) -> np.ndarray:
-        """First observations of new episodes."""
+    def reset(self, random: np.random.Generator, mask: np.ndarray | None = None) -> np.ndarray:
+        """New episodes, where the mask is true if one is given: the first observations of all that are under way."""
+        if forked_from_jax():
+            raise RuntimeError(FORKED)
         with jax.enable_x64(self.x64):
             key = jax.random.key(int(random.integers(2**31)))
-            self.state, observation = _reset(self.game, key)
+            if mask is None:
+                self.state, observation = _reset(self.game, key)
+            else:
+                self.state, observation = _reset_some(self.game, self.state, key, mask)
             return np.array(observation)
 
-    def step(self, action: np.ndarray) -> Any:
-        """One iteration of every scene: a `Step` of NumPy arrays."""
+    def step(self, action: np.ndarray, waiting: np.ndarray | None = None) -> Any:
+        """One iteration of every scene that is not waiting: a `Step` of NumPy arrays."""
+        if forked_from_jax():
+            raise RuntimeError(FORKED)
         with jax.enable_x64(self.x64):
-            self.state, step = _step(self.game, self.state, jnp.asarray(action, jnp.float32))
+            given = jnp.asarray(action, jnp.float32)
+            if waiting is None:
+                self.state, step = _step(self.game, self.state, given)
+            else:
+                self.state, step = _step_some(self.game, self.state, given, ~waiting)
             return jax.tree.map(np.array, step)  # copies, which callers may keep and write to
 
 
@@ -62,36 +83,80 @@ _reset = jax.jit(lambda game, key: game.reset(key))
 _step = jax.jit(lambda game, state, action: game.step(state, action))
 
 
-class GymVectorGame(gymnasium.vector.VectorEnv):
-    """All scenes of a game. An episode that ends is followed by another one in the same step.
+@jax.jit
+def _reset_some(game: Game, state: GameState, key: Array, chosen: Array) -> tuple[GameState, Array]:
+    fresh, _ = game.reset(key)
+    merged = game.merged(chosen, fresh, state)
+    return merged, game.observations(merged)
 
-    For each episode that ended, `infos` has the last observation in `final_obs` and the metrics of the episode in
-    `final_info`: `length`, `success`, `rejections`, and `ceres`, the iterations that Ceres' rule takes.
+
+@jax.jit
+def _step_some(game: Game, state: GameState, action: Array, chosen: Array) -> tuple[GameState, Step]:
+    """A step of the chosen environments; the others stay where they are, with no reward and no end."""
+    after, step = game.step(state, action)
+    after = game.merged(chosen, after, state)
+    observation = game.observations(after)
+    return after, step._replace(
+        observation=observation,
+        reward=jnp.where(chosen, step.reward, 0),
+        terminated=step.terminated & chosen,
+        truncated=step.truncated & chosen,
+        final_observation=jnp.where(chosen[:, None], step.final_observation, observation),
+    )
+
+
+class GymVectorGame(gymnasium.vector.VectorEnv):
+    """All scenes of a game. What follows the end of an episode is Gymnasium's choice of three:
+
+    - `SAME_STEP`: another episode in the same step. For each episode that ended, `infos` has the last observation in
+      `final_obs` and the metrics of the episode in `final_info`: `length`, `success`, `rejections`, and `ceres`, the
+      iterations that Ceres' rule takes.
+    - `NEXT_STEP`: another episode in the next step, whose action is ignored and whose reward is zero. `infos` has the
+      metrics of an episode that ended.
+    - `DISABLED`: none, until `reset` is called with `options={"reset_mask": mask}`. `infos` as for `NEXT_STEP`.
     """
 
-    def __init__(self, game: Game) -> None:
+    def __init__(self, game: Game, autoreset_mode: AutoresetMode = AutoresetMode.SAME_STEP) -> None:
         """Random numbers are seeded by the operating system until `reset` is given a seed."""
-        self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self.num_envs = game.num_envs
         self.single_observation_space, self.single_action_space = observation_space(game), action_space(game)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._compiled: _Compiled | None = _Compiled(game)
-        self._started = False
+        self._observation: np.ndarray | None = None  # the last one that was returned; None before the first reset
+        self._ended = np.zeros(self.num_envs, bool)  # episodes that no other one has followed yet
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """New episodes everywhere.
+        """New episodes everywhere, or where a mask says so.
 
         Args:
             seed: of all random numbers from now on; if None, the current sequence continues.
-            options: not used.
+            options: `reset_mask`: which environments get new episodes, a NumPy array of bools; the others stay, and
+                their last observations are returned again.
         """
+        mask = None if options is None or options.get("reset_mask") is None else self._mask(options["reset_mask"])
+        if mask is not None and self._observation is None:
+            raise gymnasium.error.ResetNeeded("call reset without a mask before the first one with a mask")
         super().reset(seed=seed)
-        observation = self._game().reset(self.np_random)
-        self._started = True
+        observation = self._game().reset(self.np_random, mask)
+        if mask is None:
+            mask = np.ones(self.num_envs, bool)
+        elif self._observation is not None:
+            observation = np.where(mask[:, None], observation, self._observation)
+        self._ended = self._ended & ~mask
+        self._observation = observation.copy()
         return observation, {}
+
+    def _mask(self, mask: Any) -> np.ndarray:
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_:
+            raise TypeError(f"reset_mask must be a NumPy array of bools, is {mask!r}")
+        if mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(f"reset_mask must choose some of {self.num_envs} environments, is {mask.tolist()}")
+        return mask
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One iteration of every scene.
@@ -99,11 +164,23 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
         Args:
             actions: one row per scene; numbers outside of [-1, 1] are clipped.
         """
-        if not self._started:
+        if self._observation is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        step = self._game().step(_actions(actions, self.action_space.shape))
-        done = step.terminated | step.truncated
-        return step.observation, step.reward.astype(np.float64), step.terminated, step.truncated, _infos(step, done)
+        disabled = self.autoreset_mode == AutoresetMode.DISABLED
+        if disabled and self._ended.any():
+            ended = np.flatnonzero(self._ended).tolist()
+            raise gymnasium.error.ResetNeeded(f"episodes {ended} have ended: call reset with a reset_mask before step")
+        actions = _actions(actions, self.action_space.shape)
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+            step = self._game().step(actions)
+            done = step.terminated | step.truncated
+            observation, infos = step.observation, _infos(step, done)
+        else:
+            step = self._game().step(actions, self._ended)
+            done = self._ended = step.terminated | step.truncated
+            observation, infos = step.final_observation, _metrics(step, done)
+        self._observation = observation.copy()
+        return observation, step.reward.astype(np.float64), step.terminated, step.truncated, infos
 
     def close_extras(self, **kwargs: Any) -> None:
         """Releases the memory of the scenes."""
@@ -188,9 +265,15 @@ def _infos(step: Any, done: np.ndarray) -> dict[str, Any]:
     if not done.any():
         return {}
     last = np.full(len(done), None, dtype=object)
-    metrics: dict[str, np.ndarray] = {}
     for k in np.flatnonzero(done):
         last[k] = step.final_observation[k].copy()
-    for name, values in step.metrics.items():
-        metrics[name], metrics[f"_{name}"] = np.where(done, values, 0), done.copy()
-    return {"final_obs": last, "_final_obs": done.copy(), "final_info": metrics, "_final_info": done.copy()}
+    final = {"final_obs": last, "_final_obs": done.copy()}
+    return {**final, "final_info": _metrics(step, done), "_final_info": done.copy()}
+
+
+def _metrics(step: Any, done: np.ndarray) -> dict[str, Any]:
+    """The metrics of the episodes that ended, in the same form."""
+    found: dict[str, Any] = {}
+    for name, values in step.metrics.items() if done.any() else ():
+        found[name], found[f"_{name}"] = np.where(done, values, 0), done.copy()
+    return found

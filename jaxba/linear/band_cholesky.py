@@ -17,6 +17,7 @@ from jax import Array, lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
+from jaxba.linear.cholesky import lower_cholesky
 from jaxba.structure.camera_ordering import Band
 from jaxba.structure.segment_sums import take_rows
 
@@ -81,7 +82,7 @@ def band_factor(band: Band, blocks: Float[Array, "blocks 9 9"]) -> BandFactor:
     unit = jnp.eye(size, dtype=rows.dtype)
 
     def eliminate(window: Array, new: Array) -> tuple[Array, tuple[Array, Array]]:
-        factor = jnp.linalg.cholesky(window[:size, :size], symmetrize_input=False)
+        factor = lower_cholesky(window[:size, :size])
         inverse = solve_triangular(factor, unit, lower=True)
         below = jnp.matmul(window[size:, :size], inverse.T, precision="highest")
         update = jnp.matmul(below, below.T, precision="highest")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array, lax
 from jax.scipy.linalg import solve_triangular
@@ -48,6 +49,24 @@ class Panels(NamedTuple):
         return after
 
 
+@jax.custom_jvp
+def lower_cholesky(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+    """The lower Cholesky factor of matrices of which only the lower triangle is read, also by the derivative.
+
+    Returns:
+        L with `A = L L^T`; non-finite if a matrix is not positive definite.
+    """
+    return jnp.linalg.cholesky(matrix, symmetrize_input=False)
+
+
+@lower_cholesky.defjvp
+def _lower_cholesky_jvp(matrix: tuple[Array], change: tuple[Array]) -> tuple[Array, Array]:
+    """JAX's own rule takes the tangent for symmetric, and would be wrong where only its lower triangle is filled."""
+    full = jnp.tril(change[0]) + jnp.tril(change[0], -1).mT
+    factored = lambda a: jnp.linalg.cholesky(a, symmetrize_input=False)
+    return jax.jvp(factored, matrix, (full,))
+
+
 def factor_and_solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
     """Solves `A x = b` for a symmetric positive definite matrix after Jacobi scaling.
 
@@ -67,7 +86,7 @@ def factor_and_solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> 
 
 
 def _lapack_solve(matrix: Array, right: Array) -> Array:
-    factor = jnp.linalg.cholesky(matrix, symmetrize_input=False)
+    factor = lower_cholesky(matrix)
     half = solve_triangular(factor, right, lower=True)
     return solve_triangular(factor, half, lower=True, trans="T")
 
@@ -90,7 +109,7 @@ def factor_panels(matrix: Float[Array, "n n"], least: int | None = None) -> Pane
             parts = [below[(number - 1 - k) * width :] for k, below in enumerate(belows)]
             earlier = jnp.concatenate(parts, axis=1)
             panel = panel - jnp.matmul(earlier, earlier[:size].T, precision="highest")
-        factor = jnp.linalg.cholesky(panel[:size], symmetrize_input=False)
+        factor = lower_cholesky(panel[:size])
         inverses.append(solve_triangular(factor, jnp.eye(size, dtype=matrix.dtype), lower=True))
         belows.append(jnp.matmul(panel[size:], inverses[-1].T, precision="highest"))
     return Panels(inverses, belows)

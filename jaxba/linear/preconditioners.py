@@ -16,10 +16,12 @@ from jax import Array
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
+from jaxba.linear.cholesky import lower_cholesky
 from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.linear.two_level import Anchor, coarse_preconditioner
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import Preconditioner
+from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.fusion import fusion_barrier
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
@@ -71,9 +73,9 @@ def diagonal_blocks(
     """
     over, under = points.projected
     dot = lambda a, b: a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    f00 = jnp.sqrt(jnp.maximum(1 - dot(over, over), 0))
+    f00 = safe_sqrt(jnp.maximum(1 - dot(over, over), 0))
     f10 = -dot(over, under) / jnp.where(f00 > 0, f00, 1)
-    f11 = jnp.sqrt(jnp.maximum(1 - dot(under, under) - f10 * f10, 0))
+    f11 = safe_sqrt(jnp.maximum(1 - dot(under, under) - f10 * f10, 0))
     f00, f10, f11 = fusion_barrier(jnp.stack([f00, f10, f11]))
     first, second = linear.camera_jacobian
     columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
@@ -84,7 +86,7 @@ def diagonal_blocks(
 
 def block_inverse(blocks: Float[Array, "cameras 9 9"]) -> Callable[[Array], Array]:
     """The product with the inverses of positive definite blocks, which are formed once by Cholesky."""
-    factor = jnp.linalg.cholesky(blocks, symmetrize_input=False)
+    factor = lower_cholesky(blocks)
     eye = jnp.broadcast_to(jnp.eye(blocks.shape[-1], dtype=blocks.dtype), blocks.shape)
     root = solve_triangular(factor, eye, lower=True)
     inverse = jnp.einsum("cji,cjk->cik", root, root)

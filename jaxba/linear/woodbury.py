@@ -19,7 +19,7 @@ from jax import Array
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Float
 
-from jaxba.linear.cholesky import factor_and_solve
+from jaxba.linear.cholesky import factor_and_solve, lower_cholesky
 from jaxba.linear.schur import CameraSystem
 
 
@@ -33,7 +33,7 @@ def capacitance_solve(wide: Float[Array, "unknowns columns"], system: CameraSyst
     Returns:
         The camera step; non-finite if S is not positive definite.
     """
-    factor = jnp.linalg.cholesky(system.blocks, symmetrize_input=False)
+    factor = lower_cholesky(system.blocks)
     unit = jnp.broadcast_to(jnp.eye(9, dtype=factor.dtype), factor.shape)
     inverse = solve_triangular(factor, unit, lower=True)  # [cameras, 9, 9]
     # matmul instead of a fused sum: XLA would recompute W for every row of the result

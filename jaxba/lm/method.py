@@ -93,6 +93,9 @@ class Round(NamedTuple):
     accepted: Bool[Array, ""]
     """Whether any cluster was accepted."""
 
+    weightless: Bool[Array, ""]
+    """See `StepInfo`."""
+
 
 @runtime_checkable
 class StepMethod(MethodTraits, Protocol):

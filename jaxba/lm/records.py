@@ -69,5 +69,8 @@ class StepInfo(NamedTuple):
     damping_fraction: Float[Array, ""]
     """`d.D d / d.(H + D) d`: 0 for Gauss-Newton, 1 for gradient descent."""
 
+    weightless: Bool[Array, ""]
+    """Whether the robust loss gave weight to no observation, so that there was no step to take."""
+
     repairs: Int[Array, ""]
     """Number of camera rounds, backtracking trials and pattern moves after the first candidate."""

@@ -26,9 +26,10 @@ from jaxba.linear.step import Effort, Step
 from jaxba.lm.damped_step import solve_step
 from jaxba.lm.method import Round, RoundMethod
 from jaxba.lm.records import LMState, StepInfo
-from jaxba.model.linearize import Reference, cost, linearize, with_free_lenses
+from jaxba.model.linearize import Reference, cost, is_weightless, linearize, with_free_lenses
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
+from jaxba.problem.safe_math import safe_divide, safe_sqrt
 from jaxba.refinement.acceptance import Candidate
 from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.subproblems import Whole
@@ -42,6 +43,7 @@ class Proposal(NamedTuple):
 
     step: Step
     reference: Reference
+    weightless: Bool[Array, ""] | None = None  # see `StepInfo`; None: no
 
 
 def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
@@ -80,6 +82,10 @@ def lm_step(
 ) -> tuple[LMState, StepInfo]:
     """One iteration: one linear solve with the given lambda, accepted or rejected.
 
+    Without refinement it is differentiable by cameras, points, observations and lambda (the accept decision is a
+    constant): forwards with every linear solver; backwards with a factorisation in full precision and a layout without
+    padding, but not through loops that end when they are done, as conjugate gradients do.
+
     Args:
         layout: the problem's observations.
         state: current parameters and cost.
@@ -117,7 +123,7 @@ def propose(
     step = solve_step(
         layout, linear, state.cameras, state.points, damping, options, iteration, effort, state.previous_steps
     )
-    return Proposal(step, linear.reference)
+    return Proposal(step, linear.reference, is_weightless(linear, state.cost, options.loss))
 
 
 def try_step(
@@ -131,13 +137,14 @@ def try_step(
 ) -> tuple[LMState, StepInfo]:
     """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
     candidate = best_candidate(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
-    return take_step(layout, state, damping, proposal.step, candidate)
+    return take_step(layout, state, damping, proposal, candidate)
 
 
 def take_step(
-    layout: Layout, state: LMState, damping: Float[Array, ""], step: Step, candidate: Candidate
+    layout: Layout, state: LMState, damping: Float[Array, ""], proposal: Proposal, candidate: Candidate
 ) -> tuple[LMState, StepInfo]:
     """End of `try_step`: the state after the accept decision on a candidate, and the record. Arguments as there."""
+    step = proposal.step
     tried_step = [candidate.step_fraction * step.cameras, candidate.points - state.points]
     return _advance(
         state,
@@ -149,7 +156,8 @@ def take_step(
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
         step_fraction=candidate.step_fraction,
-        damping_fraction=jnp.clip(step.damped / step.slope, 0, 1),
+        damping_fraction=jnp.clip(safe_divide(step.damped, step.slope), 0, 1),
+        weightless=jnp.zeros((), bool) if proposal.weightless is None else proposal.weightless,
         repairs=candidate.repairs,
     )
 
@@ -183,6 +191,7 @@ def _round(
         forcing=jnp.zeros_like(state.cost),
         step_fraction=result.step_fraction,
         damping_fraction=jnp.clip(1 - result.curvature / result.slope, 0, 1),
+        weightless=result.weightless,
         repairs=result.repairs,
     )
 
@@ -220,7 +229,7 @@ def _advance(
         gain_ratio=candidate.gain,
         accepted=candidate.accepted,
         damping=damping,
-        step_norm=jnp.sqrt(sum(jnp.sum(part**2) for part in tried_step)),
-        parameter_norm=jnp.sqrt(jnp.sum(jnp.where(camera_seen, state.cameras, 0) ** 2) + jnp.sum(state.points**2)),
+        step_norm=safe_sqrt(jnp.sum(tried_step[0] ** 2) + jnp.sum(tried_step[1] ** 2)),
+        parameter_norm=safe_sqrt(jnp.sum(jnp.where(camera_seen, state.cameras, 0) ** 2) + jnp.sum(state.points**2)),
         **fields,
     )

@@ -43,6 +43,7 @@ class Termination(enum.IntEnum):
     STOPPED = 7
     TARGET = 8
     ROUNDING = 9
+    NO_WEIGHT = 10
 
     @property
     def converged(self) -> bool:
@@ -61,6 +62,8 @@ _REASONS = {
     Termination.STEP: "accepted step within xtol",
     Termination.GRADIENT: "gradient within gtol",
     Termination.ROUNDING: "predicted decrease of a rejected step within the rounding of the cost",
+    Termination.NO_WEIGHT: "every residual lies beyond the scale of the loss, so that no observation has a weight: "
+    "choose a larger scale, or another loss",
     Termination.MAX_ITERATIONS: "iteration limit",
     Termination.STALLED: "a rejected step would be repeated unchanged",
     Termination.STOPPED: "stopped by the caller",
@@ -144,6 +147,7 @@ def termination_of(
     limit = ~step.accepted & ~(step.damping < DAMPING_LIMIT)
     stalled = ~step.accepted & stuck
     rules: list[tuple[Bool[Array, ""], Termination]] = [
+        (step.weightless, Termination.NO_WEIGHT),  # first: small decreases and a zero gradient say nothing there
         (by_cost, Termination.COST),
         (by_step, Termination.STEP),
         (by_gradient, Termination.GRADIENT),

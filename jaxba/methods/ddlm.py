@@ -35,7 +35,7 @@ from jaxba.linear.schur import (
 from jaxba.linear.step import Step
 from jaxba.lm.method import Round
 from jaxba.methods.stba import solve_clusters
-from jaxba.model.linearize import Linearization, Reference, linearize, point_terms, slot_frames
+from jaxba.model.linearize import Linearization, Reference, is_weightless, linearize, point_terms, slot_frames
 from jaxba.model.observations import point_passes, view_terms
 from jaxba.problem.options import StepOptions, check_count
 from jaxba.refinement.acceptance import NEGLIGIBLE
@@ -146,6 +146,7 @@ def decomposed_round(
         jnp.clip(fraction, MIN_STEP_FRACTION, 1),
         jnp.max(found.repairs),
         new_cost < cost,
+        is_weightless(linear, cost, options.loss),
     )
 
 

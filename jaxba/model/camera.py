@@ -163,7 +163,8 @@ def project(
     rotation = frame.rotation
     rotated = [row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in rotation]
     x, y, z = (rotated[k] + frame.translation[k] for k in range(3))
-    inverse = 1 / z
+    # masked twice: the derivative of the quotient, too, must not see the depth of an empty slot
+    inverse = 1 / (z if mask is None else jnp.where(mask, z, jnp.ones_like(z)))
     if mask is not None:
         inverse = jnp.where(mask, inverse, jnp.zeros_like(inverse))
     u, v = -x * inverse, -y * inverse

@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.model import camera
 from jaxba.model.observations import Views, view_terms
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
+from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.compilation import traced_once
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.layout import Layout
@@ -122,13 +123,22 @@ def linearize(
         costs = slot_costs(loss, residual)
         rows = [*residual, *by_camera[0], *by_camera[1], *by_point[0], *by_point[1]]
         if not loss.trivial:
-            root = jnp.sqrt(loss(residual[0] * residual[0] + residual[1] * residual[1])[1])
+            root = safe_sqrt(loss(residual[0] * residual[0] + residual[1] * residual[1])[1])
             rows = [root * row for row in rows]
         return [*rows, costs, projection.inverse_depth]
 
     *rows, costs, inverse_depth = view_terms(layout, slot_frames(layout, cameras), points, terms)
     residual, rows = rows[:2], rows[2:]
     return Linearization(residual, [rows[:9], rows[9:18]], [rows[18:21], rows[21:24]], costs, inverse_depth)
+
+
+def is_weightless(linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:
+    """Whether the loss gives weight to no observation though there is a cost: gradient and Hessian are zero, and
+    nothing says where to go."""
+    if loss.trivial:
+        return jnp.zeros((), bool)
+    first, second = linear.residual
+    return (total(first * first + second * second) == 0) & (cost > 0)
 
 
 def with_free_lenses(

@@ -21,10 +21,10 @@ from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.loop import History
 from jaxba.solver.names import INNER
 from jaxba.solver.options import MAX_ITERATIONS
-from jaxba.solver.prepare import explain_start
 from jaxba.solver.solve import Solution
 
 _log = logging.getLogger(__name__)
@@ -157,6 +157,7 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
         "forcing": 0.0,
         "step_fraction": 1.0,
         "damping_fraction": np.nan,
+        "weightless": False,
         "repairs": 0,
     }
     return StepInfo(**{**fields, **known})

@@ -162,6 +162,8 @@ def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:
         weight = np.asarray(weight, dtype=np.float64)
         if weight.shape != (count,) or not np.isfinite(weight).all() or (weight < 0).any():
             raise ProblemError(f"weight must be {count} finite numbers that are not negative")
+        if not weight.any():
+            raise ProblemError("weight is zero for every observation: there is nothing to optimise")
         return np.sqrt(weight)[:, None, None] * np.eye(2)
     if covariance is None:
         return None

@@ -2,7 +2,9 @@
 
 With the cost f, the candidate x' and the decrease that the linear model predicts, a candidate is accepted if
 
-    f(x') < f(x)   and   rho = (f(x) - f(x')) / predicted > min_gain.
+    f(x') < f(x)   and   rho = (f(x) - f(x')) / predicted > min_gain
+
+and no focal length changes its sign (`retraction.keep_focal_signs`).
 
 If a problem decomposes into subproblems (subproblems.py), the decision is made for each of them separately, and the
 arrays below have an axis `parts`.
@@ -22,7 +24,9 @@ from jaxtyping import Bool, Float, Int
 from jaxba.linear.step import Effort, Step
 from jaxba.model.linearize import Reference
 from jaxba.problem.options import StepOptions
+from jaxba.problem.safe_math import safe_divide
 from jaxba.refinement.points import PreviousPoints
+from jaxba.refinement.retraction import keep_focal_signs
 from jaxba.refinement.subproblems import PointSearch, Subproblems
 
 NEGLIGIBLE = 1e-6
@@ -169,12 +173,13 @@ def assess(
     points, terms = parts.refine(cameras, points, against.previous, options, search)
     cost, decrease = parts.sums(terms), parts.sums(against.terms - terms)
     predicted = against.step.predicted(step_fraction)
-    gain = decrease / predicted
+    gain = safe_divide(decrease, predicted)
     accepted = (decrease > 0) & (cost <= against.cost) & (predicted > 0) & (gain > against.min_gain)
     # costs before and after come from two computations: a decrease that nothing predicts may be their rounding alone
     rounding = float(jnp.finfo(against.cost.dtype).eps) * against.cost
     accepted = accepted & ((predicted > rounding) | (decrease > COST_ROUNDING * rounding))
-    return Candidate(cameras, points, cost, predicted, gain, accepted & jnp.isfinite(cost), step_fraction, repairs)
+    accepted = accepted & jnp.isfinite(cost) & parts.all_cameras(keep_focal_signs(against.cameras, cameras))
+    return Candidate(cameras, points, cost, predicted, gain, accepted, step_fraction, repairs)
 
 
 def select(parts: Subproblems, which: Bool[Array, "*parts"], new: Candidate, old: Candidate) -> Candidate:

@@ -10,6 +10,7 @@ from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
 from jaxba.model.linearize import linearize, observation_costs, with_free_lenses
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
+from jaxba.refinement.retraction import keep_focal_signs
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.conventions import components_first
@@ -54,8 +55,7 @@ def refine_cameras(
         # the Jacobian, and so the step, is in manifold coordinates
         trial = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
         costs = observation_costs(layout, trial, points, options.loss)
-        same_sign = trial[6] * cameras[6] >= 0  # of the focal length, as in candidates.py
-        better = (own_cost(costs) < before) & ~done & same_sign
+        better = (own_cost(costs) < before) & ~done & keep_focal_signs(cameras, trial)
         return jnp.where(better, trial, best), done | better, attempt_number + 1
 
     # a loop instead of unrolled attempts: half as much to compile

@@ -7,8 +7,8 @@ linear solve and allow longer steps. `Refinement` switches on four of them:
 1. `points`: every point is re-optimised on its own at the new cameras (points.py, midpoints.py).
 2. `camera_rounds`: cameras, then points are re-optimised on their own (camera_rounds.py).
 3. `trials`: a candidate that is still rejected is tried again at a quarter of the length (backtracking.py). A camera
-   whose focal length would change its sign then keeps its previous parameters: a mirrored image can fit for a while,
-   and the iterations do not lead back.
+   whose focal length would change its sign then keeps its previous parameters; without trials such a candidate is
+   rejected.
 4. `pattern_moves`: an accepted step is repeated in its direction (pattern_move.py).
 
 None of these takes another linear solve, so all of them belong to one iteration.
@@ -32,7 +32,7 @@ from jaxba.refinement.backtracking import SHORTER, should_backtrack
 from jaxba.refinement.camera_rounds import should_refine_cameras
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.pattern_move import should_extend, should_repeat
-from jaxba.refinement.retraction import move_cameras, step_between
+from jaxba.refinement.retraction import keep_focal_signs, move_cameras, step_between
 from jaxba.refinement.subproblems import Subproblems
 from jaxba.runtime import loops
 
@@ -147,7 +147,7 @@ def _assess_next(against: Comparison, search: Search, refined: Float[Array, "9 c
     lengths = parts.of_cameras(search.length)
     cameras = move_cameras(parts.layout, search.cameras, lengths * search.direction[0], against.options)
     if against.options.refinement.trials > 1:
-        cameras = jnp.where(cameras[6] * against.cameras[6] < 0, search.cameras, cameras)
+        cameras = jnp.where(keep_focal_signs(search.cameras, cameras), cameras, search.cameras)
     points = search.points + parts.of_points(search.length) * search.direction[1]
     fraction = jnp.where(best.accepted, best.step_fraction, search.length)
     full_step = jnp.any(_is_full_step(search) & search.active)

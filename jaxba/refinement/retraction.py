@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.model import camera
 from jaxba.problem.options import StepOptions
@@ -49,6 +49,15 @@ def move_cameras(
         free = near if layout.lenses is None else near & layout.lenses.free[row - 6]
         moved = moved.at[row].set(jnp.where(free, kept, moved[row]))
     return moved
+
+
+def keep_focal_signs(before: Float[Array, "9 cameras"], after: Float[Array, "9 cameras"]) -> Bool[Array, " cameras"]:
+    """Whether the focal length of each camera keeps its sign; false where it becomes zero.
+
+    A mirrored image can fit for a while, and the iterations do not lead back; no file of cameras may hold one. A camera
+    that had no focal length may get any, and numbers that are not finite pass, since their cost is none.
+    """
+    return ~(jnp.sign(before[6]) * jnp.sign(after[6]) <= 0) | (before[6] == 0)
 
 
 def step_between(

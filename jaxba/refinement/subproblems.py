@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.model.linearize import Reference, observation_costs, slot_frames
 from jaxba.problem.options import StepOptions
@@ -57,6 +57,10 @@ class Subproblems(Protocol):
         """Sums terms over every part."""
         ...
 
+    def all_cameras(self, holds: Bool[Array, " cameras"]) -> Bool[Array, "*parts"]:
+        """Whether something holds for every camera of each part."""
+        ...
+
     def of_cameras(self, values: Array) -> Array:
         """The value of each camera's part, or a scalar that broadcasts."""
         ...
@@ -91,6 +95,10 @@ class Whole(NamedTuple):
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
         """See `Subproblems`."""
         return total(terms)
+
+    def all_cameras(self, holds: Bool[Array, " cameras"]) -> Bool[Array, ""]:
+        """See `Subproblems`."""
+        return jnp.all(holds)
 
     def of_cameras(self, values: Array) -> Array:
         """See `Subproblems`."""
@@ -143,6 +151,10 @@ class Clusters(NamedTuple):
         members = self.partition.members
         own = per_camera.at[members].get(mode="clip")
         return jnp.sum(jnp.where(members < self.layout.num_cameras, own, 0), axis=1)
+
+    def all_cameras(self, holds: Bool[Array, " cameras"]) -> Bool[Array, " clusters"]:
+        """See `Subproblems`."""
+        return jnp.all(holds.at[self.partition.members].get(mode="fill", fill_value=True), axis=1)
 
     def of_cameras(self, values: Array) -> Array:
         """See `Subproblems`."""

@@ -47,10 +47,13 @@ def map_rows(function: Callable[[Any], Any], rows: Any, used: Int[AnyArray, ""] 
     Args:
         function: of one entry.
         rows: a pytree of arrays with a common leading axis, at least one entry long.
-        used: number of entries to which the function is applied, the others giving zero; None for all.
+        used: number of entries to which the function is applied, the others giving zero; None for all. With a number
+            there are no reverse derivatives.
     """
     count = jax.tree.leaves(rows)[0].shape[0]
     at = lambda k: jax.tree.map(lambda all_: lax.dynamic_index_in_dim(all_, k, keepdims=False), rows)
+    if used is None:  # a scan, for reverse differentiation
+        return lax.scan(lambda k, _: (_next(k), function(at(k))), jnp.zeros((), jnp.int32), length=count)[1]
     results = jax.tree.map(lambda one: jnp.zeros((count, *one.shape), one.dtype), jax.eval_shape(function, at(0)))
 
     def body(k: Array, results: Any) -> Any:
@@ -58,7 +61,7 @@ def map_rows(function: Callable[[Any], Any], rows: Any, used: Int[AnyArray, ""] 
             lambda all_, one: lax.dynamic_update_index_in_dim(all_, one, k, 0), results, function(at(k))
         )
 
-    return fori_loop(0, count if used is None else used, body, results)
+    return fori_loop(0, used, body, results)
 
 
 def _next(counter: Int[Array, ""]) -> Int[Array, ""]:

@@ -10,6 +10,7 @@ import ctypes
 import functools
 import gc
 import importlib.util
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -114,6 +115,27 @@ def single_blas_thread() -> Iterator[None]:
         importlib.import_module("scipy.linalg.cython_lapack")
     with ThreadpoolController().limit(limits=1, user_api="blas"):
         yield
+
+
+_forked_from_jax = False
+"""Whether this process is the fork of one in which JAX had started."""
+
+
+def forked_from_jax() -> bool:
+    """Whether this process is the fork of one in which JAX had started, so that it would wait for threads that only
+    that one has. Known of forks after the import of this module."""
+    return _forked_from_jax
+
+
+def _after_fork() -> None:
+    global _forked_from_jax
+    bridge = sys.modules.get("jax._src.xla_bridge")  # JAX has no public name for this
+    started = getattr(bridge, "backends_are_initialized", lambda: bridge is not None)
+    _forked_from_jax = _forked_from_jax or started()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 @functools.cache

@@ -14,13 +14,13 @@ import numpy as np
 from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState
 from jaxba.lm.step import initial_state
-from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.structure.conventions import items_first
@@ -78,7 +78,8 @@ class Setup:
     def check_cost(self, state: LMState) -> None:
         """Raises a ProblemError that names an observation if the cost of the initial state is not finite."""
         if not np.isfinite(float(state.cost)):
-            raise ProblemError(explain_start(self.problem))
+            here = self.problem if self.offset is None else shift(self.problem, -self.offset)
+            raise ProblemError(explain_start(here, self.options.loss, self.dtype))
 
     def problem_at(self, state: LMState) -> BundleProblem:
         """The problem with the parameters of a state, as NumPy float64; what is not optimised is copied exactly."""
@@ -173,20 +174,6 @@ def _check_policy(policy: object) -> None:
         raise ValueError(f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)")
     if jax.tree_util.treedef_is_leaf(jax.tree.structure(policy)):
         raise ValueError(f"policy {name} is no pytree: decorate its dataclass with jax.tree_util.register_dataclass")
-
-
-def explain_start(problem: BundleProblem) -> str:
-    """A one-line message that names the observation for which the initial cost is not finite."""
-    with np.errstate(all="ignore"):
-        bad = np.flatnonzero(~np.isfinite(geometry.residuals(problem)).all(axis=1))
-    if not bad.size:
-        return "the cost at the start overflows"
-    camera, point = (int(index[bad[0]]) for index in (problem.camera_index, problem.point_index))
-    others = f" (and {bad.size - 1} more)" if bad.size > 1 else ""
-    return (
-        f"the cost at the start is not finite: observation {bad[0]}{others}, point {point} lies on the plane of camera "
-        f"{camera} or its projection overflows"
-    )
 
 
 def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:

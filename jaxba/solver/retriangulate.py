@@ -31,7 +31,7 @@ from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import compile_and_run, level_after, program, stages
-from jaxba.solver.prepare import explain_start
+from jaxba.solver.diagnosis import explain_start
 from jaxba.structure.conventions import components_first, items_first
 from jaxba.structure.layout import Layout, build_layout
 
@@ -113,7 +113,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         found = jax.device_get(compile_and_run(search, *given))
         process.release_programs()  # see `release_programs`: too many programs end a process
     if not np.isfinite(found.cost_before):
-        raise ProblemError(explain_start(problem))
+        raise ProblemError(explain_start(problem, loss))
     points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real
     points[order[moved]] = items_first(np.asarray(found.points))[moved]
     return Retriangulation(

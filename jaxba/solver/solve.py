@@ -22,6 +22,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, Stage, compile_and_run, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord, Run, parts_of, run_stepwise
+from jaxba.solver.diagnosis import cost_of_rounding
 from jaxba.solver.loop import History, solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, numerics, set_up
@@ -129,13 +130,18 @@ def solve(
             process.release_programs()  # see above: too many programs end a process
         count = int(carry.iteration)
         history = History(*(np.asarray(field)[:count] for field in history))
+        final_cost = float(carry.state.cost)
+        termination = Termination(int(carry.termination))
+        gave_up = termination in (Termination.DAMPING_LIMIT, Termination.STALLED)
+        if gave_up and final_cost <= cost_of_rounding(problem, setup.dtype):
+            termination = Termination.ROUNDING
         return Solution(
             problem=setup.problem_at(carry.state),
             initial_cost=initial_cost,
-            final_cost=float(carry.state.cost),
+            final_cost=final_cost,
             iterations=count,
             accepted=int(np.sum(history.accepted)),
-            termination=Termination(int(carry.termination)),
+            termination=termination,
             history=history,
             linear_solver=setup.options.solver_name,
             setup_s=setup.setup_s,

@@ -6,9 +6,15 @@ stored as a flat mapping from paths to NumPy arrays; every leaf that is restored
 
 from __future__ import annotations
 
+import errno
+import gc
 import json
+import logging
+import os
 import shutil
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -73,7 +79,7 @@ def steps(folder: Path) -> list[int]:
 
 
 def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any], keep: int) -> None:
-    """Writes a checkpoint, then removes all but the last `keep`, and incomplete ones of a killed process.
+    """Writes a checkpoint, then removes all but the last `keep` up to it, and incomplete ones of a killed process.
 
     Args:
         folder: of all checkpoints; created if missing.
@@ -81,18 +87,60 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
         arrays: see `pack`.
         metadata: anything that JSON can hold.
         keep: number of checkpoints kept, this one included.
+
+    Raises:
+        CheckpointError: it cannot be written; those before are still there.
+        OSError: the folder cannot be created.
     """
     import orbax.checkpoint as ocp
 
     folder.mkdir(parents=True, exist_ok=True)
     content = {**arrays, _METADATA: np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
-    with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save((folder / f"{_PREFIX}{step}").absolute(), content, force=True)
-        checkpointer.wait_until_finished()
-    complete = {f"{_PREFIX}{number}" for number in steps(folder)[-keep:]}
+    path = (folder / f"{_PREFIX}{step}").absolute()
+    reason = ""
+    with _quiet_tasks():
+        try:
+            with ocp.StandardCheckpointer() as checkpointer:
+                checkpointer.save(path, content, force=True)
+                checkpointer.wait_until_finished()
+        except Exception as error:  # of a full disk Orbax makes a ValueError with a page of text
+            full = os.strerror(errno.ENOSPC)
+            reason = full if full in str(error) else _reason(error)
+        if reason:
+            gc.collect()  # asyncio reports errors of tasks when these are collected
+    if reason:
+        sys.excepthook = _without_closed_loops(sys.excepthook)  # callbacks of the same failure still come in
+        raise CheckpointError(f"{path} cannot be written: {reason}")
+    complete = {f"{_PREFIX}{number}" for number in [n for n in steps(folder) if n <= step][-keep:]}
     for item in folder.iterdir():
         if item.name.startswith(_PREFIX) and item.name not in complete:
             shutil.rmtree(item, ignore_errors=True)
+
+
+@contextmanager
+def _quiet_tasks() -> Iterator[None]:
+    """In which errors of Orbax's tasks and threads are not reported with a page of text each: the first is raised."""
+    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
+    before, hook = [logger.disabled for logger in loggers], sys.excepthook
+    try:
+        for logger in loggers:
+            logger.disabled = True
+        sys.excepthook = lambda *_: None  # of callbacks from C++
+        yield
+    finally:
+        sys.excepthook = hook
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled
+
+
+def _without_closed_loops(hook: Callable[..., Any]) -> Callable[..., Any]:
+    """The hook for all errors but those of callbacks that come when their event loop is gone."""
+
+    def report(kind: type[BaseException], error: BaseException, traceback: Any) -> None:
+        if not (kind is RuntimeError and str(error) == "Event loop is closed"):
+            hook(kind, error, traceback)
+
+    return report
 
 
 def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -107,8 +155,12 @@ def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, A
     try:
         with ocp.PyTreeCheckpointer() as checkpointer:
             content = checkpointer.restore(path)
-    except (OSError, ValueError, KeyError) as error:
-        raise CheckpointError(f"{path} cannot be read: {str(error).splitlines()[0]}") from None
-    arrays = {name: np.asarray(value) for name, value in content.items()}
-    metadata = json.loads(arrays.pop(_METADATA).tobytes())
-    return arrays, metadata
+        arrays = {name: np.asarray(value) for name, value in content.items()}
+        return arrays, dict(json.loads(arrays.pop(_METADATA).tobytes()))
+    except Exception as error:  # Orbax names no set of errors for damaged files
+        raise CheckpointError(f"{path} cannot be read: {_reason(error)}") from None
+
+
+def _reason(error: Exception) -> str:
+    """The first line of an error."""
+    return next(iter(str(error).splitlines()), "") or type(error).__name__

@@ -1,8 +1,8 @@
 """The training driver: compiled chunks, evaluations between them, checkpoints, and bitwise identical resuming.
 
 A run has a folder with `config.yaml`, `metrics.jsonl`, `tensorboard/` and `checkpoints/`. A checkpoint holds the loop's
-state, the best policy so far, its score, and the length of the log. A run that is resumed cuts the log to that length
-and repeats what followed, with the same numbers.
+state, the best policy so far, and its score. A run that is resumed goes on from the last checkpoint that can be read,
+removes from the log what was written after it, and repeats that, with the same numbers.
 """
 
 from __future__ import annotations
@@ -28,6 +28,9 @@ from jaxba.training.train_loop import LoopState, run_chunk, start
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
+
+_METADATA = ("seed", "chunk", "wall_s", "evaluated", "best")
+"""What a checkpoint holds besides arrays."""
 
 CHANGEABLE = ("chunks", "keep", "checkpoint_every")
 """Settings that a resumed run may change; `chunks` only with one seed, since all agents are trained equally long."""
@@ -137,7 +140,7 @@ def train(
         hooks: callbacks.
 
     Raises:
-        TrainError: the losses are not finite any more, or the last checkpoint does not fit.
+        TrainError: the losses are not finite any more, or no checkpoint can be used or written.
     """
     run = _Run(config, env, evaluate, folder, hooks or Hooks())
     try:
@@ -152,20 +155,18 @@ class _Run:
     def __init__(self, config: TrainConfig, env: Any, evaluate: Any, folder: Path, hooks: Hooks) -> None:
         self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
         self.folder = folder / CHECKPOINTS
-        self.seed, self.chunk, self.wall_s, size = 0, 0, 0.0, 0
+        self.seed, self.chunk, self.wall_s = 0, 0, 0.0
         self.evaluated = 0  # chunk of the agent after which it was evaluated last
         self.best: Best | None = None
         like = jax.eval_shape(lambda: start(config.sac, config.loop, env, self._key()))
-        found = checkpoint.steps(self.folder)
-        if found:
-            self.step = found[-1]
-            size = self._restore(like)
+        self.step = 0
+        if checkpoint.steps(self.folder):
+            self._restore_latest(like)
         else:
-            self.step = 0
             self._begin()
         hooks.stage("compiling the training loop")
         self._compiled = run_chunk.lower(config.sac, config.loop, env, self.state).compile()
-        self.log = Log(folder, size, self.seed, self.chunk)
+        self.log = Log(folder, self.seed, self.chunk, hooks.stage)
 
     def _key(self) -> Any:
         """Random key of the agent; scenes have another one."""
@@ -178,35 +179,46 @@ class _Run:
             checkpoint.pack(fresh), fresh
         )  # the same memory layout as after a checkpoint
 
-    def _restore(self, like: Any) -> int:
+    def _restore_latest(self, like: Any) -> None:
+        """Restores the last checkpoint that can be used; one that was cut short says nothing about those before."""
+        reasons = []
+        for step in reversed(checkpoint.steps(self.folder)):
+            try:
+                self._restore(step, like)
+            except checkpoint.CheckpointError as error:
+                reasons.append(str(error))
+                continue
+            if reasons:
+                self.hooks.stage(f"{reasons[0]}; going on from the one before, after chunk {self.chunk}")
+            return
+        others = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+        raise TrainError(f"the last checkpoint does not fit: {reasons[0]}{others}; begin in a new folder")
+
+    def _restore(self, step: int, like: Any) -> None:
+        arrays, metadata = checkpoint.restore(self.folder, step)
         try:
-            arrays, metadata = checkpoint.restore(self.folder, self.step)
+            seed, chunk, wall_s, evaluated, best = (metadata[name] for name in _METADATA)
             tree: dict[str, Any] = {"state": like}
-            if metadata["best"] is not None:
+            if best is not None:
                 tree["best"] = like.learner.actor
             tree = checkpoint.unpack(arrays, tree)
-        except checkpoint.CheckpointError as error:
-            raise TrainError(f"the last checkpoint does not fit: {error}") from None
-        self.state = tree["state"]
-        self.seed, self.chunk, self.wall_s = metadata["seed"], metadata["chunk"], metadata["wall_s"]
-        self.evaluated = metadata["evaluated"]
-        if metadata["best"] is not None:
-            self.best = Best(tree["best"], **metadata["best"])
-        return metadata["log_size"]
+            self.best = None if best is None else Best(tree["best"], **best)
+        except (KeyError, TypeError) as error:
+            raise checkpoint.CheckpointError(f"checkpoint {step} was written by another version: {error}") from None
+        self.state, self.step = tree["state"], step
+        self.seed, self.chunk, self.wall_s, self.evaluated = seed, chunk, wall_s, evaluated
 
     def _save(self) -> None:
         tree: dict[str, Any] = {"state": self.state}
         if self.best is not None:
             tree["best"] = self.best.actor
-        metadata = {
-            "seed": self.seed,
-            "chunk": self.chunk,
-            "wall_s": self.wall_s,
-            "evaluated": self.evaluated,
-            "log_size": self.log.size,
-            "best": None if self.best is None else {k: getattr(self.best, k) for k in ("score", "seed", "chunk")},
-        }
-        checkpoint.save(self.folder, self.step, checkpoint.pack(tree), metadata, self.config.keep)
+        best = None if self.best is None else {k: getattr(self.best, k) for k in ("score", "seed", "chunk")}
+        values = self.seed, self.chunk, self.wall_s, self.evaluated, best
+        metadata: dict[str, Any] = dict(zip(_METADATA, values, strict=True))
+        try:
+            checkpoint.save(self.folder, self.step, checkpoint.pack(tree), metadata, self.config.keep)
+        except checkpoint.CheckpointError as error:
+            raise TrainError(f"{error}; --resume goes on from the one before") from None
 
     def finish(self) -> Outcome:
         """Trains the remaining chunks of all agents."""

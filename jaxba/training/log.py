@@ -4,43 +4,49 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
+
+from jaxba.runtime.atomic import atomic_write
 
 FILE = "metrics.jsonl"
 BOARD = "tensorboard"
+
+ORDER = ("seed", "chunk", "updates")
+"""Integers by which rows are ordered and drawn: every row has them."""
 
 Row = dict[str, Any]
 """Metrics of one chunk by name; None if not finite."""
 
 
 class Log:
-    """Appends rows, after removing those that a killed run wrote after its last checkpoint."""
+    """Appends rows, after removing those that a killed run wrote after its last checkpoint, and damaged ones."""
 
-    def __init__(self, folder: Path, size: int, seed: int, chunk: int) -> None:
+    def __init__(self, folder: Path, seed: int, chunk: int, report: Callable[[str], None] = lambda _: None) -> None:
         """Opens the log of a run.
 
         Args:
             folder: of the run.
-            size: length to which the file is cut, bytes.
-            seed: number of the agent that is trained next, for TensorBoard.
+            seed: number of the agent that is trained next.
             chunk: chunks that this agent has done.
+            report: called with a line of text if damaged lines are dropped.
+
+        Raises:
+            OSError: the file cannot be read or written.
         """
         self.path = folder / FILE
         self._boards = folder / BOARD
-        self._board: tuple[int, Any] | None = None
-        self._purge = {seed: chunk + 1} if size else {}
-        self.path.touch()
-        with self.path.open("r+b") as file:
-            file.truncate(min(size, os.fstat(file.fileno()).st_size))
+        self._board: tuple[int, _Board] | None = None
+        self._purge = {seed: chunk + 1} if seed or chunk else {}
+        lines, damaged = _lines(self.path)
+        kept = [line for line, row in lines if (row["seed"], row["chunk"]) <= (seed, chunk)]
+        if damaged and kept:
+            report(f"{self.path}: {damaged} damaged line{'s' * (damaged > 1)} dropped")
+        with atomic_write(self.path) as file:
+            file.writelines(kept)
         self._file = self.path.open("a", encoding="utf-8")
-
-    @property
-    def size(self) -> int:
-        """Bytes written and flushed."""
-        return self._file.tell()
 
     def write(self, row: Mapping[str, Any]) -> Row:
         """Appends a row and returns it as `read` does."""
@@ -54,15 +60,11 @@ class Log:
         board.flush()
         return clean
 
-    def _writer(self, seed: int) -> Any:
+    def _writer(self, seed: int) -> _Board:
         if self._board is None or self._board[0] != seed:
-            from tensorboardX import SummaryWriter
-
             if self._board:
                 self._board[1].close()
-            folder = self._boards / f"seed{seed}"
-            # with `purge_step` TensorBoard ignores what a killed run wrote after its last checkpoint
-            self._board = seed, SummaryWriter(str(folder), purge_step=self._purge.pop(seed, 0))
+            self._board = seed, _Board(self._boards / f"seed{seed}", self._purge.pop(seed, 0))
         return self._board[1]
 
     def close(self) -> None:
@@ -72,10 +74,61 @@ class Log:
             self._board[1].close()
 
 
+class _Board:
+    """A file for TensorBoard, written by the thread that calls: that of tensorboardX's `SummaryWriter` ends when
+    the disk is full, and is then waited for for ever."""
+
+    def __init__(self, folder: Path, purge: int) -> None:
+        """
+        Args:
+            folder: created if missing.
+            purge: TensorBoard ignores what earlier files have from this step on, which a killed run wrote; 0: nothing.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto import event_pb2 as messages
+
+        folder.mkdir(parents=True, exist_ok=True)
+        self._writer, self._messages = EventsWriter(str(folder / "events")), cast(Any, messages)
+        if purge:
+            self._write(purge, session_log=self._messages.SessionLog(status=self._messages.SessionLog.START))
+
+    def _write(self, step: int, **content: Any) -> None:
+        self._writer.write_event(self._messages.Event(wall_time=time.time(), step=step, **content))
+
+    def add_scalar(self, name: str, value: float | int, step: int) -> None:
+        """Adds a number. Raises OSError."""
+        from tensorboardX.summary import scalar
+
+        self._write(step, summary=scalar(name, value))
+
+    def flush(self) -> None:
+        """Raises OSError."""
+        self._writer.flush()
+
+    def close(self) -> None:
+        """Raises OSError."""
+        self._writer.close()
+
+
 def read(folder: Path) -> list[Row]:
-    """All rows of a run, without an incomplete last line."""
-    path = folder / FILE
+    """All rows of a run, without damaged lines."""
+    return [row for _, row in _lines(folder / FILE)[0]]
+
+
+def _lines(path: Path) -> tuple[list[tuple[bytes, Row]], int]:
+    """The lines that hold a row, with that row, and how many do not: cut short, or zeros after a power failure."""
+    found: list[tuple[bytes, Row]] = []
     if not path.is_file():
-        return []
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1]
-    return [json.loads(line) for line in lines]
+        return found, 0
+    lines = path.read_bytes().splitlines(keepends=True)
+    for line in lines:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if line.endswith(b"\n") and isinstance(row, dict) and all(isinstance(row.get(key), int) for key in ORDER):
+            found.append((line, row))
+    return found, len(lines) - len(found)

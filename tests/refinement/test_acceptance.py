@@ -252,6 +252,7 @@ def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
     found = lambda options: _best_candidate(Whole(layout), *before[:3], linear.reference, mirrored, options, 0.0)
     plain, kept = found(PLAIN), found(SHORTER_ONLY)
     assert plain.cameras[6, 0] < 0
+    assert not plain.accepted
     assert kept.step_fraction == 1
     assert np.array_equal(kept.cameras[:, 0], before.cameras[:, 0])
     np.testing.assert_allclose(kept.cameras[:, 1:], plain.cameras[:, 1:], rtol=1e-12)

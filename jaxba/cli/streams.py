@@ -1,0 +1,78 @@
+"""Standard output and error that outlive their readers: `jaxba-bench --help | head`, a terminal that is gone."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import TextIOWrapper
+from typing import Any
+
+
+class UnwritableStreamError(Exception):
+    """Standard output cannot be written, for another reason than that its reader has closed it. No `OSError`, which
+    commands take for one of their files."""
+
+
+class TolerantStream:
+    """A text stream that, once its reader has closed it, discards what is written."""
+
+    def __init__(self, stream: Any, *, discard_all: bool) -> None:
+        """
+        Args:
+            stream: standard output or error.
+            discard_all: whether to do so after any other error, too, instead of raising an `UnwritableStreamError`.
+        """
+        self._stream, self._discard_all = stream, discard_all
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """As that of the stream."""
+        with self._tolerance():
+            self._stream.write(text)
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        """As that of the stream."""
+        for line in lines:
+            self.write(line)
+
+    def flush(self) -> None:
+        """As that of the stream."""
+        with self._tolerance():
+            self._stream.flush()
+
+    @contextmanager
+    def _tolerance(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            discard(self._stream)
+            if not (self._discard_all or isinstance(error, BrokenPipeError)):
+                raise UnwritableStreamError(f"standard output: {error.strerror or error}") from None
+
+
+def discard(stream: Any) -> None:
+    """Redirects a stream, including what it has buffered, to the null device."""
+    with suppress(OSError, ValueError):  # a stream without a file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+@contextmanager
+def tolerant_streams() -> Iterator[None]:
+    """A context in which standard output and error are tolerant, and escape characters that their encoding lacks, which
+    file names may have, instead of raising an error."""
+    before = sys.stdout, sys.stderr
+    for stream in before:
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    with open(os.devnull, "w") as nothing:  # for streams that were closed from the start
+        wrap = lambda stream, discard_all: TolerantStream(stream or nothing, discard_all=discard_all)
+        sys.stdout, sys.stderr = wrap(before[0], False), wrap(before[1], True)
+        try:
+            yield
+        finally:
+            sys.stdout, sys.stderr = before

@@ -1,0 +1,23 @@
+"""Short runs of the benchmarks that look for what must not happen; docs/results/robustness.md has long ones."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks import invariants, kill
+
+
+@pytest.mark.slow
+def test_trainings_killed_at_random_end_as_one_that_ran_through(capsys):
+    assert kill.main(["--times", "4", "--seed", "3", "--per-run", "4"]) == 0
+    assert "4 kills of" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_no_cost_rises_and_every_number_is_finite(capsys):
+    assert (
+        invariants.main(["--scenes", "24", "--seed", "5", "--iterations", "12", "--solvers", "ceres,bold,learned"]) == 0
+    )
+    printed = capsys.readouterr().out
+    assert printed.count("everything holds") == 6
+    assert "0 costs that rose" in printed

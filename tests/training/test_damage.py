@@ -1,0 +1,124 @@
+"""What a full disk or a power failure leaves of a run: a torn log, checkpoints that were cut short."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import toys
+from test_driver import CONFIG, evaluate, rows, run, same
+
+from jaxba.training import checkpoint, driver, log
+from jaxba.training.driver import Outcome, TrainError
+
+LONGER = dataclasses.replace(CONFIG, chunks=8)
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory) -> tuple[Path, Outcome]:
+    """A run of eight chunks that nothing interrupts."""
+    folder = tmp_path_factory.mktemp("unbroken") / "run"
+    return folder, run(folder, LONGER)
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory) -> Path:
+    """The folder of a run of six chunks; its checkpoints are after 4 and 6."""
+    folder = tmp_path_factory.mktemp("six") / "run"
+    run(folder)
+    assert checkpoint.steps(folder / driver.CHECKPOINTS) == [4, 6]
+    return folder
+
+
+@pytest.fixture
+def folder(six, tmp_path) -> Path:
+    return Path(shutil.copytree(six, tmp_path / "run"))
+
+
+def resumed(folder: Path) -> tuple[Outcome, list[str]]:
+    said: list[str] = []
+    config = driver.prepare_folder(folder, LONGER, True)
+    return driver.train(config, toys.SEEN, evaluate, folder, driver.Hooks(stage=said.append)), said
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def files_of(checkpoint_folder: Path) -> list[Path]:
+    return sorted(path for path in checkpoint_folder.rglob("*") if path.is_file())
+
+
+DAMAGES = {
+    "all-files-cut": lambda at: [cut(path) for path in files_of(at)],
+    "all-files-empty": lambda at: [path.write_bytes(b"") for path in files_of(at)],
+    "all-files-zeros": lambda at: [path.write_bytes(bytes(path.stat().st_size)) for path in files_of(at)],
+    "largest-file-cut": lambda at: cut(max(files_of(at), key=lambda path: path.stat().st_size)),
+    "largest-file-gone": lambda at: max(files_of(at), key=lambda path: path.stat().st_size).unlink(),
+    "empty": lambda at: (shutil.rmtree(at), at.mkdir()),
+    "a-file": lambda at: (shutil.rmtree(at), at.write_bytes(b"")),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_the_checkpoint_before_a_damaged_one_is_taken_with_a_word(damage, folder, unbroken):
+    DAMAGES[damage](folder / driver.CHECKPOINTS / "step_6")
+    outcome, said = resumed(folder)
+    same(outcome, unbroken[1])
+    assert rows(folder) == rows(unbroken[0])
+    (word,) = [line for line in said if "cannot be read" in line]
+    assert "step_6" in word
+    assert word.endswith("; going on from the one before, after chunk 4")
+    assert "\n" not in word
+    assert checkpoint.steps(folder / driver.CHECKPOINTS) == [6, 8]
+
+
+def test_a_stray_checkpoint_of_a_higher_number_displaces_none(folder, unbroken):
+    (folder / driver.CHECKPOINTS / "step_999").mkdir()
+    outcome, _ = resumed(folder)
+    same(outcome, unbroken[1])
+    assert checkpoint.steps(folder / driver.CHECKPOINTS) == [6, 8]
+
+
+def test_damaged_checkpoints_alone_are_one_line(folder):
+    for number in (4, 6):
+        DAMAGES["all-files-cut"](folder / driver.CHECKPOINTS / f"step_{number}")
+    with pytest.raises(TrainError, match=r"^the last checkpoint does not fit: [^\n]*step_6[^\n]* \(and 1 more\)"):
+        resumed(folder)
+
+
+TEARS = {
+    "last-line": lambda text: text[:-40],
+    "last-newline": lambda text: text[:-1],
+    "zeros-at-the-end": lambda text: text[:-300] + bytes(300),
+    "middle": lambda text: text[:900] + text[1100:],
+    "no-utf-8": lambda text: text[:900] + b"\xff\xfe" + text[902:],
+    "another-object": lambda text: text.replace(b'"chunk": 3', b'"chunk": "x"', 1),
+    "a-number": lambda text: b"17\n" + text,
+}
+
+
+@pytest.mark.parametrize("tear", TEARS)
+def test_damaged_lines_of_the_log_are_dropped_with_a_word(tear, folder, unbroken):
+    path = folder / log.FILE
+    whole = path.read_bytes()
+    path.write_bytes(TEARS[tear](whole))
+    good = [line for line in path.read_bytes().splitlines(keepends=True) if line in whole.splitlines(keepends=True)]
+    expected = [json.loads(line) for line in good]
+    assert log.read(folder) == expected
+    outcome, said = resumed(folder)
+    same(outcome, unbroken[1])
+    assert log.read(folder)[: len(good)] == expected
+    assert [row["chunk"] for row in log.read(folder)][-2:] == [7, 8]
+    assert path.read_bytes().startswith(b"".join(good))
+    (word,) = [line for line in said if "damaged" in line]
+    assert "metrics.jsonl: 1 damaged line dropped" in word
+
+
+def test_a_log_that_is_gone_or_empty_begins_anew(folder):
+    (folder / log.FILE).unlink()
+    resumed(folder)
+    assert [row["chunk"] for row in log.read(folder)] == [7, 8]
