@@ -315,6 +315,8 @@ def execute(
     on_start: Callable[[Job], Any],
     on_iteration: Callable[[IterationRecord], Any],
     on_error: Callable[[Job, ProblemError], Any],
+    *,
+    strict: bool = False,
 ) -> Iterator[Record]:
     """Runs the jobs that have no record yet. Appends each record to the results file, then yields it.
 
@@ -329,6 +331,7 @@ def execute(
         on_start: called before each job.
         on_iteration: called after every iteration.
         on_error: called for what is skipped.
+        strict: skip problems of which a part would be left out.
 
     Raises:
         OSError: a result cannot be written.
@@ -341,7 +344,7 @@ def execute(
         on_start(job)
         if loaded != job.source:
             try:
-                problem, loaded = job.source.read(), job.source
+                problem, loaded = job.source.read(strict=strict), job.source
             except ProblemError as error:
                 broken.add(job.source)
                 on_error(job, error)

@@ -7,8 +7,8 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
 from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -120,6 +120,19 @@ def print_line(text: str) -> None:
         print(text, flush=True)
     except BrokenPipeError:
         discard_stdout()
+
+
+@contextmanager
+def notes_printed(say: Callable[[str], object] = print_line) -> Iterator[None]:
+    """Prints the notes of what is read inside, one line each.
+
+    Args:
+        say: prints a line.
+    """
+    from jaxba.io.notes import told
+
+    with told(lambda note: say(f"note: {note}")):
+        yield
 
 
 def exit_with(status: int) -> NoReturn:

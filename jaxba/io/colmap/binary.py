@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from jaxba.io.colmap.records import (
     Image,
     Points,
     Pose,
+    Record,
     Rig,
     Sensor,
     pose_of,
@@ -41,14 +42,6 @@ _NAMES = {model.number: name for name, model in CAMERA_MODELS.items()}
 _LENGTH_AT = POINT.fields["length"][1] if POINT.fields else 0
 
 
-class _HasId(Protocol):
-    @property
-    def id(self) -> int: ...
-
-
-Record = TypeVar("Record", bound=_HasId)
-
-
 class _Bytes:
     """The bytes of a file, taken one after the other."""
 
@@ -62,7 +55,7 @@ class _Bytes:
         return len(self.data) - self.at
 
     def fail(self, complaint: str) -> NoReturn:
-        raise ProblemError(f"{self.name}: {complaint}")
+        raise ProblemError(f"{self.name}{'' if complaint.startswith('is ') else ':'} {complaint}")
 
     def take(self, layout: struct.Struct, where: str) -> tuple[Any, ...]:
         if self.left < layout.size:

@@ -36,15 +36,14 @@ def read_model(folder: StrPath) -> Model:
         raise ProblemError(f"{display_name(folder)}: no directory with a COLMAP model (cameras.bin or cameras.txt)")
     whole = [suffix for suffix in _READERS if _has(folder, suffix)]
     suffix = whole[0] if whole else next(s for s in _READERS if (Path(folder) / f"cameras{s}").is_file())
-    here = {part for part in (*PARTS, *RIG_PARTS) if os.path.lexists(Path(folder) / (part + suffix))}
-    for part in PARTS if here.isdisjoint(RIG_PARTS) else (*PARTS, *RIG_PARTS):
+    here = [part for part in (*PARTS, *RIG_PARTS) if os.path.lexists(Path(folder) / (part + suffix))]
+    for part in PARTS if set(here).isdisjoint(RIG_PARTS) else (*PARTS, *RIG_PARTS):
         if part not in here:
-            raise ProblemError(f"{file_name(os.fspath(folder), part + suffix)}: is missing")
+            raise ProblemError(f"{file_name(os.fspath(folder), part + suffix)} is missing")
     try:
-        cameras, images, points, rigs, frames = (
-            _read(folder, part, suffix) if part in here else None for part in (*PARTS, *RIG_PARTS)
-        )
-        model = Model(os.fspath(folder), suffix, cameras, images, points, rigs, frames)
+        content = {part: _read(folder, part, suffix) for part in here}
+        cameras, images, points = (content[part] for part in PARTS)
+        model = Model(os.fspath(folder), suffix, cameras, images, points, *map(content.get, RIG_PARTS))
         check_model(model)
     except MemoryError:
         raise ProblemError(f"cannot read {display_name(folder)}: not enough memory") from None
@@ -59,7 +58,7 @@ def _read(folder: StrPath, part: str, suffix: str) -> Any:
     path = Path(folder) / (part + suffix)
     name = file_name(os.fspath(folder), path.name)
     if path.exists() and not path.is_file():  # reading a pipe could wait for ever
-        raise ProblemError(f"{name}: is no file")
+        raise ProblemError(f"{name} is no file")
     try:
         data = path.read_bytes()
     except (*READ_ERRORS, ValueError) as error:

@@ -101,7 +101,7 @@ def seen_through(model: Model, camera: Camera, pixels: Float[np.ndarray, "n 2"])
     whitening = np.tile(np.diag([1.0, ratio]), (len(pixels), 1, 1))
     with np.errstate(over="ignore"):
         observations = (pixels - principal_point(camera)) / [1.0, ratio]
-    return Seen(observations, whitening, np.isfinite(observations).all(axis=1))
+    return Seen(observations, whitening, finite_rows(observations))
 
 
 def with_lens(camera: Camera, lens: Float[np.ndarray, " 3"]) -> Camera:
@@ -128,6 +128,11 @@ def project(model: Model, camera: Camera, plane: Float[np.ndarray, "n 2"]) -> Fl
     lens = np.tile([named.get(one, 0.0) for one in PARAMETERS], (len(plane), 1))
     with np.errstate(over="ignore", invalid="ignore"):
         return geometry.distort(plane, lens) * [1.0, named.get("fy", named["f"]) / named["f"]] + principal_point(camera)
+
+
+def finite_rows(values: Float[np.ndarray, "n width"]) -> Bool[np.ndarray, " n"]:
+    """Whether all numbers of a row are finite."""
+    return np.asarray(np.isfinite(values).all(axis=1))
 
 
 def _named(camera: Camera) -> dict[str, float] | None:
@@ -160,7 +165,7 @@ def _undistorted(lens: Any, focal: float, pixels: Float[np.ndarray, "n 2"]) -> S
     rates = [(_image(lens, plane + step) - _image(lens, plane - step)) / (2 * _STEP * focal) for step in steps]
     rates = np.stack(rates, axis=2)
     with np.errstate(over="ignore", invalid="ignore"):
-        valid = np.isfinite(np.column_stack([focal * plane, rates.reshape(-1, 4)])).all(axis=1)
+        valid = finite_rows(np.column_stack([focal * plane, rates.reshape(-1, 4)]))
         rates = np.where(valid[:, None, None], rates, np.eye(2))
         determinant, square = np.abs(np.linalg.det(rates)), np.square(rates).sum(axis=(1, 2))
         # the sum of squares over the determinant is the ratio of the singular values, plus its inverse

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from jaxba.io.colmap import lenses
 from jaxba.io.colmap.records import CAMERA_MODELS, CAMERA_SENSOR, Frame, Image, Model, Pose, quaternions
@@ -70,7 +70,7 @@ def assemble(model: Model) -> Assembled:
         raise ProblemError("; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]]))
     sees = np.bincount(views.image, minlength=len(images)) > 0
     observed = np.bincount(views.point, minlength=len(table.points)) > 0
-    blind, unseen = np.flatnonzero(~sees), np.flatnonzero(~observed & _are_finite(table))
+    blind, unseen = np.flatnonzero(~sees), np.flatnonzero(~observed & lenses.finite_rows(table.points["xyz"]))
     notes += note(model.file("images"), blind, "image", "left out, without observations", lambda at: str(images[at]))
     notes += note(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
     images = [image for image, kept in zip(images, sees, strict=True) if kept]
@@ -140,16 +140,12 @@ def _registered(model: Model) -> tuple[list[Image], list[str]]:
     return posed, notes
 
 
-def _are_finite(table: Ordered) -> Bool[np.ndarray, " points"]:
-    return np.isfinite(table.points["xyz"]).all(axis=1)
-
-
 def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
     """Views of finite pixels and points, and notes on the others."""
-    model, finite, what = table.model, _are_finite(table), "left out, not finite"
+    model, finite, what = table.model, lenses.finite_rows(table.points["xyz"]), "left out, not finite"
     notes = note(model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name)
     views = views.of(finite[views.point])
-    visible = np.isfinite(table.keys["xy"][views.key]).all(axis=1)
+    visible = lenses.finite_rows(table.keys["xy"][views.key])
     notes += note(model.file("images"), views.key[~visible], "key-point", what, table.key_name)
     return views.of(visible), notes
 

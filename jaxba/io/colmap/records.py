@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -143,6 +143,10 @@ class Frame:
     def images(self) -> list[tuple[int, int]]:
         """Ids of camera and image of what cameras took."""
         return [(sensor, image) for kind, sensor, image in self.data if kind == CAMERA_SENSOR]
+
+
+Record = TypeVar("Record", Camera, Image, Rig, Frame)
+"""A record with an id."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ follows the ninth field of its line. Source: COLMAP, src/colmap/scene/reconstruc
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TypeVar
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from jaxba.io.colmap.records import (
     Image,
     Points,
     Pose,
+    Record,
     Rig,
     Sensor,
     make_points,
@@ -31,8 +31,6 @@ from jaxba.io.colmap.words import Words, lines
 
 _POSE = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 _NAME = 9  # fields before the name of an image: id, pose, camera
-
-Record = TypeVar("Record", Camera, Image, Rig, Frame)
 
 
 def read_cameras(data: bytes, name: str) -> dict[int, Camera]:
@@ -125,9 +123,9 @@ def _images(file: Iterator[Words]) -> Iterator[tuple[Words, Image]]:
 def _starts_image(line: Words) -> bool:
     """Whether a line where key-points are due is that of the next image."""
     words = line.rest
-    if len(words) <= _NAME or (len(words) % 3 == 0 and _all(float, words)):
+    if len(words) <= _NAME or not _all(int, [words[0], words[_NAME - 1]]) or not _all(float, words[1 : _NAME - 1]):
         return False
-    return _all(int, [words[0], words[_NAME - 1]]) and _all(float, words[1 : _NAME - 1])
+    return len(words) % 3 != 0 or not _all(float, words)
 
 
 def _all(convert: Callable[[bytes], object], words: list[bytes]) -> bool:

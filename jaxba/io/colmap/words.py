@@ -30,7 +30,7 @@ def lines(data: bytes, name: str, *, empty: bool = False) -> Iterator[Words]:
     for mark, encoding in _MARKS.items():
         if data.startswith(mark):
             if encoding:
-                raise ProblemError(f"{name}: is a text in {encoding}; save it as UTF-8")
+                raise ProblemError(f"{name} is a text in {encoding}; save it as UTF-8")
             data = data[len(mark) :]
     start, number = 0, 0
     while start < len(data):
