@@ -29,6 +29,11 @@ def is_model(output: str, source: str | None) -> bool:
     return bare == output and Path(bare).suffix.lower() not in FILE_ENDINGS
 
 
+def _is_like_source(output: str, source: str | None) -> bool:
+    """Whether the output is written as a COLMAP model like that of the problem."""
+    return source is not None and Path(source).is_dir() and is_model(output, source)
+
+
 def check_outputs(output: str | None, log: str | None, source: str | None) -> None:
     """Checks that the output files can be written and differ from each other and from the problem.
 
@@ -37,6 +42,8 @@ def check_outputs(output: str | None, log: str | None, source: str | None) -> No
     """
     if output and is_model(output, source):
         common.check_folder("--output", output)
+        if not _is_like_source(output, source):
+            check_output(output)
     else:
         common.check_writable("--output", output)
         check_output(output or "")
@@ -55,10 +62,10 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
     """
     lost = ""
     try:
-        if source is not None and Path(source).is_dir() and is_model(output, source):
+        if _is_like_source(output, source):
             write_colmap(problem, output, like=source)
         elif is_model(output, source):
-            write_colmap(problem, output)
+            write_problem(problem, output)
             lost = table.lost_in_new_model(problem)
             common.print_line("note: names and sizes of images, and so principal points, are made up in that model")
         else:

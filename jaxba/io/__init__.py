@@ -50,10 +50,10 @@ def write_problem(problem: BundleProblem, path: StrPath) -> None:
     Raises:
         ProblemError: as `check_output`, `write_colmap`, `write_ply` and `write_bal` do.
     """
+    check_output(path)
     if is_folder(path):
         write_colmap(problem, path)
         return
-    check_output(path)
     (write_ply if _kind(path) == ".ply" else write_bal)(problem, path)
 
 
@@ -66,9 +66,14 @@ def check_output(path: StrPath) -> None:
     """Refuses a name that `read_problem` would not read as the format that `write_problem` writes.
 
     Raises:
-        ProblemError: the name is that of a Bundler model; one line.
+        ProblemError: the name is that of a Bundler model, or of a folder of other things; one line.
     """
-    if _kind(path) == ".out":
+    if is_folder(path):
+        if os.path.isdir(path) and os.listdir(path) and not is_colmap(path):
+            raise ProblemError(
+                f"cannot write {display_name(path)}: the directory holds other files, and no COLMAP model"
+            )
+    elif _kind(path) == ".out":
         raise ProblemError(f"cannot write {display_name(path)}: Bundler models are only read; .txt is for BAL")
 
 

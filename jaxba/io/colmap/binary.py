@@ -91,7 +91,8 @@ class _Bytes:
 
     def finish(self, count: int) -> None:
         if self.left:
-            self.fail(f"{self.left} bytes are left over after {count} {self.record}s")
+            plural = "" if self.left == 1 else "s"
+            self.fail(f"is too long, by {self.left} byte{plural} after {count} {self.record}s")
 
 
 def read_cameras(data: bytes, name: str) -> dict[int, Camera]:
@@ -130,9 +131,8 @@ def read_points(data: bytes, name: str) -> Points:
             rest.fail(f"is cut short in point {number + 1} of {count}")
         starts.append(at)
         at += POINT.itemsize + TRACK.itemsize * length_of(data, at + _LENGTH_AT)[0]
-    if at > end:
-        (identity,) = _COUNT.unpack_from(data, starts[-1])
-        rest.fail(f"is cut short in the track of point {identity}")
+        if at > end:
+            rest.fail(f"is cut short in the track of point {length_of(data, starts[-1])[0]}")
     rest.at = at
     rest.finish(count)
     ends = [*starts[1:], at]

@@ -61,7 +61,8 @@ def _check_frames(model: Model, rigs: dict[int, Rig], frames: dict[int, Frame]) 
             image = model.images.get(identity)
             if image is not None and image.camera != camera:
                 _fail(model, "frames", f"frame {frame.id}: {image} is of camera {image.camera}, not {camera}")
-        _check_pose(model, "frames", f"frame {frame.id}", frame.pose)
+        seen = [str(model.images[image]) for _, image in frame.images[:1] if image in model.images]
+        _check_pose(model, "frames", " of ".join([f"frame {frame.id}", *seen]), frame.pose)
     ids = [image for frame in frames.values() for _, image in frame.images]
     if len(set(ids)) < len(ids):
         twice = next(one for number, one in enumerate(sorted(ids)) if one == sorted(ids)[number + 1])

@@ -169,7 +169,7 @@ def _undistorted(lens: Any, focal: float, pixels: Float[np.ndarray, "n 2"]) -> S
         rates = np.where(valid[:, None, None], rates, np.eye(2))
         determinant, square = np.abs(np.linalg.det(rates)), np.square(rates).sum(axis=(1, 2))
         # the sum of squares over the determinant is the ratio of the singular values, plus its inverse
-        valid &= (determinant >= _SMALLEST_DETERMINANT) & (square <= LARGEST_RATIO * determinant)
+        valid &= (determinant >= _SMALLEST_DETERMINANT) & (square <= LARGEST_RATIO * np.minimum(determinant, 1.0))
     return Seen(
         np.where(valid[:, None], focal * plane, 0.0),
         np.where(valid[:, None, None], rates @ np.diag(COLMAP_FLIP[:2]), np.eye(2)),

@@ -157,7 +157,7 @@ def _through_lenses(table: Ordered, views: Views) -> tuple[Views, lenses.Seen, l
     used = sorted({image.camera for image in table.images})
     lens = np.searchsorted(used, [image.camera for image in table.images])[views.image] if used else views.image
     seen = lenses.Seen(np.empty_like(pixels), np.empty((len(pixels), 2, 2)), np.empty(len(pixels), bool))
-    for number, at in _groups(lens, len(used)):
+    for number, at in _groups(lens, len(used)) if used else ():
         camera = model.cameras[used[number]]
         for whole, part in zip(seen, lenses.seen_through(model, camera, pixels[at]), strict=True):
             whole[at] = part

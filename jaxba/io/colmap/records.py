@@ -21,6 +21,9 @@ RIG_PARTS = ("rigs", "frames")
 """Files that models have since COLMAP 3.12, both or none."""
 
 
+_LONGEST_NAME = 60  # of an image in messages
+
+
 class CameraModel(NamedTuple):
     """A kind of lens."""
 
@@ -108,7 +111,8 @@ class Image:
     """Of type `KEY`."""
 
     def __str__(self) -> str:
-        return f"image {self.id} ({display_name(os.fsdecode(self.name))})"
+        name = display_name(self.name.decode("utf-8", "backslashreplace"))
+        return f"image {self.id} ({name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 3] + '...'})"
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ follows the ninth field of its line. Source: COLMAP, src/colmap/scene/reconstruc
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -29,6 +30,7 @@ from jaxba.io.colmap.records import (
 )
 from jaxba.io.colmap.words import Words, lines
 
+_UNIT = 0.1  # how far the norm of a quaternion may be from 1, if that is to tell a pose from pixels
 _POSE = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
 _NAME = 9  # fields before the name of an image: id, pose, camera
 
@@ -124,6 +126,8 @@ def _starts_image(line: Words) -> bool:
     """Whether a line where key-points are due is that of the next image."""
     words = line.rest
     if len(words) <= _NAME or not _all(int, [words[0], words[_NAME - 1]]) or not _all(float, words[1 : _NAME - 1]):
+        return False
+    if not abs(math.hypot(*map(float, words[1:5])) - 1) < _UNIT:  # pixels of a damaged line are no unit quaternion
         return False
     return len(words) % 3 != 0 or not _all(float, words)
 
