@@ -37,6 +37,7 @@ LARGEST_RATIO = 1e6
 are singular to rounding beyond it."""
 
 _STEP = 1e-6  # in the image plane, for the derivative of a distortion that is not optimised
+_LARGEST_MISS = 0.1  # pixels, from a pixel to that of its direction; COLMAP gives some direction for any pixel
 _SMALLEST_DETERMINANT = 1e-6  # of that derivative; below it the image folds over itself
 
 
@@ -166,6 +167,7 @@ def _undistorted(lens: Any, focal: float, pixels: Float[np.ndarray, "n 2"]) -> S
     rates = np.stack(rates, axis=2)
     with np.errstate(over="ignore", invalid="ignore"):
         valid = finite_rows(np.column_stack([focal * plane, rates.reshape(-1, 4)]))
+        valid &= np.abs(_image(lens, plane) - pixels).max(axis=1, initial=0.0) < _LARGEST_MISS
         rates = np.where(valid[:, None, None], rates, np.eye(2))
         determinant, square = np.abs(np.linalg.det(rates)), np.square(rates).sum(axis=(1, 2))
         # the sum of squares over the determinant is the ratio of the singular values, plus its inverse
