@@ -298,8 +298,9 @@ def _digest(path: Path) -> str:
     policy reports that later."""
     total = hashlib.sha256()
     try:
-        parts = sorted(p for p in path.iterdir() if p.suffix in (".bin", ".txt")) if path.is_dir() else [path]
-        for part in parts:
+        for part in sorted(path.iterdir()) if path.is_dir() else [path]:
+            if part != path and (part.suffix not in (".bin", ".txt") or not part.is_file()):
+                continue
             with open(part, "rb") as file:
                 total.update(hashlib.file_digest(file, "sha256").digest())
     except OSError:

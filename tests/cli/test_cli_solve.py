@@ -427,10 +427,10 @@ BAD = {
         "--loss-scale must be positive",
     ),
     "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
-    "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "--output"),
-    "output named as a directory": (
-        lambda tiny: [str(tiny), "--output", f"{tiny.parent}/new/"],
-        "new/: is the name of a directory",
+    "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "holds other files"),
+    "output in a missing directory": (
+        lambda tiny: [str(tiny), "--output", f"{tiny.parent}/no/new/"],
+        "no does not exist",
     ),
     "output that would be read as Bundler's": (
         lambda tiny: [str(tiny), "--output", "o.out"],

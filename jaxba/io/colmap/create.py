@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.colmap.records import KEY, POINT, TRACK, Camera, Image, Model, Points, pose_of
+from jaxba.io.colmap.records import KEY, POINT, TRACK, WXYZ, Camera, Image, Model, Points, pose_of
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, colmap_quaternions
 from jaxba.problem.intrinsics import LENS_SIZE
 
 _NAME_DIGITS = 4  # at least, so that the names of images sort as their ids do
-_WXYZ = [3, 0, 1, 2]
 _LARGEST_HALF = 2**30  # pixels; COLMAP's sizes are whole numbers, and no image is larger
 
 
@@ -54,7 +53,7 @@ def create_model(problem: BundleProblem, target: str) -> Model:
     heads["id"], heads["xyz"] = np.arange(1, len(heads) + 1), valid.points
     heads["length"] = np.diff(point_ends, prepend=0)
     heads["error"] = mean_errors(geometry.residuals(valid), point_index, len(heads))
-    poses = np.hstack([colmap_quaternions(cameras[:, :3])[:, _WXYZ], cameras[:, 3:6] * COLMAP_FLIP])
+    poses = np.hstack([colmap_quaternions(cameras[:, :3])[:, WXYZ], cameras[:, 3:6] * COLMAP_FLIP])
     digits = max(_NAME_DIGITS, len(str(len(cameras))))
     images = {
         number: Image(number, pose_of(pose), int(of) + 1, f"image{number:0{digits}d}.jpg".encode(), seen)

@@ -14,16 +14,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.io.colmap import lenses
-from jaxba.io.colmap.records import CAMERA_MODELS, CAMERA_SENSOR, Frame, Image, Model, Pose, quaternions
+from jaxba.io.colmap.records import CAMERA_MODELS, CAMERA_SENSOR, XYZW, Frame, Image, Model, Pose, quaternions
 from jaxba.io.colmap.views import Ordered, Views, find_views, ordered
 from jaxba.io.colmap.wording import note
 from jaxba.io.files import display_name
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
-
-_XYZW = [1, 2, 3, 0]
-"""From COLMAP's order of a quaternion to that of `jaxba.problem.geometry`."""
 
 _EDGE = 0.01
 """A principal point is at the edge of an image within this fraction of its size."""
@@ -180,7 +177,7 @@ def _problem(
     numbers = [lenses.intrinsics(model.cameras[camera]) for camera in cameras]
     intrinsics, free = (np.array(part).reshape(-1, LENS_SIZE) for part in zip(*numbers, strict=True))
     poses = [image.pose for image in images]
-    rotations = bal_rotations(quaternions(poses)[:, _XYZW])
+    rotations = bal_rotations(quaternions(poses)[:, XYZW])
     translations = np.array([pose.tvec for pose in poses]) * COLMAP_FLIP
     covariance = None
     if (seen.whitening != np.eye(2)).any():

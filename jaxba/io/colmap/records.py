@@ -78,6 +78,13 @@ TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])
 """An element of a track: id of an image, and index of one of its key-points."""
 
 
+WXYZ = [3, 0, 1, 2]
+"""From the order of a quaternion in `jaxba.problem.geometry` to COLMAP's."""
+
+XYZW = [1, 2, 3, 0]
+"""And back."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """A lens, which images share."""

@@ -16,14 +16,22 @@ from jaxba.io.colmap.create import create_model, mean_errors
 from jaxba.io.colmap.encode import encode
 from jaxba.io.colmap.folder import is_binary, read_model
 from jaxba.io.colmap.problem import Assembled, assemble
-from jaxba.io.colmap.records import CAMERA_SENSOR, Camera, Frame, Model, Points, Pose, Rig, Sensor, pose_of
+from jaxba.io.colmap.records import (
+    CAMERA_MODELS,
+    CAMERA_SENSOR,
+    WXYZ,
+    Camera,
+    Frame,
+    Model,
+    Points,
+    Rig,
+    Sensor,
+    pose_of,
+)
 from jaxba.io.files import StrPath, display_name, reason
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, colmap_quaternions
-
-_WXYZ = [3, 0, 1, 2]
-"""From the order of a quaternion of `jaxba.problem.geometry` to COLMAP's."""
 
 
 def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None = None) -> None:
@@ -64,15 +72,21 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
     """The model with the numbers of the problem."""
     cameras = np.asarray(problem.cameras, np.float64)
     points = np.asarray(problem.points, np.float64)
+    pose_name = lambda at: f"the pose of {assembled.images[at]}"
+    point_name = lambda at: f"point {model.points.heads['id'][assembled.points[at]]}"
+    for values, name in ((cameras[:, :6], pose_name), (points, point_name)):
+        if not (finite := lenses.finite_rows(values)).all():
+            raise ProblemError(f"cannot write {target}: {name(int(finite.argmin()))} is not finite")
     new_lenses: dict[int, np.ndarray] = {}
     for number, image in enumerate(assembled.images):
         lens = new_lenses.setdefault(image.camera, cameras[number, 6:])
         if (lens != cameras[number, 6:]).any():
             raise ProblemError(f"cannot write {target}: images of camera {image.camera} have different f, k1 or k2")
     new_cameras = {identity: lenses.with_lens(model.cameras[identity], lens) for identity, lens in new_lenses.items()}
-    quaternions = colmap_quaternions(cameras[:, :3])[:, _WXYZ]
+    for camera in new_cameras.values():
+        _check_lens(camera, target)
+    quaternions = colmap_quaternions(cameras[:, :3])[:, WXYZ]
     poses = [pose_of(row) for row in np.hstack([quaternions, cameras[:, 3:6] * COLMAP_FLIP])]
-    _check(assembled, new_cameras, poses, points, target)
     new_images = {
         image.id: replace(model.images[image.id], pose=pose)
         for image, pose in zip(assembled.images, poses, strict=True)
@@ -98,20 +112,12 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
     )
 
 
-def _check(
-    assembled: Assembled, cameras: dict[int, Camera], poses: list[Pose], points: np.ndarray, target: str
-) -> None:
-    """Refuses what `read_colmap` would refuse."""
-    for camera in cameras.values():
-        focals = camera.params[: lenses.CAMERA_MODELS[camera.model].focals]
-        if not np.isfinite(camera.params).all() or min(focals) <= 0:
-            shown = ", ".join(f"{value:g}" for value in camera.params)
-            raise ProblemError(f"cannot write {target}: camera {camera.id} would have impossible parameters: {shown}")
-    for image, pose in zip(assembled.images, poses, strict=True):
-        if not np.isfinite([*pose.qvec, *pose.tvec]).all():
-            raise ProblemError(f"cannot write {target}: the pose of {image} is not finite")
-    if not np.isfinite(points).all():
-        raise ProblemError(f"cannot write {target}: a point is not finite")
+def _check_lens(camera: Camera, target: str) -> None:
+    """Refuses a lens that `read_colmap` would refuse."""
+    focals = camera.params[: CAMERA_MODELS[camera.model].focals]
+    if not np.isfinite(camera.params).all() or min(focals) <= 0:
+        shown = ", ".join(f"{value:g}" for value in camera.params)
+        raise ProblemError(f"cannot write {target}: camera {camera.id} would have impossible parameters: {shown}")
 
 
 def _errors(
