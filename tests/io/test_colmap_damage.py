@@ -526,9 +526,9 @@ def test_a_benchmark_goes_on_after_models_that_cannot_be_read(tmp_path, capsys):
     assert printed.err.count("\n") == 1
     assert f"note: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n" in printed.out
     assert [record.problem for record in read_records(tmp_path / "runs" / "results.jsonl")] == ["odd", "good"]
-    assert run_bench([*arguments, "--strict", "--out", str(tmp_path / "strict")]) == 2
-    assert capsys.readouterr().err.count("error: ") == 2
-    assert [record.problem for record in read_records(tmp_path / "strict" / "results.jsonl")] == ["good"]
+    assert run_bench([str(odd), "--strict", *arguments[3:], "--out", str(tmp_path / "strict")]) == 2
+    error = f"error: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n"
+    assert capsys.readouterr().err == error
 
 
 # Any bytes
@@ -585,7 +585,7 @@ def test_any_bytes_are_a_model_or_refused_in_one_line(tmp_path, text):
     files = {path.name: path.read_bytes() for path in source.iterdir()}
     rng = np.random.default_rng(5)
     read = 0
-    for case in range(300):
+    for case in range(150):
         for name, data in files.items():
             (source / name).write_bytes(mutated(rng, data, text) if rng.random() < 0.5 else data)
         started = time.perf_counter()
@@ -600,4 +600,4 @@ def test_any_bytes_are_a_model_or_refused_in_one_line(tmp_path, text):
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
         write_colmap(problem, tmp_path / "out", like=source)
         assert noted(tmp_path / "out")[0].num_observations == problem.num_observations
-    assert 20 < read < 280
+    assert 10 < read < 140

@@ -161,19 +161,20 @@ def _image(lens: Any, plane: np.ndarray) -> np.ndarray:
 
 def _undistorted(lens: Any, focal: float, pixels: Float[np.ndarray, "n 2"]) -> Seen:
     """Undistorted pixels, and the derivatives of the distorted pixels with respect to them."""
-    plane = np.asarray(lens.cam_from_img(pixels))
-    steps = _STEP * np.eye(2)
-    rates = [(_image(lens, plane + step) - _image(lens, plane - step)) / (2 * _STEP * focal) for step in steps]
-    rates = np.stack(rates, axis=2)
     with np.errstate(over="ignore", invalid="ignore"):
-        valid = finite_rows(np.column_stack([focal * plane, rates.reshape(-1, 4)]))
+        plane = np.asarray(lens.cam_from_img(pixels))
+        steps = _STEP * np.eye(2)
+        rates = [(_image(lens, plane + step) - _image(lens, plane - step)) / (2 * _STEP * focal) for step in steps]
+        rates = np.stack(rates, axis=2)
+        undistorted = focal * plane
+        valid = finite_rows(np.column_stack([undistorted, rates.reshape(-1, 4)]))
         valid &= np.abs(_image(lens, plane) - pixels).max(axis=1, initial=0.0) < _LARGEST_MISS
         rates = np.where(valid[:, None, None], rates, np.eye(2))
         determinant, square = np.abs(np.linalg.det(rates)), np.square(rates).sum(axis=(1, 2))
         # the sum of squares over the determinant is the ratio of the singular values, plus its inverse
         valid &= (determinant >= _SMALLEST_DETERMINANT) & (square <= LARGEST_RATIO * np.minimum(determinant, 1.0))
     return Seen(
-        np.where(valid[:, None], focal * plane, 0.0),
+        np.where(valid[:, None], undistorted, 0.0),
         np.where(valid[:, None, None], rates @ np.diag(COLMAP_FLIP[:2]), np.eye(2)),
         valid,
     )
