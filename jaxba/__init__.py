@@ -35,7 +35,7 @@ from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.methods.registry import METHODS, Method, make_method
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
@@ -76,6 +76,7 @@ __all__ = [
     "Prepared",
     "ProblemError",
     "ProblemInfo",
+    "ProblemWarning",
     "Refinement",
     "Retriangulation",
     "SceneConfig",

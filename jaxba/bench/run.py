@@ -298,8 +298,9 @@ def _digest(path: Path) -> str:
     policy reports that later."""
     total = hashlib.sha256()
     try:
-        parts = sorted(p for p in path.iterdir() if p.suffix in (".bin", ".txt")) if path.is_dir() else [path]
-        for part in parts:
+        for part in sorted(path.iterdir()) if path.is_dir() else [path]:
+            if part != path and (part.suffix not in (".bin", ".txt") or not part.is_file()):
+                continue
             with open(part, "rb") as file:
                 total.update(hashlib.file_digest(file, "sha256").digest())
     except OSError:
@@ -315,6 +316,8 @@ def execute(
     on_start: Callable[[Job], Any],
     on_iteration: Callable[[IterationRecord], Any],
     on_error: Callable[[Job, ProblemError], Any],
+    *,
+    strict: bool = False,
 ) -> Iterator[Record]:
     """Runs the jobs that have no record yet. Appends each record to the results file, then yields it.
 
@@ -329,6 +332,7 @@ def execute(
         on_start: called before each job.
         on_iteration: called after every iteration.
         on_error: called for what is skipped.
+        strict: skip problems of which a part would be left out.
 
     Raises:
         OSError: a result cannot be written.
@@ -341,7 +345,7 @@ def execute(
         on_start(job)
         if loaded != job.source:
             try:
-                problem, loaded = job.source.read(), job.source
+                problem, loaded = job.source.read(strict=strict), job.source
             except ProblemError as error:
                 broken.add(job.source)
                 on_error(job, error)

@@ -40,14 +40,17 @@ class Source:
     location: str
     """Path, or `scene:NAME:SEED`."""
 
-    def read(self) -> BundleProblem:
+    def read(self, *, strict: bool = False) -> BundleProblem:
         """Reads or generates the problem.
+
+        Args:
+            strict: as for `read_problem`.
 
         Raises:
             ProblemError: the input is invalid; the message is one line.
         """
         if not self.location.startswith(SCENE_PREFIX):
-            return read_problem(self.location)
+            return read_problem(self.location, strict=strict)
         name, seed = _scene(self.location)
         return random_scene(DEFAULT_SCENES.get(name) or scene_like(name), seed)
 

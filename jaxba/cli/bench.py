@@ -58,6 +58,9 @@ class Arguments:
     linear_solver: LinearSolverChoice = "auto"
     """Linear solver of the method lm; other methods have their own."""
 
+    strict: bool = False
+    """Refuse problems of which a part would be left out, such as a view in a COLMAP model that names no key-point."""
+
     out: str = "runs/bench"
     """Folder of the results. A second run with the same folder does only what is missing."""
 
@@ -91,12 +94,12 @@ def _bench(args: Arguments) -> int:
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
     try:
         with run.only_writer(Path(args.out)):
-            return _run_missing(Path(args.out), jobs, settings, tolerance)
+            return _run_missing(Path(args.out), jobs, settings, tolerance, args.strict)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
 
 
-def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float) -> int:
+def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, strict: bool) -> int:
     """Runs the jobs that the folder has no record of, and writes the report. Raises OSError if a file cannot be
     written."""
     from rich.console import Console
@@ -117,7 +120,8 @@ def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float) -> in
         console.print(f"{len(records)} of {common.counted(len(jobs), 'run')} already in {folder}", highlight=False)
     status = 0
     try:
-        status = _execute(jobs, done, folder, settings, console, records)
+        with common.notes_printed(lambda note: console.print(note, highlight=False, soft_wrap=True)):
+            status = _execute(jobs, done, folder, settings, console, records, strict)
     except KeyboardInterrupt:
         console.print("interrupted; what is done is kept, run the same command again to continue", highlight=False)
         status = common.INTERRUPTED
@@ -129,7 +133,7 @@ def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float) -> in
     return status
 
 
-def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, records: list) -> int:
+def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, records: list, strict: bool) -> int:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from jaxba.bench import run
@@ -156,7 +160,7 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
             failures.append(job)
             common.print_error(str(error))
 
-        for record in run.execute(jobs, done, folder, settings, start, iterate, fail):
+        for record in run.execute(jobs, done, folder, settings, start, iterate, fail, strict=strict):
             records.append(record)
             progress.advance(task)
             if not console.is_terminal:

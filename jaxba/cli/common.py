@@ -179,6 +179,19 @@ def print_line(text: str) -> None:
     print(text, flush=True)
 
 
+@contextmanager
+def notes_printed(say: Callable[[str], object] = print_line) -> Iterator[None]:
+    """Prints the notes of what is read inside, one line each.
+
+    Args:
+        say: prints a line.
+    """
+    from jaxba.io.notes import told
+
+    with told(lambda note: say(f"note: {note}")):
+        yield
+
+
 def exit_with(status: int) -> NoReturn:
     """Ends the process. From here on Ctrl-C changes nothing."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

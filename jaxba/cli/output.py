@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxba.cli import common, table
-from jaxba.io import check_output, write_colmap, write_problem
+from jaxba.io import check_output, is_folder, write_colmap, write_problem
 from jaxba.io.files import strip_compression
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -14,17 +14,24 @@ FILE_ENDINGS = (".txt", ".bal", ".ply")
 
 
 def is_model(output: str, source: str | None) -> bool:
-    """Whether the output is written as a COLMAP model: the problem is one, and the output has no ending of a file.
+    """Whether the output is written as a COLMAP model: it is a folder, or the problem is a model and the output has no
+    ending of a file.
 
     Args:
         output: path of the output.
         source: path of the problem; None for a random scene.
     """
+    if is_folder(output):
+        return True
     if source is None or not Path(source).is_dir():
         return False
     bare = strip_compression(output)
-    is_file = bare != output or Path(bare).suffix.lower() in FILE_ENDINGS
-    return Path(output).is_dir() or not is_file
+    return bare == output and Path(bare).suffix.lower() not in FILE_ENDINGS
+
+
+def _is_like_source(output: str, source: str | None) -> bool:
+    """Whether the output is written as a COLMAP model like that of the problem."""
+    return source is not None and Path(source).is_dir() and is_model(output, source)
 
 
 def check_outputs(output: str | None, log: str | None, source: str | None) -> None:
@@ -35,6 +42,8 @@ def check_outputs(output: str | None, log: str | None, source: str | None) -> No
     """
     if output and is_model(output, source):
         common.check_folder("--output", output)
+        if not _is_like_source(output, source):
+            check_output(output)
     else:
         common.check_writable("--output", output)
         check_output(output or "")
@@ -53,8 +62,12 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
     """
     lost = ""
     try:
-        if source is not None and is_model(output, source):
+        if _is_like_source(output, source):
             write_colmap(problem, output, like=source)
+        elif is_model(output, source):
+            write_problem(problem, output)
+            lost = table.lost_in_new_model(problem)
+            common.print_line("note: names and sizes of images, and so principal points, are made up in that model")
         else:
             write_problem(problem, output)
             lost = table.lost_in_bal(problem)
@@ -62,4 +75,4 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
     common.print_line(f"wrote {output}")
     if lost:
-        common.print_line(f"note: that file cannot store: {lost}")
+        common.print_line(f"note: that {'model' if is_model(output, source) else 'file'} cannot store: {lost}")

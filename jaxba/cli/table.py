@@ -133,8 +133,14 @@ def _how_compiled(solution: Solution) -> str:
 def lost_in_bal(problem: BundleProblem) -> str:
     """Properties of a problem that a BAL file cannot store, as text; empty if there are none."""
     lenses = problem.lenses
+    shared = ["which images share a lens"] if lenses is not None and lenses.shared else []
+    return ", ".join([*shared, *filter(None, [lost_in_new_model(problem)])])
+
+
+def lost_in_new_model(problem: BundleProblem) -> str:
+    """Properties of a problem that a COLMAP model cannot store, as text; empty if there are none."""
+    lenses = problem.lenses
     lost = [
-        (lenses is not None and lenses.shared, "which images share a lens"),
         (lenses is not None and not np.asarray(lenses.free).all(), "which numbers of a lens stay as they are"),
         (problem.whitening is not None, "weights of observations"),
     ]

@@ -427,10 +427,10 @@ BAD = {
         "--loss-scale must be positive",
     ),
     "output in a missing folder": (lambda tiny: [str(tiny), "--output", str(tiny.parent / "no" / "o.txt")], "--output"),
-    "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "--output"),
-    "output named as a directory": (
-        lambda tiny: [str(tiny), "--output", f"{tiny.parent}/new/"],
-        "new/: is the name of a directory",
+    "output is a directory": (lambda tiny: [str(tiny), "--output", str(tiny.parent)], "holds other files"),
+    "output in a missing directory": (
+        lambda tiny: [str(tiny), "--output", f"{tiny.parent}/no/new/"],
+        "no does not exist",
     ),
     "output that would be read as Bundler's": (
         lambda tiny: [str(tiny), "--output", "o.out"],
@@ -476,6 +476,8 @@ def test_the_parser_proposes_the_nearest_option(capsys):
 
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (0.01, True)])
 def test_the_heading_reports_a_different_damping_of_cameras(factor, said):
-    args = SimpleNamespace(policy="mine.safetensors", dtype="float64", method="lm", linear_solver="auto", compilation="full")
+    args = SimpleNamespace(
+        policy="mine.safetensors", dtype="float64", method="lm", linear_solver="auto", compilation="full"
+    )
     text = table.heading("scene", support.tiny(), args, StepOptions(coordinates=Coordinates(camera_damping=factor)))
     assert ("cameras damped by 0.01 lambda" in text) == said

@@ -1,0 +1,74 @@
+"""Folders of COLMAP models: which files they have, and reading them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from jaxba.io.colmap import binary, text
+from jaxba.io.colmap.check import check_model
+from jaxba.io.colmap.records import PARTS, RIG_PARTS, Model, file_name
+from jaxba.io.files import READ_ERRORS, StrPath, display_name, reason
+from jaxba.problem.bundle_problem import ProblemError
+
+_READERS: dict[str, Any] = {".bin": binary, ".txt": text}
+
+
+def is_colmap(path: StrPath) -> bool:
+    """Whether a path is a folder that holds a COLMAP model."""
+    return any((Path(path) / f"cameras{suffix}").is_file() for suffix in _READERS)
+
+
+def is_binary(folder: StrPath) -> bool:
+    """Whether COLMAP would read the binary files of a folder."""
+    return _has(folder, ".bin")
+
+
+def read_model(folder: StrPath) -> Model:
+    """Reads the files of a model, the binary ones where there are both, and checks its structure.
+
+    Raises:
+        ProblemError: a file is missing, cannot be read or understood, or `check_model` refuses the model; one line
+            that names the file.
+    """
+    if not is_colmap(folder):
+        raise ProblemError(f"{display_name(folder)}: no directory with a COLMAP model (cameras.bin or cameras.txt)")
+    whole = [suffix for suffix in _READERS if _has(folder, suffix)]
+    suffix = whole[0] if whole else next(s for s in _READERS if (Path(folder) / f"cameras{s}").is_file())
+    here = [part for part in (*PARTS, *RIG_PARTS) if os.path.lexists(Path(folder) / (part + suffix))]
+    for part in PARTS if set(here).isdisjoint(RIG_PARTS) else (*PARTS, *RIG_PARTS):
+        if part not in here:
+            raise ProblemError(f"{file_name(os.fspath(folder), part + suffix)} is missing")
+    try:
+        content = {part: _read(folder, part, suffix) for part in here}
+        cameras, images, points = (content[part] for part in PARTS)
+        model = Model(os.fspath(folder), suffix, cameras, images, points, *map(content.get, RIG_PARTS))
+        check_model(model)
+    except MemoryError:
+        raise ProblemError(f"cannot read {display_name(folder)}: not enough memory") from None
+    return model
+
+
+def _has(folder: StrPath, suffix: str) -> bool:
+    return all((Path(folder) / (part + suffix)).is_file() for part in PARTS)
+
+
+def _read(folder: StrPath, part: str, suffix: str) -> Any:
+    path = Path(folder) / (part + suffix)
+    name = file_name(os.fspath(folder), path.name)
+    if path.exists() and not path.is_file():  # reading a pipe could wait for ever
+        raise ProblemError(f"{name} is no file")
+    try:
+        data = path.read_bytes()
+    except (*READ_ERRORS, ValueError) as error:
+        raise ProblemError(f"cannot read {name}: {reason(error)}") from error
+    readers = _READERS[suffix]
+    read = {
+        "cameras": readers.read_cameras,
+        "images": readers.read_images,
+        "points3D": readers.read_points,
+        "rigs": readers.read_rigs,
+        "frames": readers.read_frames,
+    }
+    return read[part](data, name)

@@ -1,0 +1,205 @@
+"""The bundle adjustment problem of a COLMAP model, and where its parts stand in the model.
+
+COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards; pixels of a problem are relative to the
+principal point, which is not optimised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba.io.colmap import lenses
+from jaxba.io.colmap.records import CAMERA_MODELS, CAMERA_SENSOR, XYZW, Frame, Image, Model, Pose, quaternions
+from jaxba.io.colmap.views import Ordered, Views, find_views, ordered
+from jaxba.io.colmap.wording import note
+from jaxba.io.files import display_name
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations
+from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+
+_EDGE = 0.01
+"""A principal point is at the edge of an image within this fraction of its size."""
+
+_SAME = 1e-6
+"""Poses that differ by less, relatively, are the same."""
+
+
+class Assembled(NamedTuple):
+    """A problem, and the records of the model that its parts are of."""
+
+    problem: BundleProblem
+    images: list[Image]
+    """Those of the problem's cameras."""
+
+    cameras: list[int]
+    """Ids of the cameras of the problem's lenses."""
+
+    points: Int[np.ndarray, " points"]
+    """Positions in `model.points.heads`."""
+
+    pixels: Float[np.ndarray, "observations 2"]
+    """Pixels of the observations as the model has them."""
+
+    notes: list[str]
+    """What was left out or mended, one line each."""
+
+
+def assemble(model: Model) -> Assembled:
+    """The problem of a model.
+
+    Raises:
+        ProblemError: a rig of several cameras, a lens that cannot be used, or nothing is observed.
+    """
+    images, notes = _registered(model)
+    table = ordered(model, images)
+    for camera in sorted({image.camera for image in images}):
+        lenses.check_lens(model, model.cameras[camera])
+    views, found = find_views(table)
+    views, odd = _finite(table, views)
+    views, seen, folded = _through_lenses(table, views)
+    notes += found + odd + folded
+    if not len(views.key):
+        raise ProblemError("; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]]))
+    sees = np.bincount(views.image, minlength=len(images)) > 0
+    observed = np.bincount(views.point, minlength=len(table.points)) > 0
+    blind, unseen = np.flatnonzero(~sees), np.flatnonzero(~observed & lenses.finite_rows(table.points["xyz"]))
+    notes += note(model.file("images"), blind, "image", "left out, without observations", lambda at: str(images[at]))
+    notes += note(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
+    images = [image for image, kept in zip(images, sees, strict=True) if kept]
+    camera_index, point_index = (np.cumsum(sees) - 1)[views.image], (np.cumsum(observed) - 1)[views.point]
+    points = table.points["xyz"][observed]
+    problem, cameras = _problem(model, images, points, seen, camera_index, point_index)
+    return Assembled(problem, images, cameras, table.order[observed], table.keys["xy"][views.key], notes)
+
+
+def hints(model: Model) -> list[str]:
+    """What looks wrong in a model, one line each."""
+    odd = []
+    for camera in model.cameras.values():
+        if camera.width and camera.height and CAMERA_MODELS[camera.model].focals:
+            at = np.array(lenses.principal_point(camera)) / (float(camera.width), float(camera.height))
+            if not ((at >= _EDGE) & (at <= 1 - _EDGE)).all():
+                odd.append(camera)
+
+    def place(at: int) -> str:
+        x, y = lenses.principal_point(odd[at])
+        return f"camera {odd[at].id}: pixel {x:g}, {y:g} of {odd[at].width} x {odd[at].height}"
+
+    notes = note(model.file("cameras"), np.arange(len(odd)), "principal point", "at the edge of the image", place)
+    frames = _frames(model)
+    other = [one for one in model.images.values() if one.id in frames and _differ(one.pose, frames[one.id].pose)]
+    where = f"with another pose than in {model.file('frames')}, which counts"
+    return notes + note(model.file("images"), np.arange(len(other)), "image", where, lambda at: str(other[at]))
+
+
+def _differ(one: Pose, other: Pose) -> bool:
+    """Whether two poses are not the same to the digits of a file."""
+    if one == other:
+        return False
+    first, second = quaternions([one, other])
+    parallel = abs(first @ second) >= (1 - _SAME) * np.linalg.norm(first) * np.linalg.norm(second)
+    return not (parallel and np.allclose(one.tvec, other.tvec, rtol=_SAME, atol=_SAME))
+
+
+def _frames(model: Model) -> dict[int, Frame]:
+    """Frames by the ids of their images."""
+    return {image: frame for frame in (model.frames or {}).values() for _, image in frame.images}
+
+
+def _registered(model: Model) -> tuple[list[Image], list[str]]:
+    """Registered images by id, with the poses of their frames, and notes on the others.
+
+    Raises:
+        ProblemError: a frame has several cameras, or one that is not the reference of its rig.
+    """
+    images = [model.images[identity] for identity in sorted(model.images)]
+    frames = _frames(model)
+    for image in images:
+        frame = frames.get(image.id)
+        if frame is not None and model.rigs is not None:
+            first = model.rigs[frame.rig].sensors[0]
+            if len(frame.images) > 1 or (first.type, first.id) != (CAMERA_SENSOR, image.camera):
+                name = display_name(model.folder)
+                raise ProblemError(f"{name}: image {image.id} is of a rig of several cameras, whose poses depend on it")
+    if model.frames is None:
+        return images, []
+    away = np.flatnonzero([image.id not in frames for image in images])
+    lost = [frame for number, frame in sorted(frames.items()) if number not in model.images]
+    notes = note(model.file("images"), away, "image", "left out, without a frame", lambda at: str(images[at]))
+    name = lambda at: f"frame {lost[at].id}"
+    notes += note(model.file("frames"), np.arange(len(lost)), "frame", "left out, without an image", name)
+    posed = [replace(image, pose=frames[image.id].pose) for image in images if image.id in frames]
+    return posed, notes
+
+
+def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
+    """Views of finite pixels and points, and notes on the others."""
+    model, finite, what = table.model, lenses.finite_rows(table.points["xyz"]), "left out, not finite"
+    notes = note(model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name)
+    views = views.of(finite[views.point])
+    visible = lenses.finite_rows(table.keys["xy"][views.key])
+    notes += note(model.file("images"), views.key[~visible], "key-point", what, table.key_name)
+    return views.of(visible), notes
+
+
+def _through_lenses(table: Ordered, views: Views) -> tuple[Views, lenses.Seen, list[str]]:
+    """Views in the range of their lenses, what these see, and notes on the others."""
+    model, notes = table.model, []
+    pixels = table.keys["xy"][views.key]
+    used = sorted({image.camera for image in table.images})
+    lens = np.searchsorted(used, [image.camera for image in table.images])[views.image] if used else views.image
+    seen = lenses.Seen(np.empty_like(pixels), np.empty((len(pixels), 2, 2)), np.empty(len(pixels), bool))
+    for number, at in _groups(lens, len(used)) if used else ():
+        camera = model.cameras[used[number]]
+        for whole, part in zip(seen, lenses.seen_through(model, camera, pixels[at]), strict=True):
+            whole[at] = part
+        what = f"left out, outside of the range of camera {camera.id} ({camera.model})"
+        notes += note(model.file("images"), views.key[at[~seen.valid[at]]], "key-point", what, table.key_name)
+    return views.of(seen.valid), lenses.Seen(*(part[seen.valid] for part in seen)), notes
+
+
+def _problem(
+    model: Model,
+    images: list[Image],
+    points: Float[np.ndarray, "points 3"],
+    seen: lenses.Seen,
+    camera_index: Int[np.ndarray, " observations"],
+    point_index: Int[np.ndarray, " observations"],
+) -> tuple[BundleProblem, list[int]]:
+    """The problem, and the ids of the cameras of its lenses."""
+    cameras = sorted({image.camera for image in images})
+    lens = np.searchsorted(cameras, [image.camera for image in images])
+    numbers = [lenses.intrinsics(model.cameras[camera]) for camera in cameras]
+    intrinsics, free = (np.array(part).reshape(-1, LENS_SIZE) for part in zip(*numbers, strict=True))
+    poses = [image.pose for image in images]
+    rotations = bal_rotations(quaternions(poses)[:, XYZW])
+    translations = np.array([pose.tvec for pose in poses]) * COLMAP_FLIP
+    covariance = None
+    if (seen.whitening != np.eye(2)).any():
+        root = np.linalg.inv(seen.whitening)
+        covariance = root @ root.transpose(0, 2, 1)
+        covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    try:
+        problem = BundleProblem.create(
+            np.hstack([rotations, translations, intrinsics[lens]]),
+            points,
+            seen.pixels * COLMAP_FLIP[:2],
+            camera_index,
+            point_index,
+            covariance=covariance,
+            lenses=None if len(cameras) == len(images) and free.all() else Lenses(lens, free),
+        )
+    except ProblemError as error:
+        raise ProblemError(f"{display_name(model.folder)}: {error}") from error
+    return problem, cameras
+
+
+def _groups(numbers: np.ndarray, count: int) -> Iterator[tuple[int, np.ndarray]]:
+    """Every number below `count`, with its positions in `numbers`."""
+    order = np.argsort(numbers, kind="stable")
+    return enumerate(np.split(order, np.searchsorted(numbers[order], np.arange(1, count))))

@@ -1,0 +1,603 @@
+"""COLMAP models with damage: that of one view, point or image is left out with a note, all else refused in one line."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import time
+import tracemalloc
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from colmap_model import FIRST_POINT, TextModel
+
+from jaxba import BundleProblem, ProblemError, ProblemWarning, read_colmap, read_problem, write_colmap
+from jaxba.bench.records import read_records
+from jaxba.cli.bench import run as run_bench
+from jaxba.cli.solve import run
+
+
+def noted(folder: Path) -> tuple[BundleProblem, list[str]]:
+    """The problem of a model, and the notes on it without the folder's name."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        problem = read_colmap(folder)
+    assert all(issubclass(one.category, ProblemWarning) for one in caught)
+    lines = [str(one.message) for one in caught]
+    assert all(line.startswith(f"{folder}/") and line.isprintable() for line in lines)
+    return problem, [line.replace(f"{folder}/", "") for line in lines]
+
+
+def refusal(folder: Path) -> str:
+    """Why a model is refused, without the folder's name."""
+    with pytest.raises(ProblemError) as caught:
+        read_colmap(folder)
+    assert str(caught.value).isprintable()
+    assert str(folder) in str(caught.value)
+    return str(caught.value).replace(f"{folder}/", "")
+
+
+def same(one: BundleProblem, other: BundleProblem) -> bool:
+    names = ("cameras", "points", "observations", "camera_index", "point_index")
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+def without(problem: BundleProblem, views: list[int]) -> BundleProblem:
+    kept = np.delete(np.arange(problem.num_observations), views)
+    names = ("observations", "camera_index", "point_index")
+    return problem.replace(**{name: getattr(problem, name)[kept] for name in names})
+
+
+@pytest.fixture(scope="module")
+def healthy(tmp_path_factory) -> BundleProblem:
+    problem, notes = noted(TextModel().write(tmp_path_factory.mktemp("healthy")))
+    assert notes == []
+    return problem
+
+
+def test_the_model_of_these_tests_is_read_as_the_scene_that_it_was_made_of(healthy):
+    scene = TextModel().scene
+    assert np.array_equal(healthy.points, scene.points)
+    np.testing.assert_allclose(healthy.cameras, scene.cameras, rtol=1e-12, atol=1e-14)
+    assert healthy.num_observations == scene.num_observations
+    order = np.lexsort((scene.camera_index, scene.point_index))
+    assert np.array_equal(healthy.camera_index, scene.camera_index[order])
+
+
+def test_a_binary_model_is_read_as_the_text_of_the_same_numbers(tmp_path, healthy):
+    problem, notes = noted(TextModel().write_binary(tmp_path / "m"))
+    assert notes == []
+    assert same(problem, healthy)
+
+
+# What is left out or mended
+
+
+def key_numbers_beyond(model: TextModel) -> None:
+    for at in range(9, len(model.points[7]), 2):
+        model.points[7][at] = str(1000 + int(model.points[7][at]))
+
+
+def all_name_key_point_zero(model: TextModel) -> None:
+    for point in model.points:
+        point[9::2] = ["0"] * len(point[9::2])
+
+
+def no_tracks(model: TextModel) -> None:
+    model.points = [point[:8] for point in model.points]
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+@pytest.mark.parametrize(
+    "damage", [key_numbers_beyond, all_name_key_point_zero, no_tracks], ids=lambda one: one.__name__
+)
+def test_key_points_are_believed_where_tracks_name_others(tmp_path, healthy, damage, binary):
+    model = TextModel()
+    damage(model)
+    folder = (model.write_binary if binary else model.write)(tmp_path / "m")
+    problem, (note,) = noted(folder)
+    images = "images.bin" if binary else "images.txt"
+    assert f"where {images} is believed (point {18 if damage is key_numbers_beyond else ''}" in note
+    if damage is key_numbers_beyond:
+        count = len(model.points[7][9::2])
+        image = model.points[7][8]
+        assert f"{count} track elements with a wrong key-point" in note
+        size = len(model.keys[int(image) - 1])
+        beyond = f"key-point {model.points[7][9]} of image {image} (view{int(image) - 1}.jpg), which has {size})"
+        assert note.endswith(f"(point 18: {beyond}")
+    assert same(problem, healthy)
+
+
+def test_a_view_that_names_an_absent_image_is_left_out(tmp_path, healthy):
+    model = TextModel()
+    model.points[3] += ["99", "0", "4294967295", "4294967295", "-1", "-1"]
+    problem, (note,) = noted(model.write(tmp_path / "m"))
+    assert note == (
+        "points3D.txt: 3 track elements left out, of an image that images.txt does not have (point 14: key-point 0 of "
+        "image 99)"
+    )
+    assert same(problem, healthy)
+
+
+def test_a_view_that_is_said_twice_counts_once(tmp_path, healthy):
+    model = TextModel()
+    model.points[3] += model.points[3][8:10]
+    problem, (note,) = noted(model.write(tmp_path / "m"))
+    assert note.startswith("points3D.txt: 1 track element left out, there twice (point 14: key-point ")
+    assert same(problem, healthy)
+
+
+def test_views_that_only_one_file_knows_are_left_out(tmp_path, healthy):
+    model = TextModel()
+    image, key = int(model.points[0][8]), int(model.points[0][9])
+    model.keys[image - 1][key][2] = "-1"  # the track of point 11 goes on to name it
+    other, index = model.points[1][-2:]
+    del model.points[1][-2:]  # its key-point goes on to name point 12
+    problem, notes = noted(model.write(tmp_path / "m"))
+    assert notes == [
+        "points3D.txt: 1 track element left out, of a key-point that is of another point or none (point 11: key-point "
+        f"{key} of image {image} (view{image - 1}.jpg))",
+        f"images.txt: 1 key-point left out, in no track of points3D.txt (image {other} (view{int(other) - 1}.jpg): "
+        f"key-point {index}, point 12)",
+    ]
+    lost = [
+        np.flatnonzero((healthy.camera_index == camera - 1) & (healthy.point_index == point))[0]
+        for camera, point in ((image, 0), (int(other), 1))
+    ]
+    assert same(problem, without(healthy, lost))
+
+
+def test_points_that_are_missing_are_those_of_no_view(tmp_path, healthy):
+    model = TextModel()
+    views = len(model.points.pop()[8:]) // 2
+    problem, (note,) = noted(model.write(tmp_path / "m"))
+    assert note.startswith(
+        f"images.txt: {views} key-points left out, of a point that points3D.txt does not have (image "
+    )
+    assert problem.num_points == 39
+    assert np.array_equal(problem.points, healthy.points[:39])
+
+
+@pytest.mark.parametrize("word", ["nan", "-nan(ind)", "inf", "1e999", "-1.#IND"])
+def test_what_is_no_number_leaves_out_its_point_or_key_point(tmp_path, healthy, word):
+    model = TextModel()
+    model.points[5][2] = word
+    model.keys[2][0][1] = word
+    point = int(model.keys[2][0][2]) - FIRST_POINT
+    assert point != 5
+    problem, notes = noted(model.write(tmp_path / "m"))
+    assert notes == [
+        "points3D.txt: 1 point left out, not finite (point 16)",
+        "images.txt: 1 key-point left out, not finite (image 3 (view2.jpg): key-point 0)",
+    ]
+    assert np.array_equal(problem.points, np.delete(healthy.points, 5, axis=0))
+    views = np.flatnonzero((healthy.point_index == 5) | ((healthy.point_index == point) & (healthy.camera_index == 2)))
+    assert np.array_equal(problem.observations, np.delete(healthy.observations, views, axis=0))
+
+
+@pytest.mark.parametrize("layout", ["empty line", "no line", "no line in the middle", "no end of the last line"])
+def test_an_image_without_key_points_is_left_out_and_written_again(tmp_path, healthy, layout):
+    model = TextModel()
+    blind = 2 if layout == "no line in the middle" else 5
+    model.keys[blind] = []
+    for point in model.points:
+        track = [pair for pair in zip(point[8::2], point[9::2], strict=True) if pair[0] != str(blind + 1)]
+        point[8:] = [word for pair in track for word in pair]
+    folder = model.write(tmp_path / "m")
+    if layout != "empty line":
+        lines = (folder / "images.txt").read_text().split("\n")
+        del lines[2 + 2 * blind]
+        text = "\n".join(lines)
+        (folder / "images.txt").write_text(text.rstrip("\n") if layout == "no end of the last line" else text)
+    problem, (note,) = noted(folder)
+    assert note == f"images.txt: 1 image left out, without observations (image {blind + 1} (view{blind}.jpg))"
+    assert np.array_equal(problem.cameras, np.delete(healthy.cameras, blind, axis=0))
+    with pytest.raises(ProblemError, match="1 image left out, without observations"):
+        read_problem(folder, strict=True)
+    write_colmap(problem, tmp_path / "out", like=folder)
+    heads = (tmp_path / "out" / "images.txt").read_text().splitlines()[1::2]
+    assert [head.split()[9] for head in heads] == [f"view{image}.jpg" for image in range(6)]
+    assert [head.split()[0] for head in heads] == list("123456")
+
+
+def test_writing_in_place_keeps_what_was_left_out(tmp_path):
+    model = TextModel()
+    model.heads[4] = model.heads[4].replace("view4", "flight A, plan  (2) 4")
+    model.points[5][2] = "nan"
+    model.points[3] += ["99", "0"]
+    model.keys[2][0][1] = "nan"
+    model.keys[0][1][2] = "-1"
+    folder = model.write(tmp_path / "m")
+    problem, notes = noted(folder)
+    assert len(notes) == 4
+    moved = problem.replace(points=problem.points + 1)
+    write_colmap(moved, folder, like=folder)
+    lines = {
+        name: (folder / name).read_text().splitlines()[1:] for name in ("cameras.txt", "images.txt", "points3D.txt")
+    }
+    assert [line.split(None, 9)[9] for line in lines["images.txt"][::2]] == [
+        head.split(None, 9)[9] for head in model.heads
+    ]
+    for line, keys in zip(lines["images.txt"][1::2], model.keys, strict=True):
+        assert line.split() == [word for key in keys for word in key]
+    for line, point in zip(lines["points3D.txt"], model.points, strict=True):
+        words = line.split()
+        assert (words[0], words[4:7], words[8:]) == (point[0], point[4:7], point[8:])
+        by = 0 if point is model.points[5] else 1
+        np.testing.assert_allclose(np.array(words[1:4], float), np.array(point[1:4], float) + by, rtol=1e-14)
+    assert lines["points3D.txt"][5].split()[7] == "0.5"  # its error is as it was
+    again, after = noted(folder)
+    assert [note.partition("(")[0] for note in after] == [note.partition("(")[0] for note in notes]
+    assert np.array_equal(again.points, moved.points)
+
+
+# What is refused
+
+
+def swap(file: str, old: str, new: str):
+    def damage(folder: Path) -> None:
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new, 1))
+
+    return damage
+
+
+def head_with(field: int, word: str):
+    """Image 4 with another word."""
+
+    def damage(folder: Path) -> None:
+        lines = (folder / "images.txt").read_text().split("\n")
+        words = lines[7].split(" ")
+        words[field] = word
+        lines[7] = " ".join(words)
+        (folder / "images.txt").write_text("\n".join(lines))
+
+    return damage
+
+
+REFUSED = {
+    "NaN pose": (head_with(1, "nan"), "images.txt: image 4 (view3.jpg): qvec is not finite: nan "),
+    "NaN of Windows": (head_with(6, "-nan(ind)"), "images.txt: image 4 (view3.jpg): tvec is not finite: "),
+    "overflowing pose": (head_with(7, "1e999"), "images.txt: image 4 (view3.jpg): tvec is not finite: "),
+    "missing camera": (head_with(8, "8"), "images.txt: image 4 (view3.jpg): camera 8 is not in "),
+    "word in a pose": (head_with(3, "1,5"), "images.txt line 8: image 4: '1,5' is not a number (qy)"),
+    "number with underscores": (head_with(5, "1_0"), "images.txt line 8: image 4: '1_0' is not a number (tx)"),
+    "id with a fraction": (head_with(0, "4.5"), "images.txt line 8: '4.5' is not an integer (IMAGE_ID)"),
+    "id below -1": (head_with(0, "-2"), "images.txt line 8: '-2' is outside 0..4294967295 (IMAGE_ID)"),
+    "id of nothing": (head_with(0, "-1"), "images.txt: 4294967295 is the id of no image"),
+    "image twice": (head_with(0, "3"), "images.txt line 8: image 3: is there twice"),
+    "cut line": (swap("images.txt", " view3.jpg", "x"), "images.txt line 8: image 4: '7x' is not a number (CAMERA_ID)"),
+    "unknown model": (
+        swap("cameras.txt", "SIMPLE_RADIAL", "FISHEYE_2"),
+        "cameras.txt line 2: camera 7: 'FISHEYE_2' is an unknown camera model",
+    ),
+    "another number of parameters": (
+        swap("cameras.txt", "SIMPLE_RADIAL", "RADIAL"),
+        "cameras.txt line 2: camera 7: RADIAL has 5 parameters, not 4",
+    ),
+    "negative focal length": (
+        swap("cameras.txt", "700.0", "-700.0"),
+        "cameras.txt: camera 7 has impossible parameters: -700, 640, 480, -0.03 (SIMPLE_RADIAL)",
+    ),
+    "no focal length": (
+        swap("cameras.txt", "SIMPLE_RADIAL 1280 960 700.0 640.0 480.0 -0.03", "EQUIRECTANGULAR 1280 960 1280 960"),
+        "cameras.txt: camera 7: EQUIRECTANGULAR has no focal length and cannot be used",
+    ),
+    "point twice": (swap("points3D.txt", "\n12 ", "\n11 "), "points3D.txt: point 11 is there twice"),
+    "colour": (
+        swap("points3D.txt", " 1 2 3 ", " 1 256 3 "),
+        "points3D.txt line 2: point 11: '256' is outside 0..255 (green)",
+    ),
+    "half a pair": (swap("points3D.txt", " 0.5 ", " 0.5 1 "), "points3D.txt line 2: point 11: the track has "),
+    "16-bit text": (
+        lambda folder: (folder / "images.txt").write_bytes((folder / "images.txt").read_text().encode("utf-16")),
+        "images.txt is a text in UTF-16; save it as UTF-8",
+    ),
+    "missing file": (lambda folder: (folder / "points3D.txt").unlink(), "points3D.txt is missing"),
+    "folder for a file": (
+        lambda folder: ((folder / "images.txt").unlink(), (folder / "images.txt").mkdir()),
+        "images.txt is no file",
+    ),
+    "rigs without frames": (lambda folder: (folder / "rigs.txt").write_text("7 1 CAMERA 7\n"), "frames.txt is missing"),
+}
+
+
+@pytest.mark.parametrize("damage", REFUSED)
+def test_damage_of_the_structure_is_refused_in_one_line(tmp_path, damage):
+    change, message = REFUSED[damage]
+    folder = TextModel().write(tmp_path / "m")
+    change(folder)
+    assert refusal(folder).startswith(message)
+
+
+def test_a_quaternion_of_zeros_is_refused_and_one_of_any_other_norm_is_not(tmp_path, healthy):
+    for scale in (0.0, 1e-300, 1e-5, 3.0, 1e300):
+        model = TextModel()
+        identity, *quaternion, x, y, z, camera, name = model.heads[3].split()
+        model.heads[3] = " ".join([identity, *(str(scale * float(w)) for w in quaternion), x, y, z, camera, name])
+        folder = model.write(tmp_path / f"{scale}")
+        if scale:
+            np.testing.assert_allclose(read_colmap(folder).cameras, healthy.cameras, rtol=1e-12, atol=1e-13)
+        else:
+            assert refusal(folder) == "images.txt: image 4 (view3.jpg): qvec is zero, which is no rotation"
+
+
+BINARY = {
+    "no points at all": ("points3D.bin", 0, b"", "points3D.bin is empty"),
+    "half a count": ("points3D.bin", 0, b"\1\0\0", "points3D.bin is cut short in the number of points"),
+    "number of points": ("points3D.bin", 0, 2**63, f"points3D.bin is cut short: {2**63} points do not"),
+    "number of images": (
+        "images.bin",
+        0,
+        2**64 - 1,
+        f"images.bin is cut short: {2**64 - 1} images do not",
+    ),
+    "number of cameras": (
+        "cameras.bin",
+        0,
+        2**40,
+        f"cameras.bin is cut short: {2**40} cameras do not",
+    ),
+    "one camera too many": ("cameras.bin", 0, 2, "cameras.bin is cut short in camera 2 of 2"),
+    "length of a track": ("points3D.bin", 51, 2**60, "points3D.bin is cut short in the track of point 11"),
+    "key-points": (
+        "images.bin",
+        82,
+        2**60,
+        f"images.bin is cut short: the key-points of image 1 (view0.jpg) should have {2**60}",
+    ),
+    "model": ("cameras.bin", 12, b"\x63\0\0\0", "cameras.bin: camera 7 has an unknown model, number 99"),
+    "point of no id": ("points3D.bin", 8, 2**64 - 1, f"points3D.bin: {2**64 - 1} is the id of no point"),
+    "no name ends": ("images.bin", 72, b"x" * 10**4, "images.bin"),
+}
+
+
+@pytest.mark.parametrize("damage", BINARY)
+def test_counts_that_do_not_fit_are_refused_at_once_and_in_little_memory(tmp_path, damage):
+    file, at, value, message = BINARY[damage]
+    folder = TextModel().write_binary(tmp_path / "m")
+    data = (folder / file).read_bytes()
+    if isinstance(value, int):
+        data = data[:at] + struct.pack("<Q", value) + data[at + 8 :]
+    elif len(value) == 4:
+        data = data[:at] + value + data[at + 4 :]
+    else:
+        data = data[:at] + value
+    (folder / file).write_bytes(data)
+    tracemalloc.start()
+    started = time.perf_counter()
+    assert refusal(folder).startswith(message)
+    assert time.perf_counter() - started < 2
+    assert tracemalloc.get_traced_memory()[1] < 2**26
+    tracemalloc.stop()
+
+
+def test_every_cut_of_a_binary_file_is_refused(tmp_path):
+    folder = TextModel().write_binary(tmp_path / "m")
+    for file in ("cameras.bin", "images.bin", "points3D.bin"):
+        data = (folder / file).read_bytes()
+        for end in [*range(0, min(200, len(data))), *range(200, len(data), 97)]:
+            (folder / file).write_bytes(data[:end])
+            assert refusal(folder).startswith((f"{file} is cut short", f"{file} is empty"))
+        (folder / file).write_bytes(data + b"\0")
+        assert refusal(folder).startswith(f"{file} is too long, by 1 byte after ")
+        (folder / file).write_bytes(data)
+    read_colmap(folder)
+
+
+# Courtesies
+
+
+def test_marks_line_ends_blanks_and_comments_do_not_matter(tmp_path, healthy):
+    files = TextModel().files()
+    layouts = {
+        "windows": lambda lines: b"\xef\xbb\xbf" + "\r\n".join([*lines, ""]).encode(),
+        "blanks": lambda lines: "".join(f"  {line.replace(' ', '  ')} \t\n" for line in lines).encode(),
+        "no end": lambda lines: "\n".join(lines).encode(),
+        "comments": lambda lines: "".join(f"# {n}\n{line}\n# x y z\n" for n, line in enumerate(lines)).encode(),
+    }
+    for layout, text in layouts.items():
+        (tmp_path / layout).mkdir()
+        for name, lines in files.items():
+            (tmp_path / layout / name).write_bytes(text(lines))
+        problem, notes = noted(tmp_path / layout)
+        assert notes == []
+        assert same(problem, healthy), layout
+
+
+def test_whole_numbers_may_be_written_with_a_point(tmp_path, healthy):
+    model = TextModel()
+    model.cameras[1] = model.cameras[1].replace("1280 960", "1280.0 9.6e2")
+    model.keys = [[[x, y, f"{point}.0"] for x, y, point in keys] for keys in model.keys]
+    model.points = [[f"{point[0]}.0", *point[1:4], "1.0", *point[5:]] for point in model.points]
+    assert same(noted(model.write(tmp_path / "m"))[0], healthy)
+
+
+def test_ids_of_points_are_exact_up_to_the_largest(tmp_path, healthy):
+    model = TextModel()
+    large = lambda identity: str(2**64 - 60 + int(identity))
+    model.keys = [[[x, y, large(point)] for x, y, point in keys] for keys in model.keys]
+    model.points = [[large(point[0]), *point[1:]] for point in model.points]
+    problem, notes = noted(model.write(tmp_path / "m"))
+    assert notes == []
+    assert same(problem, healthy)
+    write_colmap(problem, tmp_path / "out", like=tmp_path / "m")
+    written = (tmp_path / "out" / "points3D.txt").read_text().splitlines()[1:]
+    assert [line.split()[0] for line in written] == [point[0] for point in model.points]
+    assert np.array_equal(noted(tmp_path / "out")[0].point_index, healthy.point_index)
+
+
+# Rigs and frames
+
+
+def framed(folder: Path, images: list[int], rigs: str = "7 1 CAMERA 7", data: str = "1 CAMERA 7 {}") -> Path:
+    model = TextModel()
+    model.write(folder)
+    (folder / "rigs.txt").write_text(f"# rigs\n{rigs}\n")
+    poses = {image: " ".join(model.heads[image - 1].split()[1:8]) for image in images}
+    frames = [f"{100 + image} 7 {pose} " + data.format(image) for image, pose in poses.items()]
+    (folder / "frames.txt").write_text("\n".join(["# frames", *frames, ""]))
+    return folder
+
+
+def test_poses_of_frames_count_and_images_without_one_stay_as_they_are(tmp_path, healthy):
+    folder = framed(tmp_path / "m", [1, 2, 3, 4, 6])
+    head_with(7, "123.0")(folder)
+    problem, notes = noted(folder)
+    assert notes == [
+        "images.txt: 1 image left out, without a frame (image 5 (view4.jpg))",
+        "images.txt: 1 image with another pose than in frames.txt, which counts (image 4 (view3.jpg))",
+    ]
+    assert np.array_equal(problem.cameras, np.delete(healthy.cameras, 4, axis=0))
+    moved = problem.replace(cameras=problem.cameras + np.array([0, 0, 0, 1, 0, 0, 0, 0, 0]))
+    write_colmap(moved, folder, like=folder)
+    heads = (folder / "images.txt").read_text().splitlines()[1::2]
+    assert heads[4] == TextModel().heads[4]
+    again, notes = noted(folder)
+    assert notes == ["images.txt: 1 image left out, without a frame (image 5 (view4.jpg))"]
+    np.testing.assert_allclose(again.cameras, moved.cameras, rtol=1e-12, atol=1e-13)
+
+
+RIGS = {
+    "absent rig": (("8 1 CAMERA 7", "1 CAMERA 7 {}"), "frames.txt: frame 101: rig 7 is not in "),
+    "absent sensor": (("7 1 IMU 7", "1 CAMERA 7 {}"), "frames.txt: frame 101: rig 7 has no sensor 7 of datum 1"),
+    "absent camera": (("7 1 CAMERA 8", "1 CAMERA 7 {}"), "rigs.txt: rig 7: camera 8 is not in "),
+    "word of no sensor": (("7 1 LIDAR 7", "1 CAMERA 7 {}"), "rigs.txt line 2: rig 7: 'LIDAR' is no type of sensors"),
+    "image in two frames": (("7 1 CAMERA 7", "1 CAMERA 7 3"), "frames.txt: image 3 is in two frames"),
+    "count too large": (("7 9 CAMERA 7", "1 CAMERA 7 {}"), "rigs.txt line 2: rig 7: '9' is outside 0..3"),
+    "left over": (("7 1 CAMERA 7 1", "1 CAMERA 7 {}"), "rigs.txt line 2: rig 7: '1' is left over"),
+}
+
+
+@pytest.mark.parametrize("damage", RIGS)
+def test_references_of_rigs_and_frames_are_checked(tmp_path, damage):
+    words, message = RIGS[damage]
+    assert refusal(framed(tmp_path / "m", [1, 2, 3, 4, 5, 6], *words)).startswith(message)
+
+
+def test_a_frame_without_a_finite_pose_is_refused_by_its_image(tmp_path):
+    folder = framed(tmp_path / "m", [1, 2, 3, 4, 5, 6])
+    lines = (folder / "frames.txt").read_text().split("\n")
+    lines[4] = " ".join([*lines[4].split()[:2], "nan", *lines[4].split()[3:]])
+    (folder / "frames.txt").write_text("\n".join(lines))
+    assert refusal(folder).startswith("frames.txt: frame 104 of image 4 (view3.jpg): qvec is not finite: nan ")
+
+
+# Commands
+
+
+def test_the_command_says_what_was_left_out_and_strict_refuses(tmp_path, capsys):
+    model = TextModel()
+    model.points[3] += ["99", "0"]
+    folder = model.write(tmp_path / "m")
+    note = f"{folder}/points3D.txt: 1 track element left out, of an image that {folder}/images.txt does not have"
+    assert run([str(folder), "--max-iterations", "1", "--output", str(tmp_path / "out")]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"note: {note} (")
+    assert printed.out.count(note) == 1
+    assert printed.err == ""
+    assert run([str(folder), "--strict", "--output", str(tmp_path / "strict")]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"error: {note} (")
+    assert (printed.err.count("\n"), printed.out) == (1, "")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["m", "out"]
+
+
+def test_a_principal_point_at_the_edge_is_mentioned_and_not_refused(tmp_path):
+    folder = TextModel().write(tmp_path / "m")
+    swap("cameras.txt", "640.0 480.0", "0.0 0.0")(folder)
+    _, (note,) = noted(folder)
+    assert note == "cameras.txt: 1 principal point at the edge of the image (camera 7: pixel 0, 0 of 1280 x 960)"
+    with pytest.warns(ProblemWarning, match="principal point"):
+        read_colmap(folder, strict=True)
+
+
+def test_a_benchmark_goes_on_after_models_that_cannot_be_read(tmp_path, capsys):
+    bad, odd, good = (TextModel().write(tmp_path / name) for name in ("bad", "odd", "good"))
+    head_with(1, "nan")(bad)
+    (odd / "images.txt").write_text((odd / "images.txt").read_text() + "9 1 0 0 0 0 0 0 7 last.jpg")
+    arguments = [*map(str, (bad, odd, good)), "--solvers", "ceres", "--repeats", "1", "--max-iterations", "2"]
+    assert run_bench([*arguments, "--out", str(tmp_path / "runs")]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith(f"error: {bad}/images.txt: image 4 (view3.jpg): qvec is not finite: ")
+    assert printed.err.count("\n") == 1
+    assert f"note: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n" in printed.out
+    assert [record.problem for record in read_records(tmp_path / "runs" / "results.jsonl")] == ["odd", "good"]
+    assert run_bench([str(odd), "--strict", *arguments[3:], "--out", str(tmp_path / "strict")]) == 2
+    error = f"error: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n"
+    assert capsys.readouterr().err == error
+
+
+# Any bytes
+
+
+NUMBERS = [0, 1, 7, 2**31, 2**32 - 1, 2**53, 2**60, 2**63, 2**64 - 1]
+WORDS = [
+    b"nan",
+    b"-nan(ind)",
+    b"1e999",
+    b"-1",
+    b"-2",
+    b"99999999999999999999",
+    b"1_0",
+    b"",
+    b"#",
+    b"\n",
+    b"\0",
+    b"9" * 5000,
+]
+
+
+def mutated(rng: np.random.Generator, data: bytes, text: bool) -> bytes:
+    at, kind = int(rng.integers(max(1, len(data)))), int(rng.integers(6))
+    if text and kind < 3:
+        words = data.split(b" ")
+        one, other = rng.integers(len(words), size=2)
+        words[one] = [words[other], WORDS[rng.integers(len(WORDS))], b""][kind]
+        return b" ".join(words)
+    if kind == 0:
+        return data[:at] + struct.pack("<Q", NUMBERS[rng.integers(len(NUMBERS))]) + data[at + 8 :]
+    if kind == 1:
+        return data[:at] + struct.pack("<d", rng.choice([np.nan, np.inf, 0.0, 1e-320, 1e308])) + data[at + 8 :]
+    if kind == 2:
+        return data[:at] + rng.bytes(rng.integers(1, 9)) + data[at + rng.integers(1, 9) :]
+    if kind == 3:
+        return data[:at]
+    if kind == 4:
+        return data[:at] + data[at + rng.integers(1, 40) :]
+    return data[: at - 1] + rng.bytes(1) + data[at:]
+
+
+def read_or_refused(folder: Path) -> tuple[BundleProblem | None, str]:
+    try:
+        return noted(folder)[0], ""
+    except ProblemError as error:
+        return None, str(error)
+
+
+@pytest.mark.parametrize("text", [True, False], ids=["text", "binary"])
+def test_any_bytes_are_a_model_or_refused_in_one_line(tmp_path, text):
+    model = TextModel()
+    source = (model.write if text else model.write_binary)(tmp_path / "m")
+    files = {path.name: path.read_bytes() for path in source.iterdir()}
+    rng = np.random.default_rng(5)
+    read = 0
+    for case in range(150):
+        for name, data in files.items():
+            (source / name).write_bytes(mutated(rng, data, text) if rng.random() < 0.5 else data)
+        started = time.perf_counter()
+        problem, error = read_or_refused(source)
+        assert time.perf_counter() - started < 2, case
+        if problem is None:
+            assert error.isprintable(), case
+            continue
+        read += 1
+        assert np.isfinite(problem.cameras).all()
+        assert np.isfinite(problem.points).all()
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        write_colmap(problem, tmp_path / "out", like=source)
+        assert noted(tmp_path / "out")[0].num_observations == problem.num_observations
+    assert 10 < read < 140
