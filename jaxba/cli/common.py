@@ -7,8 +7,9 @@ import os
 import re
 import stat
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import redirect_stderr
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr
 from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -65,7 +66,8 @@ def run_command(
 
         names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
         try:
-            return main(parsed)
+            with notes_as_lines():
+                return main(parsed)
         except (ProblemError, UsageError, PolicyFileError, *names) as error:
             return print_error(str(error))
         except Exception as error:
@@ -77,6 +79,25 @@ def run_command(
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+@contextmanager
+def notes_as_lines() -> Iterator[None]:
+    """Prints what readers remark (`ProblemWarning`) as lines that begin with `note:`."""
+    from jaxba.io.notes import ProblemWarning
+
+    with warnings.catch_warnings():
+        others = warnings.showwarning
+
+        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+            if issubclass(category, ProblemWarning):
+                print_line(f"note: {message}")
+            else:
+                others(message, category, *where, **more)
+
+        warnings.showwarning = show
+        warnings.simplefilter("always", ProblemWarning)
+        yield
 
 
 def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str:

@@ -147,10 +147,13 @@ def _build(args: Arguments) -> int:
     if args.stride is not None and args.window is None:
         raise common.UsageError("--stride needs --window")
     common.check_writable("--out", args.out)
+    from jaxba.io import check_output
     from jaxba.io.files import strip_compression
+    from jaxba.io.formats import FORMATS, by_ending
 
     stem = Path(strip_compression(args.out))
-    if stem.suffix.lower() in (".ply", ".out"):
+    check_output(args.out)
+    if by_ending(args.out) not in (None, FORMATS[0]):
         raise common.UsageError(f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
     try:
         from jaxba.datasets.kitti import opencv  # noqa: F401 - the error names the package to install

@@ -5,16 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxba.cli import common, table
-from jaxba.io import check_output, write_colmap, write_problem
-from jaxba.io.files import strip_compression
+from jaxba.io import check_output, formats, write_colmap, write_problem
 from jaxba.problem.bundle_problem import BundleProblem
-
-FILE_ENDINGS = (".txt", ".bal", ".ply")
-"""If the output has one of these endings, or one of compression, a COLMAP model is written as a single file."""
 
 
 def is_model(output: str, source: str | None) -> bool:
-    """Whether the output is written as a COLMAP model: the problem is one, and the output has no ending of a file.
+    """Whether the output is written as a COLMAP model: the problem is one, and the output has no ending of a file
+    (`formats.is_file_name`).
 
     Args:
         output: path of the output.
@@ -22,9 +19,7 @@ def is_model(output: str, source: str | None) -> bool:
     """
     if source is None or not Path(source).is_dir():
         return False
-    bare = strip_compression(output)
-    is_file = bare != output or Path(bare).suffix.lower() in FILE_ENDINGS
-    return Path(output).is_dir() or not is_file
+    return Path(output).is_dir() or not formats.is_file_name(output)
 
 
 def check_outputs(output: str | None, log: str | None, source: str | None) -> None:
@@ -52,14 +47,17 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
         UsageError: the solution cannot be written.
     """
     lost = ""
+    model = is_model(output, source)
     try:
-        if source is not None and is_model(output, source):
+        if model and source is not None:
             write_colmap(problem, output, like=source)
         else:
             write_problem(problem, output)
-            lost = table.lost_in_bal(problem)
+            lost = table.lost_in_file(problem)
     except OSError as error:
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
     common.print_line(f"wrote {output}")
+    if formats.ending(output) and formats.by_ending(output) is None and not model:
+        common.print_line(f"note: {output} is a BAL file; {formats.formats_written()}")
     if lost:
         common.print_line(f"note: that file cannot store: {lost}")

@@ -1,18 +1,20 @@
-"""Readers and writers: BAL text, Bundler and COLMAP models, PLY point clouds; configurations found by name."""
+"""Readers and writers of problems (`jaxba.io.formats` lists them), PLY point clouds; configurations found by name."""
 
 from __future__ import annotations
 
 import os
-from pathlib import PurePath
 
+from jaxba.io import formats
 from jaxba.io.bal import read_bal, write_bal
-from jaxba.io.bundler import read_bundler
+from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
-from jaxba.io.files import StrPath, display_name, strip_compression
+from jaxba.io.files import StrPath
+from jaxba.io.notes import ProblemWarning
 from jaxba.io.ply import write_ply
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem
 
 __all__ = [
+    "ProblemWarning",
     "check_output",
     "is_colmap",
     "read_bal",
@@ -20,6 +22,7 @@ __all__ = [
     "read_colmap",
     "read_problem",
     "write_bal",
+    "write_bundler",
     "write_colmap",
     "write_ply",
     "write_problem",
@@ -27,36 +30,32 @@ __all__ = [
 
 
 def read_problem(path: StrPath) -> BundleProblem:
-    """Reads a problem: a folder is a COLMAP model, `.out` a Bundler model, every other name a BAL file, these two also
+    """Reads a problem in any format that is known: a folder is a COLMAP model or OpenSfM's, a file is what its ending
+    says (`jaxba.io.formats.FORMATS`). One with another ending is BAL, or what its first bytes say. Files may be
     compressed.
 
+    What is remarkable but no error, such as observations that were left out, is a `ProblemWarning`.
+
     Raises:
-        ProblemError: as `read_colmap`, `read_bundler` and `read_bal` do.
+        ProblemError: it cannot be read; one line that names the file and, where there is one, the record and the field.
     """
-    if os.path.isdir(path):
-        return read_colmap(path)
-    return (read_bundler if _kind(path) == ".out" else read_bal)(path)
+    return formats.read_folder(path) if os.path.isdir(path) else formats.read(path)
 
 
 def write_problem(problem: BundleProblem, path: StrPath) -> None:
-    """Writes a problem: `.ply` is a point cloud for viewers, every other name a BAL file; each also compressed.
+    """Writes a problem: `.out` is a Bundler model, `.ply` a point cloud for viewers, every other name that is not
+    another format's a BAL file; each also compressed.
 
     Raises:
-        ProblemError: as `check_output`, `write_ply` and `write_bal` do.
+        ProblemError: as `check_output` and the writers do.
     """
-    check_output(path)
-    (write_ply if _kind(path) == ".ply" else write_bal)(problem, path)
+    formats.writer(path)(problem, path)
 
 
 def check_output(path: StrPath) -> None:
-    """Refuses a name that `read_problem` would not read as the format that `write_problem` writes.
+    """Refuses a name whose ending is that of a format that `write_problem` does not write.
 
     Raises:
-        ProblemError: the name is that of a Bundler model; one line.
+        ProblemError: it is; one line with the endings that are written.
     """
-    if _kind(path) == ".out":
-        raise ProblemError(f"cannot write {display_name(path)}: Bundler models are only read; .txt is for BAL")
-
-
-def _kind(path: StrPath) -> str:
-    return PurePath(strip_compression(path)).suffix.lower()
+    formats.writer(path)

@@ -49,4 +49,7 @@ def note_origin(path: StrPath, pixels: Float[np.ndarray, "n 2"]) -> None:
     x, y = pixels.T
     if len(pixels) >= LEAST_PIXELS and (x >= 0).all() and ((y >= 0).all() or (y <= 0).all()):
         extent = f"x in {x.min():g}..{x.max():g}, y in {y.min():g}..{y.max():g}"
-        note(path, f"pixels are measured from a corner of the image, it seems ({extent}); their origin is its centre here")
+        note(
+            path,
+            f"pixels are measured from a corner of the image, it seems ({extent}); their origin is its centre here",
+        )

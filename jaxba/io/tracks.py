@@ -6,7 +6,7 @@ A point is its position, its colour, the number of its views, and for each view 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
