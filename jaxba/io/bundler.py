@@ -74,7 +74,8 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
         raise ProblemError(f"cannot write {display_name(path)}: camera {lost[0]} has focal length 0")
     order = np.argsort(valid.point_index, kind="stable")
     views = np.bincount(np.asarray(valid.point_index), minlength=valid.num_points).tolist()
-    rows = zip(camera_index[order].tolist(), _keys(camera_index)[order].tolist(), valid.observations[order].tolist())
+    keys, pixels = _keys(camera_index)[order].tolist(), valid.observations[order].tolist()
+    rows = zip(camera_index[order].tolist(), keys, pixels, strict=True)
     colour = " ".join(map(str, POINT_COLOUR))
     with open_output(path) as file:
         file.write(HEADER + f"\n{valid.num_cameras} {valid.num_points}\n".encode())

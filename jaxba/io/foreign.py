@@ -41,7 +41,7 @@ class ForeignLens:
     """Where BAL has no such distortion, pixels are undistorted once, and the lens stays as it is."""
 
     free: tuple[bool, bool, bool] = ALL_FREE
-    """Which of f, k1 and k2 may be optimised, if the distortion is BAL's, or is inverse: then pixels do not depend on f."""
+    """Which of f, k1 and k2 may be optimised, if the distortion is BAL's, or inverse: its pixels do not depend on f."""
 
     size: tuple[float, float] | None = None
     """Width and height of the image, pixels, if the principal point is measured from its corner."""
@@ -98,10 +98,10 @@ def assemble(
         intrinsics[number] = [lens.focal[0], *coefficients]
         free[number] = lens.free if plain or lens.distortion.inverse else FIXED
         observations[seen], whitening[seen] = _observed(lens, pixels[seen])
-    kept = np.isfinite(observations).all(axis=1) & np.isfinite(whitening).all(axis=(1, 2))
-    if not kept.all():
-        note(path, f"{np.sum(~kept)} of {len(kept)} observations left out: no direction of their lens leads there")
-    if not kept.any():
+    kept = np.flatnonzero(np.isfinite(np.column_stack([observations, whitening.reshape(-1, 4)])).all(axis=1))
+    if len(kept) < len(pixels):
+        note(path, f"{len(pixels) - len(kept)} of {len(pixels)} observations left out: beyond the range of their lens")
+    if not len(kept):
         raise ProblemError(f"{name}: no camera sees a point")
     unshared = len(np.unique(lens_of)) == len(lens_of)
     cameras = np.hstack(

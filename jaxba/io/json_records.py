@@ -14,6 +14,9 @@ from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import ProblemError
 
+LARGEST_INTEGER = 2**53
+"""Whole numbers below it are exact as float64."""
+
 _SHOWN = 40
 """Characters of a bad value in a message."""
 
@@ -84,6 +87,8 @@ class Record:
     def integer(self) -> int:
         """A whole number. Raises ProblemError."""
         found = self.number()
+        if abs(found) >= LARGEST_INTEGER:
+            self.fail(f"is too large: {_shown(self.value)}")
         if not found.is_integer():
             self.fail(f"must be a whole number, is {_shown(self.value)}")
         return int(found)

@@ -22,6 +22,7 @@ from jaxba.io.json_records import Record, read_json
 from jaxba.io.notes import note
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import are_rotations
 
 RECONSTRUCTION = "reconstruction.json"
 """Name of the file of cameras and points in OpenSfM's folder."""
@@ -105,6 +106,10 @@ def from_document(document: Record, path: StrPath, tracks: StrPath | None = None
     seen = _read_tracks(_tracks_beside(path) if tracks is None else tracks, shots, set(points))
     from scipy.spatial.transform import Rotation
 
+    rotations = Rotation.from_rotvec(np.array(turns)).as_matrix()
+    bad = np.flatnonzero(~are_rotations(rotations))
+    if bad.size:
+        document.fail(f"has shot {display_name(list(shots)[bad[0]])} with a rotation that is none")
     point_number = {key: at for at, key in enumerate(points)}
     lens_number = {key: at for at, key in enumerate(lenses)}
     lens_of = np.array([lens_number[key] for key in lens_keys])
@@ -114,7 +119,7 @@ def from_document(document: Record, path: StrPath, tracks: StrPath | None = None
         path,
         list(lenses.values()),
         lens_of,
-        Rotation.from_rotvec(np.array(turns)).as_matrix(),
+        rotations,
         np.array(shifts),
         np.array(list(points.values())),
         size.max(axis=1)[:, None] * np.array(seen.pixels) + size / 2,

@@ -1,4 +1,4 @@
-"""What OpenMVG's and AliceVision's files have in common: views with poses and intrinsics, and points with observations."""
+"""What OpenMVG's and AliceVision's files have in common: views with poses and intrinsics, points with observations."""
 
 from __future__ import annotations
 
