@@ -173,7 +173,11 @@ def write_alicevision(path: Path, scene: Scene, types: list[str], version: tuple
         distortion = [*lens.radial, *(lens.tangential if kind == "brown" else ())]
         value |= {"type": kind, "distortionParams": text(distortion) if distortion else ""}
         if version >= (1, 2, 6):
-            value |= {"type": "pinhole", "distortionType": kind.replace("radial", "radialk"), "undistortionType": "none"}
+            value |= {
+                "type": "pinhole",
+                "distortionType": kind.replace("radial", "radialk"),
+                "undistortionType": "none",
+            }
         center = [lens.cx, lens.cy] if version < (1, 2, 1) else [lens.cx - width / 2, lens.cy - height / 2]
         value["principalPoint"] = text(center)
         if version < (1, 2, 0):
@@ -221,7 +225,16 @@ def write_nvm(path: Path, scene: Scene, distortion: list[float], header: str = "
         seen = [(i, m.tolist()) for (i, other), m in zip(scene.seen, measured, strict=True) if other == j]
         views = " ".join(f"{i} 7 {x!r} {y!r}" for i, (x, y) in seen)
         lines.append(f"{point[0]!r} {point[1]!r} {point[2]!r} 1 2 3 {len(seen)} {views}")
-    lines += ["", "2", "lost.jpg 100 1 0 0 0 0 0 0 0 0", "lost2.jpg 100 1 0 0 0 0 0 0 0 0", "0", "", "0", "#the last part"]
+    lines += [
+        "",
+        "2",
+        "lost.jpg 100 1 0 0 0 0 0 0 0 0",
+        "lost2.jpg 100 1 0 0 0 0 0 0 0 0",
+        "0",
+        "",
+        "0",
+        "#the last part",
+    ]
     path.write_text("\n".join(lines) + "\n")
     return path
 

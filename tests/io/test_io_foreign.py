@@ -10,7 +10,7 @@ import sys
 import foreign_scene
 import numpy as np
 import pytest
-from foreign_scene import Lens, Scene, write_alicevision, write_nvm, write_opensfm, write_openmvg
+from foreign_scene import Lens, Scene, write_alicevision, write_nvm, write_openmvg, write_opensfm
 
 from jaxba.io import ProblemWarning, read_problem
 from jaxba.io.distortion import Distortion
@@ -108,8 +108,12 @@ def test_alicevision_s_versions_keep_the_cost(tmp_path, version, fy):
 
 @pytest.mark.parametrize(
     ("kind", "lens", "tolerance"),
-    [("pinhole", Lens(), ROUNDING), ("radial3", RADIAL3, FIRST_ORDER), ("brown", BROWN, FIRST_ORDER)]
-    + [("fisheye4", FISHEYE4, FIRST_ORDER)],
+    [
+        ("pinhole", Lens(), ROUNDING),
+        ("radial3", RADIAL3, FIRST_ORDER),
+        ("brown", BROWN, FIRST_ORDER),
+        ("fisheye4", FISHEYE4, FIRST_ORDER),
+    ],
 )
 def test_alicevision_s_models_keep_the_cost(tmp_path, kind, lens, tolerance):
     scene = scene_of(lens)
@@ -212,7 +216,7 @@ def test_a_principal_point_at_the_edge_is_noted(tmp_path):
 
 def test_only_the_first_reconstruction_is_read_and_that_is_said(tmp_path):
     path = write_opensfm(tmp_path, scene_of(PINHOLE), ["perspective"])
-    path.write_text(json.dumps(json.loads(path.read_text()) + [{"cameras": {}, "shots": {}, "points": {}}]))
+    path.write_text(json.dumps([*json.loads(path.read_text()), {"cameras": {}, "shots": {}, "points": {}}]))
     with pytest.warns(ProblemWarning, match="only the first of 2 reconstructions is read"):
         assert read_problem(path).num_cameras == 5
 
@@ -243,16 +247,32 @@ def refused(path) -> str:
 
 OPENSFM = {
     "no points": ('"points": {', '"pts": {', "has no points, only cameras and shots"),
-    "unknown model": ('"perspective"', '"spherical"', "camera v2 maker 0 has projection_type 'spherical', which is not"),
+    "unknown model": (
+        '"perspective"',
+        '"spherical"',
+        "camera v2 maker 0 has projection_type 'spherical', which is not",
+    ),
     "dangling camera": ('"camera": "v2 maker 0"', '"camera": "v2 x"', "shot a shot 0.jpg names camera v2 x, which is"),
     "text for a number": ('"focal": 0.75', '"focal": "wide"', "camera v2 maker 0: focal must be a number, is 'wide'"),
     "nan": ('"focal": 0.75', '"focal": NaN', "camera v2 maker 0: focal is not a finite number: nan"),
-    "negative focal length": ('"focal": 0.75', '"focal": -0.75', "camera v2 maker 0 has focal length -1200, which must"),
+    "negative focal length": (
+        '"focal": 0.75',
+        '"focal": -0.75',
+        "camera v2 maker 0 has focal length -1200, which must",
+    ),
     "no width": ('"width": 1600', '"width": 0', "camera v2 maker 0 has no width and height"),
     "no rotation": ('"rotation"', '"turn"', "shot a shot 0.jpg has no rotation"),
-    "short point": ('"coordinates": [', '"coordinates": [1,', "point 100: coordinates must be a list of 3 numbers, is a"),
+    "short point": (
+        '"coordinates": [',
+        '"coordinates": [1,',
+        "point 100: coordinates must be a list of 3 numbers, is a",
+    ),
     "cut": ('"coordinates": [', "", "not JSON"),
-    "rig": ('"cameras"', '"rig_instances": {"r": {"rig_camera_ids": {"a": "b", "c": "d"}}}, "cameras"', "rig instance r"),
+    "rig": (
+        '"cameras"',
+        '"rig_instances": {"r": {"rig_camera_ids": {"a": "b", "c": "d"}}}, "cameras"',
+        "rig instance r",
+    ),
 }
 
 
