@@ -26,7 +26,7 @@ class Arguments:
     """Options of `jaxba-kitti`."""
 
     sequence: Annotated[str, tyro.conf.Positional]
-    """Folder of a KITTI odometry sequence: image_0/000000.png ..., calib.txt."""
+    """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
 
     out: str = "kitti.txt.bz2"
     """Output file of the problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json, written
@@ -55,8 +55,8 @@ class Arguments:
     accumulating errors."""
 
     poses: str | None = None
-    """File of the true poses, 12 numbers per line, a line for every frame of the sequence from frame 0. With --start vo
-    they are only used to print the error of the start."""
+    """File of the true poses, 12 numbers per line, a line for every frame of the sequence from frame 0; or 13 numbers,
+    the first of them the frame. With --start vo they are only used to print the error of the start."""
 
     rotation_sigma: float = 0.1
     """Error of noisy-poses: standard deviation of the rotation on each axis per key-frame, degrees."""
@@ -84,7 +84,8 @@ class Arguments:
     """Number of the camera, 0 (image_0 and P0) to 3."""
 
     calibration: str | None = None
-    """File of the camera matrix, lines as in calib.txt or 3 x 3 numbers. Default: that of the sequence."""
+    """File of the camera matrix, lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers.
+    Default: that of the sequence."""
 
     work: str | None = None
     """Folder of intermediate results, with which an interrupted run continues. Default: NAME.work."""
@@ -150,6 +151,7 @@ def _build(args: Arguments) -> int:
     from jaxba.io import check_output
     from jaxba.io.files import strip_compression
     from jaxba.io.formats import FORMATS, by_ending
+    from jaxba.io.notes import note, note_center
 
     stem = Path(strip_compression(args.out))
     check_output(args.out)
@@ -161,16 +163,24 @@ def _build(args: Arguments) -> int:
         raise common.UsageError(str(error)) from None
     from jaxba.datasets.kitti.build import BuildOptions, build
     from jaxba.datasets.kitti.frontend import FrontEndOptions
+    from jaxba.datasets.kitti.images import image_size
+    from jaxba.datasets.kitti.poses import poses_of, read_poses
     from jaxba.datasets.kitti.result_cache import ResultCache
-    from jaxba.datasets.kitti.sequence import poses_of, read_poses, read_sequence
+    from jaxba.datasets.kitti.sequence import read_sequence
     from jaxba.datasets.kitti.triangulate import Filters
 
     sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
     poses = None
     if args.poses is not None:
-        table, name = read_poses(args.poses), args.poses
-        poses_of(table, sequence.numbers, sequence.calibration, name)  # raises errors before any work is done
-        poses = lambda frames: poses_of(table, frames, sequence.calibration, name)
+        table = read_poses(args.poses)
+        if not table.one_a_line:
+            whole, sequence = len(sequence), sequence.only(table.numbers)
+            if len(sequence) < whole:
+                note(args.poses, f"{whole - len(sequence)} of {whole} frames left out: they have no pose")
+        poses_of(table, sequence.numbers, sequence.calibration)  # raises errors before any work is done
+        poses = lambda frames: poses_of(table, frames, sequence.calibration)
+    center = (sequence.calibration.cx, sequence.calibration.cy)
+    note_center(args.calibration or sequence.folder, f"camera {args.camera}", center, image_size(sequence))
     front = FrontEndOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
     options = BuildOptions(
         front,
