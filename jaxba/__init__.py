@@ -21,6 +21,7 @@ from jaxba.io import (
     read_colmap,
     read_problem,
     write_bal,
+    write_bundler,
     write_colmap,
     write_ply,
     write_problem,
@@ -30,7 +31,7 @@ from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.methods.registry import METHODS, Method, make_method
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
@@ -71,6 +72,7 @@ __all__ = [
     "Prepared",
     "ProblemError",
     "ProblemInfo",
+    "ProblemWarning",
     "Refinement",
     "Retriangulation",
     "SceneConfig",
@@ -106,6 +108,7 @@ __all__ = [
     "solve_loop",
     "trained_step",
     "write_bal",
+    "write_bundler",
     "write_colmap",
     "write_ply",
     "write_problem",

@@ -9,7 +9,7 @@ from pathlib import Path
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import read_problem
 from jaxba.io.files import display_name, strip_compression
-from jaxba.io.formats import by_ending, is_folder
+from jaxba.io.formats import by_ending, holds_problem
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, random_scene, scene_like
 
@@ -78,7 +78,7 @@ def sources(locations: list[str]) -> list[Source]:
         else:
             name, location = location, resolve(location)
             path = Path(location)
-            if not path.is_file() and not is_folder(path):
+            if not path.is_file() and not holds_problem(path):
                 raise ProblemError(
                     f"{location}: {'a directory without a COLMAP model' if path.is_dir() else 'no such file'}"
                 )

@@ -7,7 +7,6 @@ import os
 import re
 import stat
 import sys
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr
 from io import StringIO, TextIOWrapper
@@ -66,8 +65,7 @@ def run_command(
 
         names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
         try:
-            with notes_as_lines():
-                return main(parsed)
+            return main(parsed)
         except (ProblemError, UsageError, PolicyFileError, *names) as error:
             return print_error(str(error))
         except Exception as error:
@@ -79,25 +77,6 @@ def run_command(
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED
-
-
-@contextmanager
-def notes_as_lines() -> Iterator[None]:
-    """Prints what readers remark (`ProblemWarning`) as lines that begin with `note:`."""
-    from jaxba.io.notes import ProblemWarning
-
-    with warnings.catch_warnings():
-        others = warnings.showwarning
-
-        def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
-            if issubclass(category, ProblemWarning):
-                print_line(f"note: {message}")
-            else:
-                others(message, category, *where, **more)
-
-        warnings.showwarning = show
-        warnings.simplefilter("always", ProblemWarning)
-        yield
 
 
 def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str:
@@ -141,6 +120,19 @@ def print_line(text: str) -> None:
         print(text, flush=True)
     except BrokenPipeError:
         discard_stdout()
+
+
+@contextmanager
+def notes_printed(say: Callable[[str], object] = print_line) -> Iterator[None]:
+    """Prints the notes of what is read inside, one line each.
+
+    Args:
+        say: prints a line.
+    """
+    from jaxba.io.notes import told
+
+    with told(lambda note: say(f"note: {note}")):
+        yield
 
 
 def exit_with(status: int) -> NoReturn:

@@ -151,7 +151,6 @@ def _build(args: Arguments) -> int:
     from jaxba.io import check_output
     from jaxba.io.files import strip_compression
     from jaxba.io.formats import FORMATS, by_ending
-    from jaxba.io.notes import note, note_center
 
     stem = Path(strip_compression(args.out))
     check_output(args.out)
@@ -163,24 +162,11 @@ def _build(args: Arguments) -> int:
         raise common.UsageError(str(error)) from None
     from jaxba.datasets.kitti.build import BuildOptions, build
     from jaxba.datasets.kitti.frontend import FrontEndOptions
-    from jaxba.datasets.kitti.images import image_size
-    from jaxba.datasets.kitti.poses import poses_of, read_poses
     from jaxba.datasets.kitti.result_cache import ResultCache
-    from jaxba.datasets.kitti.sequence import read_sequence
     from jaxba.datasets.kitti.triangulate import Filters
 
-    sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
-    poses = None
-    if args.poses is not None:
-        table = read_poses(args.poses)
-        if not table.one_a_line:
-            whole, sequence = len(sequence), sequence.only(table.numbers)
-            if len(sequence) < whole:
-                note(args.poses, f"{whole - len(sequence)} of {whole} frames left out: they have no pose")
-        poses_of(table, sequence.numbers, sequence.calibration)  # raises errors before any work is done
-        poses = lambda frames: poses_of(table, frames, sequence.calibration)
-    center = (sequence.calibration.cx, sequence.calibration.cy)
-    note_center(args.calibration or sequence.folder, f"camera {args.camera}", center, image_size(sequence))
+    with common.notes_printed():
+        sequence, poses = _inputs(args)
     front = FrontEndOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
     options = BuildOptions(
         front,
@@ -210,6 +196,28 @@ def _build(args: Arguments) -> int:
             console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")
     console.print(f"wrote {', '.join(files)}")
     return 0
+
+
+def _inputs(args: Arguments) -> tuple[Any, Any]:
+    """The sequence, and its true poses as a function of the numbers of frames, or None."""
+    from jaxba.datasets.kitti.images import image_size
+    from jaxba.datasets.kitti.poses import poses_of, read_poses
+    from jaxba.datasets.kitti.sequence import read_sequence
+    from jaxba.io.remarks import note, note_center
+
+    sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
+    poses = None
+    if args.poses is not None:
+        table = read_poses(args.poses)
+        if not table.one_a_line:
+            whole, sequence = len(sequence), sequence.only(table.numbers)
+            if len(sequence) < whole:
+                note(args.poses, f"{whole - len(sequence)} of {whole} frames left out: they have no pose")
+        poses_of(table, sequence.numbers, sequence.calibration)  # raises errors before any work is done
+        poses = lambda frames: poses_of(table, frames, sequence.calibration)
+    center = (sequence.calibration.cx, sequence.calibration.cy)
+    note_center(args.calibration or sequence.folder, f"camera {args.camera}", center, image_size(sequence))
+    return sequence, poses
 
 
 def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
@@ -281,7 +289,8 @@ def _evaluate(args: EvaluateArguments) -> int:
 
     side = evaluate.read_sidecar(args.problem)
     truth = None if args.poses is None else evaluate.truth_of(side, args.poses)
-    results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
+    with common.notes_printed():
+        results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
     path = None if truth is None else truth[:, :, 3]
     views = [plots.View(_caption(r), r.points, r.poses[:, :, 3]) for r in results]
     figure = plots.plot_top_view(views, path)

@@ -56,8 +56,9 @@ class Arguments:
     """Options of `jaxba-solve`."""
 
     problem: Annotated[str | None, tyro.conf.Positional] = None
-    """BAL file or Bundler .out file, plain or .bz2, .gz, .xz; the folder of a COLMAP model (extra colmap); or the name
-    of a downloaded BAL problem such as ladybug-49 (see jaxba-data). Default: a random scene."""
+    """BAL file, Bundler .out file, VisualSFM .nvm file, or a .json or .sfm file of OpenSfM, OpenMVG or AliceVision,
+    plain or .bz2, .gz, .xz; the folder of a COLMAP model (extra colmap); or the name of a downloaded BAL problem such
+    as ladybug-49 (see jaxba-data). Default: a random scene."""
 
     policy: str = DEFAULT_POLICY
     """Damping policy, which chooses lambda: learned (the shipped policy for the options of the step), a .safetensors
@@ -133,8 +134,12 @@ class Arguments:
     """Scale of the robust loss, pixels: residuals well below it count quadratically."""
 
     output: str | None = None
-    """Output file in BAL format, compressed by its ending, or .ply for a viewer; also /dev/stdout. If the problem is a
-    COLMAP model: output folder of a COLMAP model, unless the name ends in .txt, .bal, .ply, .bz2, .gz or .xz."""
+    """Output file in BAL format, compressed by its ending, .out for Bundler's format, or .ply for a viewer; also
+    /dev/stdout. If the problem is a COLMAP model: output folder of a COLMAP model, unless the name ends in .txt, .bal,
+    .out, .ply, .bz2, .gz or .xz."""
+
+    strict: bool = False
+    """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point."""
 
     log: str | None = None
     """Output file of a JSON record of the solve, compressed by its ending."""
@@ -219,7 +224,8 @@ def _solve(args: Arguments) -> int:
     policy, options = solve_options(args)
     path = None if args.problem is None else resolve(args.problem)
     check_outputs(args.output, args.log, path)
-    problem = _default_scene() if path is None else read_problem(path)
+    with common.notes_printed():
+        problem = _default_scene() if path is None else read_problem(path, strict=args.strict)
     common.prepare_process(untraced=True)
     name = args.problem or DEFAULT_SCENE
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
+import warnings
 
 from jaxba.io import formats
 from jaxba.io.bal import read_bal, write_bal
 from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
 from jaxba.io.files import StrPath
-from jaxba.io.notes import ProblemWarning
 from jaxba.io.ply import write_ply
-from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 
 __all__ = [
     "ProblemWarning",
@@ -29,17 +29,27 @@ __all__ = [
 ]
 
 
-def read_problem(path: StrPath) -> BundleProblem:
+def read_problem(path: StrPath, *, strict: bool = False) -> BundleProblem:
     """Reads a problem in any format that is known: a folder is a COLMAP model or OpenSfM's, a file is what its ending
     says (`jaxba.io.formats.FORMATS`). One with another ending is BAL, or what its first bytes say. Files may be
     compressed.
 
-    What is remarkable but no error, such as observations that were left out, is a `ProblemWarning`.
+    Args:
+        path: file or folder.
+        strict: refuse what else is a `ProblemWarning`: parts that would be left out, and what looks wrong.
 
     Raises:
         ProblemError: it cannot be read; one line that names the file and, where there is one, the record and the field.
     """
-    return formats.read_folder(path) if os.path.isdir(path) else formats.read(path)
+    read = formats.read_folder if os.path.isdir(path) else formats.read
+    if not strict:
+        return read(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ProblemWarning)
+        try:
+            return read(path)
+        except ProblemWarning as note:
+            raise ProblemError(str(note)) from None
 
 
 def write_problem(problem: BundleProblem, path: StrPath) -> None:

@@ -174,7 +174,7 @@ def writer(path: StrPath) -> Writer:
     return write
 
 
-def is_folder(path: StrPath) -> bool:
+def holds_problem(path: StrPath) -> bool:
     """Whether a path is a folder that holds a problem."""
     return is_colmap(path) or (Path(path) / RECONSTRUCTION).is_file()
 

@@ -21,7 +21,7 @@ from jaxba.io.distortion import Distortion
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import FIXED, ForeignLens, assemble
-from jaxba.io.notes import note_origin
+from jaxba.io.remarks import note_origin
 from jaxba.io.text import LineReader, NumberReader, number
 from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError

@@ -26,6 +26,11 @@ class ProblemError(ValueError):
     """The input is not a valid bundle adjustment problem. The message is one line for the user."""
 
 
+class ProblemWarning(UserWarning):
+    """A part of the input was left out of the problem, was mended, or looks wrong. The message is one line for the
+    user."""
+
+
 @register_pytree
 @dataclass(frozen=True)
 class BundleProblem:

@@ -73,6 +73,14 @@ def test_what_readers_remark_is_printed_as_notes(tmp_path, capsys):
     assert printed.err == ""
 
 
+def test_what_is_remarked_is_refused_if_asked(tmp_path):
+    path = write_openmvg(tmp_path / "sfm_data.json", Scene([Lens(cx=0.0)], [0, 0, 0]), ["pinhole"])
+    with pytest.raises(ProblemError, match=r"sfm_data\.json: the principal point of intrinsic 0 lies at the edge"):
+        read_problem(path, strict=True)
+    assert run([str(path), "--strict", "--output", str(tmp_path / "a.txt")]) == 2
+    assert not (tmp_path / "a.txt").exists()
+
+
 @pytest.mark.parametrize("name", ["model", "model.txt", "model.dat"])
 def test_a_file_is_recognised_by_its_first_bytes_where_the_name_says_nothing(tmp_path, name):
     scene = Scene([Lens(cx=800.0, cy=600.0)], [0, 0, 0])
