@@ -52,6 +52,7 @@ class _Observed(NamedTuple):
     whitening: np.ndarray  # (n, 2, 2)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
 def assemble(
     path: StrPath,
     lenses: Sequence[ForeignLens],

@@ -12,7 +12,6 @@ Multicore Bundle Adjustment, `SetNormalizedMeasurementDistortion` and `LoadNVM`.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -31,9 +30,6 @@ from jaxba.typing import LARGEST_COUNT
 HEADERS = (b"NVM_V3", b"NVM_V3_R9T")
 """First words of the versions that are read."""
 
-SMALLEST_NORM = 1e-150
-"""Of a quaternion; the square of a smaller one is no longer a normal number."""
-
 _FIELDS = ("f", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "r", "0")
 _FIELDS_R9T = ("f", *(f"R{row}{column}" for row in "123" for column in "123"), "tx", "ty", "tz", "r", "0")
 
@@ -50,6 +46,7 @@ class _Images(NamedTuple):
     distortion: np.ndarray  # (n,)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
 def read_nvm(path: StrPath) -> BundleProblem:
     """Reads the first model of a VisualSFM file.
 
@@ -135,14 +132,16 @@ def _images(lines: LineReader, header: _Header) -> _Images:
         rows.append(_numbers(words[1:], fields, f"{where}: image {image}"))
         if header.matrices and not are_rotations(np.array(rows[-1][1:10]).reshape(1, 3, 3))[0]:
             raise ProblemError(f"{where}: image {image}: R11 to R33 are no rotation")
-        if not header.matrices and not SMALLEST_NORM < math.hypot(*rows[-1][1:5]) < np.inf:
+        if not header.matrices and not any(rows[-1][1:5]):
             raise ProblemError(f"{where}: image {image}: qw to qz are no rotation")
     table = np.array(rows)
     if header.matrices:
         return _Images(table[:, 0], table[:, 1:10].reshape(-1, 3, 3), table[:, 10:13], table[:, 13])
     from scipy.spatial.transform import Rotation
 
-    rotations = Rotation.from_quat(table[:, [2, 3, 4, 1]]).as_matrix()
+    quaternions = table[:, [2, 3, 4, 1]]
+    largest = np.abs(quaternions).max(axis=1, keepdims=True)  # without it squares overflow
+    rotations = Rotation.from_quat(quaternions / largest).as_matrix()
     return _Images(table[:, 0], rotations, translations(rotations, table[:, 5:8]), table[:, 8])
 
 

@@ -75,6 +75,7 @@ def is_opensfm(document: Record) -> bool:
     return isinstance(first, dict) and "shots" in first and "cameras" in first
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
 def from_document(document: Record, path: StrPath, tracks: StrPath | None = None) -> BundleProblem:
     """As `read_opensfm`, from the contents of its file. Raises ProblemError."""
     if isinstance(document.value, list):

@@ -61,6 +61,7 @@ def part(document: Record, key: str, program: str) -> Record:
     document.fail(f"has no {key}, only {', '.join(there) or 'other parts'}: have {program} write its whole result")
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
 def build(
     path: StrPath,
     views: Mapping[int, View],

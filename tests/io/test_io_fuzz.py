@@ -35,6 +35,8 @@ WORDS = [
     b"nan",
     b"-inf",
     b"1e999",
+    b"1e308",
+    b"1e200",
     b"1e-999",
     b"abc",
     b"",
@@ -148,7 +150,7 @@ def foreign_seed(folder: Path, program: str) -> tuple[Path, Path]:
     return path, folder / "tracks.csv" if program == "tracks" else path
 
 
-WRONG = [None, True, 0, -1, 1.5, 1e300, 1e-300, 10**30, float("nan"), float("inf"), "", "nan", "1e999", "\u0663", "x\n"]
+WRONG = [None, True, 0, -1, 1.5, 1e308, 1e200, 1e-300, 10**30, float("nan"), float("inf"), "", "nan", "1e999", "\u0663", "x\n"]
 WRONG += [[], {}, [[]], [1], {"key": 0}, [0, 0], [1.0, 2.0, 3.0], 2**31, 2**32 - 1, 2**53, -(2**63)]
 
 
