@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jaxba.datasets.bal.paths import resolve
-from jaxba.io import is_colmap, read_problem
-from jaxba.io.files import display_name
+from jaxba.io import read_problem
+from jaxba.io.files import display_name, strip_compression
+from jaxba.io.formats import by_ending, holds_problem
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.scenes import SceneConfig, random_scene, scene_like
 
@@ -80,11 +81,12 @@ def sources(locations: list[str]) -> list[Source]:
         else:
             name, location = location, resolve(location)
             path = Path(location)
-            if not path.is_file() and not is_colmap(path):
+            if not path.is_file() and not holds_problem(path):
                 raise ProblemError(
                     f"{location}: {'a directory without a COLMAP model' if path.is_dir() else 'no such file'}"
                 )
-            label = re.sub(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$", "", Path(name).name) or path.name
+            label = Path(strip_compression(name)).name
+            label = (Path(label).stem if by_ending(label) else label) or path.name
             if path.is_dir():
                 label = _model_name(path)
             # reports and figures cannot show bytes that are not valid text

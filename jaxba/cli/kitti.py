@@ -26,7 +26,7 @@ class Arguments:
     """Options of `jaxba-kitti`."""
 
     sequence: Annotated[str, tyro.conf.Positional]
-    """Folder of a KITTI odometry sequence: image_0/000000.png ..., calib.txt."""
+    """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
 
     out: str = "kitti.txt.bz2"
     """Output file of the problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json, written
@@ -55,8 +55,8 @@ class Arguments:
     accumulating errors."""
 
     poses: str | None = None
-    """File of the true poses, 12 numbers per line, a line for every frame of the sequence from frame 0. With --start vo
-    they are only used to print the error of the start."""
+    """File of the true poses, 12 numbers per line, a line for every frame of the sequence from frame 0; or 13 numbers,
+    the first of them the frame. With --start vo they are only used to print the error of the start."""
 
     rotation_sigma: float = 0.1
     """Error of noisy-poses: standard deviation of the rotation on each axis per key-frame, degrees."""
@@ -84,7 +84,8 @@ class Arguments:
     """Number of the camera, 0 (image_0 and P0) to 3."""
 
     calibration: str | None = None
-    """File of the camera matrix, lines as in calib.txt or 3 x 3 numbers. Default: that of the sequence."""
+    """File of the camera matrix, lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers.
+    Default: that of the sequence."""
 
     work: str | None = None
     """Folder of intermediate results, with which an interrupted run continues. Default: NAME.work."""
@@ -147,10 +148,13 @@ def _build(args: Arguments) -> int:
     if args.stride is not None and args.window is None:
         raise common.UsageError("--stride needs --window")
     common.check_writable("--out", args.out)
+    from jaxba.io import check_output
     from jaxba.io.files import strip_compression
+    from jaxba.io.formats import FORMATS, by_ending
 
     stem = Path(strip_compression(args.out))
-    if stem.suffix.lower() in (".ply", ".out"):
+    check_output(args.out)
+    if by_ending(args.out) not in (None, FORMATS[0]):
         raise common.UsageError(f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
     try:
         from jaxba.datasets.kitti import opencv  # noqa: F401 - the error names the package to install
@@ -159,15 +163,10 @@ def _build(args: Arguments) -> int:
     from jaxba.datasets.kitti.build import BuildOptions, build
     from jaxba.datasets.kitti.frontend import FrontEndOptions
     from jaxba.datasets.kitti.result_cache import ResultCache
-    from jaxba.datasets.kitti.sequence import poses_of, read_poses, read_sequence
     from jaxba.datasets.kitti.triangulate import Filters
 
-    sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
-    poses = None
-    if args.poses is not None:
-        table, name = read_poses(args.poses), args.poses
-        poses_of(table, sequence.numbers, sequence.calibration, name)  # raises errors before any work is done
-        poses = lambda frames: poses_of(table, frames, sequence.calibration, name)
+    with common.notes_printed():
+        sequence, poses = _inputs(args)
     front = FrontEndOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
     options = BuildOptions(
         front,
@@ -197,6 +196,28 @@ def _build(args: Arguments) -> int:
             console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")
     console.print(f"wrote {', '.join(files)}")
     return 0
+
+
+def _inputs(args: Arguments) -> tuple[Any, Any]:
+    """The sequence, and its true poses as a function of the numbers of frames, or None."""
+    from jaxba.datasets.kitti.images import image_size
+    from jaxba.datasets.kitti.poses import poses_of, read_poses
+    from jaxba.datasets.kitti.sequence import read_sequence
+    from jaxba.io.remarks import note, note_center
+
+    sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
+    poses = None
+    if args.poses is not None:
+        table = read_poses(args.poses)
+        if not table.one_a_line:
+            whole, sequence = len(sequence), sequence.only(table.numbers)
+            if len(sequence) < whole:
+                note(args.poses, f"{whole - len(sequence)} of {whole} frames left out: they have no pose")
+        poses_of(table, sequence.numbers, sequence.calibration)  # raises errors before any work is done
+        poses = lambda frames: poses_of(table, frames, sequence.calibration)
+    center = (sequence.calibration.cx, sequence.calibration.cy)
+    note_center(args.calibration or sequence.folder, f"camera {args.camera}", center, image_size(sequence))
+    return sequence, poses
 
 
 def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
@@ -268,7 +289,8 @@ def _evaluate(args: EvaluateArguments) -> int:
 
     side = evaluate.read_sidecar(args.problem)
     truth = None if args.poses is None else evaluate.truth_of(side, args.poses)
-    results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
+    with common.notes_printed():
+        results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
     path = None if truth is None else truth[:, :, 3]
     views = [plots.View(_caption(r), r.points, r.poses[:, :, 3]) for r in results]
     figure = plots.plot_top_view(views, path)

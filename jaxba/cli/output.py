@@ -5,17 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxba.cli import common, table
-from jaxba.io import check_output, is_folder, write_colmap, write_problem
-from jaxba.io.files import strip_compression
+from jaxba.io import check_output, formats, is_colmap, is_folder, write_colmap, write_problem
 from jaxba.problem.bundle_problem import BundleProblem
-
-FILE_ENDINGS = (".txt", ".bal", ".ply")
-"""If the output has one of these endings, or one of compression, a COLMAP model is written as a single file."""
 
 
 def is_model(output: str, source: str | None) -> bool:
     """Whether the output is written as a COLMAP model: it is a folder, or the problem is a model and the output has no
-    ending of a file.
+    ending of a file (`formats.is_file_name`).
 
     Args:
         output: path of the output.
@@ -23,15 +19,14 @@ def is_model(output: str, source: str | None) -> bool:
     """
     if is_folder(output):
         return True
-    if source is None or not Path(source).is_dir():
+    if source is None or not is_colmap(source):
         return False
-    bare = strip_compression(output)
-    return bare == output and Path(bare).suffix.lower() not in FILE_ENDINGS
+    return not formats.is_file_name(output)
 
 
 def _is_like_source(output: str, source: str | None) -> bool:
     """Whether the output is written as a COLMAP model like that of the problem."""
-    return source is not None and Path(source).is_dir() and is_model(output, source)
+    return source is not None and is_colmap(source) and is_model(output, source)
 
 
 def check_outputs(output: str | None, log: str | None, source: str | None) -> None:
@@ -61,18 +56,21 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
         UsageError: the solution cannot be written.
     """
     lost = ""
+    model = is_model(output, source)
     try:
         if _is_like_source(output, source):
             write_colmap(problem, output, like=source)
-        elif is_model(output, source):
+        elif model:
             write_problem(problem, output)
             lost = table.lost_in_new_model(problem)
             common.print_line("note: names and sizes of images, and so principal points, are made up in that model")
         else:
             write_problem(problem, output)
-            lost = table.lost_in_bal(problem)
+            lost = table.lost_in_file(problem)
     except OSError as error:
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
     common.print_line(f"wrote {output}")
+    if formats.ending(output) and formats.by_ending(output) is None and not model:
+        common.print_line(f"note: {output} is a BAL file; {formats.formats_written()}")
     if lost:
-        common.print_line(f"note: that {'model' if is_model(output, source) else 'file'} cannot store: {lost}")
+        common.print_line(f"note: that {'model' if model else 'file'} cannot store: {lost}")

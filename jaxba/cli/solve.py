@@ -56,8 +56,9 @@ class Arguments:
     """Options of `jaxba-solve`."""
 
     problem: Annotated[str | None, tyro.conf.Positional] = None
-    """BAL file or Bundler .out file, plain or .bz2, .gz, .xz; the folder of a COLMAP model; or the name of a downloaded
-    BAL problem such as ladybug-49 (see jaxba-data). Default: a random scene."""
+    """BAL file, Bundler .out file, VisualSFM .nvm file, or a .json or .sfm file of OpenSfM, OpenMVG or AliceVision,
+    plain or .bz2, .gz, .xz; the folder of a COLMAP model; or the name of a downloaded BAL problem such as ladybug-49
+    (see jaxba-data). Default: a random scene."""
 
     policy: str = DEFAULT_POLICY
     """Damping policy, which chooses lambda: learned (the shipped policy for the options of the step), a .safetensors
@@ -133,9 +134,9 @@ class Arguments:
     """Scale of the robust loss, pixels: residuals well below it count quadratically."""
 
     output: str | None = None
-    """Output file in BAL format, compressed by its ending, or .ply for a viewer; also /dev/stdout. A folder that is
-    there, or a name that ends in /, becomes a COLMAP model. If the problem is one: every name does, unless it ends in
-    .txt, .bal, .ply, .bz2, .gz or .xz."""
+    """Output file in BAL format, compressed by its ending, .out for Bundler's format, or .ply for a viewer; also
+    /dev/stdout. A folder that is there, or a name that ends in /, becomes a COLMAP model. If the problem is one: every
+    name does, unless it ends in .txt, .bal, .out, .ply, .bz2, .gz or .xz."""
 
     strict: bool = False
     """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point."""

@@ -130,8 +130,8 @@ def _how_compiled(solution: Solution) -> str:
     return f" ({which} with quickly compiled programs, see --compilation)"
 
 
-def lost_in_bal(problem: BundleProblem) -> str:
-    """Properties of a problem that a BAL file cannot store, as text; empty if there are none."""
+def lost_in_file(problem: BundleProblem) -> str:
+    """Properties of a problem that a BAL or Bundler file cannot store, as text; empty if there are none."""
     lenses = problem.lenses
     shared = ["which images share a lens"] if lenses is not None and lenses.shared else []
     return ", ".join([*shared, *filter(None, [lost_in_new_model(problem)])])

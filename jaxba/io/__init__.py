@@ -1,18 +1,20 @@
-"""Readers and writers: BAL text, Bundler and COLMAP models, PLY point clouds; configurations found by name."""
+"""Readers and writers of problems (`jaxba.io.formats` lists them), PLY point clouds; configurations found by name."""
 
 from __future__ import annotations
 
 import os
-from pathlib import PurePath
+import warnings
 
+from jaxba.io import formats
 from jaxba.io.bal import read_bal, write_bal
-from jaxba.io.bundler import read_bundler
+from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
-from jaxba.io.files import StrPath, display_name, strip_compression
+from jaxba.io.files import StrPath, display_name
 from jaxba.io.ply import write_ply
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 
 __all__ = [
+    "ProblemWarning",
     "check_output",
     "is_colmap",
     "is_folder",
@@ -21,6 +23,7 @@ __all__ = [
     "read_colmap",
     "read_problem",
     "write_bal",
+    "write_bundler",
     "write_colmap",
     "write_ply",
     "write_problem",
@@ -28,33 +31,41 @@ __all__ = [
 
 
 def read_problem(path: StrPath, *, strict: bool = False) -> BundleProblem:
-    """Reads a problem: a folder is a COLMAP model, `.out` a Bundler model, every other name a BAL file, these two also
+    """Reads a problem in any format that is known: a folder is a COLMAP model or OpenSfM's, a file is what its ending
+    says (`jaxba.io.formats.FORMATS`). One with another ending is BAL, or what its first bytes say. Files may be
     compressed.
 
     Args:
         path: file or folder.
-        strict: refuse a problem of which a part would be left out, as only `read_colmap` does.
+        strict: refuse what else is a `ProblemWarning`: parts that would be left out and, but for COLMAP models, what
+            looks wrong.
 
     Raises:
-        ProblemError: as `read_colmap`, `read_bundler` and `read_bal` do.
+        ProblemError: it cannot be read; one line that names the file and, where there is one, the record and the field.
     """
-    if os.path.isdir(path):
+    if is_colmap(path):
         return read_colmap(path, strict=strict)
-    return (read_bundler if _kind(path) == ".out" else read_bal)(path)
+    read = formats.read_folder if os.path.isdir(path) else formats.read
+    if not strict:
+        return read(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ProblemWarning)
+        try:
+            return read(path)
+        except ProblemWarning as note:
+            raise ProblemError(str(note)) from None
 
 
 def write_problem(problem: BundleProblem, path: StrPath) -> None:
-    """Writes a problem: a folder, or a name that ends in a separator, is a COLMAP model that is like no other, `.ply`
-    is a point cloud for viewers, every other name a BAL file; these two also compressed.
+    """Writes a problem: a folder, or a name that ends in a separator, is a COLMAP model that is like no other, `.out` a
+    Bundler model, `.ply` a point cloud for viewers, every other name that is not another format's a BAL file. Files may
+    be compressed.
 
     Raises:
-        ProblemError: as `check_output`, `write_colmap`, `write_ply` and `write_bal` do.
+        ProblemError: as `check_output` and the writers do.
     """
     check_output(path)
-    if is_folder(path):
-        write_colmap(problem, path)
-        return
-    (write_ply if _kind(path) == ".ply" else write_bal)(problem, path)
+    (write_colmap if is_folder(path) else formats.writer(path))(problem, path)
 
 
 def is_folder(path: StrPath) -> bool:
@@ -63,19 +74,12 @@ def is_folder(path: StrPath) -> bool:
 
 
 def check_output(path: StrPath) -> None:
-    """Refuses a name that `read_problem` would not read as the format that `write_problem` writes.
+    """Refuses a name whose ending is that of a format that `write_problem` does not write.
 
     Raises:
-        ProblemError: the name is that of a Bundler model, or of a folder of other things; one line.
+        ProblemError: it is, or the path is a folder of other things; one line.
     """
-    if is_folder(path):
-        if os.path.isdir(path) and os.listdir(path) and not is_colmap(path):
-            raise ProblemError(
-                f"cannot write {display_name(path)}: the directory holds other files, and no COLMAP model"
-            )
-    elif _kind(path) == ".out":
-        raise ProblemError(f"cannot write {display_name(path)}: Bundler models are only read; .txt is for BAL")
-
-
-def _kind(path: StrPath) -> str:
-    return PurePath(strip_compression(path)).suffix.lower()
+    if not is_folder(path):
+        formats.writer(path)
+    elif os.path.isdir(path) and os.listdir(path) and not is_colmap(path):
+        raise ProblemError(f"cannot write {display_name(path)}: the directory holds other files, and no COLMAP model")

@@ -12,7 +12,9 @@ from functools import partial
 
 import numpy as np
 
-from jaxba.io.files import StrPath, display_name, open_input, open_output
+from jaxba.io.encoding import open_text
+from jaxba.io.files import StrPath, display_name, open_output
+from jaxba.io.remarks import note_origin
 from jaxba.io.text import NumberReader
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
 from jaxba.typing import LARGEST_COUNT
@@ -36,8 +38,10 @@ def read_bal(path: StrPath) -> BundleProblem:
         ProblemError: the file cannot be read or is no valid problem; one line that names the file and, where there is
             one, the line and the field.
     """
-    with open_input(path) as blocks:
-        return _read(NumberReader(blocks, display_name(path), partial(_field, ())))
+    with open_text(path) as blocks:
+        problem = _read(NumberReader(blocks, display_name(path), partial(_field, ())))
+    note_origin(path, np.asarray(problem.observations))
+    return problem
 
 
 def write_bal(problem: BundleProblem, path: StrPath) -> None:

@@ -6,28 +6,24 @@ image centre, y upwards. Source: Snavely, "Bundler v0.4 User's Manual", https://
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Iterator, Sequence
 from functools import partial
-from itertools import chain
 
 import numpy as np
 
-from jaxba.io.files import READ_ERRORS, StrPath, display_name, open_input, reason
-from jaxba.io.text import NumberReader
+from jaxba.io.encoding import open_text
+from jaxba.io.files import StrPath, display_name, open_output
+from jaxba.io.ply import POINT_COLOUR
+from jaxba.io.remarks import note_origin
+from jaxba.io.text import LineReader, NumberReader
+from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import angle_axis
+from jaxba.problem.geometry import angle_axis, are_rotations, rotation_matrices
 from jaxba.typing import LARGEST_COUNT
 
 HEADER = b"# Bundle file v0.3"
 """First line of every file of this version."""
 
-ROTATION_TOLERANCE = 1e-3
-"""Largest entry of `R R^T - I` that still counts as rounding; Bundler writes 11 digits, other programs fewer."""
-
 _CAMERA = ("f", "k1", "k2", *(f"R{row}{column}" for row in "123" for column in "123"), "t1", "t2", "t3")
-_POINT = ("x", "y", "z", "red", "green", "blue", "number of views")
-_VIEW = ("camera index", "key", "x", "y")
 
 
 def read_bundler(path: StrPath) -> BundleProblem:
@@ -44,30 +40,64 @@ def read_bundler(path: StrPath) -> BundleProblem:
             line that names the file and, where there is one, the line and the field.
     """
     name = display_name(path)
-    with open_input(path) as blocks:
-        numbers = _after_header(blocks, name)
-        reader = NumberReader(numbers, name, partial(_field, 0, ()), line=2)
-        return _read(reader)
+    with open_text(path) as blocks:
+        lines = LineReader(blocks, name)
+        header = lines.next_filled()
+        if header != HEADER:
+            shown = ascii(header[:40].decode("latin-1"))
+            complaint = f"{shown} is not the header {HEADER.decode()!r} of a Bundler file"
+            raise ProblemError(f"{name} line {max(lines.line, 1)}: {complaint}")
+        problem = _read(NumberReader(lines.rest(), name, partial(_field, 0), line=lines.line + 1))
+    note_origin(path, np.asarray(problem.observations))
+    return problem
 
 
-def _after_header(blocks: Iterator[bytes], name: str) -> Iterator[bytes]:
-    """The blocks after the first line, which must be the header."""
-    line = b""
-    try:
-        while b"\n" not in line and len(line) <= len(HEADER) + 2 and (block := next(blocks, None)) is not None:
-            line += block
-    except READ_ERRORS as error:
-        raise ProblemError(f"{name} line 1: cannot read on: {reason(error)}") from error
-    line, _, rest = line.partition(b"\n")
-    if line.strip() != HEADER:
-        shown = ascii(line[:40].decode("latin-1"))
-        raise ProblemError(f"{name} line 1: {shown} is not the header {HEADER.decode()!r} of a Bundler file")
-    return chain([rest], blocks)
+def write_bundler(problem: BundleProblem, path: StrPath) -> None:
+    """Writes a Bundler model of version 0.3; compressed if the name ends in `.bz2`, `.gz` or `.xz`.
+
+    The file is replaced whole or not at all. Observations stand in the order of their points, rotations are matrices,
+    and points are grey. Covariances, weights and shared intrinsics cannot be stored, as in BAL.
+
+    Args:
+        problem: of NumPy or JAX arrays.
+        path: the file, replaced if it exists.
+
+    Raises:
+        ProblemError: the problem is not valid, a camera that sees points has focal length 0, which stands for cameras
+            that are not registered, or the file cannot be written.
+    """
+    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
+    valid = BundleProblem.create(*arrays)
+    cameras, camera_index = np.asarray(valid.cameras), np.asarray(valid.camera_index)
+    lost = np.flatnonzero((cameras[:, 6] == 0) & (np.bincount(camera_index, minlength=len(cameras)) > 0))
+    if lost.size:
+        raise ProblemError(f"cannot write {display_name(path)}: camera {lost[0]} has focal length 0")
+    order = np.argsort(valid.point_index, kind="stable")
+    views = np.bincount(np.asarray(valid.point_index), minlength=valid.num_points).tolist()
+    keys, pixels = _keys(camera_index)[order].tolist(), valid.observations[order].tolist()
+    rows = zip(camera_index[order].tolist(), keys, pixels, strict=True)
+    colour = " ".join(map(str, POINT_COLOUR))
+    with open_output(path) as file:
+        file.write(HEADER + f"\n{valid.num_cameras} {valid.num_points}\n".encode())
+        for camera, rotation in zip(cameras.tolist(), rotation_matrices(cameras[:, :3]).tolist(), strict=True):
+            parts = [camera[6:], *rotation, camera[3:6]]
+            file.write("".join(" ".join(map(str, part)) + "\n" for part in parts).encode())
+        for point, count in zip(np.asarray(valid.points).tolist(), views, strict=True):
+            seen = "".join(f" {camera} {key} {x} {y}" for camera, key, (x, y) in (next(rows) for _ in range(count)))
+            file.write(f"{point[0]} {point[1]} {point[2]}\n{colour}\n{count}{seen}\n".encode())
+
+
+def _keys(camera_index: np.ndarray) -> np.ndarray:
+    """A number for every observation that no other of the same camera has, from 0 in the order of the problem."""
+    order = np.argsort(camera_index, kind="stable")
+    counts = np.bincount(camera_index)
+    keys = np.empty(len(camera_index), np.int64)
+    keys[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return keys
 
 
 def _read(reader: NumberReader) -> BundleProblem:
     values = reader.peek_all()
-    starts: list[int] = []
 
     def need(end: int) -> None:
         if end > values.size:
@@ -75,36 +105,21 @@ def _read(reader: NumberReader) -> BundleProblem:
 
     need(2)
     num_cameras, num_points = reader.integers(range(2), values[:2], 1, LARGEST_COUNT).tolist()
-    reader.field = partial(_field, num_cameras, starts)
+    reader.field = partial(_field, num_cameras)
     position = 2 + len(_CAMERA) * num_cameras
     need(position)
     cameras = values[2:position].reshape(-1, len(_CAMERA))
-    for _ in range(num_points):
-        starts.append(position)
-        need(position + len(_POINT))
-        views = float(values[position + 6])
-        if not 0 <= views <= LARGEST_COUNT or not views.is_integer():
-            reader.integers([position + 6], values[position + 6 : position + 7], 0, LARGEST_COUNT)
-        position += len(_POINT) + len(_VIEW) * int(views)
-        need(position)
-    first_view = np.array(starts) + len(_POINT)
-    views = values[first_view - 1].astype(np.int64)
-    before = np.cumsum(views) - views
-    at = np.repeat(first_view - 4 * before, views) + 4 * np.arange(views.sum())
-    camera_index = reader.integers(at, values[at], 0, num_cameras - 1)
-    if not camera_index.size:
-        raise ProblemError(f"{reader.name}: no camera sees a point")
-    registered = _check_cameras(reader, cameras, camera_index)
+    tracks = read_tracks(reader, position, num_points, num_cameras, reader.field)
+    registered = _check_cameras(reader, cameras, tracks.camera_index)
     rotations = cameras[registered, 3:12].reshape(-1, 3, 3)
     parameters = (angle_axis(rotations), cameras[registered, 12:], cameras[registered, :3])
-    points = values[first_view[:, None] - len(_POINT) + np.arange(3)]
-    observations = values[at[:, None] + [2, 3]]
-    reader.skip(position)
+    reader.skip(tracks.end)
     reader.finish()
     new_index = np.cumsum(registered) - 1
-    point_index = np.repeat(np.arange(num_points), views)
     try:
-        return BundleProblem.create(np.hstack(parameters), points, observations, new_index[camera_index], point_index)
+        return BundleProblem.create(
+            np.hstack(parameters), tracks.points, tracks.pixels, new_index[tracks.camera_index], tracks.point_index
+        )
     except ProblemError as error:
         raise ProblemError(f"{reader.name}: {error}") from error
 
@@ -113,10 +128,7 @@ def _check_cameras(reader: NumberReader, cameras: np.ndarray, camera_index: np.n
     """Mask (cameras,) of registered cameras, after a check that they have rotations and that views name no others."""
     registered = cameras[:, 0] != 0
     used = np.bincount(camera_index, minlength=len(cameras)) > 0
-    rotations = cameras[:, 3:12].reshape(-1, 3, 3)
-    with np.errstate(over="ignore", invalid="ignore"):
-        residual = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-        rotation = (residual <= ROTATION_TOLERANCE) & (np.linalg.det(rotations) > 0)
+    rotation = are_rotations(cameras[:, 3:12].reshape(-1, 3, 3))
     for start, complaint, bad in (
         (0, "stands for a camera that is not registered, but a view names it", used & ~registered),
         (3, "is the first number of a matrix that is no rotation", registered & ~rotation),
@@ -126,16 +138,9 @@ def _check_cameras(reader: NumberReader, cameras: np.ndarray, camera_index: np.n
     return registered
 
 
-def _field(num_cameras: int, starts: Sequence[int], ordinal: int) -> str:
-    """Description of the number at an ordinal; `starts` are the ordinals of the first numbers of points."""
+def _field(num_cameras: int, ordinal: int) -> str:
+    """Description of the number at an ordinal, given how many cameras the file names (0 while that is read)."""
     if ordinal < 2:
         return f"number of {('cameras', 'points')[ordinal]}"
     camera, part = divmod(ordinal - 2, len(_CAMERA))
-    if camera < num_cameras:
-        return f"{_CAMERA[part]} of camera {camera}"
-    point = bisect_right(starts, ordinal) - 1
-    at = ordinal - starts[point]
-    if at < len(_POINT):
-        return f"{_POINT[at]} of point {point}"
-    view, part = divmod(at - len(_POINT), len(_VIEW))
-    return f"{_VIEW[part]} of view {view} of point {point}"
+    return f"{_CAMERA[part]} of camera {camera}"

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
+from jaxba.io.encoding import decode
 from jaxba.io.files import display_name, reason
 
 Kind: TypeAlias = Literal["train", "paper", "bench"]
@@ -110,7 +111,7 @@ def _folder(kind: Kind) -> Path:
 
 def _read_file(path: Path, name: str) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = decode(path.read_bytes())
     except UnicodeDecodeError:
         raise SettingsError(f"{name}: not text") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a null character

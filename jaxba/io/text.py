@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
 from typing import NamedTuple, NoReturn
 
 import numpy as np
@@ -17,7 +18,78 @@ MAX_WORD_BYTES = 1 << 16
 bound a large file without whitespace would be collected in memory as one word."""
 
 _WORD = re.compile(rb"[^ \t\n\r\v\f]+")
-_NUMBER = re.compile(rb"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|nan|inf|infinity)", re.IGNORECASE)
+_NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?", re.IGNORECASE)
+_NOT_FINITE = re.compile(
+    rb"[+-]?(?:nan(?:\(\w*\))?|inf(?:inity)?|\d\.#(?:[qs]nan|ind|inf)\d*)",  # the last is Microsoft's, as 1.#QNAN
+    re.IGNORECASE,
+)
+_FORTRAN = re.compile(rb"[\d.][Dd][+-]?\d")  # the exponent of 1.0D+00
+_FORTRAN_TO_C = bytes.maketrans(b"Dd", b"Ee")
+
+
+def number(word: str) -> float:
+    """The number that a word is, also with Fortran's exponents (1.0D+00); NaN if it is one that is not finite in any
+    spelling (inf, -nan(ind), 1.#QNAN).
+
+    Raises:
+        ValueError: it is no number.
+    """
+    try:
+        text = word.encode("ascii")
+    except UnicodeEncodeError:
+        text = b""
+    if _NUMBER.fullmatch(text):
+        return float(text.translate(_FORTRAN_TO_C))
+    if _NOT_FINITE.fullmatch(text):
+        return float("nan")
+    raise ValueError(f"{word!r} is no number")
+
+
+class LineReader:
+    """The first lines of a text; what follows them is handed on in blocks."""
+
+    def __init__(self, blocks: Iterable[bytes], name: str):
+        """Reads `blocks` of the file called `name`."""
+        self.name = name
+        self.line = 0
+        """Number of the line that was read last, from 1."""
+        self._blocks = iter(blocks)
+        self._text = b""
+        self._at = 0  # where in it the next line begins
+
+    def next(self) -> bytes | None:
+        """The next line without blanks at its ends; None at the end of the text.
+
+        Raises:
+            ProblemError: the line is longer than any can be, or the data cannot be decompressed.
+        """
+        while (end := self._text.find(b"\n", self._at)) < 0:
+            self._text, self._at = self._text[self._at :], 0
+            if len(self._text) > MAX_WORD_BYTES:
+                raise ProblemError(f"{self.name} line {self.line + 1}: is longer than {MAX_WORD_BYTES} characters")
+            try:
+                block = next(self._blocks, None)
+            except READ_ERRORS as error:
+                raise ProblemError(f"{self.name} line {self.line + 1}: cannot read on: {reason(error)}") from error
+            if block is None:
+                if not self._text:
+                    return None
+                end = len(self._text)
+                break
+            self._text += block
+        line, self._at = self._text[self._at : end], end + 1
+        self.line += 1
+        return line.strip()
+
+    def next_filled(self) -> bytes:
+        """The next line that is not blank, empty at the end of the text. Raises ProblemError as `next` does."""
+        while (line := self.next()) == b"":
+            pass
+        return line or b""
+
+    def rest(self) -> Iterator[bytes]:
+        """The blocks after the lines that were read."""
+        return chain([self._text[self._at :]], self._blocks)
 
 
 class _Piece(NamedTuple):
@@ -180,20 +252,28 @@ def _parse(text: bytes, count: int) -> tuple[np.ndarray, str | None]:
     """The numbers of a text of `count` words up to the first bad one, and what is wrong with that one, if any."""
     if count == 0:
         return np.empty(0), None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # NumPy before 2.3 warns instead of raising ValueError
-            values = np.fromstring(text, dtype=np.float64, sep=" ")
-    except (ValueError, DeprecationWarning):
-        values = np.empty(0)
+    values = _parse_quickly(text)
+    if values.size != count and _FORTRAN.search(text):
+        values = _parse_quickly(text.translate(_FORTRAN_TO_C))
     if values.size != count:  # one of the words is no number: search it word by word
         good = []
         for word in _WORD.findall(text):
-            if not _NUMBER.fullmatch(word):
+            try:
+                good.append(number(word.decode("latin-1")))
+            except ValueError:
                 break
-            good.append(float(word))
         values = np.array(good, dtype=np.float64)
     finite = np.isfinite(values)
     if not finite.all():
         return values[: finite.argmin()], "is not a finite number"
     return values, None if values.size == count else "is not a number"
+
+
+def _parse_quickly(text: bytes) -> np.ndarray:
+    """The numbers of a text; of another count than its words if one of them is no number."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # NumPy before 2.3 warns instead of raising ValueError
+            return np.fromstring(text, dtype=np.float64, sep=" ")
+    except (ValueError, DeprecationWarning):
+        return np.empty(0)

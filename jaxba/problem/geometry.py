@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -23,6 +23,10 @@ CHUNK = 1 << 19
 COLMAP_FLIP = np.array([1.0, -1.0, -1.0])
 """Signs that take the axes of a BAL camera (looks down -z, y upwards) to those of COLMAP (+z, y downwards), and back.
 The first two are those of pixels."""
+
+ROTATION_TOLERANCE = 1e-3
+"""Largest entry of `R R^T - I` of a matrix in a file that still counts as rounding; Bundler writes 11 digits, KITTI 7,
+other programs fewer."""
 
 _HALF_TURN_X = np.array([1.0, 0.0, 0.0, 0.0])
 """The rotation `diag(COLMAP_FLIP)` as a quaternion xyzw."""
@@ -57,6 +61,14 @@ def angle_axis(rotations: Float[Array, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
     from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
 
     return Rotation.from_matrix(np.array(rotations, dtype=np.float64)).as_rotvec()  # SciPy takes no read-only arrays
+
+
+def are_rotations(matrices: Float[Array, "n 3 3"]) -> Bool[np.ndarray, " n"]:
+    """Which matrices are rotations, but for the rounding in a file (`ROTATION_TOLERANCE`)."""
+    matrices = np.asarray(matrices, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        residual = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        return (residual <= ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0)
 
 
 def colmap_quaternions(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:

@@ -432,13 +432,13 @@ BAD = {
         lambda tiny: [str(tiny), "--output", f"{tiny.parent}/no/new/"],
         "no does not exist",
     ),
-    "output that would be read as Bundler's": (
-        lambda tiny: [str(tiny), "--output", "o.out"],
-        "cannot write o.out: Bundler",
+    "output that would be read as VisualSFM's": (
+        lambda tiny: [str(tiny), "--output", "o.nvm"],
+        "cannot write o.nvm: files of VisualSFM",
     ),
-    "compressed output of Bundler's": (
-        lambda tiny: [str(tiny), "--output", "o.out.gz"],
-        "cannot write o.out.gz: Bundler",
+    "compressed output of another format": (
+        lambda tiny: [str(tiny), "--output", "o.zip.gz"],
+        "cannot write o.zip.gz: files with .zip",
     ),
     "log is the problem": (lambda tiny: [str(tiny), "--log", f"{tiny.parent}/../in/tiny.txt"], "the problem's file"),
     "log in a missing folder": (lambda tiny: [str(tiny), "--log", str(tiny.parent / "no" / "log.json")], "--log"),

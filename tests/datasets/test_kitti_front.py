@@ -16,8 +16,10 @@ from jaxba import BundleProblem, read_bal
 from jaxba.cli.kitti import run
 from jaxba.cli.solve import run as solve
 from jaxba.datasets.kitti import frontend, klt
+from jaxba.datasets.kitti.calibration import Calibration
 from jaxba.datasets.kitti.features import KeyPoints, detect, essential, match
-from jaxba.datasets.kitti.sequence import Calibration, image_reader, read_sequence
+from jaxba.datasets.kitti.images import image_reader
+from jaxba.datasets.kitti.sequence import read_sequence
 from jaxba.io import write_problem
 from jaxba.problem import geometry
 
@@ -493,3 +495,52 @@ def test_bundle_adjustment_ends_within_a_hundredth_of_the_real_drive_of_the_trut
     before, after = json.loads((tmp_path / "e" / "evaluation.json").read_text())["results"]
     assert after["ate_m"]["rmse"] < 0.01 * 144.9
     assert after["rms_px"] < before["rms_px"]
+
+
+def test_the_orientation_that_a_photograph_asks_for_is_not_made(sequence):
+    """Calibration is that of the stored pixels. The segment is EXIF's with one tag: orientation 6, a quarter turn."""
+    tag = b"\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00"
+    exif = b"Exif\x00\x00MM\x00\x2a\x00\x00\x00\x08\x00\x01" + tag + bytes(4)
+    segment = b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif
+    for number in range(FRAMES):
+        pixels = cv2.imread(str(image(sequence, number)), cv2.IMREAD_GRAYSCALE)
+        data = cv2.imencode(".jpg", pixels)[1].tobytes()
+        image(sequence, number).unlink()
+        image(sequence, number).with_suffix(".JPG").write_bytes(data[:2] + segment + data[2:])
+    turned = cv2.imread(str(image(sequence, 0).with_suffix(".JPG")), cv2.IMREAD_GRAYSCALE)
+    assert turned.shape == (SMALL.width, SMALL.height)  # what a viewer would show
+    assert image_reader(read_sequence(sequence))(3).shape == (SMALL.height, SMALL.width)
+
+
+def test_hidden_files_change_nothing(rendered, sequence, tmp_path):
+    (image(sequence, 0).parent / "._000000.png").write_bytes(b"\0\5\x16\7Mac OS X")
+    assert build(rendered[SMALL], tmp_path / "a.txt", "--work", str(tmp_path / "work")) == 0
+    assert build(sequence, tmp_path / "b.txt") == 0
+    assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
+
+
+def test_frames_without_a_pose_are_left_out_and_counted(sequence, tmp_path, capsys):
+    rows = (sequence / "poses.txt").read_text().splitlines()
+    numbered = [f"{at} {row}" for at, row in enumerate(rows) if at not in (3, 7)]
+    (sequence / "poses.txt").write_text("\n".join(numbered))
+    assert build(sequence, tmp_path / "a.txt", "--start", "poses", "--keyframes", "all") == 0
+    assert (
+        f"note: {sequence / 'poses.txt'}: 2 of {FRAMES} frames left out: they have no pose" in capsys.readouterr().out
+    )
+    frames = json.loads((tmp_path / "a.frames.json").read_text())["frames"]
+    assert frames == [at for at in range(FRAMES) if at not in (3, 7)]
+
+
+def test_a_principal_point_at_the_edge_of_the_image_is_noted(sequence, tmp_path, capsys):
+    calibration = sequence / "calib.txt"
+    calibration.write_text("P0: 210 0 0 0 0 210 0 0 0 0 1 0\n")
+    build(sequence, tmp_path / "a.txt", "--start", "poses")
+    assert "note: " in (printed := capsys.readouterr().out)
+    assert f"the principal point of camera 0 lies at the edge of the image: (0, 0) of {SMALL.width} x" in printed
+
+
+@pytest.mark.parametrize("name", ["a.nvm", "a.out", "a.ply", "a.json", "a.zip"])
+def test_a_problem_is_not_written_under_the_name_of_another_format(sequence, tmp_path, capsys, name):
+    assert build(sequence, tmp_path / name) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not list(tmp_path.glob("a.*"))

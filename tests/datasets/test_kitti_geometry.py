@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.datasets.kitti import keyframes
 from jaxba.datasets.kitti.assemble import assemble, poses_of_cameras, windows
+from jaxba.datasets.kitti.calibration import Calibration
 from jaxba.datasets.kitti.initial_poses import drift
 from jaxba.datasets.kitti.odometry import Odometry, visual_odometry
-from jaxba.datasets.kitti.sequence import Calibration
 from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.datasets.kitti.triangulate import Filters, Observations, Views, triangulate, triangulate_robustly
 from jaxba.problem import geometry

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxba.datasets.kitti.sequence import Calibration, poses_of, read_calibration, read_poses, read_sequence
+from jaxba.datasets.kitti.calibration import Calibration, read_calibration
+from jaxba.datasets.kitti.poses import Poses, poses_of, read_poses
+from jaxba.datasets.kitti.sequence import read_sequence
 from jaxba.problem.bundle_problem import ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")
@@ -45,7 +47,8 @@ def test_the_second_camera_stands_beside_the_first(folder):
     calibration = read_calibration(folder, 1)
     assert calibration.offset == pytest.approx((-0.5, 0, 0))
     turned = np.array([[0.0, 0, 1, 10], [0, 1, 0, 20], [-1, 0, 0, 30]])[None]  # x of the camera is -z of the world
-    np.testing.assert_allclose(poses_of(turned, (0,), calibration, "poses")[0, :, 3], [10, 20, 29.5])
+    poses = Poses(np.array([0]), turned, "poses")
+    np.testing.assert_allclose(poses_of(poses, (0,), calibration)[0, :, 3], [10, 20, 29.5])
 
 
 def test_a_matrix_alone_is_a_calibration(folder):
@@ -121,6 +124,7 @@ def test_what_is_missing_is_named(folder, tmp_path):
 
 def test_an_image_without_a_number_is_refused(folder):
     (folder / "image_0" / "first.png").touch()
+    (folder / "image_0" / ".second.png").touch()
     with pytest.raises(ProblemError, match=r"first\.png: the name of an image must be its frame's number"):
         read_sequence(folder)
 
@@ -152,9 +156,131 @@ def test_poses_are_read_row_by_row_and_made_exact(tmp_path):
     path = tmp_path / "poses.txt"
     path.write_text("0 0 1 5 0 1 0 6 -1 0 0 7\n" * 3)
     poses = read_poses(path)
-    np.testing.assert_allclose(poses[1], [[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7]], atol=1e-15)
+    np.testing.assert_allclose(poses.matrices[1], [[0, 0, 1, 5], [0, 1, 0, 6], [-1, 0, 0, 7]], atol=1e-15)
     with pytest.raises(ProblemError, match="has 3 poses, none for frame 3"):
-        poses_of(poses, (1, 3), Calibration(1.0, 1.0, 0.0, 0.0), "poses.txt")
+        poses_of(poses, (1, 3), Calibration(1.0, 1.0, 0.0, 0.0))
+
+
+# Layouts of other releases and habits of other programs
+
+
+def test_hidden_files_are_no_images(folder):
+    for name in ("._000005.png", ".000099.png", "._notes.jpg"):
+        (folder / "image_0" / name).write_bytes(b"Mac OS X")
+    assert read_sequence(folder).numbers == tuple(range(5, 15))
+
+
+def test_a_folder_of_hidden_files_holds_no_images(folder):
+    (folder / "image_1").mkdir()
+    (folder / "image_1" / "._000005.png").touch()
+    with pytest.raises(ProblemError, match=r"image_1: holds no images .*; images are in image_0: use --camera 0$"):
+        read_sequence(folder, camera=1)
+
+
+def test_where_only_coloured_images_are_there_the_option_is_named(folder):
+    (folder / "image_0").rename(folder / "image_2")
+    with pytest.raises(ProblemError, match=r"image_00/data; images are in image_2: use --camera 2$"):
+        read_sequence(folder)
+    (folder / "image_2").rename(folder / "image_03")
+    with pytest.raises(ProblemError, match=r"; images are in image_03: use --camera 3$"):
+        read_sequence(folder)
+
+
+BARE = "700 0 600.5 0 0 700 180.25 0 0 0 1 0\n700 0 600.5 -350 0 700 180.25 0 0 0 1 0\n"
+
+
+@pytest.mark.parametrize("change", [lambda text: text, lambda text: "\ufeff" + text.replace("\n", "\r\n\r\n")])
+def test_bare_rows_of_twelve_numbers_are_the_cameras_from_the_left_grey_one(folder, change):
+    (folder / "calib.txt").write_bytes(change(BARE).encode())
+    assert read_calibration(folder, 0) == Calibration(700.0, 700.0, 600.5, 180.25)
+    assert read_calibration(folder, 1).offset == pytest.approx((-0.5, 0, 0))
+    with pytest.raises(ProblemError, match="has 2 lines of 12 numbers, none for camera 2"):
+        read_calibration(folder, 2)
+
+
+def test_a_matrix_of_three_rows_of_four_is_a_calibration(folder):
+    (folder / "calib.txt").write_text("7.0D+02 0 600.5 -350\n0 700 180.25 0\n0 0 1 0\n")
+    assert read_calibration(folder) == Calibration(700.0, 700.0, 600.5, 180.25, (-0.5, 0.0, 0.0))
+
+
+def raw(root: Path) -> Path:
+    """A drive of the raw data: images and time stamps by camera, calibration of the day above."""
+    drive = root / "2011_09_26" / "2011_09_26_drive_0001_sync"
+    (drive / "image_00" / "data").mkdir(parents=True)
+    for number in range(4):
+        (drive / "image_00" / "data" / f"{number:010d}.png").touch()
+    stamps = [f"2011-09-26 13:0{at + 1}:5{at}.{at}64389445" for at in range(4)]
+    (drive / "image_00" / "timestamps.txt").write_text("\r\n".join(stamps))
+    lines = ["calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.950000e-02", "K_00: 9 0 1 0 9 1 0 0 1"]
+    lines += ["P_rect_00: 700 0 600.5 0 0 700 180.25 0 0 0 1 0", "P_rect_01: 700 0 600.5 -350 0 700 180.25 0 0 0 1 0"]
+    (root / "2011_09_26" / "calib_cam_to_cam.txt").write_text("\n".join(lines))
+    return drive
+
+
+def test_the_folders_of_the_raw_data_are_read(tmp_path, monkeypatch):
+    drive = raw(tmp_path)
+    sequence = read_sequence(drive, "1:4")
+    assert sequence.numbers == (1, 2, 3)
+    assert sequence.images[0].name == "0000000001.png"
+    assert sequence.calibration == Calibration(700.0, 700.0, 600.5, 180.25)
+    np.testing.assert_allclose(sequence.times, [61.1, 122.2, 183.3], atol=1e-12)
+    monkeypatch.chdir(drive)
+    assert read_sequence(".").calibration == sequence.calibration
+    (drive / "image_00" / "timestamps.txt").write_text("2011-09-26 13:02:25.9\n" * 3 + "2011-13-26 13:02:25.9\n")
+    with pytest.raises(ProblemError, match=r"timestamps\.txt line 4: is no date and time"):
+        read_sequence(drive)
+
+
+def test_the_folders_of_kitti_360_are_read(tmp_path):
+    folder = tmp_path / "2013_05_28_drive_0000_sync"
+    raw(tmp_path).rename(folder)
+    (folder / "image_00" / "data").rename(folder / "image_00" / "data_rect")
+    calibration = tmp_path / "perspective.txt"
+    calibration.write_text("R_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_00: 550 0 680 0 0 550 230 0 0 0 1 0\n")
+    assert read_sequence(folder, calibration=calibration).calibration == Calibration(550.0, 550.0, 680.0, 230.0)
+
+
+IDENTITY = "1 0 0 5 0 1 0 6 0 0 1 7"
+
+
+def test_poses_with_frame_numbers_may_miss_frames(tmp_path):
+    (tmp_path / "poses.txt").write_text(f"4 {IDENTITY}\n 2 {IDENTITY.replace('5', '9')}\n\n9.0 {IDENTITY}\n")
+    (tmp_path / "cam0_to_world.txt").write_text(f"4 {IDENTITY} 0 0 0 1\n2 {IDENTITY} 0 0 0 1\n")
+    poses = read_poses(tmp_path / "poses.txt")
+    assert poses.numbers.tolist() == [2, 4, 9]
+    still = Calibration(1.0, 1.0, 0.0, 0.0)
+    np.testing.assert_array_equal(poses_of(poses, (2, 9), still)[:, :, 3], [[9, 6, 7], [5, 6, 7]])
+    with pytest.raises(ProblemError, match=r"poses\.txt: has 3 poses, none for frame 3"):
+        poses_of(poses, (2, 3), still)
+    assert read_poses(tmp_path / "cam0_to_world.txt").numbers.tolist() == [2, 4]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f"0.5 {IDENTITY}", "line 1: the first of 13 or 17 numbers is no number of a frame"),
+        (f"1 {IDENTITY}\n-1 {IDENTITY}", "line 2: the first of 13 or 17 numbers is no number of a frame"),
+        (f"1 {IDENTITY}\n\n1 {IDENTITY}", "has two poses for frame 1"),
+        (f"1 {IDENTITY}\n{IDENTITY}", "line 2: has 12 numbers instead of 13"),
+        (f"1 {IDENTITY} 0 0 0 2", "line 1: the last row of the matrix is not 0 0 0 1"),
+        (f"{IDENTITY}\n\n{IDENTITY} x", "line 3: holds something that is no number"),
+        (f"{IDENTITY}\n\n{IDENTITY.replace('7', '-nan(ind)')}", "line 3: holds a number that is not finite"),
+        (f"{IDENTITY}\n{IDENTITY.replace('7', '1_0')}", "line 2: holds something that is no number"),
+    ],
+)
+def test_malformed_poses_are_refused_by_the_line_of_the_file(tmp_path, text, words):
+    path = tmp_path / "poses.txt"
+    path.write_text(text)
+    with pytest.raises(ProblemError, match=rf"poses\.txt:? ?{words}"):
+        read_poses(path)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_byte_order_marks_are_no_trouble_in_poses_and_times(folder, encoding):
+    (folder / "times.txt").write_text((folder / "times.txt").read_text(), encoding=encoding)
+    (folder / "poses.txt").write_text(f"{IDENTITY}\r{IDENTITY}\r", encoding=encoding, newline="")
+    np.testing.assert_array_equal(read_sequence(folder, "6:9").times, [0.6, 0.7, 0.8])
+    assert len(read_poses(folder / "poses.txt").numbers) == 2
 
 
 @needs_data
@@ -164,6 +290,6 @@ def test_the_real_sequence_has_200_frames_and_poses_for_each():
     sequence = read_sequence(root / "seq00", "0:200")
     assert len(sequence) == 200
     assert sequence.calibration.fx == pytest.approx(718.856)
-    poses = poses_of(read_poses(root / "poses" / "00.txt"), sequence.numbers, sequence.calibration, "00.txt")
+    poses = poses_of(read_poses(root / "poses" / "00.txt"), sequence.numbers, sequence.calibration)
     turn = poses[:, :, :3] @ poses[:, :, :3].transpose(0, 2, 1)
     np.testing.assert_allclose(turn, np.broadcast_to(np.eye(3), turn.shape), atol=1e-14)

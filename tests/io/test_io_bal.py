@@ -161,7 +161,6 @@ BAD_TEXTS = {
     "word among the pixels": ({5: "1 2 0x1F 7"}, f"line 5: '0x1F' {NUMBER} (x of observation 3)"),
     "word among the cameras": ({6: "1_0"}, f"line 6: '1_0' {NUMBER} (rotation x of camera 0)"),
     "word among the points": ({32: "1.5.5"}, f"line 32: '1.5.5' {NUMBER} (z of point 2)"),
-    "fortran exponent": ({7: "1d5"}, f"line 7: '1d5' {NUMBER} (rotation y of camera 0)"),
     "comma": ({2: "0 0 1.5, -2.5"}, f"line 2: '1.5,' {NUMBER} (x of observation 0)"),
     "two numbers in one word": ({2: "0 0 1.5-2.5"}, f"line 2: '1.5-2.5' {NUMBER} (x of observation 0)"),
     "lone sign": ({2: "0 0 - 1"}, f"line 2: '-' {NUMBER} (x of observation 0)"),

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import support
 
-from jaxba.io import files, read_bundler, read_problem, write_problem
+from jaxba.io import files, read_bundler, read_problem
 from jaxba.problem.bundle_problem import ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")
@@ -150,10 +149,3 @@ def test_real_model_is_the_problem_that_was_converted_from_it():
     renumber[kept] = np.arange(len(kept))
     found = rows(problem, renumber)
     np.testing.assert_allclose(found[found[:, 1] >= 0], rows(expected, np.arange(expected.num_points)), rtol=1e-7)
-
-
-@pytest.mark.parametrize("name", ["model.out", "model.OUT.gz"])
-def test_bal_is_not_written_under_a_name_that_is_read_as_bundlers(name, tmp_path):
-    with pytest.raises(ProblemError, match="Bundler models are only read"):
-        write_problem(support.tiny(), tmp_path / name)
-    assert not list(tmp_path.iterdir())

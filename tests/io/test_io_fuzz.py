@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import json
 import lzma
 import warnings
+from copy import deepcopy
 from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_scene import Lens, Scene, write_alicevision, write_openmvg, write_opensfm
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jaxba.io import files, read_problem, write_problem
+from jaxba.io import ProblemWarning, files, read_problem, write_problem
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 BAL = b"2 3 4\n0 0 1.5 -2.5\n1 0 3.25 4e0\n0 1 -5 6\n1 2 .5 7.\n" + b"".join(b"%d.25\n" % i for i in range(27))
@@ -23,12 +26,18 @@ CAMERAS = (
 )
 POINTS = b"1.0 2.0 -3.0\n255 0 7\n2 0 11 10.5 -20.5 1 12 30.5 40.5\n4.0 5.0 -6.0\n0 0 0\n1 1 13 -1.5 1e1\n"
 BUNDLER = b"# Bundle file v0.3\n3 2\n" + CAMERAS + POINTS
-SEEDS = {"a.txt": BAL, "a.out": BUNDLER}
+NVM = (
+    b"NVM_V3 FixedK 500 320 510 240 0.1\n\n2\na.jpg 500 1 0 0 0 0 0 0 0.1 0\nb c.jpg 500 0.9 0.1 0 0 1 0 0 -0.1 0\n\n"
+    b"2\n1 2 9 0 0 0 2 0 5 10.5 -20.5 1 6 30.5 40.5\n4 5 16 1 2 3 1 1 13 -1.5 1e1\n\n0\n"
+)
+SEEDS = {"a.txt": BAL, "a.out": BUNDLER, "a.nvm": NVM}
 PACKERS = {"": bytes, ".bz2": bz2.compress, ".gz": lambda data: gzip.compress(data, mtime=0), ".xz": lzma.compress}
 WORDS = [
     b"nan",
     b"-inf",
     b"1e999",
+    b"1e308",
+    b"1e200",
     b"1e-999",
     b"abc",
     b"",
@@ -90,6 +99,7 @@ def check(path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        warnings.simplefilter("ignore", ProblemWarning)
         complaint, problem = None, None
         try:
             problem = read_problem(path)
@@ -131,8 +141,90 @@ def test_damaged_text_under_compression_is_refused_or_still_a_problem(tmp_path, 
     check(tmp_path / (name + suffix), PACKERS[suffix](data.draw(damaged(SEEDS[name]))))
 
 
+def foreign_seed(folder: Path, program: str) -> tuple[Path, Path]:
+    """The file to read, and the one to damage."""
+    scene = Scene([Lens(radial=(-0.1, 0.02, 0.01))], [0, 0, 0])
+    if program == "openmvg":
+        return (write_openmvg(folder / "a.json", scene, ["pinhole_radial_k3"]),) * 2
+    if program == "alicevision":
+        return (write_alicevision(folder / "a.sfm", scene, ["radial3"], (1, 2, 8)),) * 2
+    path = write_opensfm(folder, scene, ["brown"], version=1)
+    return path, folder / "tracks.csv" if program == "tracks" else path
+
+
+WRONG = [None, True, 0, -1, 1.5, 1e308, 1e200, 1e-300, 10**30]
+WRONG += [float("nan"), float("inf"), "", "nan", "1e999", "\u0663", "x\n"]
+WRONG += [[], {}, [[]], [1], {"key": 0}, [0, 0], [1.0, 2.0, 3.0], 2**31, 2**32 - 1, 2**53, -(2**63)]
+
+
+@st.composite
+def mutated(draw: st.DrawFn, value: object) -> object:
+    """A JSON document after one to three replacements, removals or doublings of values at any depth."""
+    value = json.loads(json.dumps(value))
+    for _ in range(draw(st.integers(1, 3))):
+        above, key, here = None, None, value
+        for _ in range(draw(st.integers(1, 9))):
+            if not (isinstance(here, (dict, list)) and here):
+                break
+            above, key = here, draw(st.sampled_from(list(here) if isinstance(here, dict) else range(len(here))))
+            here = above[key]
+        if above is None:
+            continue
+        kind = draw(st.sampled_from(["replace", "replace", "remove", "double", "swap"]))
+        if kind == "replace":
+            above[key] = deepcopy(draw(st.sampled_from(WRONG) | st.floats() | st.integers()))
+        elif kind == "remove":
+            del above[key]
+        elif kind == "double" and isinstance(above, list):
+            above.append(json.loads(json.dumps(here)))
+        elif isinstance(above, dict):
+            other = draw(st.sampled_from(list(above)))
+            above[key], above[other] = above[other], above[key]
+    return value
+
+
+def check_foreign(path: Path) -> None:
+    """A valid problem of finite numbers or a `ProblemError` of one line, and no warning but those of readers."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", ProblemWarning)
+        complaint, problem = None, None
+        try:
+            problem = read_problem(path)
+        except ProblemError as error:
+            complaint = str(error)
+    if problem is None:
+        assert complaint is not None
+        assert complaint.isprintable()
+        assert str(path.parent) in complaint
+        return
+    assert all(np.isfinite(np.asarray(part)).all() for part in (problem.cameras, problem.points, problem.observations))
+    assert problem.whitening is None or np.isfinite(np.asarray(problem.whitening)).all()
+
+
 @fuzz
-@given(content=st.binary(max_size=200), name=st.sampled_from(["a.txt", "a.out", "a.txt.gz", "a.bz2", "a.out.xz"]))
+@given(data=st.data())
+@pytest.mark.parametrize("program", ["openmvg", "alicevision", "opensfm"])
+def test_mutated_json_is_refused_or_still_a_problem(tmp_path, program, data):
+    path, target = foreign_seed(tmp_path, program)
+    target.write_text(json.dumps(data.draw(mutated(json.loads(target.read_text())))))
+    check_foreign(path)
+
+
+@fuzz
+@given(data=st.data())
+@pytest.mark.parametrize("program", ["openmvg", "alicevision", "opensfm", "tracks"])
+def test_damaged_bytes_of_json_and_tracks_are_refused_or_still_a_problem(tmp_path, program, data):
+    path, target = foreign_seed(tmp_path, program)
+    target.write_bytes(data.draw(damaged(target.read_bytes())))
+    check_foreign(path)
+
+
+@fuzz
+@given(
+    content=st.binary(max_size=200),
+    name=st.sampled_from(["a.txt", "a.out", "a.txt.gz", "a.bz2", "a.out.xz", "a.nvm", "a.json", "a.sfm"]),
+)
 def test_random_bytes_are_refused(tmp_path, content, name):
     check(tmp_path / name, content)
 

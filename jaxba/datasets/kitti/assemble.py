@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.sequence import Calibration
+from jaxba.datasets.kitti.calibration import Calibration
 from jaxba.datasets.kitti.tracks import Tracks
 from jaxba.datasets.kitti.triangulate import Filters, Observations, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError

@@ -13,8 +13,10 @@ from jaxtyping import Float
 
 from jaxba.datasets.kitti import trajectory
 from jaxba.datasets.kitti.assemble import poses_of_cameras
-from jaxba.datasets.kitti.sequence import Calibration, poses_of, read_poses
+from jaxba.datasets.kitti.calibration import Calibration
+from jaxba.datasets.kitti.poses import poses_of, read_poses
 from jaxba.io import read_problem
+from jaxba.io.encoding import decode
 from jaxba.io.files import StrPath, display_name, open_output, reason, strip_compression
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -73,7 +75,7 @@ def read_sidecar(path: StrPath) -> Sidecar:
     """
     side = sidecar_path(path)
     try:
-        contents = json.loads(side.read_text(encoding="utf-8"))
+        contents = json.loads(decode(side.read_bytes()))
         calibration = Calibration(**{**contents["calibration"], "offset": tuple(contents["calibration"]["offset"])})
         frames = tuple(int(number) for number in contents["frames"])
     except OSError as error:
@@ -85,7 +87,7 @@ def read_sidecar(path: StrPath) -> Sidecar:
 
 def truth_of(side: Sidecar, path: StrPath) -> Float[np.ndarray, "cameras 3 4"]:
     """True poses of a problem's cameras, from the file of the whole sequence. Raises ProblemError."""
-    return poses_of(read_poses(path), side.frames, side.calibration, display_name(path))
+    return poses_of(read_poses(path), side.frames, side.calibration)
 
 
 def score(

@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxba.datasets.kitti.features import Features, KeyPoints, Verified, detect, epipolar_inliers, match
+from jaxba.datasets.kitti.images import image_reader, spare_bits, stamp
 from jaxba.datasets.kitti.klt import TrackedPoints, detect_corners, track
 from jaxba.datasets.kitti.opencv import cv2
 from jaxba.datasets.kitti.result_cache import ResultCache, digest
-from jaxba.datasets.kitti.sequence import Sequence, image_reader, spare_bits, stamp
+from jaxba.datasets.kitti.sequence import Sequence
 from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.problem.bundle_problem import ProblemError
 

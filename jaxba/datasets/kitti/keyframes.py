@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.sequence import Calibration
+from jaxba.datasets.kitti.calibration import Calibration
 from jaxba.datasets.kitti.tracks import Tracks
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import perspective

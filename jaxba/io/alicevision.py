@@ -1,0 +1,148 @@
+"""AliceVision's and Meshroom's scenes (`.sfm`, `.json`): views, intrinsics, poses and structure, numbers as texts.
+
+A camera at c maps X to `diag(fx, fy) d((R (X - c)).xy / z) + principal point`, pixels from the corner of the image; R
+is written column by column. Source: AliceVision, sfmDataIO/jsonIO.cpp, and for the versions CHANGES.md beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from jaxba.io.distortion import Distortion
+from jaxba.io.files import StrPath
+from jaxba.io.foreign import FIXED, ForeignLens
+from jaxba.io.json_records import Record, read_json
+from jaxba.io.remarks import note
+from jaxba.io.sfm_data import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.problem.bundle_problem import BundleProblem
+
+DISTORTIONS = {
+    "pinhole": 0,
+    "none": 0,
+    "radial1": 1,
+    "radialk1": 1,
+    "radial3": 3,
+    "radialk3": 3,
+    "brown": 5,
+    "fisheye4": 4,
+}
+"""Models that are read, as `type` calls them and as `distortionType` does, and how many coefficients they have."""
+
+SENSOR_WIDTH = 36.0
+"""Millimetres, where a file does not say. Source: `loadIntrinsic`."""
+
+_PROGRAM = "AliceVision"
+
+
+def read_alicevision(path: StrPath) -> BundleProblem:
+    """Reads a scene of AliceVision.
+
+    Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. Intrinsics without
+    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Of the others
+    in `DISTORTIONS` pixels are undistorted once and intrinsics stay.
+
+    Args:
+        path: the file, plain or compressed.
+
+    Raises:
+        ProblemError: the file cannot be read, lacks a part, names a model that is not in `DISTORTIONS`, or views are of
+            a rig; one line that names the file, the record and the field.
+    """
+    return from_document(read_json(path), path)
+
+
+def is_alicevision(document: Record) -> bool:
+    """Whether a JSON document is of AliceVision."""
+    return (
+        isinstance(document.value, dict)
+        and isinstance(document.value.get("version"), list)
+        and "views" in document.value
+    )
+
+
+def from_document(document: Record, path: StrPath) -> BundleProblem:
+    """As `read_alicevision`, from the contents of its file. Raises ProblemError."""
+    version = tuple(row.integer() for row in document.get("version").rows())
+    views = {}
+    for number, value in _numbered(part(document, "views", _PROGRAM), "viewId", "view"):
+        independent = value.get("isPoseIndependant").flag() if value.has("isPoseIndependant") else True
+        if _number(value, "rigId") >= 0 and _number(value, "rigId") != UNDEFINED and not independent:
+            value.fail("is of a rig of several cameras, whose poses depend on it; rigs are not read")
+        views[number] = View(_number(value, "poseId"), _number(value, "intrinsicId"))
+    intrinsics = dict(_numbered(part(document, "intrinsics", _PROGRAM), "intrinsicId", "intrinsic"))
+    poses, locked = {}, 0
+    for number, value in _numbered(part(document, "poses", _PROGRAM), "poseId", "pose"):
+        pose = value.get("pose")
+        inside = pose.get("transform") if pose.has("transform") else pose
+        rotation = np.array(inside.get("rotation").vector(9)).reshape(3, 3).T
+        poses[number] = checked_pose(value, rotation, inside.get("center").vector(3))
+        locked += pose.get("locked").flag() if pose.has("locked") else False
+    if locked:
+        note(path, f"{locked} of {len(poses)} poses are locked in the file, but are optimised here")
+    landmarks = _landmarks(part(document, "structure", _PROGRAM))
+    return build(path, views, poses, intrinsics, lambda number: _lens(intrinsics[number], version), landmarks)
+
+
+def _numbered(record: Record, key: str, what: str) -> Iterator[tuple[int, Record]]:
+    for row in record.rows():
+        number = row.get(key).integer()
+        yield number, row.called(f"{what} {number}")
+
+
+def _number(record: Record, key: str) -> int:
+    return record.get(key).integer() if record.has(key) else UNDEFINED
+
+
+def _lens(value: Record, version: tuple[int, ...]) -> ForeignLens:
+    """The lens of an intrinsic in pixels from the corner of the image, whatever the version of the file."""
+    kind = value.get("type").text()
+    model = value.get("distortionType").text() if kind == "pinhole" and value.has("distortionType") else kind
+    undistortion = value.get("undistortionType").text() if value.has("undistortionType") else "none"
+    for name in (model, undistortion if undistortion != "none" else model):
+        if name not in DISTORTIONS:
+            value.fail(f"is of the model {name!a}, which is not read; read are {', '.join(DISTORTIONS)}")
+    count = DISTORTIONS[model]
+    given = value.has("distortionParams") and value.get("distortionParams").value not in ("", [])
+    numbers = value.get("distortionParams").vector(count) if count and given else [0.0] * count
+    width, height = value.get("width").number(), value.get("height").number()
+    x, y = value.get("principalPoint").vector(2)
+    if version >= (1, 2, 1):
+        x, y = x + width / 2, y + height / 2
+    fisheye = model == "fisheye4"
+    distortion = Distortion(
+        tuple(numbers if fisheye else numbers[:3]), (numbers[3], numbers[4]) if count == 5 else (0.0, 0.0), fisheye
+    )
+    stays = value.has("locked") and value.get("locked").flag()
+    free = FIXED if stays else (True, count > 0, count > 1)
+    return ForeignLens(value.where, _focal(value, version, width), (x, y), distortion, free, (width, height))
+
+
+def _focal(value: Record, version: tuple[int, ...], width: float) -> tuple[float, float]:
+    """Focal lengths in pixels."""
+    if version < (1, 2, 0):
+        focal = value.get("pxFocalLength").number()
+        return focal, focal
+    if version < (1, 2, 2):
+        x, y = value.get("pxFocalLength").vector(2)
+        return x, y
+    sensor = value.get("sensorWidth").number() if value.has("sensorWidth") else SENSOR_WIDTH
+    ratio = value.get("pixelRatio").number() if value.has("pixelRatio") else 1.0
+    if not (sensor > 0 and ratio > 0):
+        value.fail("has a sensorWidth or pixelRatio that is not positive")
+    focal = value.get("focalLength").number() / sensor * width
+    return focal, focal * ratio if version >= (1, 2, 5) else focal / ratio
+
+
+def _landmarks(structure: Record) -> Iterator[Landmark]:
+    for number, value in _numbered(structure, "landmarkId", "landmark"):
+        views, pixels = [], []
+        for view, seen in _numbered(
+            value.get("observations"), "observationId", f"landmark {number}: observation in view"
+        ):
+            if not seen.has("x"):
+                seen.fail("has no x: have AliceVision write observations with their features")
+            views.append(view)
+            pixels.append(seen.get("x").vector(2))
+        yield Landmark(value.get("X").vector(3), views, pixels)

@@ -1,0 +1,204 @@
+"""The formats of problems: endings, readers and writers, in one table that documents and errors speak from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+
+from jaxba.io.colmap import is_colmap, read_colmap
+from jaxba.io.files import READ_ERRORS, StrPath, display_name, strip_compression
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+
+Reader = Callable[[StrPath], BundleProblem]
+Writer = Callable[[BundleProblem, StrPath], None]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of single files. Readers and writers import what they need when they are called."""
+
+    name: str
+    """What messages call it."""
+
+    endings: tuple[str, ...]
+    """Lower-case endings of its files, without that of compression; the first is the one to recommend."""
+
+    read: Reader | None = None
+    """Reader; None if it is only written."""
+
+    write: Writer | None = None
+    """Writer; None if it is only read."""
+
+    begins: tuple[bytes, ...] = ()
+    """First bytes of its files after blanks, by which a file without a known ending is recognised."""
+
+
+def _read_bal(path: StrPath) -> BundleProblem:
+    from jaxba.io.bal import read_bal
+
+    return read_bal(path)
+
+
+def _write_bal(problem: BundleProblem, path: StrPath) -> None:
+    from jaxba.io.bal import write_bal
+
+    write_bal(problem, path)
+
+
+def _read_bundler(path: StrPath) -> BundleProblem:
+    from jaxba.io.bundler import read_bundler
+
+    return read_bundler(path)
+
+
+def _write_bundler(problem: BundleProblem, path: StrPath) -> None:
+    from jaxba.io.bundler import write_bundler
+
+    write_bundler(problem, path)
+
+
+def _write_ply(problem: BundleProblem, path: StrPath) -> None:
+    from jaxba.io.ply import write_ply
+
+    write_ply(problem, path)
+
+
+def _read_nvm(path: StrPath) -> BundleProblem:
+    from jaxba.io.nvm import read_nvm
+
+    return read_nvm(path)
+
+
+def _read_json(path: StrPath) -> BundleProblem:
+    """Reads OpenSfM's, OpenMVG's or AliceVision's file, which are told apart by their contents."""
+    from jaxba.io import alicevision, json_records, openmvg, opensfm
+
+    document = json_records.read_json(path)
+    for recognised, read in (
+        (opensfm.is_opensfm, opensfm.from_document),
+        (openmvg.is_openmvg, openmvg.from_document),
+        (alicevision.is_alicevision, alicevision.from_document),
+    ):
+        if recognised(document):
+            return read(document, path)
+    document.fail(f"is JSON, but not of a program that is known here; {formats_read()}")
+
+
+FORMATS = (
+    Format("BAL", (".txt", ".bal"), _read_bal, _write_bal),
+    Format("Bundler", (".out",), _read_bundler, _write_bundler, (b"# Bundle file",)),
+    Format("VisualSFM", (".nvm",), _read_nvm, begins=(b"NVM_V3",)),
+    Format("OpenSfM, OpenMVG or AliceVision", (".json", ".sfm"), _read_json, begins=(b"{", b"[")),
+    Format("PLY", (".ply",), write=_write_ply),
+)
+"""Formats of files. The first is that of names whose ending says nothing. Folders are COLMAP models, or OpenSfM's."""
+
+RECONSTRUCTION = "reconstruction.json"
+"""File by which a folder of OpenSfM is known."""
+
+OTHER_ENDINGS = (
+    *(".abc", ".b3dm", ".bin", ".blend", ".csv", ".dae", ".db", ".dot", ".e57", ".fbx", ".g2o", ".glb", ".gltf"),
+    *(".graph", ".h5", ".hdf5", ".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mg"),
+    *(".mvs", ".npy", ".npz", ".nvm2", ".obj", ".off", ".p4p", ".pcd", ".pdf", ".pickle", ".pkl", ".png", ".pose"),
+    *(".psx", ".psz", ".pt", ".pts", ".ptx", ".py", ".rcalign", ".safetensors", ".sql", ".sqlite", ".stl", ".svg"),
+    *(".tif", ".tiff", ".toml", ".toro", ".tsv", ".usd", ".usda", ".usdc", ".usdz", ".vrml", ".vtk", ".wrl", ".xml"),
+    *(".xyz", ".yaml", ".yml"),
+    *(".7z", ".lz4", ".lzma", ".rar", ".tar", ".tbz", ".tbz2", ".tgz", ".txz", ".z", ".zip", ".zst", ".zstd"),
+)
+"""Endings of what is neither read nor written, so that a name with one of them is a mistake."""
+
+_SNIFFED = 64
+"""Bytes at the beginning of a file that tell its format."""
+
+
+def ending(path: StrPath) -> str:
+    """The lower-case ending of a path without that of compression; empty if it has none."""
+    return PurePath(strip_compression(path)).suffix.lower()
+
+
+def by_ending(path: StrPath) -> Format | None:
+    """The format that a name's ending stands for."""
+    return next((one for one in FORMATS if ending(path) in one.endings), None)
+
+
+def is_file_name(path: StrPath) -> bool:
+    """Whether a name has an ending of compression, of a format or of another program's file: it is no folder's."""
+    known = by_ending(path) is not None or ending(path) in OTHER_ENDINGS
+    return known or strip_compression(path) != str(path)
+
+
+def formats_read() -> str:
+    """The formats that are read, as part of a message."""
+    shown = ", ".join(f"{one.name} ({', '.join(one.endings)})" for one in FORMATS if one.read is not None)
+    return f"read are {shown}, and folders of COLMAP or OpenSfM"
+
+
+def formats_written() -> str:
+    """The endings that are written, as part of a message."""
+    shown = ", ".join(f"{', '.join(one.endings)} ({one.name})" for one in FORMATS if one.write is not None)
+    return f"written are {shown}, each also with .gz, .bz2 or .xz"
+
+
+def read(path: StrPath) -> BundleProblem:
+    """Reads a file in the format of its ending, or else of its first bytes. Raises ProblemError."""
+    known = by_ending(path)
+    if known is not None and known is not FORMATS[0]:
+        if known.read is None:
+            raise ProblemError(f"cannot read {display_name(path)}: {known.name} is only written; {formats_read()}")
+        return known.read(path)
+    try:
+        return _read_bal(path)
+    except ProblemError as error:
+        begin = _beginning(path)
+        found = next((one for one in FORMATS if one.read and begin.startswith(one.begins)), None) if begin else None
+        if found is not None and found.read is not None:
+            return found.read(path)
+        if begin and not begin[:1].isdigit() and not begin.startswith((b"+", b"-", b".")):
+            raise ProblemError(f"{error}; {formats_read()}") from error
+        raise
+
+
+def writer(path: StrPath) -> Writer:
+    """What writes a file of a name.
+
+    Raises:
+        ProblemError: the ending is that of a format that is not written; one line with the endings that are.
+    """
+    known = by_ending(path)
+    write = FORMATS[0].write if known is None and ending(path) not in OTHER_ENDINGS else known and known.write
+    if write is None:
+        of = f" of {known.name}" if known else ""
+        name = display_name(path)
+        raise ProblemError(f"cannot write {name}: files{of} with {ending(path)} are not written; {formats_written()}")
+    return write
+
+
+def holds_problem(path: StrPath) -> bool:
+    """Whether a path is a folder that holds a problem."""
+    return is_colmap(path) or (Path(path) / RECONSTRUCTION).is_file()
+
+
+def read_folder(path: StrPath) -> BundleProblem:
+    """Reads a folder: a COLMAP model, or else OpenSfM's. Raises ProblemError."""
+    if (Path(path) / RECONSTRUCTION).is_file() and not is_colmap(path):
+        return _read_json(Path(path) / RECONSTRUCTION)
+    return read_colmap(path)
+
+
+def _beginning(path: StrPath) -> bytes:
+    """First bytes of a regular file after blanks, decompressed; empty if they cannot be read (again)."""
+    from jaxba.io.encoding import open_text
+
+    if not Path(path).is_file():
+        return b""
+    try:
+        with open_text(path) as blocks:
+            text = b""
+            for block in blocks:
+                text = (text + block).lstrip()[:_SNIFFED]
+                if len(text) == _SNIFFED:
+                    break
+            return text
+    except (ProblemError, *READ_ERRORS):
+        return b""

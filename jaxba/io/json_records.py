@@ -1,0 +1,153 @@
+"""JSON files of other programs: every value is checked as it is taken, and every error names record and field."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any, NoReturn
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.io.encoding import read_text
+from jaxba.io.files import StrPath, display_name
+from jaxba.io.text import number
+from jaxba.problem.bundle_problem import ProblemError
+
+LARGEST_INTEGER = 2**53
+"""Whole numbers below it are exact as float64."""
+
+_SHOWN = 40
+"""Characters of a bad value in a message."""
+
+
+class Record:
+    """A value of a JSON file, and how messages call it. Numbers may be texts, as AliceVision writes them."""
+
+    __slots__ = ("name", "value", "where")
+
+    def __init__(self, value: Any, name: str, where: str = ""):
+        """Wraps `value` of the file called `name`."""
+        self.value = value
+        self.name = name
+        self.where = where
+
+    def fail(self, complaint: str) -> NoReturn:
+        """Raises a `ProblemError` about this value."""
+        raise ProblemError(f"{self.name}: {self.where}{' ' if self.where else ''}{complaint}")
+
+    def called(self, where: str) -> Record:
+        """The same value under another name in messages."""
+        return Record(self.value, self.name, where)
+
+    def has(self, key: str) -> bool:
+        """Whether this is an object with a key whose value is not null."""
+        return isinstance(self.value, dict) and self.value.get(key) is not None
+
+    def get(self, key: str) -> Record:
+        """The value of a key, which must be there. Raises ProblemError."""
+        if not isinstance(self.value, dict):
+            self.fail(f"must be an object with {key}, is {_shown(self.value)}")
+        if key not in self.value:
+            self.fail(f"has no {key}")
+        return Record(self.value[key], self.name, f"{self.where}: {key}" if self.where else key)
+
+    def rows(self) -> Iterator[Record]:
+        """The values of a list; an empty text is an empty list, as AliceVision writes one. Raises ProblemError."""
+        if self.value != "" and not isinstance(self.value, list):
+            self.fail(f"must be a list, is {_shown(self.value)}")
+        for at, value in enumerate(self.value):
+            yield Record(value, self.name, f"{self.where}[{at}]")
+
+    def entries(self, what: str) -> Iterator[tuple[str, Record]]:
+        """Keys and values of an object, the values called `what KEY`. Raises ProblemError."""
+        if not isinstance(self.value, dict):
+            self.fail(f"must be an object, is {_shown(self.value)}")
+        for key, value in self.value.items():
+            yield key, Record(value, self.name, f"{what} {display_name(key)}")
+
+    def number(self) -> float:
+        """A finite number. Raises ProblemError."""
+        value = self.value
+        if isinstance(value, str):
+            try:
+                value = number(value.strip())
+            except ValueError:
+                value = None
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            self.fail(f"must be a number, is {_shown(self.value)}")
+        try:
+            found = float(value)
+        except OverflowError:
+            found = np.inf
+        if not np.isfinite(found):
+            self.fail(f"is not a finite number: {_shown(self.value)}")
+        return found
+
+    def integer(self) -> int:
+        """A whole number. Raises ProblemError."""
+        found = self.number()
+        if abs(found) >= LARGEST_INTEGER:
+            self.fail(f"is too large: {_shown(self.value)}")
+        if not found.is_integer():
+            self.fail(f"must be a whole number, is {_shown(self.value)}")
+        return int(found)
+
+    def text(self) -> str:
+        """A text. Raises ProblemError."""
+        if not isinstance(self.value, str):
+            self.fail(f"must be a text, is {_shown(self.value)}")
+        return self.value
+
+    def flag(self) -> bool:
+        """Truth, also as 0, 1, "true" or "false". Raises ProblemError."""
+        if isinstance(self.value, bool):
+            return self.value
+        if self.value in ("true", "false"):
+            return self.value == "true"
+        return self.number() != 0
+
+    def vector(self, size: int) -> list[float]:
+        """A list of finite numbers. Raises ProblemError."""
+        value = self.value
+        if not isinstance(value, list) or len(value) != size:
+            self.fail(f"must be a list of {size} numbers, is {_shown(value)}")
+        if all(type(one) is float and abs(one) < np.inf for one in value):
+            return value
+        return [row.number() for row in self.rows()]
+
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """A 3 x 3 matrix as a list of its rows. Raises ProblemError."""
+        if not isinstance(self.value, list) or len(self.value) != 3:
+            self.fail(f"must be a list of 3 rows, is {_shown(self.value)}")
+        return np.array([row.vector(3) for row in self.rows()])
+
+
+def read_json(path: StrPath) -> Record:
+    """The contents of a JSON file, decompressed; NaN and Infinity, which JSON lacks, are found when they are taken.
+
+    Raises:
+        ProblemError: the file cannot be read, is no JSON, or is nested too deeply.
+    """
+    name = display_name(path)
+    text = read_text(path)
+    try:
+        return Record(json.loads(text), name)
+    except json.JSONDecodeError as error:
+        raise ProblemError(f"{name} line {error.lineno}: not JSON: {error.msg}") from None
+    except RecursionError:
+        raise ProblemError(f"{name}: is nested too deeply") from None
+    except ValueError:  # Python reads no integers of thousands of digits
+        raise ProblemError(f"{name}: holds a number of too many digits") from None
+    except MemoryError:
+        raise ProblemError(f"cannot read {name}: not enough memory") from None
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, (dict, list)):
+        return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
+    try:
+        text = ascii(value)
+    except ValueError:  # an integer of thousands of digits, as a text
+        return "a number of too many digits"
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."

@@ -1,0 +1,158 @@
+"""VisualSFM's models (`.nvm`, version 3): images with focal length, pose and one distortion, then points with views.
+
+    NVM_V3 [FixedK fx cx fy cy r]
+    number of images, and for each: name, f, quaternion w x y z, centre x y z, r, 0
+    number of points, and for each: x y z, red green blue, number of views, and for each: image, key-point, x, y
+
+The camera looks down +z with y downwards; pixels are relative to the principal point. The distortion acts the other way
+round than BAL's: the measured m becomes the undistorted `(1 + r |m|^2 / f^2) m`. `NVM_V3_R9T` has rotation matrices and
+translations. Source: Wu, "VisualSFM: documentation", http://ccwu.me/vsfm/doc.html#nvm; for f^2 and R9T Wu et al.,
+Multicore Bundle Adjustment, `SetNormalizedMeasurementDistortion` and `LoadNVM`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxba.io.distortion import Distortion
+from jaxba.io.encoding import open_text
+from jaxba.io.files import StrPath, display_name
+from jaxba.io.foreign import FIXED, ForeignLens, assemble
+from jaxba.io.remarks import note_origin
+from jaxba.io.text import LineReader, NumberReader, number
+from jaxba.io.tracks import read_tracks
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import are_rotations, translations
+from jaxba.typing import LARGEST_COUNT
+
+HEADERS = (b"NVM_V3", b"NVM_V3_R9T")
+"""First words of the versions that are read."""
+
+_FIELDS = ("f", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "r", "0")
+_FIELDS_R9T = ("f", *(f"R{row}{column}" for row in "123" for column in "123"), "tx", "ty", "tz", "r", "0")
+
+
+class _Header(NamedTuple):
+    matrices: bool  # whether poses are rotation matrices and translations
+    calibration: tuple[float, ...] | None  # fx cx fy cy r of all images
+
+
+class _Images(NamedTuple):
+    focal: np.ndarray  # (n,)
+    rotations: np.ndarray  # (n, 3, 3)
+    translations: np.ndarray  # (n, 3)
+    distortion: np.ndarray  # (n,)
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
+def read_nvm(path: StrPath) -> BundleProblem:
+    """Reads the first model of a VisualSFM file.
+
+    An image without distortion is a camera of BAL, whose f, k1 and k2 are optimised. With one, its pixels are
+    undistorted once and residuals weighted so that to first order they are those of the measured image; its f is
+    optimised, k1 and k2 stay zero. With `FixedK` all intrinsics stay as they are.
+
+    Args:
+        path: the file, plain or compressed; may be a pipe.
+
+    Raises:
+        ProblemError: the file cannot be read or is no valid model; one line that names the file and, where there is
+            one, the line and the field.
+    """
+    name = display_name(path)
+    with open_text(path) as blocks:
+        lines = LineReader(blocks, name)
+        header = _header(lines)
+        images = _images(lines, header)
+        reader = NumberReader(lines.rest(), name, lambda _: "number of points", line=lines.line + 1)
+        values = reader.peek_all()
+        if not values.size:
+            reader.missing()
+        count = int(reader.integers([0], values[:1], 0, LARGEST_COUNT)[0])
+        if not count:
+            raise ProblemError(f"{name}: its first model has no points")
+        tracks = read_tracks(reader, 1, count, len(images.focal), reader.field)
+    note_origin(path, tracks.pixels)
+    lenses, lens_of = _lenses(header, images)
+    poses = images.rotations, images.translations
+    return assemble(
+        path, lenses, lens_of, *poses, tracks.points, tracks.pixels, tracks.camera_index, tracks.point_index
+    )
+
+
+def _lenses(header: _Header, images: _Images) -> tuple[list[ForeignLens], np.ndarray]:
+    """The lenses, and that of each image."""
+    if header.calibration is not None:
+        fx, _, fy, _, r = header.calibration
+        lens = ForeignLens("FixedK", (fx, fy), distortion=_distortion(r), free=FIXED)
+        return [lens], np.zeros(len(images.focal), np.int64)
+    lenses = [
+        ForeignLens(f"image {image}", (f, f), distortion=_distortion(r), free=(True, r == 0, r == 0))
+        for image, (f, r) in enumerate(zip(images.focal.tolist(), images.distortion.tolist(), strict=True))
+    ]
+    return lenses, np.arange(len(lenses))
+
+
+def _distortion(r: float) -> Distortion:
+    return Distortion(radial=(r,), inverse=True) if r else Distortion()
+
+
+def _header(lines: LineReader) -> _Header:
+    words = lines.next_filled().split()
+    where = f"{lines.name} line {max(lines.line, 1)}"
+    if not words or words[0] not in HEADERS:
+        shown = ascii(b" ".join(words)[:40].decode("latin-1"))
+        raise ProblemError(f"{where}: {shown} is not the header 'NVM_V3' of a VisualSFM file")
+    if len(words) == 1:
+        return _Header(words[0] == HEADERS[1], None)
+    if words[1] != b"FixedK" or len(words) != 7:
+        raise ProblemError(f"{where}: after {words[0].decode()} there must be nothing, or FixedK and fx cx fy cy r")
+    return _Header(words[0] == HEADERS[1], tuple(_numbers(words[2:], ("fx", "cx", "fy", "cy", "r"), where)))
+
+
+def _images(lines: LineReader, header: _Header) -> _Images:
+    line = lines.next_filled()
+    where = f"{lines.name} line {max(lines.line, 1)}"
+    if not line:
+        raise ProblemError(f"{where}: the file ends before the number of images")
+    count = _numbers([line], ("number of images",), where)[0]
+    if not count.is_integer() or not 1 <= count <= LARGEST_COUNT:
+        raise ProblemError(f"{where}: {count:g} is no number of images of a model")
+    fields = _FIELDS_R9T if header.matrices else _FIELDS
+    rows = []
+    for image in range(int(count)):
+        words = lines.next_filled().rsplit(maxsplit=len(fields))  # names may have blanks
+        where = f"{lines.name} line {max(lines.line, 1)}"
+        if not words:
+            raise ProblemError(f"{where}: the file ends before image {image} of {count:g}")
+        if len(words) != len(fields) + 1:
+            raise ProblemError(f"{where}: image {image} has {len(words)} fields instead of {len(fields) + 1}")
+        rows.append(_numbers(words[1:], fields, f"{where}: image {image}"))
+        if header.matrices and not are_rotations(np.array(rows[-1][1:10]).reshape(1, 3, 3))[0]:
+            raise ProblemError(f"{where}: image {image}: R11 to R33 are no rotation")
+        if not header.matrices and not any(rows[-1][1:5]):
+            raise ProblemError(f"{where}: image {image}: qw to qz are no rotation")
+    table = np.array(rows)
+    if header.matrices:
+        return _Images(table[:, 0], table[:, 1:10].reshape(-1, 3, 3), table[:, 10:13], table[:, 13])
+    from scipy.spatial.transform import Rotation
+
+    quaternions = table[:, [2, 3, 4, 1]]
+    largest = np.abs(quaternions).max(axis=1, keepdims=True)  # without it squares overflow
+    rotations = Rotation.from_quat(quaternions / largest).as_matrix()
+    return _Images(table[:, 0], rotations, translations(rotations, table[:, 5:8]), table[:, 8])
+
+
+def _numbers(words: list[bytes], fields: tuple[str, ...], where: str) -> list[float]:
+    found = []
+    for word, field in zip(words, fields, strict=True):
+        shown = word[:40].decode("latin-1")
+        try:
+            found.append(number(word.decode("latin-1")))
+        except ValueError:
+            raise ProblemError(f"{where}: {shown!a} is not a number ({field})") from None
+        if not np.isfinite(found[-1]):
+            raise ProblemError(f"{where}: {shown!a} is not a finite number ({field})")
+    return found

@@ -1,0 +1,123 @@
+"""OpenMVG's `sfm_data.json`: views, intrinsics, extrinsics and structure, as its serialisation library writes them.
+
+A camera at c maps X to `K d((R (X - c)).xy / z)`, pixels from the corner of the image. A class that comes again has
+only the number of its first coming, without the name. Source: OpenMVG, sfm/sfm_data_io_cereal.cpp, cameras/*_io.hpp;
+cereal, "Polymorphism".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from jaxba.io.distortion import Distortion
+from jaxba.io.files import StrPath
+from jaxba.io.foreign import ForeignLens
+from jaxba.io.json_records import Record, read_json
+from jaxba.io.sfm_data import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.problem.bundle_problem import BundleProblem
+
+VERSION = "sfm_data_version"
+"""Key that only OpenMVG's files have."""
+
+MODELS = {
+    "pinhole": (None, 0),
+    "pinhole_radial_k1": ("disto_k1", 1),
+    "pinhole_radial_k3": ("disto_k3", 3),
+    "pinhole_brown_t2": ("disto_t2", 5),
+    "fisheye": ("fisheye", 4),
+}
+"""Camera models that are read: where their coefficients stand, and how many they are."""
+
+_FIRST = 1 << 31
+"""Bit of a number that marks the first coming of a class or an object. Source: cereal, `detail::msb_32bit`."""
+
+_PROGRAM = "OpenMVG"
+
+
+def read_openmvg(path: StrPath) -> BundleProblem:
+    """Reads a whole result of OpenMVG.
+
+    Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. `pinhole`,
+    `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. Of the others in `MODELS` pixels are
+    undistorted once and intrinsics stay.
+
+    Args:
+        path: the file, plain or compressed.
+
+    Raises:
+        ProblemError: the file cannot be read, lacks a part, names a camera model that is not in `MODELS`, or views
+            share a pose; one line that names the file, the record and the field.
+    """
+    return from_document(read_json(path), path)
+
+
+def is_openmvg(document: Record) -> bool:
+    """Whether a JSON document is of OpenMVG."""
+    return isinstance(document.value, dict) and VERSION in document.value
+
+
+def from_document(document: Record, path: StrPath) -> BundleProblem:
+    """As `read_openmvg`, from the contents of its file. Raises ProblemError."""
+    views = {}
+    for key, value in _map(part(document, "views", _PROGRAM), "view"):
+        data = value.get("ptr_wrapper").get("data").called(value.where)
+        number = data.get("id_view").integer() if data.has("id_view") else key
+        pose, intrinsic = (
+            data.get(one).integer() if data.has(one) else UNDEFINED for one in ("id_pose", "id_intrinsic")
+        )
+        views[number] = View(pose, intrinsic)
+    intrinsics = _intrinsics(part(document, "intrinsics", _PROGRAM))
+    poses = {}
+    for key, value in _map(part(document, "extrinsics", _PROGRAM), "pose"):
+        poses[key] = checked_pose(value, value.get("rotation").matrix(), value.get("center").vector(3))
+    landmarks = _landmarks(part(document, "structure", _PROGRAM))
+    return build(path, views, poses, intrinsics, lambda key: _lens(*intrinsics[key]), landmarks)
+
+
+def _map(record: Record, what: str) -> Iterator[tuple[int, Record]]:
+    """Keys and values of a map, which is a list of pairs."""
+    for row in record.rows():
+        key = row.get("key").integer()
+        yield key, row.get("value").called(f"{what} {key}")
+
+
+def _intrinsics(record: Record) -> dict[int, tuple[str, Record]]:
+    """Model and parameters of each intrinsic, with the references of the serialisation library resolved."""
+    found = {}
+    models: dict[int, str] = {}
+    objects: dict[int, Record] = {}
+    for key, value in _map(record, "intrinsic"):
+        identity = value.get("polymorphic_id").integer()
+        if value.has("polymorphic_name"):
+            models[identity & ~_FIRST] = value.get("polymorphic_name").text()
+        if identity & ~_FIRST not in models:
+            value.fail(f"has polymorphic_id {identity}, whose name was not given before")
+        wrapper = value.get("ptr_wrapper")
+        number = wrapper.get("id").integer() & ~_FIRST
+        if wrapper.has("data"):
+            objects[number] = wrapper.get("data").called(value.where)
+        if number not in objects:
+            value.fail(f"has no data, and none before has its id {number}")
+        found[key] = models[identity & ~_FIRST], objects[number]
+    return found
+
+
+def _lens(model: str, data: Record) -> ForeignLens:
+    if model not in MODELS:
+        data.fail(f"is of the model {model!a}, which is not read; read are {', '.join(MODELS)}")
+    key, count = MODELS[model]
+    numbers = data.get(key).vector(count) if key else []
+    focal, size = data.get("focal_length").number(), (data.get("width").number(), data.get("height").number())
+    x, y = data.get("principal_point").vector(2)
+    fisheye = model == "fisheye"
+    distortion = Distortion(
+        tuple(numbers if fisheye else numbers[:3]), (numbers[3], numbers[4]) if count == 5 else (0.0, 0.0), fisheye
+    )
+    return ForeignLens(data.where, (focal, focal), (x, y), distortion, (True, count > 0, count > 1), size)
+
+
+def _landmarks(structure: Record) -> Iterator[Landmark]:
+    for key, value in _map(structure, "landmark"):
+        seen = list(_map(value.get("observations"), f"landmark {key}: observation in view"))
+        pixels = [one.get("x").vector(2) for _, one in seen]
+        yield Landmark(value.get("X").vector(3), [view for view, _ in seen], pixels)

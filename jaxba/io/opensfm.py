@@ -1,0 +1,214 @@
+"""OpenSfM's reconstructions: `reconstruction.json`, and the observations in `tracks.csv` beside it.
+
+Coordinates of images are normalised: the origin is the middle, y grows downwards, the larger side is 1. Focal lengths
+and principal points are in the same unit, so all are multiplied by the larger side. Source: OpenSfM,
+doc/source/dataset.rst and geometry.rst; map/src/tracks_manager.cc for the three versions of tracks.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Container
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxba.io.distortion import Distortion
+from jaxba.io.encoding import read_text
+from jaxba.io.files import StrPath, display_name
+from jaxba.io.foreign import ALL_FREE, ForeignLens, assemble
+from jaxba.io.json_records import Record, read_json
+from jaxba.io.remarks import note
+from jaxba.io.text import number
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import are_rotations
+
+RECONSTRUCTION = "reconstruction.json"
+"""Name of the file of cameras and points in OpenSfM's folder."""
+
+TRACKS = "tracks.csv"
+"""Name of the file of observations, beside the reconstruction."""
+
+TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"
+"""Begins the first line of tracks; files of version 0 have no such line."""
+
+FIELDS = {0: 8, 1: 9, 2: 11}
+"""Fields of a line of tracks by version: image, track, key-point, x, y, ..."""
+
+_RADIAL = {"simple_radial": 1, "radial": 2, "brown": 3, "fisheye_opencv": 4}
+"""Models with two focal lengths and a principal point, and how many radial coefficients they have."""
+
+MODELS = ("perspective", "fisheye", *_RADIAL)
+"""Camera models that are read."""
+
+
+class _Observations(NamedTuple):
+    images: list[str]
+    tracks: list[str]
+    pixels: list[tuple[float, float]]
+
+
+def read_opensfm(path: StrPath, tracks: StrPath | None = None) -> BundleProblem:
+    """Reads the first reconstruction of a file, which is the largest.
+
+    `perspective`, `simple_radial` and `radial` cameras are optimised; of `brown`, `fisheye` and `fisheye_opencv` pixels
+    are undistorted once and intrinsics stay. Images share the lens of their camera. Images and tracks that are not
+    reconstructed are ignored; of repeated observations the last one counts.
+
+    Args:
+        path: `reconstruction.json`, or the folder that holds it; plain or compressed.
+        tracks: the file of observations. Default: `tracks.csv`, also compressed, in the same folder.
+
+    Raises:
+        ProblemError: a file is missing or malformed, a camera model is not one of `MODELS`, or images are of a rig;
+            one line that names the file, the record and the field.
+    """
+    path = Path(path) / RECONSTRUCTION if os.path.isdir(path) else Path(path)
+    document = read_json(path)
+    return from_document(document, path, tracks)
+
+
+def is_opensfm(document: Record) -> bool:
+    """Whether a JSON document is a list of reconstructions, or one of them."""
+    first = document.value[0] if isinstance(document.value, list) and document.value else document.value
+    return isinstance(first, dict) and "shots" in first and "cameras" in first
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
+def from_document(document: Record, path: StrPath, tracks: StrPath | None = None) -> BundleProblem:
+    """As `read_opensfm`, from the contents of its file. Raises ProblemError."""
+    if isinstance(document.value, list):
+        if not document.value:
+            document.fail("holds no reconstruction")
+        if len(document.value) > 1:
+            note(path, f"only the first of {len(document.value)} reconstructions is read")
+        document = Record(document.value[0], document.name)
+    _refuse_rigs(document)
+    cameras = dict(document.get("cameras").entries("camera"))
+    lenses: dict[str, ForeignLens] = {}  # of the cameras that shots name
+    shots: dict[str, int] = {}
+    lens_keys, turns, shifts = [], [], []
+    for key, shot in document.get("shots").entries("shot"):
+        camera = shot.get("camera").text()
+        if camera not in cameras:
+            shot.fail(f"names camera {display_name(camera)}, which is not there")
+        if camera not in lenses:
+            lenses[camera] = _lens(cameras[camera])
+        shots[key] = len(shots)
+        lens_keys.append(camera)
+        turns.append(shot.get("rotation").vector(3))
+        shifts.append(shot.get("translation").vector(3))
+    if not document.has("points"):
+        document.fail("has no points, only cameras and shots")
+    points = {key: point.get("coordinates").vector(3) for key, point in document.get("points").entries("point")}
+    if not shots or not points:
+        document.fail(f"has no {'points' if shots else 'shots'}")
+    seen = _read_tracks(_tracks_beside(path) if tracks is None else tracks, shots, set(points))
+    from scipy.spatial.transform import Rotation
+
+    rotations = Rotation.from_rotvec(np.array(turns)).as_matrix()
+    bad = np.flatnonzero(~are_rotations(rotations))
+    if bad.size:
+        document.fail(f"has shot {display_name(list(shots)[bad[0]])} with a rotation that is none")
+    point_number = {key: at for at, key in enumerate(points)}
+    lens_number = {key: at for at, key in enumerate(lenses)}
+    lens_of = np.array([lens_number[key] for key in lens_keys])
+    camera_index = np.array([shots[image] for image in seen.images])
+    size = np.array([lens.size for lens in lenses.values()])[lens_of][camera_index]
+    return assemble(
+        path,
+        list(lenses.values()),
+        lens_of,
+        rotations,
+        np.array(shifts),
+        np.array(list(points.values())),
+        size.max(axis=1)[:, None] * np.array(seen.pixels) + size / 2,
+        camera_index,
+        np.array([point_number[track] for track in seen.tracks]),
+    )
+
+
+def _refuse_rigs(document: Record) -> None:
+    if not document.has("rig_instances"):
+        return
+    for _, instance in document.get("rig_instances").entries("rig instance"):
+        shots = list(instance.get("rig_camera_ids").entries("shot")) if instance.has("rig_camera_ids") else []
+        if len(shots) > 1:
+            instance.fail("is of a rig of several cameras, whose poses depend on it; rigs are not read")
+
+
+def _lens(camera: Record) -> ForeignLens:
+    """The lens of a camera, in pixels from the corner of the image."""
+    model = camera.get("projection_type").text() if camera.has("projection_type") else "perspective"
+    if model not in MODELS:
+        camera.fail(f"has projection_type {model!a}, which is not read; read are {', '.join(MODELS)}")
+    width, height = camera.get("width").number(), camera.get("height").number()
+    if not min(width, height) > 0:
+        camera.fail("has no width and height, so that nothing can be in pixels")
+    side = max(width, height)
+    optional = lambda key: camera.get(key).number() if camera.has(key) else 0.0
+    if model in _RADIAL:
+        focal = camera.get("focal_x").number(), camera.get("focal_y").number()
+        offset = optional("c_x"), optional("c_y")
+        count = _RADIAL[model]
+    else:
+        focal = (camera.get("focal").number(),) * 2
+        offset = (0.0, 0.0)
+        count = 2
+    radial = tuple(optional(f"k{power}") for power in range(1, count + 1))
+    tangential = (optional("p1"), optional("p2")) if model == "brown" else (0.0, 0.0)
+    return ForeignLens(
+        camera.where,
+        (side * focal[0], side * focal[1]),
+        (width / 2 + side * offset[0], height / 2 + side * offset[1]),
+        Distortion(radial, tangential, fisheye=model.startswith("fisheye")),
+        (True, True, count > 1) if model in ("simple_radial", "radial", "perspective") else ALL_FREE,
+        (width, height),
+    )
+
+
+def _tracks_beside(path: StrPath) -> Path:
+    folder = Path(path).parent
+    for ending in ("", ".gz", ".bz2", ".xz"):
+        if (folder / f"{TRACKS}{ending}").is_file():
+            return folder / f"{TRACKS}{ending}"
+    raise ProblemError(f"{display_name(path)}: there is no {TRACKS} beside it, which has OpenSfM's observations")
+
+
+def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -> _Observations:
+    """The observations of reconstructed images and points."""
+    name = display_name(path)
+    lines = read_text(path).split("\n")
+    version, first = 0, 0
+    if lines[0].startswith(TRACKS_HEADER):
+        stated = lines[0].removeprefix(TRACKS_HEADER).strip()
+        version, first = int(stated) if stated in ("1", "2") else -1, 1
+        if version < 0:
+            raise ProblemError(f"{name} line 1: version {stated!a} of tracks is not read; 1 and 2 are")
+    found: dict[tuple[str, str], tuple[float, float]] = {}
+    for at, line in enumerate(lines[first:], first + 1):
+        if not line.strip():
+            continue
+        words = line.rstrip().split("\t")
+        if len(words) != FIELDS[version]:
+            count = f"{len(words)} fields, separated by tabs, instead of {FIELDS[version]}"
+            raise ProblemError(f"{name} line {at}: has {count}")
+        image, track = words[:2]
+        if image not in shots or track not in points:
+            continue
+        found[image, track] = (_pixel(words[3], "x", f"{name} line {at}"), _pixel(words[4], "y", f"{name} line {at}"))
+    if not found:
+        raise ProblemError(f"{name}: no image of the reconstruction sees a point of it")
+    images, tracks = zip(*found, strict=True)
+    return _Observations(list(images), list(tracks), list(found.values()))
+
+
+def _pixel(word: str, field: str, where: str) -> float:
+    try:
+        found = number(word.strip())
+    except ValueError:
+        raise ProblemError(f"{where}: {word[:40]!a} is not a number ({field})") from None
+    if not np.isfinite(found):
+        raise ProblemError(f"{where}: {word[:40]!a} is not a finite number ({field})")
+    return found

@@ -1,0 +1,43 @@
+"""Notes about a file: what was left out, and what is implausible in it."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.io.files import StrPath, display_name
+from jaxba.io.notes import report
+
+EDGE = 0.1
+"""Share of the width or height of an image: a principal point as near to the border, or outside, is implausible. Those
+of real lenses lie within a few percent of the middle; 0 is that of a calibration left empty, or of another origin."""
+
+LEAST_PIXELS = 16
+"""Observations that must lie on one side of the origin before that is remarkable; with fewer it may be chance."""
+
+
+def note(path: StrPath, text: str) -> None:
+    """Warns about a file; the message begins with its name."""
+    report([f"{display_name(path)}: {text}"])
+
+
+def note_center(path: StrPath, what: str, center: tuple[float, float], size: tuple[float, float]) -> None:
+    """Warns if a principal point lies at the edge of its image or outside.
+
+    Args:
+        path: of the file.
+        what: whose it is, such as `camera 3`.
+        center: the principal point from the corner of the image, pixels.
+        size: width and height of the image, pixels.
+    """
+    if any(not EDGE * extent <= at <= (1 - EDGE) * extent for at, extent in zip(center, size, strict=True)):
+        shown = f"({center[0]:g}, {center[1]:g}) of {size[0]:g} x {size[1]:g} pixels"
+        note(path, f"the principal point of {what} lies at the edge of the image: {shown}; is the calibration its own?")
+
+
+def note_origin(path: StrPath, pixels: Float[np.ndarray, "n 2"]) -> None:
+    """Warns if all pixels lie in one quadrant, as they do from a corner of the image; the formats have its centre."""
+    x, y = pixels.T
+    if len(pixels) >= LEAST_PIXELS and (x >= 0).all() and ((y >= 0).all() or (y <= 0).all()):
+        extent = f"x in {x.min():g}..{x.max():g}, y in {y.min():g}..{y.max():g}"
+        note(path, f"pixels seem to be measured from a corner of the image ({extent}), not from its centre")

@@ -1,0 +1,86 @@
+"""Points with lists of their views, as Bundler and VisualSFM write them.
+
+A point is its position, its colour, the number of its views, and for each view a camera, a key-point, x and y.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba.io.text import NumberReader
+from jaxba.problem.bundle_problem import ProblemError
+from jaxba.typing import LARGEST_COUNT
+
+POINT_FIELDS = ("x", "y", "z", "red", "green", "blue", "number of views")
+VIEW_FIELDS = ("camera index", "key", "x", "y")
+
+
+class Tracks(NamedTuple):
+    """Points and their views, in the order of the file."""
+
+    points: Float[np.ndarray, "points 3"]
+    camera_index: Int[np.ndarray, " observations"]
+    point_index: Int[np.ndarray, " observations"]
+    pixels: Float[np.ndarray, "observations 2"]
+    end: int
+    """Position after the last number of the last view."""
+
+
+def read_tracks(
+    reader: NumberReader, position: int, count: int, num_cameras: int, other_field: Callable[[int], str]
+) -> Tracks:
+    """Reads points from a position among the numbers of a reader that were not taken yet.
+
+    Counts allocate nothing; memory is proportional to what the file really holds.
+
+    Args:
+        reader: of the file; nothing is taken from it, and its field describes points from now on.
+        position: of the first point's x.
+        count: how many points there are.
+        num_cameras: cameras have the indices below it.
+        other_field: description of the numbers before the points.
+
+    Raises:
+        ProblemError: the file ends early, or something is no number or out of range; or there are no views.
+    """
+    values = reader.peek_all()
+    starts: list[int] = []
+
+    def field(ordinal: int) -> str:
+        point = bisect_right(starts, ordinal) - 1
+        return other_field(ordinal) if point < 0 else _point_field(point, ordinal - starts[point])
+
+    def need(end: int) -> None:
+        if end > values.size:
+            reader.missing()
+
+    reader.field = field
+    for _ in range(count):
+        starts.append(position)
+        need(position + len(POINT_FIELDS))
+        views = float(values[position + 6])
+        if not 0 <= views <= LARGEST_COUNT or not views.is_integer():
+            reader.integers([position + 6], values[position + 6 : position + 7], 0, LARGEST_COUNT)
+        position += len(POINT_FIELDS) + len(VIEW_FIELDS) * int(views)
+        need(position)
+    first_view = np.array(starts, dtype=np.int64) + len(POINT_FIELDS)
+    views = values[first_view - 1].astype(np.int64)
+    before = np.cumsum(views) - views
+    at = np.repeat(first_view - 4 * before, views) + 4 * np.arange(views.sum())
+    camera_index = reader.integers(at, values[at], 0, num_cameras - 1)
+    if not camera_index.size:
+        raise ProblemError(f"{reader.name}: no camera sees a point")
+    points = values[first_view[:, None] - len(POINT_FIELDS) + np.arange(3)]
+    return Tracks(points, camera_index, np.repeat(np.arange(count), views), values[at[:, None] + [2, 3]], position)
+
+
+def _point_field(point: int, at: int) -> str:
+    if at < len(POINT_FIELDS):
+        return f"{POINT_FIELDS[at]} of point {point}"
+    view, part = divmod(at - len(POINT_FIELDS), len(VIEW_FIELDS))
+    return f"{VIEW_FIELDS[part]} of view {view} of point {point}"

@@ -1,0 +1,417 @@
+"""Files of VisualSFM, OpenSfM, OpenMVG and AliceVision: the cost is that of each program's own projection."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import subprocess
+import sys
+
+import foreign_scene
+import numpy as np
+import pytest
+from foreign_scene import Lens, Scene, write_alicevision, write_nvm, write_openmvg, write_opensfm
+
+from jaxba.io import ProblemWarning, read_problem
+from jaxba.io.distortion import Distortion
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+
+LENS_OF = [0, 0, 1, 1, 0]
+PINHOLE = Lens(cx=800.0, cy=600.0)
+RADIAL = Lens(cx=800.0, cy=600.0, radial=(-0.12, 0.03))
+RADIAL3 = Lens(radial=(-0.12, 0.03, 0.01))
+BROWN = Lens(fy=1230.0, radial=(-0.12, 0.03, 0.01), tangential=(0.003, -0.002))
+FISHEYE = Lens(cx=800.0, cy=600.0, fx=900.0, fy=900.0, radial=(0.02, -0.01), fisheye=True)
+FISHEYE4 = Lens(fx=900.0, fy=900.0, radial=(0.02, -0.01, 0.004, -0.002), fisheye=True)
+ROUNDING = 1e-9
+FIRST_ORDER = 0.02
+"""Of the cost, where undistorted observations are weighted to first order, at half a pixel of noise."""
+
+
+def scene_of(*lenses: Lens, noise: float = 0.5) -> Scene:
+    return Scene([*lenses], LENS_OF if len(lenses) == 2 else [0] * 5, noise=noise)
+
+
+def check(problem: BundleProblem, scene: Scene, tolerance: float) -> None:
+    assert (problem.num_cameras, problem.num_points) == (5, 30)
+    assert problem.num_observations == len(scene.seen)
+    np.testing.assert_allclose(geometry.camera_centers(problem.cameras), scene.centers, atol=1e-9)
+    np.testing.assert_allclose(problem.points, scene.points, rtol=1e-12)
+    np.testing.assert_allclose(geometry.cost(problem), scene.cost, rtol=tolerance)
+    assert (geometry.depths(problem) > 0).all()
+
+
+def free(problem: BundleProblem) -> list[list[bool]]:
+    return [] if problem.lenses is None else np.asarray(problem.lenses.free).tolist()
+
+
+@pytest.mark.parametrize("version", [0, 1, 2])
+def test_opensfm_s_perspective_cameras_are_bal_s_but_shared(tmp_path, version):
+    scene = scene_of(RADIAL, PINHOLE)
+    write_opensfm(tmp_path, scene, ["perspective", "perspective"], version)
+    for path in (tmp_path / "reconstruction.json", tmp_path):
+        problem = read_problem(path)
+        check(problem, scene, ROUNDING)
+        assert free(problem) == [[True] * 3] * 2
+        assert problem.whitening is None
+
+
+@pytest.mark.parametrize(
+    ("model", "lens", "tolerance", "kept"),
+    [
+        ("radial", Lens(fy=1230.0, radial=(-0.12, 0.03)), ROUNDING, [True] * 3),
+        ("simple_radial", Lens(fy=1230.0, radial=(-0.12,)), ROUNDING, [True, True, False]),
+        ("brown", BROWN, FIRST_ORDER, [False] * 3),
+        ("fisheye", FISHEYE, FIRST_ORDER, [False] * 3),
+        ("fisheye_opencv", FISHEYE4, FIRST_ORDER, [False] * 3),
+    ],
+)
+def test_opensfm_s_other_cameras_keep_the_cost(tmp_path, model, lens, tolerance, kept):
+    for noise in (0.5, 0.0):
+        scene = scene_of(lens, noise=noise)
+        problem = read_problem(write_opensfm(tmp_path, scene, [model]))
+        if noise:
+            check(problem, scene, tolerance)
+        else:
+            assert geometry.cost(problem) < 1e-15
+        assert free(problem) == [kept]
+
+
+@pytest.mark.parametrize(
+    ("models", "lenses", "tolerance", "kept"),
+    [
+        (["pinhole"], [Lens()], ROUNDING, [[True, False, False]]),
+        (["pinhole_radial_k1"], [Lens(radial=(-0.1,))], ROUNDING, [[True, True, False]]),
+        (["pinhole_radial_k3"], [Lens(radial=(-0.1, 0.02, 0.0))], ROUNDING, [[True] * 3]),
+        (["pinhole_radial_k3"], [RADIAL3], FIRST_ORDER, [[False] * 3]),
+        (["pinhole_brown_t2"], [Lens(radial=BROWN.radial, tangential=BROWN.tangential)], FIRST_ORDER, [[False] * 3]),
+        (["fisheye"], [FISHEYE4], FIRST_ORDER, [[False] * 3]),
+        (["pinhole_radial_k3"] * 2, [RADIAL3, Lens(radial=(0.1, 0.0, 0.0))], FIRST_ORDER, [[False] * 3, [True] * 3]),
+    ],
+)
+def test_openmvg_s_cameras_keep_the_cost(tmp_path, models, lenses, tolerance, kept):
+    scene = scene_of(*lenses)
+    problem = read_problem(write_openmvg(tmp_path / "sfm_data.json", scene, models))
+    check(problem, scene, tolerance)
+    assert free(problem) == kept
+
+
+@pytest.mark.parametrize("version", [(1, 0, 0), (1, 2, 0), (1, 2, 1), (1, 2, 3), (1, 2, 8)])
+@pytest.mark.parametrize("fy", [1200.0, 1230.0])
+def test_alicevision_s_versions_keep_the_cost(tmp_path, version, fy):
+    scene = scene_of(Lens(fy=1200.0 if version < (1, 2, 0) else fy, radial=(-0.1,)))
+    problem = read_problem(write_alicevision(tmp_path / "cameras.sfm", scene, ["radial1"], version))
+    check(problem, scene, ROUNDING)
+    assert free(problem) == [[True, True, False]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "lens", "tolerance"),
+    [
+        ("pinhole", Lens(), ROUNDING),
+        ("radial3", RADIAL3, FIRST_ORDER),
+        ("brown", BROWN, FIRST_ORDER),
+        ("fisheye4", FISHEYE4, FIRST_ORDER),
+    ],
+)
+def test_alicevision_s_models_keep_the_cost(tmp_path, kind, lens, tolerance):
+    scene = scene_of(lens)
+    check(read_problem(write_alicevision(tmp_path / "sfm.json", scene, [kind], (1, 2, 1))), scene, tolerance)
+
+
+def test_locked_intrinsics_stay(tmp_path):
+    path = write_alicevision(tmp_path / "a.sfm", scene_of(Lens()), ["pinhole"], (1, 2, 1))
+    path.write_text(path.read_text().replace('"locked": "0", "type"', '"locked": "true", "type"'))
+    assert free(read_problem(path)) == [[False] * 3]
+
+
+@pytest.mark.parametrize("header", ["NVM_V3", "NVM_V3_R9T", "NVM_V3 "])
+def test_visualsfm_s_pinholes_are_bal_s(tmp_path, header):
+    scene = scene_of(PINHOLE)
+    problem = read_problem(write_nvm(tmp_path / "a.nvm", scene, [0.0] * 5, header))
+    check(problem, scene, ROUNDING)
+    assert problem.lenses is None
+
+
+def test_visualsfm_s_distortion_goes_from_the_measured_pixel(tmp_path):
+    scene, values = scene_of(PINHOLE), [0.1, -0.05, 0.0, 0.02, 0.2]
+    problem = read_problem(write_nvm(tmp_path / "a.nvm", scene, values))
+    assert free(problem) == [[True, r == 0, r == 0] for r in values]
+    np.testing.assert_allclose(geometry.project(problem) * [1, -1], scene.predicted - [800, 600], atol=1e-8)
+    np.testing.assert_allclose(np.asarray(problem.observations) * [1, -1], scene.pixels - [800, 600], atol=1e-8)
+    exact = 0.0  # in measured pixels
+    for (i, _), seen, predicted in zip(scene.seen, scene.pixels, scene.predicted, strict=True):
+        places = [foreign_scene.measure((pixel - [800, 600]) / 1200, values[i]) for pixel in (seen, predicted)]
+        exact += 0.5 * 1200**2 * float(np.sum((places[0] - places[1]) ** 2))
+    np.testing.assert_allclose(geometry.cost(problem), exact, rtol=FIRST_ORDER)
+    assert abs(exact - scene.cost) > 2 * FIRST_ORDER * exact  # the weights matter
+
+
+def test_visualsfm_s_fixed_calibration_holds_for_all_images(tmp_path):
+    scene = scene_of(Lens(fy=1230.0, cx=800.0, cy=600.0))
+    problem = read_problem(write_nvm(tmp_path / "a.nvm", scene, [0.0] * 5, "NVM_V3 FixedK 1200 800 1230 600 0"))
+    check(problem, scene, ROUNDING)
+    assert free(problem) == [[False] * 3]
+    assert np.asarray(problem.lenses.index).tolist() == [0] * 5
+
+
+@pytest.mark.parametrize("distortion", [(-0.3, 0.1, 0.0, 0.0), (0.1, -0.2, 0.01, -0.02), (0.0, 0.0, 0.004, 0.003)])
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE"])
+def test_distortion_and_its_inverse_are_those_of_colmap(distortion, model):
+    pycolmap = pytest.importorskip("pycolmap", reason="the extra colmap is not installed")
+    lens = Distortion(distortion[:2], distortion[2:])
+    if model == "OPENCV_FISHEYE":
+        lens = Distortion(distortion, fisheye=True)
+    camera = pycolmap.Camera(model=model, width=2, height=2, params=[1, 1, 0, 0, *distortion])
+    plane = np.random.default_rng(0).uniform(-0.7, 0.7, (100, 2))
+    moved = np.asarray(camera.img_from_cam(np.column_stack([plane, np.ones(100)])))
+    np.testing.assert_allclose(lens.apply(plane)[0], moved, atol=1e-14)
+    found, derivative = lens.remove(moved)
+    np.testing.assert_allclose(found, plane, atol=1e-10)
+    for axis, step in enumerate(1e-6 * np.eye(2)):
+        slope = (lens.apply(plane + step)[0] - lens.apply(plane - step)[0]) / 2e-6
+        np.testing.assert_allclose(derivative[:, :, axis], slope, atol=1e-8)
+
+
+def test_what_lies_beyond_the_fold_of_a_lens_has_no_direction():
+    lens = Distortion((-0.3,))  # r (1 - 0.3 r^2) grows up to r = sqrt(1 / 0.9)
+    edge = np.sqrt(1 / 0.9)
+    largest = edge * (1 - 0.3 * edge**2)
+    found, _ = lens.remove(np.array([[0.999 * largest, 0.0], [1.001 * largest, 0.0], [0.0, -5.0], [0.0, 0.0]]))
+    assert np.isfinite(found).all(axis=1).tolist() == [True, False, False, True]
+    assert found[0, 0] < edge
+    found, _ = Distortion((0.0, 0.0), fisheye=True).remove(np.array([[1.5, 0.0], [1.6, 0.0], [1e300, 0.0]]))
+    np.testing.assert_allclose(found[0], [np.tan(1.5), 0])
+    assert np.isnan(found[1:]).all()
+
+
+def test_observations_beyond_the_range_of_a_lens_are_left_out_and_counted(tmp_path):
+    scene = scene_of(Lens(radial=(-0.3, 0.0, 0.0001)))
+    scene.pixels[3] = [1e5, 1e5]
+    path = write_openmvg(tmp_path / "sfm_data.json", scene, ["pinhole_radial_k3"])
+    with pytest.warns(ProblemWarning, match=rf"sfm_data\.json: 1 of {len(scene.seen)} observations left out") as caught:
+        problem = read_problem(path)
+    assert problem.num_observations == len(scene.seen) - 1
+    assert len(caught) == 1
+
+
+def test_views_that_are_not_reconstructed_are_left_out_and_counted(tmp_path):
+    scene = scene_of(Lens())
+    path = write_openmvg(tmp_path / "sfm_data.json", scene, ["pinhole"])
+    contents = json.loads(path.read_text())
+    contents["extrinsics"] = contents["extrinsics"][:4]
+    contents["structure"][0]["value"]["observations"].append({"key": 99, "value": {"id_feat": 0, "x": [0.0, 0.0]}})
+    path.write_text(json.dumps(contents))
+    lost = 1 + sum(i == 4 for i, _ in scene.seen)
+    with pytest.warns(ProblemWarning, match=f"{lost} of {len(scene.seen) + 1} observations left out: their views"):
+        assert read_problem(path).num_cameras == 4
+
+
+def test_a_principal_point_at_the_edge_is_noted(tmp_path):
+    path = write_openmvg(tmp_path / "sfm_data.json", scene_of(Lens(cx=0.0, cy=0.0)), ["pinhole"])
+    with pytest.warns(ProblemWarning, match=r"intrinsic 0 lies at the edge of the image: \(0, 0\) of 1600 x 1200"):
+        read_problem(path)
+
+
+def test_only_the_first_reconstruction_is_read_and_that_is_said(tmp_path):
+    path = write_opensfm(tmp_path, scene_of(PINHOLE), ["perspective"])
+    path.write_text(json.dumps([*json.loads(path.read_text()), {"cameras": {}, "shots": {}, "points": {}}]))
+    with pytest.warns(ProblemWarning, match="only the first of 2 reconstructions is read"):
+        assert read_problem(path).num_cameras == 5
+
+
+def test_compressed_marked_and_windows_files_are_read_too(tmp_path):
+    scene = scene_of(PINHOLE)
+    nvm = write_nvm(tmp_path / "a.nvm", scene, [0.0] * 5).read_bytes().replace(b"\n", b"\r\n")
+    (tmp_path / "A.NVM.GZ").write_bytes(gzip.compress(b"\xef\xbb\xbf" + nvm))
+    check(read_problem(tmp_path / "A.NVM.GZ"), scene, ROUNDING)
+    path = write_opensfm(tmp_path, scene, ["perspective"])
+    text, tracks = path.read_text(), (tmp_path / "tracks.csv").read_bytes()
+    (tmp_path / "tracks.csv").unlink()
+    (tmp_path / "tracks.csv.gz").write_bytes(gzip.compress(b"\xef\xbb\xbf" + tracks.replace(b"\n", b"\r\n")))
+    path.write_bytes(text.encode("utf-16"))
+    check(read_problem(path), scene, ROUNDING)
+
+
+# What cannot be read
+
+
+def refused(path) -> str:
+    with pytest.raises(ProblemError) as caught:
+        read_problem(path)
+    message = str(caught.value)
+    assert message.isprintable()
+    return message
+
+
+OPENSFM = {
+    "no points": ('"points": {', '"pts": {', "has no points, only cameras and shots"),
+    "unknown model": (
+        '"perspective"',
+        '"spherical"',
+        "camera v2 maker 0 has projection_type 'spherical', which is not",
+    ),
+    "dangling camera": ('"camera": "v2 maker 0"', '"camera": "v2 x"', "shot a shot 0.jpg names camera v2 x, which is"),
+    "text for a number": ('"focal": 0.75', '"focal": "wide"', "camera v2 maker 0: focal must be a number, is 'wide'"),
+    "nan": ('"focal": 0.75', '"focal": NaN', "camera v2 maker 0: focal is not a finite number: nan"),
+    "negative focal length": (
+        '"focal": 0.75',
+        '"focal": -0.75',
+        "camera v2 maker 0 has focal length -1200, which must",
+    ),
+    "no width": ('"width": 1600', '"width": 0', "camera v2 maker 0 has no width and height"),
+    "no rotation": ('"rotation"', '"turn"', "shot a shot 0.jpg has no rotation"),
+    "short point": (
+        '"coordinates": [',
+        '"coordinates": [1,',
+        "point 100: coordinates must be a list of 3 numbers, is a",
+    ),
+    "cut": ('"coordinates": [', "", "not JSON"),
+    "rig": (
+        '"cameras"',
+        '"rig_instances": {"r": {"rig_camera_ids": {"a": "b", "c": "d"}}}, "cameras"',
+        "rig instance r",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", OPENSFM)
+def test_bad_reconstructions_are_refused_by_record_and_field(tmp_path, case):
+    old, new, words = OPENSFM[case]
+    path = write_opensfm(tmp_path, scene_of(PINHOLE), ["perspective"])
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    message = refused(path)
+    assert message.startswith(str(path))
+    assert words in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("_v2", "_v9", "line 1: version '9' of tracks is not read"),
+        ("\t100\t0\t", "\t100\t", "line 2: has 10 fields, separated by tabs, instead of 11"),
+        ("\t100\t0\t", "\t100\t0\t-nan(ind)", "line 2: '-nan(ind)"),
+        ("\t0.004", "\t0.004\t", "line 2: has 12 fields"),
+        ("a shot", "no shot", ""),
+    ],
+)
+def test_bad_tracks_are_refused_by_line_and_field(tmp_path, old, new, words):
+    path = write_opensfm(tmp_path, scene_of(PINHOLE), ["perspective"])
+    tracks = tmp_path / "tracks.csv"
+    text = tracks.read_text()
+    tracks.write_text(text.replace(old, new, -1 if old == "a shot" else 1))
+    message = refused(path)
+    assert message.startswith(str(tracks))
+    assert (words or "no image of the reconstruction sees a point of it") in message
+
+
+def test_a_reconstruction_without_tracks_is_refused(tmp_path):
+    path = write_opensfm(tmp_path, scene_of(PINHOLE), ["perspective"])
+    (tmp_path / "tracks.csv").unlink()
+    assert "there is no tracks.csv beside it" in refused(path)
+
+
+@pytest.mark.parametrize("part", ["views", "intrinsics", "extrinsics", "structure"])
+def test_openmvg_s_files_without_a_part_are_refused_by_its_name(tmp_path, part):
+    path = write_openmvg(tmp_path / "sfm_data.json", scene_of(Lens()), ["pinhole"])
+    contents = json.loads(path.read_text())
+    for change in ([], None):
+        contents[part] = change
+        path.write_text(json.dumps(contents))
+        assert f"sfm_data.json: has no {part}, only " in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"pinhole"', '"spherical"', "intrinsic 0 is of the model 'spherical', which is not read; read are pinhole,"),
+        ('"polymorphic_name"', '"name"', "intrinsic 0 has polymorphic_id 2147483649, whose name was not given before"),
+        ('"focal_length"', '"f"', "intrinsic 0 has no focal_length"),
+        ('"id_pose": 11', '"id_pose": 10', "views 0 and 1 share pose 10, as in a rig; rigs are not read"),
+        ('"rotation": [[', '"rotation": [[7', "pose 10 has a rotation that is none"),
+        ('"X": [', '"X": [1, ', "landmark 1000: X must be a list of 3 numbers, is a list of 4"),
+        ('"x": [', '"x": ["a", ', "x must be a list of 2 numbers"),
+        ('{"key": 1000', '{"key": 1e400', "structure[0]: key is not a finite number: inf"),
+        ('{"key": 1000', '{"key": [[]]', "structure[0]: key must be a number, is a list of 1"),
+        ('"structure": [', '"structure": [[', "not JSON"),
+    ],
+)
+def test_bad_files_of_openmvg_are_refused_by_record_and_field(tmp_path, old, new, words):
+    path = write_openmvg(tmp_path / "sfm_data.json", scene_of(Lens()), ["pinhole"])
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    assert words in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('"structure"', '"landmarks"', "has no structure, only views, intrinsics, poses: have AliceVision write"),
+        ('"type": "pinhole"', '"type": "equidistant_r3"', "intrinsic 0 is of the model 'equidistant_r3', which is not"),
+        ('"undistortionType": "none"', '"undistortionType": "3deanamorphic4"', "the model '3deanamorphic4', which"),
+        ('"viewId": "0"', '"viewId": "0", "rigId": "1", "isPoseIndependant": "0"', "view 0 is of a rig of several"),
+        ('"x": [', '"y": [', "landmark 0: observation in view 0 has no x: have AliceVision write observations with"),
+        ('"sensorWidth": "24"', '"sensorWidth": "0"', "intrinsic 0 has a sensorWidth or pixelRatio that is not"),
+        ('"poseId": "10", "pose"', '"poseId": "ten", "pose"', "poses[0]: poseId must be a number, is 'ten'"),
+        ('"width": "1600"', '"width": "1.#QNAN"', "intrinsic 0: width is not a finite number: '1.#QNAN'"),
+    ],
+)
+def test_bad_scenes_of_alicevision_are_refused_by_record_and_field(tmp_path, old, new, words):
+    path = write_alicevision(tmp_path / "a.sfm", scene_of(Lens()), ["none"], (1, 2, 8))
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    assert words in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "words"),
+    [
+        (1, "NVM_V4", "line 1: 'NVM_V4' is not the header 'NVM_V3' of a VisualSFM file"),
+        (1, "NVM_V3 FixedK 1 2", "line 1: after NVM_V3 there must be nothing, or FixedK and fx cx fy cy r"),
+        (3, "-5", "line 3: -5 is no number of images of a model"),
+        (3, "1e9", "line 10: image 5 has 1 fields instead of 11"),
+        (4, "a.jpg 1 2 3", "line 4: image 0 has 4 fields instead of 11"),
+        (4, "a.jpg 100 1 0 0 0 0 0 nan 0 0", "line 4: image 0: 'nan' is not a finite number (cz)"),
+        (4, "a.jpg 100 0 0 0 0 0 0 0 0 0", "line 4: image 0: qw to qz are no rotation"),
+        (4, "a.jpg -100 1 0 0 0 0 0 0 0 0", "image 0 has focal length -100, which must be positive"),
+        (10, "1000000000", "line 43: 'lost.jpg' is not a number (y of point 30)"),
+        (11, "0 0 9 1 2 3 1 5 0 1 1", "line 11: '5' is outside 0..4 (camera index of view 0 of point 0)"),
+        (11, "0 0 9 1 2 3 4 x", "line 11: 'x' is not a number (camera index of view 0 of point 0)"),
+    ],
+)
+def test_bad_files_of_visualsfm_are_refused_by_line_and_field(tmp_path, line, text, words):
+    path = write_nvm(tmp_path / "a.nvm", scene_of(PINHOLE), [0.0] * 5)
+    lines = path.read_text().split("\n")
+    lines[line - 1] = text
+    path.write_text("\n".join(lines))
+    assert words in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("contents", "words"),
+    [
+        ("[" * 100_000, "is nested too deeply"),
+        ("[]", "is JSON, but not of a program that is known here; read are BAL (.txt, .bal), Bundler (.out)"),
+        ('{"a": 1}', "is JSON, but not of a program that is known here"),
+        ("", "line 1: not JSON: Expecting value"),
+        ('{"sfm_data_version": ' + "1" * 10_000 + "}", "holds a number of too many digits"),
+        ("\udcff", "is no text"),
+    ],
+)
+def test_other_json_is_refused(tmp_path, contents, words):
+    path = tmp_path / "a.json"
+    path.write_bytes(contents.encode(errors="surrogateescape"))
+    assert words in refused(path)
+
+
+def test_a_solve_of_a_bal_file_imports_none_of_these_readers():
+    code = (
+        "import sys, jaxba; "
+        "print([m for m in ('nvm', 'opensfm', 'openmvg', 'alicevision', 'foreign') if f'jaxba.io.{m}' in sys.modules])"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

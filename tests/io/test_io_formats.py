@@ -1,0 +1,120 @@
+"""Which format a name stands for, what is refused, and that messages name what is known."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+import support
+from foreign_scene import Lens, Scene, write_nvm, write_openmvg
+
+from jaxba.cli.solve import run
+from jaxba.io import check_output, formats, read_problem, write_problem
+from jaxba.problem.bundle_problem import ProblemError
+
+WRITTEN = "written are .txt, .bal (BAL), .out (Bundler), .ply (PLY), each also with .gz, .bz2 or .xz"
+
+
+@pytest.mark.parametrize(
+    "name", ["a.nvm", "a.json", "a.zip", "a.SFM", "a.abc", "a.nvm.gz", "a.npz", "a.mat", "a.tar.gz"]
+)
+def test_endings_of_other_formats_are_not_written(name, tmp_path):
+    with pytest.raises(ProblemError, match="are not written; ") as caught:
+        write_problem(support.tiny(), tmp_path / name)
+    assert WRITTEN in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "name", ["a", "a.txt", "a.BAL", "a.OUT.xz", "a.ply", "a.5", "/dev/stdout", "a.b.txt", "json", "a.txt.bz2"]
+)
+def test_other_names_may_be_written(name):
+    check_output(name)
+
+
+@pytest.fixture
+def tiny(tmp_path):
+    path = tmp_path / "tiny.out"
+    write_problem(support.tiny(), path)
+    return path
+
+
+@pytest.mark.parametrize("name", ["solved.nvm", "solved.json", "solved.zip"])
+def test_an_output_of_another_format_is_refused_before_any_work(tiny, capsys, name):
+    missing = tiny.with_name("missing.out")
+    assert run([str(missing), "--output", str(tiny.with_name(name))]) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    assert WRITTEN in printed.err
+    assert "missing" not in printed.err
+    assert [path.name for path in tiny.parent.iterdir()] == ["tiny.out"]
+
+
+def test_a_model_goes_from_bundler_to_bundler(tiny, capsys):
+    assert run([str(tiny), "--output", str(tiny.with_name("solved.OUT.GZ")), "--max-iterations", "2"]) == 0
+    assert "note" not in capsys.readouterr().out
+    solved = read_problem(tiny.with_name("solved.OUT.GZ"))
+    assert solved.num_observations == support.tiny().num_observations
+
+
+def test_a_name_whose_ending_says_nothing_is_bal_and_that_is_said(tiny, capsys):
+    assert run([str(tiny), "--output", str(tiny.with_name("solved.v5")), "--max-iterations", "1"]) == 0
+    assert "solved.v5 is a BAL file; written are" in capsys.readouterr().out
+
+
+def test_what_readers_remark_is_printed_as_notes(tmp_path, capsys):
+    path = write_openmvg(tmp_path / "sfm_data.json", Scene([Lens(cx=0.0)], [0, 0, 0]), ["pinhole"])
+    assert run([str(path), "--max-iterations", "1", "--output", str(tmp_path / "a.txt")]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"note: {path}: the principal point of intrinsic 0 lies at the edge")
+    assert "note: that file cannot store: which images share a lens, which numbers of a lens stay" in printed.out
+    assert printed.err == ""
+
+
+def test_what_is_remarked_is_refused_if_asked(tmp_path):
+    path = write_openmvg(tmp_path / "sfm_data.json", Scene([Lens(cx=0.0)], [0, 0, 0]), ["pinhole"])
+    with pytest.raises(ProblemError, match=r"sfm_data\.json: the principal point of intrinsic 0 lies at the edge"):
+        read_problem(path, strict=True)
+    assert run([str(path), "--strict", "--output", str(tmp_path / "a.txt")]) == 2
+    assert not (tmp_path / "a.txt").exists()
+
+
+@pytest.mark.parametrize("name", ["model", "model.txt", "model.dat"])
+def test_a_file_is_recognised_by_its_first_bytes_where_the_name_says_nothing(tmp_path, name):
+    scene = Scene([Lens(cx=800.0, cy=600.0)], [0, 0, 0])
+    nvm = read_problem(write_nvm(tmp_path / "a.nvm", scene, [0.0] * 3))
+    json = read_problem(write_openmvg(tmp_path / "a.json", scene, ["pinhole"]))
+    write_problem(nvm, tmp_path / "a.out")
+    for source, expected in (("a.nvm", nvm), ("a.json", json), ("a.out", nvm)):
+        shutil.copy(tmp_path / source, tmp_path / name)
+        np.testing.assert_allclose(read_problem(tmp_path / name).points, expected.points)
+
+
+@pytest.mark.parametrize(
+    "content", [b"PK\x03\x04", b"\x89HDF\r\n", b"ply\nformat ascii 1.0\n", b"<xml/>", b"cameras 3\n"]
+)
+def test_what_is_not_read_names_what_is(tmp_path, content):
+    path = tmp_path / "a.bin"
+    path.write_bytes(content)
+    with pytest.raises(ProblemError) as caught:
+        read_problem(path)
+    assert str(caught.value).isprintable()
+    assert formats.formats_read() in str(caught.value)
+    for name in ("BAL", "Bundler", "VisualSFM", "OpenSfM", "OpenMVG", "AliceVision", "COLMAP"):
+        assert name in str(caught.value)
+
+
+def test_a_point_cloud_is_not_read(tmp_path):
+    write_problem(support.tiny(), tmp_path / "a.ply")
+    with pytest.raises(ProblemError, match="PLY is only written; read are BAL"):
+        read_problem(tmp_path / "a.ply")
+
+
+def test_errors_in_a_bal_file_stay_what_they_are(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("1 1 1\n0 0 x 2\n")
+    with pytest.raises(ProblemError) as caught:
+        read_problem(path)
+    assert str(caught.value) == f"{path} line 2: 'x' is not a number (x of observation 0)"
