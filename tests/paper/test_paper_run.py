@@ -74,7 +74,7 @@ def finished(settings, tmp_path_factory) -> Path:
 
 
 def runs(capsys) -> int:
-    found = re.findall(r"^  (\d+) runs, ", capsys.readouterr().out, re.MULTILINE)
+    found = re.findall(r"^  (\d+) runs?, ", capsys.readouterr().out, re.MULTILINE)
     assert len(found) == 1
     return int(found[0])
 
