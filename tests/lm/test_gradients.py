@@ -139,17 +139,22 @@ def differences(function, at, direction, width: float):
     return jax.tree.map(slope, *near, *far)
 
 
-def check_forward(function, at) -> None:
+def rounding_of(function, at, values) -> dict:
+    """How far each number moves where the arguments move in their last digits: what rounding alone may change it by."""
+    moved = [function(*(x * (1 + sign * 2 * np.finfo(float).eps) for x in at)) for sign in (-1, 1)]
+    size = lambda x: 3e-15 * np.linalg.norm(x)
+    return {k: size(x) + max(np.linalg.norm(other[k] - x) for other in moved) for k, x in values.items()}
+
+
+def check_forward(function, at, width: float = 3e-7) -> None:
     forward = jax.jit(lambda at, direction: jax.jvp(function, at, direction)[1])
-    values = function(*at)
+    rounding = rounding_of(function, at, function(*at))
     for direction in directions(at):
-        found, expected = forward(at, direction), differences(function, at, direction, 3e-7)
+        found, expected = forward(at, direction), differences(function, at, direction, width)
         for name, slope in found.items():
             assert np.isfinite(slope).all(), name
-            # differences know no more than the rounding of the value over their width
-            rounding = 1e-8 * np.linalg.norm(values[name])
-            error = np.linalg.norm(slope - expected[name])
-            assert error <= 1e-5 * np.linalg.norm(slope) + rounding, (name, error, np.linalg.norm(slope))
+            error, size = np.linalg.norm(slope - expected[name]), np.linalg.norm(slope)
+            assert error <= 1e-5 * size + 4 * rounding[name] / width, (name, error, size, rounding[name] / width)
 
 
 def some_slow(names, fast) -> list:
