@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 
 from benchmarks import invariants, kill
@@ -21,3 +23,14 @@ def test_no_cost_rises_and_every_number_is_finite(capsys):
     printed = capsys.readouterr().out
     assert printed.count("everything holds") == 6
     assert "0 costs that rose" in printed
+
+
+@pytest.mark.extra
+@pytest.mark.skipif(sys.platform != "linux", reason="limits and measures memory as Linux does")
+def test_damaged_inputs_are_refused_in_a_line_or_solved(capsys):
+    pytest.importorskip("cv2")
+    pytest.importorskip("pycolmap")
+    from benchmarks import fuzz
+
+    assert fuzz.main(["--cases", "150", "--seed", "4"]) == 0
+    assert "150 cases, seed 4: 0 violations" in capsys.readouterr().out

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
+import pytest
 import support
 from scipy.spatial.transform import Rotation
 
+from jaxba import BundleProblem, ProblemError, ProblemWarning, read_colmap
 from jaxba.problem import geometry
 
 LENS = (700.0, 640.0, 480.0, -0.03)
@@ -86,3 +89,45 @@ class TextModel:
         for part, records in (("cameras", [camera]), ("images", images), ("points3D", points)):
             (folder / f"{part}.bin").write_bytes(struct.pack("<Q", len(records)) + b"".join(records))
         return folder
+
+
+def noted(folder: Path) -> tuple[BundleProblem, list[str]]:
+    """The problem of a model, and the notes on it without the folder's name."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        problem = read_colmap(folder)
+    assert all(issubclass(one.category, ProblemWarning) for one in caught)
+    lines = [str(one.message) for one in caught]
+    assert all(line.startswith(f"{folder}/") and line.isprintable() for line in lines)
+    return problem, [line.replace(f"{folder}/", "") for line in lines]
+
+
+def refusal(folder: Path) -> str:
+    """Why a model is refused, without the folder's name."""
+    with pytest.raises(ProblemError) as caught:
+        read_colmap(folder)
+    assert str(caught.value).isprintable()
+    assert str(folder) in str(caught.value)
+    return str(caught.value).replace(f"{folder}/", "")
+
+
+def swap(file: str, old: str, new: str):
+    def damage(folder: Path) -> None:
+        text = (folder / file).read_text()
+        assert old in text
+        (folder / file).write_text(text.replace(old, new, 1))
+
+    return damage
+
+
+def head_with(field: int, word: str):
+    """Image 4 with another word."""
+
+    def damage(folder: Path) -> None:
+        lines = (folder / "images.txt").read_text().split("\n")
+        words = lines[7].split(" ")
+        words[field] = word
+        lines[7] = " ".join(words)
+        (folder / "images.txt").write_text("\n".join(lines))
+
+    return damage

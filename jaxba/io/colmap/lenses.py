@@ -64,7 +64,7 @@ def check_lens(model: Model, camera: Camera) -> None:
     if not len(focals):
         raise ProblemError(f"{name}: {camera.model} has no focal length and cannot be used")
     possible = np.isfinite(camera.params).all() and (focals > 0).all()
-    if not possible or focals.max() > LARGEST_RATIO * focals.min():
+    if not possible or focals.max() / LARGEST_RATIO > focals.min():
         shown = ", ".join(f"{value:g}" for value in camera.params)
         raise ProblemError(f"{name} has impossible parameters: {shown} ({camera.model})")
 

@@ -1,0 +1,227 @@
+"""Small inputs of every kind that commands read, and the commands that read them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jaxba.damping import make_policy
+from jaxba.damping.policy_file import save_policy
+from jaxba.io import configurations, write_problem
+from jaxba.io.colmap.write import write_colmap
+from jaxba.problem import geometry
+from jaxba.scenes import SceneConfig, random_scene
+
+SCENE = random_scene(SceneConfig(6, 40, 160), 0)
+IMAGES, IMAGE_SIZE, FOCAL, SPEED = 4, (160, 96), 120.0, 0.15
+
+
+@dataclass(frozen=True)
+class Input:
+    """A kind of input."""
+
+    name: str
+    """Name in the table."""
+
+    make: Callable[[Path], object]
+    """Writes an undamaged one into an empty folder."""
+
+    command: str
+    """The command that reads it."""
+
+    arguments: tuple[str, ...]
+    """Its arguments; IN is the folder that was made, OUT an empty one."""
+
+    weight: int = 1
+    """How often it is taken, relative to the others."""
+
+
+def _problem(name: str) -> Callable[[Path], None]:
+    return lambda folder: write_problem(SCENE, folder / name)
+
+
+def _colmap(folder: Path, binary: bool = False) -> None:
+    """A model as COLMAP writes it."""
+    import pycolmap
+
+    write_colmap(SCENE, folder / "model")
+    model = pycolmap.Reconstruction(str(folder / "model"))
+    shutil.rmtree(folder / "model")
+    (folder / "model").mkdir()
+    (model.write_binary if binary else model.write_text)(str(folder / "model"))
+
+
+def _views() -> list[tuple[int, int, float, float]]:
+    """Image, point and pixel of every observation; y points down."""
+    pixels = np.asarray(geometry.project(SCENE)) * [1, -1]
+    return list(zip(SCENE.camera_index.tolist(), SCENE.point_index.tolist(), *pixels.T.tolist(), strict=True))
+
+
+def _poses() -> tuple[np.ndarray, np.ndarray]:
+    """Rotations and translations with z to the front and y down."""
+    flip = np.diag([1.0, -1.0, -1.0])
+    return flip @ geometry.rotation_matrices(SCENE.cameras[:, :3]), SCENE.cameras[:, 3:6] @ flip
+
+
+def _opensfm(folder: Path) -> None:
+    _, translations = _poses()
+    rotations = _turned()
+    lens = {"projection_type": "perspective", "width": 1000, "height": 800, "focal": 0.7, "k1": 0.0, "k2": 0.0}
+    shots = {
+        f"{i}.jpg": {"camera": "a", "rotation": r.tolist(), "translation": t.tolist()}
+        for i, (r, t) in enumerate(zip(rotations, translations, strict=True))
+    }
+    points = {str(j): {"coordinates": x} for j, x in enumerate(SCENE.points.tolist())}
+    (folder / "reconstruction.json").write_text(
+        json.dumps([{"cameras": {"a": lens}, "shots": shots, "points": points}])
+    )
+    rows = [f"{i}.jpg\t{j}\t{k}\t{x / 1000}\t{y / 1000}\t1\t2\t3" for k, (i, j, x, y) in enumerate(_views())]
+    (folder / "tracks.csv").write_text("\n".join(rows) + "\n")
+
+
+def _turned() -> np.ndarray:
+    """Angle-axis vectors of `_poses`."""
+    return np.asarray(geometry.angle_axis(_poses()[0]))
+
+
+def _openmvg(folder: Path) -> None:
+    rotations, translations = _poses()
+    centers = -np.einsum("nji,nj->ni", rotations, translations)
+    view = {"width": 1000, "height": 800, "id_intrinsic": 0}
+    views = [
+        {"key": i, "value": {"ptr_wrapper": {"data": {**view, "filename": f"{i}.jpg", "id_view": i, "id_pose": i}}}}
+        for i in range(len(rotations))
+    ]
+    lens = {"width": 1000, "height": 800, "focal_length": 700.0, "principal_point": [500.0, 400.0]}
+    named = {"polymorphic_id": 2147483649, "polymorphic_name": "pinhole", "ptr_wrapper": {"id": 1, "data": lens}}
+    poses = [
+        {"key": i, "value": {"rotation": r.tolist(), "center": c.tolist()}}
+        for i, (r, c) in enumerate(zip(rotations, centers, strict=True))
+    ]
+    seen: dict[int, list] = {}
+    for i, j, x, y in _views():
+        seen.setdefault(j, []).append({"key": i, "value": {"id_feat": 1, "x": [x + 500, y + 400]}})
+    structure = [
+        {"key": j, "value": {"X": SCENE.points[j].tolist(), "observations": of}} for j, of in sorted(seen.items())
+    ]
+    contents = {"sfm_data_version": "0.3", "views": views, "intrinsics": [{"key": 0, "value": named}]}
+    (folder / "a.json").write_text(json.dumps({**contents, "extrinsics": poses, "structure": structure}))
+
+
+def _alicevision(folder: Path) -> None:
+    rotations, translations = _poses()
+    centers = -np.einsum("nji,nj->ni", rotations, translations)
+    text = lambda numbers: [repr(x) for x in np.ravel(numbers).tolist()]
+    views = [
+        {"viewId": str(i), "poseId": str(i), "intrinsicId": "0", "path": f"{i}.jpg"} for i in range(len(rotations))
+    ]
+    lens = {"intrinsicId": "0", "width": "1000", "height": "800", "type": "pinhole", "pxFocalLength": ["700", "700"]}
+    lens |= {"distortionParams": "", "principalPoint": ["500", "400"]}
+    poses = [
+        {"poseId": str(i), "pose": {"transform": {"rotation": text(r.T), "center": text(c)}}}
+        for i, (r, c) in enumerate(zip(rotations, centers, strict=True))
+    ]
+    seen: dict[int, list] = {}
+    for i, j, x, y in _views():
+        seen.setdefault(j, []).append({"observationId": str(i), "featureId": "1", "x": text([x + 500, y + 400])})
+    structure = [{"landmarkId": str(j), "X": text(SCENE.points[j]), "observations": of} for j, of in seen.items()]
+    contents = {"version": ["1", "2", "0"], "views": views, "intrinsics": [lens], "poses": poses}
+    (folder / "a.sfm").write_text(json.dumps({**contents, "structure": structure}))
+
+
+def _nvm(folder: Path) -> None:
+    rotations, translations = _poses()
+    centers = -np.einsum("nji,nj->ni", rotations, translations)
+    half = _turned() / 2
+    angles = np.linalg.norm(half, axis=1, keepdims=True)
+    quaternions = np.concatenate([np.cos(angles), np.sinc(angles / np.pi) * half], axis=1)
+    lines = ["NVM_V3", "", str(len(centers))]
+    for i, (q, c) in enumerate(zip(quaternions.tolist(), centers.tolist(), strict=True)):
+        lines.append(" ".join(map(str, [f"{i}.jpg", 700.0, *q, *c, 0, 0])))
+    seen: dict[int, list] = {}
+    for i, j, x, y in _views():
+        seen.setdefault(j, []).extend([i, 0, x, y])
+    lines += ["", str(len(seen))]
+    for j, of in seen.items():
+        lines.append(" ".join(map(str, [*SCENE.points[j].tolist(), 1, 2, 3, len(of) // 4, *of])))
+    (folder / "a.nvm").write_text("\n".join([*lines, "", "0", ""]))
+
+
+def _kitti(folder: Path) -> None:
+    """A textured plane, oblique to the camera, which drives towards it."""
+    from jaxba.datasets.kitti.opencv import cv2
+
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.uniform(0, 255, (600, 600)), (0, 0), 1.5)
+    texture = np.clip(128 + 4 * (texture - 128), 0, 255).astype(np.uint8)
+    calibration = np.array([[FOCAL, 0, IMAGE_SIZE[0] / 2], [0, FOCAL, IMAGE_SIZE[1] / 2], [0, 0, 1]])
+    plane = np.array([[0.02, 0, -6.0], [0, 0.02, -6.0], [0.008, 0.004, 2.4]])  # from texture to camera 0
+    (folder / "image_0").mkdir(parents=True)
+    poses = []
+    for frame in range(IMAGES):
+        center = np.array([0.4, 0.1, 1.0]) * SPEED * frame
+        homography = calibration @ (plane - np.outer(center, [0, 0, 1]))
+        cv2.imwrite(str(folder / "image_0" / f"{frame:06d}.png"), cv2.warpPerspective(texture, homography, IMAGE_SIZE))
+        poses.append(" ".join(f"{x:.9e}" for x in np.column_stack([np.eye(3), center]).ravel()))
+    row = " ".join(f"{x:.9e}" for x in np.column_stack([calibration, np.zeros(3)]).ravel())
+    (folder / "calib.txt").write_text("".join(f"P{k}: {row}\n" for k in range(4)))
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:e}\n" for k in range(IMAGES)))
+    (folder / "poses.txt").write_text("\n".join(poses) + "\n")
+
+
+def _policy(folder: Path) -> None:
+    save_policy(folder / "a.safetensors", make_policy("learned"), {"jaxba": "0"})
+    write_problem(SCENE, folder.parent / "scene.txt")  # not to be damaged
+
+
+SOLVE = ("--max-iterations", "2", "--output", "OUT/o.txt", "--log", "OUT/log.json")
+
+
+def _solved(name: str, make: Callable[[Path], None], file: str, weight: int = 1) -> Input:
+    return Input(name, make, "solve", (f"IN/{file}", *SOLVE), weight)
+
+
+def _read(name: str, kind: configurations.Kind, configuration: str, option: str, weight: int) -> Input:
+    make = lambda folder: (folder / "a.yaml").write_bytes(configurations.find(kind, configuration).read_bytes())
+    return Input(name, make, kind, (option, "IN/a.yaml", "--out", "OUT/run"), weight)
+
+
+def real(path: Path) -> Input:
+    """A file or folder of another program, for `jaxba-solve`."""
+
+    def make(folder: Path) -> None:
+        files = [path] if path.is_file() else sorted(path.iterdir())
+        target = folder if path.is_file() else folder / path.name
+        target.mkdir(exist_ok=True)
+        for file in files:
+            (target / file.name).write_bytes(file.read_bytes())
+
+    return _solved(f"{path.parent.name}/{path.name}", make, path.name)
+
+
+INPUTS = (
+    _solved("BAL", _problem("a.txt"), "a.txt", 4),
+    _solved("BAL, compressed", _problem("a.txt.gz"), "a.txt.gz"),
+    _solved("Bundler", _problem("a.out"), "a.out", 4),
+    _solved("COLMAP, binary", lambda folder: _colmap(folder, binary=True), "model", 6),
+    _solved("COLMAP, text", _colmap, "model", 6),
+    _solved("VisualSFM", _nvm, "a.nvm", 2),
+    _solved("OpenSfM", _opensfm, "reconstruction.json", 2),
+    _solved("OpenMVG", _openmvg, "a.json", 2),
+    _solved("AliceVision", _alicevision, "a.sfm", 2),
+    Input(
+        "KITTI",
+        _kitti,
+        "kitti",
+        ("IN", "--poses", "IN/poses.txt", "--start", "poses", "--keyframes", "all", "--out", "OUT/o.txt"),
+        3,
+    ),
+    Input("policy file", _policy, "solve", ("IN/../scene.txt", "--policy", "IN/a.safetensors", *SOLVE), 3),
+    _read("configuration of a training", "train", "default", "--config", 3),
+    _read("configuration of a benchmark", "bench", "synthetic", "--suite", 2),
+)
