@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxba.damping import make_policy
+from jaxba.damping.learned import LearnedPolicy
 from jaxba.damping.policy_file import save_policy
 from jaxba.io import configurations, write_problem
 from jaxba.io.colmap.write import write_colmap
@@ -65,7 +66,7 @@ def _views() -> list[tuple[int, int, float, float]]:
 def _poses() -> tuple[np.ndarray, np.ndarray]:
     """Rotations and translations with z to the front and y down."""
     flip = np.diag([1.0, -1.0, -1.0])
-    return flip @ geometry.rotation_matrices(SCENE.cameras[:, :3]), SCENE.cameras[:, 3:6] @ flip
+    return flip @ np.asarray(geometry.rotation_matrices(SCENE.cameras[:, :3])), np.asarray(SCENE.cameras[:, 3:6]) @ flip
 
 
 def _opensfm(folder: Path) -> None:
@@ -175,7 +176,9 @@ def _kitti(folder: Path) -> None:
 
 
 def _policy(folder: Path) -> None:
-    save_policy(folder / "a.safetensors", make_policy("learned"), {"jaxba": "0"})
+    policy = make_policy("learned")
+    assert isinstance(policy, LearnedPolicy)
+    save_policy(folder / "a.safetensors", policy, {"jaxba": "0"})
     write_problem(SCENE, folder.parent / "scene.txt")  # not to be damaged
 
 
