@@ -78,7 +78,8 @@ class Arguments:
 
     linear_solver: LinearSolverChoice = DEFAULTS.linear_solver
     """explicit: form and factor the reduced camera system. sparse: form it and use conjugate gradients. implicit:
-    conjugate gradients without forming it. auto: choose by size."""
+    conjugate gradients without forming it. cg: the same, with twelve iterations. auto: choose among the first three by
+    size."""
 
     preconditioner: Preconditioner = DEFAULTS.conjugate_gradients.preconditioner
     """Preconditioner of conjugate gradients (sparse, implicit). two-level: block diagonal, and a coarse system of the

@@ -3,6 +3,8 @@
 - `explicit`: form S and factor it by Cholesky, as a band if it is one, else dense.
 - `sparse`: form the non-zero blocks of S, then conjugate gradients with them.
 - `implicit`: conjugate gradients without forming S; a product takes two passes over the observations.
+- `cg`: the same, but `jax.scipy.sparse.linalg.cg` with a fixed number of iterations. Its derivatives are those of the
+  solution, and reverse mode passes through it.
 
 Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
 """
@@ -15,6 +17,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
+from jax.scipy.sparse.linalg import cg
 from jaxtyping import Float, Int
 
 from jaxba.linear.band_cholesky import band_factor, band_factor_and_solve
@@ -112,6 +115,11 @@ def _solve_iteratively(
     precondition = preconditioner(
         layout, linear, points, system, anchor, blocks, options.conjugate_gradients.preconditioner
     )
+    if options.linear_solver == "cg":
+        # it returns no count; below the rounding error its iterations would end as 0 / 0
+        budget, least = options.conjugate_gradients.budget, float(jnp.finfo(system.right.dtype).eps)
+        step, _ = cg(apply, system.right, tol=least, maxiter=budget, M=precondition)
+        return step, jnp.full((), budget, jnp.int32)
     return _conjugate_gradients(apply, precondition, system, options, forcing)
 
 

@@ -91,6 +91,8 @@ FACTORED = {
     "fixed-intrinsics": (support.tiny, StepOptions(intrinsics="fixed"), own_size),
     **{loss: (support.odd, StepOptions(loss=Loss(loss, 1.7)), own_size) for loss in ("huber", "soft_l1", "cauchy")},
     "tukey": (support.odd, StepOptions(loss=Loss("tukey", 8.0)), own_size),
+    # jax.scipy's conjugate gradients have the derivatives of the solution, in both modes
+    "cg": (support.tiny, StepOptions(linear_solver="cg", conjugate_gradients=ConjugateGradients(budget=120)), own_size),
 }
 WITH_LOOPS = {
     "implicit": (support.tiny, StepOptions(linear_solver="implicit", conjugate_gradients=TO_THE_END), own_size),
@@ -168,7 +170,7 @@ def test_forward_derivatives_are_finite_and_those_of_differences(name):
 
 
 # backwards is what JAX makes of forwards, but for the rules of factorisations and of loops: one of each
-@pytest.mark.parametrize("name", some_slow(["dense", "pairs", "band", "few-points", "shared-lenses", "tukey"], ("dense",)))
+@pytest.mark.parametrize("name", some_slow(["dense", "pairs", "band", "few-points", "shared-lenses", "tukey", "cg"], ("dense",)))
 def test_reverse_derivatives_are_finite_and_the_transposed_of_the_forward_ones(name):
     function, at = as_function(*FACTORED[name])
     rng = np.random.default_rng(1)

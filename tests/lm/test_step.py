@@ -30,6 +30,7 @@ KINDS = {
 }
 SOLVERS = {
     "sparse": replace(TO_THE_END, linear_solver="sparse"),
+    "cg": StepOptions(linear_solver="cg", conjugate_gradients=ConjugateGradients(budget=200)),
     "implicit-jacobi": replace(TO_THE_END, conjugate_gradients=replace(UNTIL_NOTHING_CHANGES, preconditioner="jacobi")),
 }
 SHARES = {
@@ -62,6 +63,7 @@ CASES = [
     pytest.param(support.tiny, replace(EXACT, intrinsics="fixed"), id="tiny-fixed-intrinsics"),
     pytest.param(support.odd, TO_THE_END, id="odd-implicit"),
     pytest.param(support.odd, SOLVERS["sparse"], id="odd-sparse"),
+    pytest.param(support.odd, SOLVERS["cg"], id="odd-cg"),
     pytest.param(support.whitened, EXACT, id="whitened"),
     pytest.param(support.whitened, replace(TO_THE_END, loss=Loss("cauchy", 0.8)), id="whitened-implicit-cauchy"),
     *(
