@@ -186,7 +186,8 @@ def main() -> None:
     for name in args.problem or PROBLEMS:
         if not (data / name).exists():
             parser.error(f"{name} is not below JAXBA_DATA")
-    for python in filter(None, (sys.executable, args.python)):
+    other = os.path.abspath(args.python) if args.python else None  # calls run in the root folder
+    for python in filter(None, (sys.executable, other)):
         found = list(metrics_of(python, [data / name for name in args.problem or PROBLEMS], args.repeats))
         versions = subprocess.run(
             [python, "-c", "import jax, platform; print('Python', platform.python_version(), 'JAX', jax.__version__)"],
