@@ -147,7 +147,7 @@ def test_a_factorisation_that_does_not_fit_the_memory_is_refused(asked, monkeypa
     ("asked", "message"),
     [
         ({"dtype": "float16"}, "dtype must be one of float64, float32, mixed, not 'float16'"),
-        ({"linear_solver": "power"}, "linear_solver must be one of auto, explicit, sparse, implicit, not 'power'"),
+        ({"linear_solver": "power"}, "linear_solver must be one of auto, explicit, sparse, implicit, cg, not 'power'"),
         ({"compilation": "fast"}, "compilation must be one of"),
         ({"intrinsics": "shared"}, "intrinsics must be one of free, fixed, not 'shared'"),
         ({"method": "magic"}, "unknown method 'magic'; known: lm, stba, deeplm, ddlm, poba"),
