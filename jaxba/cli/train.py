@@ -142,7 +142,8 @@ def _finish(folder: Path, work: Any, best: Any, console: Any, progress: _Progres
     from jaxba.training import log
 
     _write_policy(folder, work.config, work, best)
-    rules = {name: {**score._asdict(), "score": score.mean} for name, score in work.rules.items()}
+    paid = work.config.game.reward == "price"
+    rules = {name: {**one._asdict(), "score": one.price if paid else one.mean} for name, one in work.rules.items()}
     figure = plot_curve(log.read(folder), rules, work.config.game.tolerance)
     files = [folder / POLICY, *save_figure(figure, folder / CURVE)]
     progress.stage("comparing with the rules")
@@ -164,12 +165,17 @@ def _table(scores: Mapping[str, Any], tolerance: float, count: int) -> Any:
         title_style="bold",
     )
     table.add_column("policy", no_wrap=True)
-    for name in ("mean", "geom. mean", "median", "p90", "failures", "converged", "final gap"):
+    for name in ("mean", "geom. mean", "median", "p90", "failures", "converged", "final gap", "price"):
         table.add_column(name, justify="right")
     for name, score in scores.items():
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
         table.add_row(
-            name, *numbers, f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}"
+            name,
+            *numbers,
+            f"{100 * score.failures:.1f} %",
+            f"{score.to_convergence:.2f}",
+            f"{score.end:.1e}",
+            f"{score.price:.2f}",
         )
     return table
 
@@ -229,11 +235,15 @@ class _Progress:
             self.console.print(f"{description}: {self._held_out(row)}")
 
     def _held_out(self, row: Mapping[str, Any]) -> str:
+        from jaxba.training.task import CONSTANT
+
         score = row["held_out/score"]
-        text = f"held out {score:.2f} iterations"
+        paid = self.config.game.reward == "price"
+        text = f"held out {score:.2f} {'plain steps paid' if paid else 'iterations'}"
         if row.get("held_out/p90") is not None:
             text += f", p90 {row['held_out/p90']:.0f}, failures {100 * row['held_out/failures']:.1f} %"
-        rules = [f"{name} {self.rules[name].mean:.2f}" for name in ("ceres", "ceres+embedded") if name in self.rules]
+        shown = [name for name in ("ceres", "ceres+embedded", CONSTANT) if name in self.rules]
+        rules = [f"{name} {self.rules[name].price if paid else self.rules[name].mean:.2f}" for name in shown]
         if rules:
             text += f" ({', '.join(rules)})"
         if self.best is not None and (self.best.seed, self.best.chunk) == (row["seed"], row["chunk"]):

@@ -9,7 +9,7 @@ from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions
 
 Observation = Literal["scale-free", "paper", "duration"]
 GuardMode = Literal["off", "hand-over"]
-EffortMode = Literal["fixed", "points", "points+forcing"]
+EffortMode = Literal["fixed", "points", "points+forcing", "points+repairs"]
 
 LARGEST_ESCALATION = 12.0
 """Decades; more than the whole range of lambda would have no further effect."""
@@ -85,8 +85,10 @@ class AgentConfig:
 
     effort: EffortMode = "fixed"
     """What an action decides besides lambda. `fixed`: nothing. `points`: its second number, the embedded point
-    iterations of the step. `points+forcing`: also, its third number, the forcing term of conjugate gradients. Once the
-    guard has handed over, a step has all point iterations and the smallest forcing term."""
+    iterations of the step. `points+forcing`: also, its third number, the forcing term of conjugate gradients.
+    `points+repairs`: the third number says, where it is positive, that trials, camera rounds and pattern moves are
+    allowed; what they cost is then observed, too. Once the guard has handed over, a step has all point iterations, the
+    smallest forcing term, and repairs."""
 
     def __post_init__(self) -> None:
         for name, known in (("observation", Observation), ("guard", GuardMode), ("effort", EffortMode)):
@@ -132,7 +134,12 @@ class AgentConfig:
     @property
     def action_size(self) -> int:
         """Numbers of an action: lambda, and what `effort` adds."""
-        return 1 + get_args(EffortMode).index(self.effort)
+        return {"fixed": 1, "points": 2}.get(self.effort, 3)
+
+    @property
+    def observes_prices(self) -> bool:
+        """Whether the prices of work are part of the observation."""
+        return self.effort == "points+repairs"
 
 
 def config_from(values: dict[str, Any]) -> AgentConfig:

@@ -15,7 +15,7 @@ from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.guard import FIRST_DAMPING, GuardState, full_effort, initial_guard, update_guard
 from jaxba.damping.policy import ProblemInfo
 from jaxba.linear.step import Effort
-from jaxba.lm.records import StepInfo
+from jaxba.lm.records import Prices, StepInfo
 
 FLOOR = 1e-9
 """Smallest relative decrease that a feature distinguishes from zero."""
@@ -74,7 +74,13 @@ class Memory(NamedTuple):
 def observation_size(config: AgentConfig) -> int:
     """Numbers in an observation."""
     if config.observation == "scale-free":
-        return len(StepFeatures._fields) * config.history + len(SOLVE_FEATURES) + config.action_size - 1
+        return (
+            len(StepFeatures._fields) * config.history
+            + len(SOLVE_FEATURES)
+            + config.action_size
+            - 1
+            + (len(Prices._fields) if config.observes_prices else 0)
+        )
     return config.history
 
 
@@ -115,8 +121,11 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
         _scaled_decades(memory.largest_rejected),
     ]
     if memory.effort is not None:
-        points, forcing = memory.effort
+        points, forcing, repairs = memory.effort
         solve += [points / config.refine_points, *([] if forcing is None else [_log(forcing) + 1])]
+        solve += [] if repairs is None else [repairs.astype(points.dtype)]
+    if config.observes_prices:
+        solve += [_log(price) + 1 for price in memory.info.prices]
     features = jnp.concatenate([memory.steps.reshape(-1), jnp.stack([jnp.asarray(x) for x in solve])])
     return jnp.clip(jnp.nan_to_num(features), -FEATURE_LIMIT, FEATURE_LIMIT).astype(jnp.float32)
 

@@ -153,16 +153,19 @@ def effort_for(config: AgentConfig, guard: GuardState, action: Float[Array, " ac
     if config.effort == "points+forcing":
         low, high = FORCING
         chosen = chosen._replace(forcing=10 ** (low + (high - low) * fraction[2]))
+    if config.effort == "points+repairs":
+        chosen = chosen._replace(repairs=action[2] > 0)
     full = full_effort(config, dtype)
     return jax.tree.map(lambda all_, some: jnp.where(guard.handed_over & config.guarded, all_, some), full, chosen)
 
 
 def full_effort(config: AgentConfig, dtype: Any) -> Effort | None:
-    """All point iterations and the smallest forcing term; None if the effort is fixed."""
+    """All point iterations, the smallest forcing term, and repairs; None if the effort is fixed."""
     if config.effort == "fixed":
         return None
     forcing = jnp.asarray(10 ** FORCING[0], dtype) if config.effort == "points+forcing" else None
-    return Effort(jnp.asarray(config.refine_points, jnp.int32), forcing)
+    repairs = jnp.ones((), bool) if config.effort == "points+repairs" else None
+    return Effort(jnp.asarray(config.refine_points, jnp.int32), forcing, repairs)
 
 
 def _scale(config: AgentConfig) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.linear.step import Effort
-from jaxba.lm.records import StepInfo
+from jaxba.lm.records import Prices, StepInfo
 from jaxba.problem.options import StepOptions
 
 
@@ -35,6 +35,9 @@ class ProblemInfo(NamedTuple):
 
     max_iterations: Int[Array, ""]
     """Limit of iterations."""
+
+    prices: Prices = Prices()
+    """What the work of an iteration costs."""
 
 
 @runtime_checkable

@@ -37,7 +37,7 @@ from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 from jaxba.typing import register_pytree
 
-Reward = Literal["duration", "constant", "reduction", "reversed"]
+Reward = Literal["duration", "constant", "reduction", "reversed", "price"]
 
 POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
@@ -60,8 +60,9 @@ class GameConfig:
     """What the agent observes and decides."""
 
     reward: Reward = "duration"
-    """Of an iteration. `duration`: minus a deterministic cost of the iteration. `constant`: -1. `reduction`: zero, and
-    the bonus shrinks with every iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's
+    """Of an iteration. `duration`: minus a deterministic cost of the iteration. `price`: minus the price of the work
+    that it did, at the prices of the scene (`BankConfig.price_spread`). `constant`: -1. `reduction`: zero, and the
+    bonus shrinks with every iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's
     reversed roles of state and reward)."""
 
     bonus: float = 10.0
@@ -231,6 +232,8 @@ class Game:
             points = self.options.refinement.points if memory.effort is None else memory.effort.point_iterations
             inner = CG_ITERATION_COST * step.cg_iterations if rules.agent.effort == "points+forcing" else 0.0
             reward = bonus - (1 + POINT_ITERATION_COST * points + inner)
+        elif rules.reward == "price":
+            reward = bonus - memory.info.prices.of(step)
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":

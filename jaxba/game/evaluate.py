@@ -31,12 +31,18 @@ class Score(NamedTuple):
     end: float
     """Median of the final cost over the best known, less one."""
 
+    price: float
+    """Mean price of the iterations to within the tolerance (`Prices`); a failure costs as many plain steps as the limit
+    has, or what was paid if that is more."""
+
 
 def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int) -> Score:
     """The score of a policy's runs on several banks; every scene has the same weight."""
-    iterations = np.concatenate([reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)])
+    by_bank = [reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)]
+    iterations = np.concatenate(by_bank)
     counted = np.minimum(np.maximum(iterations, 1), limit)
     ends = np.concatenate([run.costs[:, -1] / b - 1 for run, b in zip(runs, best, strict=True)])
+    paid = np.concatenate([prices_to(run, reached, limit) for run, reached in zip(runs, by_bank, strict=True)])
     length = np.concatenate([np.where(run.converged, run.iterations, limit) for run in runs])
     return Score(
         mean=float(counted.mean()),
@@ -46,7 +52,21 @@ def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]],
         failures=float(np.mean(~(iterations <= limit))),
         to_convergence=float(length.mean()),
         end=float(np.median(ends)),
+        price=float(paid.mean()),
     )
+
+
+def prices_to(run: Trajectories, iterations: Float[np.ndarray, " scenes"], limit: int) -> Float[np.ndarray, " scenes"]:
+    """Price of each scene's iterations to a tolerance, see `Score.price`.
+
+    Args:
+        run: trajectories of a policy.
+        iterations: iterations to the tolerance, as `scene_bank.reach` returns them.
+        limit: largest number of iterations.
+    """
+    at = np.clip(np.maximum(iterations, 1), 1, limit).astype(int)
+    paid = np.take_along_axis(run.paid, at[:, None], axis=1)[:, 0]
+    return np.where(iterations <= limit, paid, np.maximum(run.paid[:, -1], limit))
 
 
 def evaluate(
@@ -96,6 +116,7 @@ def virtual_best(runs: Sequence[Trajectories], limit: int) -> Trajectories:
         dampings=runs[0].dampings,
         iterations=np.min([np.where(run.converged, run.iterations, limit) for run in runs], axis=0),
         converged=np.any([run.converged for run in runs], axis=0),
+        paid=np.min([run.paid for run in runs], axis=0),
     )
 
 

@@ -23,6 +23,7 @@ from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.game.warm_starts import warm_starts
+from jaxba.lm.records import Prices
 from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, Refinement, StepOptions, check_count
@@ -63,8 +64,16 @@ class Bank(NamedTuple):
     ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule with the portfolio's steps, to the game's tolerance
 
 
-def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
-    """What a policy knows about each scene before the first iteration."""
+def draw_prices(key: Array, count: int, spread: float) -> Prices:
+    """Prices of each scene, every one drawn log-uniformly from `spread` decades around the default of `Prices`."""
+    decades = jax.random.uniform(key, (len(Prices._fields), count), minval=-0.5, maxval=0.5) * spread
+    return Prices(*(default * 10.0**d for default, d in zip(Prices(), decades, strict=True)))
+
+
+def info_of(
+    kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int, prices: Prices | None = None
+) -> ProblemInfo:
+    """What a policy knows about each scene before the first iteration. Prices are the default ones unless given."""
     count = len(scenes.mask)
     grid = scenes.mask.reshape(count, kind.cameras, kind.points + 1)
     whole = lambda x: x.astype(jnp.int32)
@@ -78,6 +87,7 @@ def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], 
         unit=jnp.ones_like(initial),
         focal=focal,
         max_iterations=jnp.full((count,), limit, jnp.int32),
+        prices=jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, initial.dtype), (count,)), prices or Prices()),
     )
 
 
@@ -108,6 +118,9 @@ class BankConfig:
     warm_share: float = 0.0
     """Fraction of the scenes that begin after a few heavily damped iterations (`warm_starts.py`)."""
 
+    price_spread: float = 0.0
+    """Decades over which the prices of a scene's work are spread (`draw_prices`)."""
+
     dtype: str = "float64"
     """Floating point type of the game's solves."""
 
@@ -127,7 +140,8 @@ class BankConfig:
             raise ValueError("every class needs at least one scene")
         if not 0 <= self.warm_share <= 1:
             raise ValueError(f"warm_share must be 0 to 1, is {self.warm_share}")
-        check_count("refine_points", self.refine_points, 0)
+        if not 0 <= self.price_spread <= 4:
+            raise ValueError(f"price_spread must be 0 to 4 decades, is {self.price_spread}")
         _ = self.options  # raises ValueError if impossible
 
 
@@ -154,6 +168,7 @@ def draft(
     on_rule: Callable[[str], None] = lambda _: None,
     warm_share: float = 0.0,
     tolerance: float = 1e-3,
+    price_spread: float = 0.0,
 ) -> Draft:
     """Makes scenes and solves them with every rule.
 
@@ -168,6 +183,7 @@ def draft(
         on_rule: called with the name of a rule when it begins.
         warm_share: fraction of the scenes with a warm start.
         tolerance: to which the first rule's iterations are counted.
+        price_spread: see `draw_prices`.
     """
     scenes = make_scenes(kind, key, count, dtype)
     initial = initial_costs(kind, scenes)
@@ -178,6 +194,8 @@ def draft(
     if warm_share:
         scenes, initial = warm_starts(kind, scenes, initial, jax.random.fold_in(key, count), warm_share, options)
         info = info_of(kind, scenes, initial, limit)
+    prices = draw_prices(jax.random.fold_in(key, count + 1), len(initial), price_spread)
+    info = info_of(kind, scenes, initial, limit, prices)
     bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
     runs = {}
     for rule in rules:
@@ -227,7 +245,17 @@ def make_banks(
         on_rule = lambda rule, where=where, count=count: report(f"{count} scenes of {where}: {rule}")
         class_key = jax.random.fold_in(key, number and MORE_CLASSES + number)
         made = draft(
-            kind, class_key, count, options, limit, config.dtype, PORTFOLIO, on_rule, config.warm_share, tolerance
+            kind,
+            class_key,
+            count,
+            options,
+            limit,
+            config.dtype,
+            PORTFOLIO,
+            on_rule,
+            config.warm_share,
+            tolerance,
+            config.price_spread,
         )
         rows = np.flatnonzero(made.usable)
         held = max(1, round(HELD_OUT * len(rows)))

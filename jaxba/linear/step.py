@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 
 class Step(NamedTuple):
@@ -34,3 +34,4 @@ class Effort(NamedTuple):
 
     point_iterations: Int[Array, ""]  # replaces Refinement.points, which is its maximum
     forcing: Float[Array, ""] | None  # replaces ConjugateGradients.forcing; None: no change
+    repairs: Bool[Array, ""] | None = None  # whether camera rounds, trials and pattern moves may be made; None: yes

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import MethodTraits, StepOptions
+from jaxba.refinement.acceptance import Work
 from jaxba.structure.layout import Layout
 
 
@@ -87,8 +88,8 @@ class Round(NamedTuple):
     step_fraction: Float[Array, ""]
     """Mean step fraction of the clusters, weighted by the predicted decrease of their full steps."""
 
-    repairs: Int[Array, ""]
-    """See `StepInfo.repairs`: the largest of all clusters."""
+    work: Work
+    """What the search for candidates took: the largest numbers of all clusters."""
 
     accepted: Bool[Array, ""]
     """Whether any cluster was accepted."""

@@ -74,3 +74,36 @@ class StepInfo(NamedTuple):
 
     repairs: Int[Array, ""]
     """Number of camera rounds, backtracking trials and pattern moves after the first candidate."""
+
+    camera_rounds: Int[Array, ""]
+    """The camera rounds among them."""
+
+    point_iterations: Int[Array, ""]
+    """Embedded point iterations of all candidates, as many as each might make."""
+
+
+class Prices(NamedTuple):
+    """What the work of an iteration costs, in units of a plain step: linearise, solve by a factorisation, and evaluate
+    one candidate. The defaults were measured on real problems on two cores (`benchmarks.prices`)."""
+
+    candidate: float | Float[Array, ""] = 0.05
+    """Evaluating another candidate."""
+
+    point_iteration: float | Float[Array, ""] = 0.13
+    """An embedded point iteration."""
+
+    camera_round: float | Float[Array, ""] = 0.19
+    """Re-optimising every camera on its own, without the candidate that follows."""
+
+    product: float | Float[Array, ""] = 0.1
+    """An iteration of conjugate gradients, where they take the place of the factorisation."""
+
+    def of(self, step: StepInfo) -> Float[Array, ""]:
+        """The price of an iteration."""
+        return (
+            1.0
+            + self.candidate * step.repairs
+            + self.point_iteration * step.point_iterations
+            + self.camera_round * step.camera_rounds
+            + self.product * step.cg_iterations
+        )

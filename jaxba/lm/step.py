@@ -158,7 +158,7 @@ def take_step(
         step_fraction=candidate.step_fraction,
         damping_fraction=jnp.clip(safe_divide(step.damped, step.slope), 0, 1),
         weightless=jnp.zeros((), bool) if proposal.weightless is None else proposal.weightless,
-        repairs=candidate.repairs,
+        **candidate.work._asdict(),
     )
 
 
@@ -192,7 +192,7 @@ def _round(
         step_fraction=result.step_fraction,
         damping_fraction=jnp.clip(1 - result.curvature / result.slope, 0, 1),
         weightless=result.weightless,
-        repairs=result.repairs,
+        **result.work._asdict(),
     )
 
 

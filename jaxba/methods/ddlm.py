@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
@@ -144,7 +145,7 @@ def decomposed_round(
         sum_of(step.slope - step.damped),
         step.gradient_max,
         jnp.clip(fraction, MIN_STEP_FRACTION, 1),
-        jnp.max(found.repairs),
+        jax.tree.map(jnp.max, found.work),
         new_cost < cost,
         is_weightless(linear, cost, options.loss),
     )

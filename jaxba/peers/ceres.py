@@ -159,6 +159,8 @@ def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
         "damping_fraction": np.nan,
         "weightless": False,
         "repairs": 0,
+        "camera_rounds": 0,
+        "point_iterations": 0,
     }
     return StepInfo(**{**fields, **known})
 

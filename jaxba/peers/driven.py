@@ -199,7 +199,8 @@ def _update_policy(
     policy: DampingPolicy, state: Any, step: StepInfo, iteration: int, tolerances: Any, limit: int
 ) -> Any:
     """`after_step` with all arguments as arrays of fixed types, so that it is compiled once."""
-    kinds = {"accepted": np.bool_, "weightless": np.bool_, "cg_iterations": np.int32, "repairs": np.int32}
+    kinds = {"accepted": np.bool_, "weightless": np.bool_}
+    kinds |= dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), np.int32)
     arrays = StepInfo(**{k: jnp.asarray(x, kinds.get(k, np.float64)) for k, x in step._asdict().items()})
     limits = Tolerances(*(np.float64(x) for x in tolerances))
     return _after_step(policy, state, arrays, np.int32(iteration), limits, np.int32(limit))

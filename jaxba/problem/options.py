@@ -47,8 +47,8 @@ class ConjugateGradients:
     """Stop after this many iterations. Source: Ceres max_linear_solver_iterations."""
 
     budget: int = 12
-    """Iterations of the solver `cg`, which makes no fewer unless rounding ends them. Twelve is what the rule of the others takes
-    with the two-level preconditioner: 6 to 20 on real problems."""
+    """Iterations of the solver `cg`, which makes no fewer unless rounding ends them. Twelve is what the rule of the
+    others takes with the two-level preconditioner: 6 to 20 on real problems."""
 
     def __post_init__(self) -> None:
         _check_known("preconditioner", self.preconditioner, Preconditioner)

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -48,6 +49,19 @@ COST_ROUNDING = 8.0
 problems, and 2e-15 in float64."""
 
 
+class Work(NamedTuple):
+    """What the search for the candidate of a step took, for every subproblem."""
+
+    repairs: Int[Array, "*parts"]
+    """Camera rounds, trials and pattern moves after the first candidate."""
+
+    camera_rounds: Int[Array, "*parts"]
+    """The camera rounds among them."""
+
+    point_iterations: Int[Array, "*parts"]
+    """Embedded point iterations of all candidates, as many as each might make."""
+
+
 class Candidate(NamedTuple):
     """Proposed parameters, with the accept decision for every subproblem."""
 
@@ -72,8 +86,8 @@ class Candidate(NamedTuple):
     step_fraction: Float[Array, "*parts"]
     """Length relative to the full step."""
 
-    repairs: Int[Array, "*parts"]
-    """Camera rounds, trials and pattern moves after the first candidate."""
+    work: Work
+    """What the search for it took so far."""
 
 
 class Comparison(NamedTuple):
@@ -113,7 +127,7 @@ class Comparison(NamedTuple):
     """Starts of points after the full step, see `PointSearch`."""
 
     matters: Bool[Array, "*parts"]
-    """Whether the predicted decrease is worth camera rounds and further trials."""
+    """Whether the predicted decrease is worth camera rounds and further trials, and the effort allows them."""
 
 
 def comparison(
@@ -132,6 +146,9 @@ def comparison(
     if effort is not None:
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     predicted = step.predicted(jnp.ones_like(cost))
+    matters = predicted > NEGLIGIBLE * cost
+    if effort is not None and effort.repairs is not None:
+        matters = matters & effort.repairs
     previous = PreviousPoints.of(parts.layout, points, reference)
     return Comparison(
         parts=parts,
@@ -145,7 +162,7 @@ def comparison(
         min_gain=min_gain,
         point_iterations=point_iterations,
         starts=jnp.where(jnp.all(predicted <= NEAR_CONVERGENCE * cost), 2, 1),
-        matters=predicted > NEGLIGIBLE * cost,
+        matters=matters,
     )
 
 
@@ -154,7 +171,7 @@ def assess(
     cameras: Float[Array, "9 cameras"],
     points: Float[Array, "3 points"],
     step_fraction: Float[Array, "*parts"],
-    repairs: Int[Array, "*parts"],
+    work: Work,
     full_step: Bool[Array, ""],
 ) -> Candidate:
     """Refines the points of a candidate and decides whether it is accepted.
@@ -164,12 +181,13 @@ def assess(
         cameras: cameras of the candidate.
         points: points before their embedded iterations.
         step_fraction: it scales the predicted decrease.
-        repairs: camera rounds, trials and pattern moves so far.
+        work: what the search took so far, without the point iterations of this candidate.
         full_step: whether this is the full step of some subproblem, after which points may also start from their rays.
     """
     options, parts = against.options, against.parts
     min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * jnp.sum(against.step.predicted(step_fraction)))
     search = PointSearch(against.point_iterations, jnp.where(full_step, against.starts, 0), min_decrease)
+    work = work._replace(point_iterations=(work.point_iterations + against.point_iterations).astype(jnp.int32))
     points, terms = parts.refine(cameras, points, against.previous, options, search)
     cost, decrease = parts.sums(terms), parts.sums(against.terms - terms)
     predicted = against.step.predicted(step_fraction)
@@ -179,11 +197,11 @@ def assess(
     rounding = float(jnp.finfo(against.cost.dtype).eps) * against.cost
     accepted = accepted & ((predicted > rounding) | (decrease > COST_ROUNDING * rounding))
     accepted = accepted & jnp.isfinite(cost) & parts.all_cameras(keep_focal_signs(against.cameras, cameras))
-    return Candidate(cameras, points, cost, predicted, gain, accepted, step_fraction, repairs)
+    return Candidate(cameras, points, cost, predicted, gain, accepted, step_fraction, work)
 
 
 def select(parts: Subproblems, which: Bool[Array, "*parts"], new: Candidate, old: Candidate) -> Candidate:
     """The new candidate for the subproblems in `which`, the old one for the others."""
-    values = [jnp.where(which, *pair) for pair in zip(new[2:], old[2:], strict=True)]
+    values = jax.tree.map(lambda *pair: jnp.where(which, *pair), new[2:], old[2:])
     cameras = jnp.where(parts.of_cameras(which), new.cameras, old.cameras)
     return Candidate(cameras, jnp.where(parts.of_points(which), new.points, old.points), *values)

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.linear.step import Effort, Step
 from jaxba.model.linearize import Reference
 from jaxba.problem.options import StepOptions
-from jaxba.refinement.acceptance import Candidate, Comparison, assess, comparison, select
+from jaxba.refinement.acceptance import Candidate, Comparison, Work, assess, comparison, select
 from jaxba.refinement.backtracking import SHORTER, should_backtrack
 from jaxba.refinement.camera_rounds import should_refine_cameras
 from jaxba.refinement.cameras import refine_cameras
@@ -137,7 +137,7 @@ def first_search(cameras: Any, points: Any, cost: Any, step: Step) -> Search:
         constant(0, bool),
     )
     none, before = constant(0, np.int32), constant(-1, np.int32)
-    initial = Candidate(cameras, points, infinite, -one, -infinite, no, one, before)
+    initial = Candidate(cameras, points, infinite, -one, -infinite, no, one, Work(before, none, none))
     return Search(initial, cameras, points, (step.cameras, step.points), one, yes, initial, none, no)
 
 
@@ -151,15 +151,16 @@ def _assess_next(against: Comparison, search: Search, refined: Float[Array, "9 c
     points = search.points + parts.of_points(search.length) * search.direction[1]
     fraction = jnp.where(best.accepted, best.step_fraction, search.length)
     full_step = jnp.any(_is_full_step(search) & search.active)
-    repairs = best.repairs + 1
+    work = best.work._replace(repairs=best.work.repairs + 1)
     if against.options.refinement.camera_rounds:
         last, refining = search.candidate, jnp.any(search.refining)
         cameras = jnp.where(refining, refined, cameras)
         points = jnp.where(refining, last.points, points)
         fraction = jnp.where(refining, last.step_fraction, fraction)
-        repairs = jnp.where(refining, last.repairs + 1, repairs)
+        again = last.work._replace(repairs=last.work.repairs + 1, camera_rounds=last.work.camera_rounds + 1)
+        work = jax.tree.map(lambda *pair: jnp.where(refining, *pair), again, work)
         full_step = full_step & ~refining
-    return assess(against, cameras, points, fraction, repairs, full_step)
+    return assess(against, cameras, points, fraction, work, full_step)
 
 
 def _is_full_step(search: Search) -> Bool[Array, "*parts"]:
@@ -192,7 +193,8 @@ def _after_candidate(against: Comparison, search: Search) -> Search:
     parts, best, candidate = against.parts, search.best, search.candidate
     first = candidate.accepted & ~best.accepted
     better = candidate.accepted & best.accepted & (candidate.cost < best.cost)
-    tried = best._replace(repairs=jnp.where(search.active, candidate.repairs, best.repairs))
+    spent = jax.tree.map(lambda *pair: jnp.where(search.active, *pair), candidate.work, best.work)
+    tried = best._replace(work=spent)
     best_now = select(parts, search.active & (better | ~best.accepted), candidate, tried)
     shorter = should_backtrack(against, candidate, search.length)
     if not against.options.refinement.pattern_moves:

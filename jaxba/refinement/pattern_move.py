@@ -27,7 +27,7 @@ def should_repeat(against: Comparison, first: Candidate) -> Bool[Array, "*parts"
     step = against.step
     predicted = (
         (jnp.abs(first.gain - 1) <= GAIN_TOLERANCE)
-        & (first.repairs == 0)
+        & (first.work.repairs == 0)
         & (step.damped <= SMALL_DAMPING_FRACTION * step.slope)
     )
     return against.matters & ~predicted

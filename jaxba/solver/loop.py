@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
 from jaxba.lm.damped_step import largest_diagonal
-from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.records import LMState, Prices, StepInfo
 from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, with_free_lenses
@@ -88,6 +88,7 @@ def problem_info(layout: Layout, state: LMState, options: StepOptions, max_itera
         unit=unit,
         focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
         max_iterations=count(max_iterations),
+        prices=Prices(*(jnp.asarray(x, state.cost.dtype) for x in Prices())),
     )
     return info
 

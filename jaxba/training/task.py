@@ -18,6 +18,7 @@ import numpy as np
 from jaxba.damping import DampingPolicy, make_policy
 from jaxba.damping.learned import LearnedPolicy, boldest, learned_from
 from jaxba.damping.registry import BOLD
+from jaxba.game.constant_actions import best_constant_action
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
 from jaxba.game.rollout import Trajectories
@@ -51,6 +52,9 @@ smallest lambda that the game's own guard allows, with the agent's step."""
 
 LEARNED = "learned"
 """Name of the trained policy in tables."""
+
+CONSTANT = "constant action"
+"""Name of the best constant action on the training scenes, where work has a price."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +94,8 @@ class Task:
             rules.max_iterations,
         )
         numbers = found._asdict()
-        return {"score": numbers.pop("mean"), **numbers}
+        kept = numbers.pop("price" if rules.reward == "price" else "mean")
+        return {"score": kept, **numbers}
 
     def compare(self, actor: Any) -> dict[str, Score]:
         """Scores of a trained policy and the baselines, relative to the best costs of all of them."""
@@ -137,7 +142,19 @@ def build(
     if path.is_file():
         return Task(config, game, held_out, _read_runs(path))
     report("baselines on the held-out scenes")
-    runs = _play(config, held_out, baseline_policies(config, game.options, baselines or BASELINES))
+    policies = baseline_policies(config, game.options, baselines or BASELINES)
+    if config.game.reward == "price":
+        found = best_constant_action(
+            config.bank.classes,
+            banks,
+            config.game.agent,
+            game.options,
+            config.game.tolerance,
+            config.game.max_iterations,
+            report,
+        )
+        policies[CONSTANT] = found, game.options
+    runs = _play(config, held_out, policies)
     _write_runs(path, runs)
     return Task(config, game, held_out, runs)
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from agent_steps import ACCEPTED, REJECTED, after, info
-from support import solve, start, step, tiny
+from support import solve, start, step, step_info, tiny
 from test_learned import random_policy
 from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 
@@ -17,17 +18,23 @@ from jaxba import Schedule, StepOptions, lm_step
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import begin, observation_size, observe
 from jaxba.damping.guard import FORCING, effort_for
-from jaxba.damping.learned import Layer, LearnedPolicy
+from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
 from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
+from jaxba.game import constant_actions
 from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
+from jaxba.game.rollout import play
+from jaxba.game.scene_bank import draw_prices
 from jaxba.io.settings import SettingsError
 from jaxba.linear.step import Effort
+from jaxba.lm.records import Prices
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.problem.options import ConjugateGradients, Refinement
 from jaxba.training import config as configs
 
 POINTS = replace(AGENT, effort="points", refine_points=3)
 BOTH = replace(POINTS, effort="points+forcing")
+PAID = replace(POINTS, effort="points+repairs")
+ALL = Refinement(points=1, trials=4, camera_rounds=3, pattern_moves=2)
 
 _step = jax.jit(lm_step, static_argnames=("options",))
 _jitted_reset = jax.jit(lambda game, key: game.reset(key))
@@ -90,6 +97,40 @@ def test_a_step_with_another_forcing_term_is_that_of_options_with_it(options):
     assert iterations[0] < iterations[2] < iterations[1]
 
 
+def test_a_step_without_repairs_is_that_of_options_without_them_and_counts_its_work():
+    layout, state = start(tiny(), StepOptions(refinement=ALL))
+    costs, repairs = [], []
+    for damping in (1e-8, 1e-4, 1e2):  # refused, mended, and too short
+        run = lambda allowed, damping=damping: _step(
+            layout,
+            state,
+            jnp.asarray(damping),
+            StepOptions(refinement=ALL),
+            effort=effort(1)._replace(repairs=jnp.asarray(allowed)),
+        )
+        (found, few), (_, many) = run(False), run(True)
+        expected, plain = step(layout, state, damping, StepOptions(refinement=Refinement(points=1)))
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
+        assert (few.repairs, few.camera_rounds, few.point_iterations) == (0, 0, 1)
+        assert bool(few.accepted) == bool(plain.accepted)
+        assert many.camera_rounds <= many.repairs
+        assert many.point_iterations == 1 + many.repairs  # one for every candidate
+        costs.append(float(many.cost) - float(few.cost))
+        repairs.append(int(many.repairs))
+    assert min(costs) < 0
+    assert max(repairs) > 1
+
+
+def test_an_iteration_costs_its_work_times_the_prices():
+    record = after_step(repairs=3, camera_rounds=2, point_iterations=4, cg_iterations=5)
+    np.testing.assert_allclose(Prices(0.1, 0.01, 0.2, 0.5).of(record), 1 + 0.3 + 0.04 + 0.4 + 2.5)
+    assert float(Prices().of(after_step())) == 1
+
+
+def after_step(**work: int):
+    return step_info(accepted=True)._replace(**{name: jnp.asarray(count) for name, count in work.items()})
+
+
 # The agent
 
 
@@ -106,6 +147,21 @@ def test_an_action_ranges_from_no_point_iteration_to_all_and_over_the_forcing_te
     np.testing.assert_allclose([forcing for _, forcing in found], np.interp([-1, -0.4, 0.4, 1], [-1, 1], FORCING))
     assert _chosen(POINTS, begin(POINTS, info()), 0.3, -1) == (0, None)
     assert effort_for(AGENT, begin(AGENT, info()).guard, jnp.zeros(1)) is None
+
+
+def test_repairs_are_allowed_by_a_positive_number_and_by_the_guards_rule():
+    guard = begin(PAID, info()).guard
+    allowed = lambda share, guard=guard: bool(_effort_for(PAID, guard, jnp.asarray([0, 0, share], jnp.float32)).repairs)
+    assert [allowed(share) for share in (-1.0, -0.01, 0.01, 1.0)] == [False, False, True, True]
+    assert allowed(-1.0, guard._replace(handed_over=jnp.asarray(True)))
+
+
+def test_prices_are_observed_where_work_is_paid():
+    at = lambda factor: info()._replace(prices=Prices(*(jnp.asarray(factor * x) for x in Prices())))
+    observed = [np.asarray(observe(PAID, begin(PAID, at(factor)))) for factor in (1.0, 10.0)]
+    assert observed[0].shape == (observation_size(PAID),)
+    np.testing.assert_allclose((observed[1] - observed[0])[-len(Prices._fields) :], 1, atol=1e-5)
+    np.testing.assert_array_equal(observed[0][: -len(Prices._fields)], observed[1][: -len(Prices._fields)])
 
 
 def test_the_guards_rule_has_the_whole_effort():
@@ -195,6 +251,40 @@ def test_an_iteration_is_paid_by_its_conjugate_gradients_where_the_action_choose
         paid.append(np.asarray(iterations))
     assert (paid[0] > paid[1] + 0.5).all()
     assert (paid[1] > 0.5).all()
+
+
+def test_work_is_paid_at_the_prices_of_the_scene():
+    """In the game, and in an evaluation: a lambda that reaches no goal, with no, one and three point iterations."""
+    agent = replace(PAID, guard="off", trials=2)
+    bank = tiny_bank()
+    prices = draw_prices(jax.random.key(1), len(bank.initial_cost), 1.0)
+    assert len({*np.asarray(prices.point_iteration).tolist()}) == len(bank.initial_cost)
+    decades = np.log10(np.asarray(prices.camera_round) / Prices().camera_round)
+    assert np.abs(decades).max() <= 0.5
+    bank = bank._replace(info=bank.info._replace(prices=prices))
+    game = make_game(replace(RULES, agent=agent, reward="price"), [KIND], [bank], [4])
+    state, _ = _jitted_reset(game, jax.random.key(0))
+    for count, share in ((0, -1.0), (1, -0.4), (3, 1.0)):
+        action = jnp.broadcast_to(jnp.asarray([0.9, share, -1.0], jnp.float32), (4, 3))
+        _, found = _jitted_play(game, state, action)
+        net = found.reward - RULES.scale * RULES.bonus * found.metrics["success"]
+        own = np.asarray(prices.point_iteration)[np.asarray(state.episodes[0].scene)]
+        np.testing.assert_allclose(-net / RULES.scale, 1 + count * own, rtol=1e-5)
+    policy = ConstantAction((0.9, -0.4, -1.0), agent)
+    run = play(KIND, bank, policy, agent.step_options(StepOptions()), 3)
+    rate = 1 + np.asarray(prices.point_iteration)
+    expected = rate[:, None] * np.minimum(np.arange(4), run.iterations[:, None])
+    np.testing.assert_allclose(run.paid, expected, rtol=1e-6)
+
+
+def test_the_best_constant_action_is_searched_one_number_after_the_other(monkeypatch):
+    best = (constant_actions.LAMBDAS[3], -1 / 3, -1.0)
+    cost = lambda kinds, banks, policy, *_: SimpleNamespace(
+        price=sum((a - b) ** 2 for a, b in zip(policy.action, best, strict=True))
+    )
+    monkeypatch.setattr(constant_actions, "evaluate", cost)
+    found = constant_actions.best_constant_action([KIND], [tiny_bank()], PAID, StepOptions())
+    np.testing.assert_allclose(found.action, best)
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,7 @@ def test_costs_start_at_the_start_never_rise_and_stay_after_the_end():
     np.testing.assert_array_equal(found.costs[:, 0], bank.initial_cost)
     assert (np.diff(found.costs, axis=1) <= 0).all()
     ends = 0
-    for costs, dampings, count, converged in zip(*found, strict=True):
+    for costs, dampings, count, converged, _ in zip(*found, strict=True):
         assert 1 <= count <= LIMIT
         assert converged or count == LIMIT
         assert (costs[count:] == costs[count]).all()
@@ -519,7 +519,8 @@ def test_reaching_a_cost_is_counted_from_the_start():
 
 def test_a_score_is_what_numpy_makes_of_the_iterations():
     costs = np.array([[8.0, 4.0, 2.0, 1.0, 1.0], [8.0, 1.0, 1.0, 1.0, 1.0], [8.0, 7.0, 6.0, 5.0, 5.0]])
-    run = Trajectories(costs, costs[:, 1:], np.array([4, 2, 4]), np.array([True, True, False]))
+    paid = np.array([[0.0, 1.5, 3.0, 4.5, 6.0], [0.0, 2.0, 4.0, 4.0, 4.0], [0.0, 1.0, 2.0, 3.0, 4.5]])
+    run = Trajectories(costs, costs[:, 1:], np.array([4, 2, 4]), np.array([True, True, False]), paid)
     found = score([run, run], [np.ones(3), np.array([4.0, 1.0, 5.0])], 1e-3, 4)
     there = np.array([3, 1, 4, 1, 1, 3])  # the third never gets there: the limit
     np.testing.assert_allclose(found.mean, there.mean())
@@ -529,6 +530,7 @@ def test_a_score_is_what_numpy_makes_of_the_iterations():
     np.testing.assert_allclose(found.failures, 1 / 6)
     np.testing.assert_allclose(found.to_convergence, 2 * (4 + 2 + 4) / 6)
     np.testing.assert_allclose(found.end, np.median([0, 0, 4, -0.75, 0, 0]))
+    np.testing.assert_allclose(found.price, np.mean([4.5, 2, 4.5, 1.5, 2, 3]))
 
 
 def test_an_evaluation_is_the_score_of_playing():

@@ -170,7 +170,9 @@ def test_forward_derivatives_are_finite_and_those_of_differences(name):
 
 
 # backwards is what JAX makes of forwards, but for the rules of factorisations and of loops: one of each
-@pytest.mark.parametrize("name", some_slow(["dense", "pairs", "band", "few-points", "shared-lenses", "tukey", "cg"], ("dense",)))
+@pytest.mark.parametrize(
+    "name", some_slow(["dense", "pairs", "band", "few-points", "shared-lenses", "tukey", "cg"], ("dense",))
+)
 def test_reverse_derivatives_are_finite_and_the_transposed_of_the_forward_ones(name):
     function, at = as_function(*FACTORED[name])
     rng = np.random.default_rng(1)
