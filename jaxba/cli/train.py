@@ -41,6 +41,11 @@ class Arguments:
     out: str | None = None
     """Folder of the run. Default: runs/NAME for the configuration NAME."""
 
+    problems: tuple[str, ...] = ()
+    """Real problems to train on: BAL files, COLMAP models, output of jaxba-kitti. Scenes are windows of neighbouring
+    cameras, the last fifth of every problem held out. With a configuration that has classes of the family windows these
+    are cut; else all its classes are."""
+
     resume: bool = False
     """Continue the run in the folder from its last checkpoint, with the same results as without the interruption."""
 
@@ -70,6 +75,10 @@ def _train(args: Arguments) -> int:
     folder = Path(args.out or Path("runs") / Path(name).stem)
     try:
         config = None if args.resume and args.config is None else configs.load(name, overrides)
+        if args.problems and config is None:
+            raise common.UsageError("--problems: a resumed run has its scenes in its folder")
+        if args.problems and config is not None:
+            config = configs.with_problems(config, _check_problems(args.problems))
         config = driver.prepare_folder(folder, config, args.resume, overrides)
     except (configs.SettingsError, driver.TrainError) as error:
         raise common.UsageError(str(error)) from None
@@ -81,7 +90,8 @@ def _train(args: Arguments) -> int:
         _Progress(console, config) as progress,
     ):
         try:
-            work = task.build(config, folder, progress.stage)
+            with common.notes_printed(lambda _: None):  # they were printed when the problems were checked
+                work = task.build(config, folder, progress.stage)
             progress.rules = work.rules
             interrupt.graceful = True
 
@@ -105,6 +115,17 @@ def _train(args: Arguments) -> int:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
             return common.INTERRUPTED
         return _finish(folder, work, outcome.best, console, progress)
+
+
+def _check_problems(problems: Sequence[str]) -> list[str]:
+    """The paths of the problems, once they were read, so that a bad one is refused before anything is written."""
+    from jaxba.datasets.bal.paths import resolve
+    from jaxba.game.windows import read_all
+
+    paths = [str(Path(resolve(name)).absolute()) for name in problems]
+    with common.notes_printed():
+        read_all(paths)
+    return paths
 
 
 def _console() -> Any:

@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.model import camera
 
-SceneFamily = Literal["wide", "paper"]
-"""`wide`: all motions, depths, noises and starts below. `paper`: every camera sees every point."""
+SceneFamily = Literal["wide", "paper", "windows"]
+"""`wide`: all motions, depths, noises and starts below. `paper`: every camera sees every point.
+`windows`: not random, but cut from real problems (game/windows.py)."""
 
 MOTIONS = ("forward", "lateral", "orbit", "photos")
 """Motions of the cameras of a wide scene, equally often."""
@@ -86,7 +87,7 @@ class _Rig(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("kind", "count", "dtype"))
 def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
-    """Random scenes, the unusable ones included; see `scene_bank.draft`.
+    """Random scenes, the unusable ones included; see `scene_bank.draft`. Not of the family `windows`.
 
     Args:
         kind: shape and family.

@@ -23,6 +23,7 @@ from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.game.warm_starts import warm_starts
+from jaxba.game.windows import read_windows
 from jaxba.lm.records import Prices
 from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
@@ -118,6 +119,9 @@ class BankConfig:
     warm_share: float = 0.0
     """Fraction of the scenes that begin after a few heavily damped iterations (`warm_starts.py`)."""
 
+    problems: tuple[str, ...] = ()
+    """Real problems, from which classes of the family `windows` are cut."""
+
     price_spread: float = 0.0
     """Decades over which the prices of a scene's work are spread (`draw_prices`)."""
 
@@ -140,6 +144,8 @@ class BankConfig:
             raise ValueError("every class needs at least one scene")
         if not 0 <= self.warm_share <= 1:
             raise ValueError(f"warm_share must be 0 to 1, is {self.warm_share}")
+        if bool(self.problems) != any(kind.family == "windows" for kind in self.classes):
+            raise ValueError("problems and classes of the family windows go together: only one of them is given")
         if not 0 <= self.price_spread <= 4:
             raise ValueError(f"price_spread must be 0 to 4 decades, is {self.price_spread}")
         _ = self.options  # raises ValueError if impossible
@@ -170,22 +176,38 @@ def draft(
     tolerance: float = 1e-3,
     price_spread: float = 0.0,
 ) -> Draft:
-    """Makes scenes and solves them with every rule.
+    """Makes random scenes and solves them with every rule. Arguments as for `solve_scenes`, and the number drawn."""
+    scenes = make_scenes(kind, key, count, dtype)
+    return solve_scenes(kind, key, scenes, options, limit, rules, on_rule, warm_share, tolerance, price_spread)
+
+
+def solve_scenes(
+    kind: SceneClass,
+    key: Array,
+    scenes: Scenes,
+    options: StepOptions,
+    limit: int,
+    rules: Sequence[str] = PORTFOLIO,
+    on_rule: Callable[[str], None] = lambda _: None,
+    warm_share: float = 0.0,
+    tolerance: float = 1e-3,
+    price_spread: float = 0.0,
+) -> Draft:
+    """Solves scenes with every rule.
 
     Args:
-        kind: class of scenes.
-        key: random key.
-        count: scenes drawn.
+        kind: class of the scenes.
+        key: random key, for warm starts and prices.
+        scenes: the scenes.
         options: of the steps.
         limit: iterations of an episode, for the scenes' `ProblemInfo`.
-        dtype: floating point type.
         rules: the portfolio.
         on_rule: called with the name of a rule when it begins.
         warm_share: fraction of the scenes with a warm start.
         tolerance: to which the first rule's iterations are counted.
         price_spread: see `draw_prices`.
     """
-    scenes = make_scenes(kind, key, count, dtype)
+    count = len(scenes.mask)
     initial = initial_costs(kind, scenes)
     info = info_of(kind, scenes, initial, limit)
     error = jnp.sqrt(2 * initial / jnp.maximum(info.observations, 1))
@@ -244,24 +266,31 @@ def make_banks(
         where = f"{kind.cameras} cameras x {kind.points} points"
         on_rule = lambda rule, where=where, count=count: report(f"{count} scenes of {where}: {rule}")
         class_key = jax.random.fold_in(key, number and MORE_CLASSES + number)
-        made = draft(
+        solved = lambda scenes, on_rule=on_rule, kind=kind, class_key=class_key: solve_scenes(
             kind,
             class_key,
-            count,
+            scenes,
             options,
             limit,
-            config.dtype,
             PORTFOLIO,
             on_rule,
             config.warm_share,
             tolerance,
             config.price_spread,
         )
-        rows = np.flatnonzero(made.usable)
-        held = max(1, round(HELD_OUT * len(rows)))
-        if len(rows) <= held:
-            raise TooFewScenes(f"only {len(rows)} of {count} scenes of {where} are usable: draw more")
-        splits.append(Split(select(made.bank, rows[held:]), select(made.bank, rows[:held])))
+        if kind.family == "windows":
+            seed = int(jax.random.randint(class_key, (), 0, 2**31 - 1))
+            parts = [solved(scenes) for scenes in read_windows(config.problems, kind, count, seed, config.dtype)]
+            banks = [select(made.bank, made.usable) for made in parts]
+        else:
+            made = solved(make_scenes(kind, class_key, count, config.dtype))
+            rows = np.flatnonzero(made.usable)
+            held = max(1, round(HELD_OUT * len(rows)))
+            banks = [select(made.bank, part) for part in (rows[held:], rows[:held])]
+        if any(not len(bank.initial_cost) for bank in banks):
+            usable = sum(len(bank.initial_cost) for bank in banks)
+            raise TooFewScenes(f"only {usable} of {count} scenes of {where} are usable: draw more")
+        splits.append(Split(*banks))
     return splits
 
 

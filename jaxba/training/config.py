@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from jaxba.damping.agent_config import AgentConfig, EffortMode
 from jaxba.damping.features import observation_size
@@ -163,6 +163,14 @@ def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
         return settings.read(TrainConfig, data)
     except SettingsError as error:
         raise SettingsError(f"{name}{' with --set' if overrides else ''}: {error}") from None
+
+
+def with_problems(config: TrainConfig, problems: Sequence[str]) -> TrainConfig:
+    """The configuration with windows of real problems for scenes: of its classes of the family `windows`, or of all."""
+    classes = config.bank.classes
+    if not any(kind.family == "windows" for kind in classes):
+        classes = tuple(replace(kind, family="windows") for kind in classes)
+    return replace(config, bank=replace(config.bank, problems=tuple(problems), classes=classes))
 
 
 def to_yaml(config: TrainConfig) -> str:

@@ -1,0 +1,175 @@
+"""Scenes of the game that are cut from real problems: neighbouring cameras with some of the points that they share.
+
+Visibility, noise, wrong matches and starts are those of the problem. Many real problems begin near their end, so half
+of the windows begin where random scenes do: cameras and points are moved by the same random amounts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from jaxba.game.random_scenes import MIN_VIEWS, START_CENTER, START_DEPTH, START_ROTATION, SceneClass, Scenes
+from jaxba.io import read_problem
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+
+HELD_OUT = 0.2
+"""Share of a problem's cameras, the last ones in the order of their places, whose windows are held out."""
+
+FEWEST_CAMERAS = 4
+"""Cameras of the smallest window."""
+
+
+def read_windows(
+    paths: Sequence[str], kind: SceneClass, count: int, seed: int, dtype: str = "float64"
+) -> tuple[Scenes, Scenes]:
+    """Windows of problems: those to train on, and held-out ones from other places.
+
+    Args:
+        paths: problems, as `jaxba.read_problem` takes them.
+        kind: largest numbers of cameras and points of a window.
+        count: windows in all, as many of each problem; a fifth is held out.
+        seed: of the choice.
+        dtype: of all numbers.
+
+    Raises:
+        ProblemError: as `read_all`.
+    """
+    parts: tuple[list, list] = [], []
+    for number, problem in enumerate(read_all(paths)):
+        rng = np.random.default_rng([seed, number])
+        share = -(-count // len(paths))
+        linked, held = covisible(problem), round(HELD_OUT * share)
+        for part, cameras, wanted in zip(parts, places(linked), (share - held, held), strict=True):
+            if len(cameras) >= FEWEST_CAMERAS:
+                part.extend(window(problem, kind, linked, cameras, rng) for _ in range(wanted))
+    typed = lambda x: jnp.asarray(x, None if x.dtype == bool else dtype)
+    stack = lambda part: Scenes(*(typed(np.stack([getattr(one, name) for one in part])) for name in Scenes._fields))
+    return stack(parts[0]), stack(parts[1])
+
+
+def read_all(paths: Sequence[str]) -> list[BundleProblem]:
+    """The problems.
+
+    Raises:
+        ProblemError: a problem cannot be read, has whitened observations or too few cameras; or none is large enough
+            for windows in two places. One line.
+    """
+    problems = []
+    for path in paths:
+        problem = read_problem(path)
+        if problem.whitening is not None:
+            raise ProblemError(f"{path}: windows of observations with covariances are not made")
+        if problem.num_cameras < FEWEST_CAMERAS:
+            raise ProblemError(f"{path}: {problem.num_cameras} cameras; a window has {FEWEST_CAMERAS} at least")
+        problems.append(problem)
+    least = round(FEWEST_CAMERAS / HELD_OUT)
+    if max(problem.num_cameras for problem in problems) < least:
+        raise ProblemError(f"no problem has {least} cameras, so that windows in another place can be held out")
+    return problems
+
+
+def places(
+    linked: Int[np.ndarray, "cameras cameras"],
+) -> tuple[Int[np.ndarray, " train"], Int[np.ndarray, " held_out"]]:
+    """The cameras of training and of held-out windows. In the order of a band matrix neighbours stand together, so that
+    the last of them are another place.
+
+    Args:
+        linked: as `covisible` returns it.
+    """
+    order = reverse_cuthill_mckee(coo_array(linked).tocsr(), symmetric_mode=True).astype(np.int64)
+    first = len(order) - round(HELD_OUT * len(order))
+    return order[:first], order[first:]
+
+
+def covisible(problem: BundleProblem) -> Int[np.ndarray, "cameras cameras"]:
+    """Points that two cameras have in common."""
+    shape = problem.num_cameras, problem.num_points
+    cells = np.unique(np.stack([problem.camera_index, problem.point_index]), axis=1)
+    seen = coo_array((np.ones(cells.shape[1], np.int32), (cells[0], cells[1])), shape=shape).tocsr()
+    return (seen @ seen.T).toarray()
+
+
+def window(
+    problem: BundleProblem,
+    kind: SceneClass,
+    linked: Int[np.ndarray, "cameras cameras"],
+    allowed: Int[np.ndarray, " allowed"],
+    rng: np.random.Generator,
+) -> Scenes:
+    """One window, its arrays without the axis of scenes.
+
+    Cameras join one by one, each time the one that shares most points with those already there; of the points that two
+    of them observe, as many as fit are drawn.
+
+    Args:
+        problem: where it is cut from.
+        kind: largest numbers of cameras and points.
+        linked: as `covisible` returns it.
+        allowed: cameras to choose from.
+        rng: source of random numbers.
+    """
+    size = int(rng.integers(FEWEST_CAMERAS, min(kind.cameras, len(allowed)) + 1))
+    chosen = [int(rng.choice(allowed))]
+    while len(chosen) < size:
+        rest = np.setdiff1d(allowed, chosen)
+        chosen.append(int(rest[np.argmax(linked[rest][:, chosen].sum(axis=1))]))
+    grid, pixels = _grid(problem, np.array(chosen))
+    shared = np.flatnonzero(grid.sum(axis=0) >= 2)
+    points = rng.permutation(shared)[: kind.points]
+    grid = grid[:, points]
+    grid &= (grid.sum(axis=1) >= MIN_VIEWS)[:, None]
+    grid &= (grid.sum(axis=0) >= 2)[None]
+    cameras, start = np.array(problem.cameras)[chosen], np.array(problem.points)[points]
+    if rng.random() < 0.5:
+        cameras, start = _moved(cameras, start, rng)
+    wide = lambda x, shape: np.zeros(shape, x.dtype)
+    c, p = len(chosen), len(points)
+    whole_cameras = np.repeat(cameras[:1], kind.cameras, axis=0)
+    whole_cameras[:c] = cameras
+    whole_points = wide(start, (kind.points + 1, 3))
+    whole_points[:p] = start
+    whole_grid = wide(grid, (kind.cameras, kind.points + 1))
+    whole_grid[:c, :p] = grid
+    whole_pixels = wide(pixels, (2, kind.cameras, kind.points + 1))
+    whole_pixels[:, :c, :p] = pixels[:, :, points] * grid
+    return Scenes(whole_cameras.T, whole_points.T, whole_pixels.reshape(2, -1), whole_grid.reshape(-1))  # pyright: ignore[reportArgumentType]
+
+
+def _grid(
+    problem: BundleProblem, chosen: Int[np.ndarray, " chosen"]
+) -> tuple[Bool[np.ndarray, "chosen points"], np.ndarray]:
+    """Which of the chosen cameras see which points, and where; of repeated observations the last."""
+    place = np.full(problem.num_cameras, -1)
+    place[chosen] = np.arange(len(chosen))
+    row = place[np.asarray(problem.camera_index)]
+    kept = row >= 0
+    row, column = row[kept], np.asarray(problem.point_index)[kept]
+    grid = np.zeros((len(chosen), problem.num_points), bool)
+    pixels = np.zeros((2, len(chosen), problem.num_points))
+    grid[row, column] = True
+    pixels[:, row, column] = np.asarray(problem.observations)[kept].T
+    return grid, pixels
+
+
+def _moved(cameras: np.ndarray, points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Cameras turned and shifted, and points moved along their distance, as at the start of random scenes."""
+    log_uniform = lambda limits: np.exp(rng.uniform(*np.log(limits)))
+    turned, centers = geometry.rotation_matrices(cameras[:, :3]), geometry.camera_centers(cameras)
+    step = np.linalg.norm(np.diff(centers, axis=0), axis=1).mean()
+    centers = centers + log_uniform(START_CENTER) * step * rng.normal(size=centers.shape)
+    noise = geometry.rotation_matrices(log_uniform(START_ROTATION) * rng.normal(size=(len(cameras), 3)))
+    turned = noise @ turned
+    cameras = cameras.copy()
+    cameras[:, :3] = geometry.angle_axis(turned)
+    cameras[:, 3:6] = geometry.translations(turned, centers)
+    middle = centers.mean(axis=0)
+    factor = np.exp(log_uniform(START_DEPTH) * rng.normal(size=(len(points), 1)))
+    return cameras, middle + factor * (points - middle)
