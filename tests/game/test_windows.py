@@ -45,7 +45,7 @@ def test_cameras_of_training_and_held_out_windows_are_disjoint_and_all():
 
 
 def test_a_window_holds_what_the_problem_holds(file):
-    """Cameras, points and pixels are the problem's and belong together; of about half of the windows the starts, too."""
+    """Cameras, points and pixels are the problem's and belong together; of about half of them the starts, too."""
     problem, unmoved = street(), 0
     train, held_out = read_windows([file], KIND, 20, seed=0)
     assert (len(train.mask), len(held_out.mask)) == (16, 4)
