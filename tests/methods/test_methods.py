@@ -266,7 +266,7 @@ def test_clusters_of_ddlm_have_shares_and_repairs_of_their_own():
         [float(x) for x in column] for column in zip(*[(i.step_fraction, i.repairs) for i in alone], strict=True)
     )
     assert (shares, repairs) == ([1, 0.25, 1], [0, 1, 1])
-    assert found.repairs == 1
+    assert found.work.repairs == 1
     np.testing.assert_allclose(found.predicted, sum(info.predicted for info in alone), rtol=1e-6)
     whole = [_step_of(problem, damping).predicted(jnp.ones(())) for problem in scenes]
     np.testing.assert_allclose(found.step_fraction, np.dot(shares, whole) / np.sum(whole), rtol=1e-6)
