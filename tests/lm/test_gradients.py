@@ -88,8 +88,7 @@ FACTORED = {
     "padded-dense": (support.tiny, PLAIN, padded),
     "manifold": (support.tiny, StepOptions(coordinates=Coordinates(rotation="manifold")), own_size),
     "identity": (support.tiny, StepOptions(coordinates=Coordinates(scaling="identity")), own_size),
-    "fixed-intrinsics": (support.tiny, StepOptions(intrinsics="fixed"), own_size),
-    **{loss: (support.odd, StepOptions(loss=Loss(loss, 1.7)), own_size) for loss in ("huber", "soft_l1", "cauchy")},
+    "cauchy": (support.odd, StepOptions(loss=Loss("cauchy", 1.7)), own_size),
     "tukey": (support.odd, StepOptions(loss=Loss("tukey", 8.0)), own_size),
     # jax.scipy's conjugate gradients have the derivatives of the solution, in both modes
     "cg": (support.tiny, StepOptions(linear_solver="cg", conjugate_gradients=ConjugateGradients(budget=120)), own_size),
@@ -170,9 +169,7 @@ def test_forward_derivatives_are_finite_and_those_of_differences(name):
 
 
 # backwards is what JAX makes of forwards, but for the rules of factorisations and of loops: one of each
-@pytest.mark.parametrize(
-    "name", some_slow(["dense", "pairs", "band", "few-points", "shared-lenses", "tukey", "cg"], ("dense",))
-)
+@pytest.mark.parametrize("name", some_slow(["dense", "band", "few-points", "shared-lenses", "cg"], ("dense",)))
 def test_reverse_derivatives_are_finite_and_the_transposed_of_the_forward_ones(name):
     function, at = as_function(*FACTORED[name])
     rng = np.random.default_rng(1)
