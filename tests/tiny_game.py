@@ -10,8 +10,8 @@ import numpy as np
 from jaxba import BundleProblem, StepOptions
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.env import Game, GameConfig, make_game
-from jaxba.game.random_scenes import SceneClass, Scenes
-from jaxba.game.scene_bank import Bank, draft, select
+from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
+from jaxba.game.scene_bank import Bank, select, solve_scenes
 
 KIND = SceneClass(4, 12)
 AGENT = AgentConfig(
@@ -31,7 +31,8 @@ RULES = GameConfig(agent=AGENT, max_iterations=4, limit_is_failure=False)
 @functools.cache
 def tiny_bank() -> Bank:
     """A dozen scenes or more, with the best costs that Ceres' and GTSAM's rules find."""
-    made = draft(KIND, jax.random.key(5), 120, StepOptions(), 40, rules=("ceres",))
+    key = jax.random.key(5)
+    made = solve_scenes(KIND, key, make_scenes(KIND, key, 120), StepOptions(), 40, rules=("ceres",))
     return select(made.bank, made.usable)
 
 

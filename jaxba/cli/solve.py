@@ -82,8 +82,8 @@ class Arguments:
     size."""
 
     preconditioner: Preconditioner = DEFAULTS.conjugate_gradients.preconditioner
-    """Preconditioner of conjugate gradients (sparse, implicit). two-level: block diagonal, and a coarse system of the
-    motion of clusters of cameras."""
+    """Preconditioner of conjugate gradients (sparse, implicit, cg). two-level: block diagonal, and a coarse system of
+    the motion of clusters of cameras."""
 
     dtype: Dtype = DEFAULTS.dtype
     """Floating point type. mixed: float64, but the reduced camera system in float32."""

@@ -32,7 +32,7 @@ from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.records import LMState, Prices, StepInfo
 from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 from jaxba.typing import register_pytree
@@ -43,10 +43,8 @@ POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
 Ladybug-49: three take 3.9 of 12.6 ms."""
 
-CG_ITERATION_COST = 0.06
-"""The same for an iteration of conjugate gradients, charged if the agent chooses the forcing term. An estimate: one
-product with the reduced system takes 20 to 25 of an implicit step's 351 ms on a scene of Ladybug-1197's size. Products
-of method `deeplm`, with all variables, were not measured."""
+CG_ITERATION_COST = Prices().product
+"""The same for an iteration of conjugate gradients, charged if the agent chooses the forcing term."""
 
 BONUS_DECAY = 0.01
 """Fraction of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023."""

@@ -87,7 +87,7 @@ class _Rig(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("kind", "count", "dtype"))
 def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
-    """Random scenes, the unusable ones included; see `scene_bank.draft`. Not of the family `windows`.
+    """Random scenes, the unusable ones included; see `scene_bank.solve_scenes`. Not of the family `windows`.
 
     Args:
         kind: shape and family.

@@ -163,24 +163,6 @@ class Draft(NamedTuple):
     usable: np.ndarray
 
 
-def draft(
-    kind: SceneClass,
-    key: Array,
-    count: int,
-    options: StepOptions,
-    limit: int,
-    dtype: str = "float64",
-    rules: Sequence[str] = PORTFOLIO,
-    on_rule: Callable[[str], None] = lambda _: None,
-    warm_share: float = 0.0,
-    tolerance: float = 1e-3,
-    price_spread: float = 0.0,
-) -> Draft:
-    """Makes random scenes and solves them with every rule. Arguments as for `solve_scenes`, and the number drawn."""
-    scenes = make_scenes(kind, key, count, dtype)
-    return solve_scenes(kind, key, scenes, options, limit, rules, on_rule, warm_share, tolerance, price_spread)
-
-
 def solve_scenes(
     kind: SceneClass,
     key: Array,

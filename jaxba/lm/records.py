@@ -84,7 +84,8 @@ class StepInfo(NamedTuple):
 
 class Prices(NamedTuple):
     """What the work of an iteration costs, in units of a plain step: linearise, solve by a factorisation, and evaluate
-    one candidate. The defaults were measured on real problems on two cores (`benchmarks.prices`)."""
+    one candidate. Source of the defaults but that of a product: `benchmarks.prices` on its two random scenes, on two
+    busy cores."""
 
     candidate: float | Float[Array, ""] = 0.05
     """Evaluating another candidate."""
@@ -95,8 +96,9 @@ class Prices(NamedTuple):
     camera_round: float | Float[Array, ""] = 0.19
     """Re-optimising every camera on its own, without the candidate that follows."""
 
-    product: float | Float[Array, ""] = 0.1
-    """An iteration of conjugate gradients, where they take the place of the factorisation."""
+    product: float | Float[Array, ""] = 0.06
+    """An iteration of conjugate gradients. An estimate: one product with the reduced system takes 20 to 25 of an
+    implicit step's 351 ms on a scene of Ladybug-1197's size. Those of method `deeplm` were not measured."""
 
     def of(self, step: StepInfo) -> Float[Array, ""]:
         """The price of an iteration."""

@@ -10,7 +10,8 @@ from support import same_bits
 from tiny_game import KIND, problem_of, tiny_bank
 
 from jaxba import StepOptions
-from jaxba.game.scene_bank import BankConfig, draft, make_banks
+from jaxba.game.random_scenes import make_scenes
+from jaxba.game.scene_bank import BankConfig, make_banks, solve_scenes
 from jaxba.game.warm_starts import warm_starts
 from jaxba.problem import geometry
 
@@ -49,7 +50,9 @@ def test_the_same_key_gives_the_same_warm_starts_and_another_one_others():
 
 
 def test_a_bank_with_warm_starts_begins_nearer_the_best_cost_and_says_so_to_the_policy():
-    cold, warm = (draft(KIND, jax.random.key(5), 120, OPTIONS, 40, rules=("ceres",), warm_share=s) for s in (0.0, 1.0))
+    key = jax.random.key(5)
+    scenes = make_scenes(KIND, key, 120)
+    cold, warm = (solve_scenes(KIND, key, scenes, OPTIONS, 40, rules=("ceres",), warm_share=s) for s in (0.0, 1.0))
     ratio = lambda made: np.median(np.asarray(made.bank.initial_cost / made.bank.best_cost))
     assert ratio(warm) < 0.1 * ratio(cold)
     chex.assert_trees_all_equal(warm.bank.info.cost, warm.bank.initial_cost, strict=True)
