@@ -3,9 +3,10 @@
     python -m benchmarks.prices [PROBLEM ...] [--repeats 15]
 
 For each problem, in milliseconds, medians: the plain step without its candidate (`propose`), a candidate, one embedded
-point iteration, a camera round, and for an inexact step one product. Then the seconds of whole solves: those measured
-and those that the parts and the counted work (`StepInfo`) predict. Last the fit of `solver/cost_model.py`: seconds for
-each observation, and their relative error.
+point iteration, and a camera round. Then the seconds of whole solves: those that the parts and the counted work
+(`StepInfo`) predict over those measured; the same by the cost model (`solver/cost_model.py`), whose seconds are of
+another machine: over their geometric mean. Last the fit for the cost model: seconds of each part as a constant and a
+share for each observation.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from scipy.optimize import nnls
 
 from jaxba.bench.sources import sources
 from jaxba.lm.records import StepInfo
@@ -135,11 +137,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         process.release_programs()
     print(f"predicted over measured: {np.exp(np.log(ratios).mean()):.2f}, {min(ratios):.2f} to {max(ratios):.2f}")
     for name in ("candidate", "point_iteration", "camera_round"):
-        each = np.array([getattr(parts, name) / count for count, parts in rows])
-        typical = np.exp(np.log(np.maximum(each, 1e-12)).mean())
-        share = np.exp(np.mean([np.log(max(getattr(parts, name), 1e-9) / parts.propose) for _, parts in rows]))
-        spread = f"{each.min():.1e} to {each.max():.1e}"
-        print(f"{name}: {typical:.2e} s an observation, {spread}; {share:.2f} of a linear solve")
+        seconds = np.array([max(getattr(parts, name), 1e-6) for _, parts in rows])
+        share = np.exp(np.mean(np.log(seconds / [parts.propose + parts.candidate for _, parts in rows])))
+        amounts = np.array([(1.0, count) for count, _ in rows])
+        (constant, each), _ = nnls(amounts / seconds[:, None], np.ones(len(rows)))  # least relative squares
+        errors = amounts @ (constant, each) / seconds
+        spread = f"fit over measured {errors.min():.2f} to {errors.max():.2f}"
+        print(f"{name}: {constant:.1e} s and {each:.2e} s an observation, {spread}; {share:.3f} of a plain step")
     return 0
 
 

@@ -71,6 +71,11 @@ def decides_effort(policy: DampingPolicy) -> bool:
     return getattr(policy, "effort", None) is not None
 
 
+def observes_prices(policy: DampingPolicy) -> bool:
+    """Whether `ProblemInfo.prices` should be those of the problem: computing them takes time."""
+    return bool(getattr(policy, "observes_prices", False))
+
+
 def effort_of(policy: DampingPolicy, state: Any) -> Effort | None:
     """Point iterations and forcing term of the next iteration; None if `StepOptions` decide them."""
     return policy.effort(state) if decides_effort(policy) else None  # pyright: ignore[reportAttributeAccessIssue]

@@ -20,7 +20,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy, decides_effort, effort_of
-from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.records import LMState, Prices, StepInfo
 from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.options import StepOptions
@@ -62,11 +62,12 @@ class _Loop(NamedTuple):
     tolerances: Tolerances
     options: StepOptions
     max_iterations: int
+    prices: Prices
 
     def start(self, call: Callable[..., Any], state: LMState) -> Carry:
         """The carry before the first iteration, from the initial state."""
         info_program = program(problem_info, "options", "max_iterations", level="quick")
-        info = call(info_program, self.layout, state, self.options, self.max_iterations)
+        info = call(info_program, self.layout, state, self.options, self.max_iterations, self.prices)
         # without the parameters, whose shapes differ, the policy's program is compiled once for all problems
         return call(program(begin, level="quick"), info, self.policy, None)._replace(state=state)
 
@@ -161,7 +162,7 @@ def run_stepwise(
     Raises:
         ProblemError: the cost of the initial state is not finite.
     """
-    loop = _Loop(setup.layout, setup.policy, tolerances, setup.options, max_iterations)
+    loop = _Loop(setup.layout, setup.policy, tolerances, setup.options, max_iterations, setup.prices)
     runs: Counter[str] = Counter()
 
     def levels_now() -> dict[str, Level]:

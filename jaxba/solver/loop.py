@@ -73,7 +73,9 @@ class Carry(NamedTuple):
     """Integer of a `Termination`."""
 
 
-def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: Any) -> ProblemInfo:
+def problem_info(
+    layout: Layout, state: LMState, options: StepOptions, max_iterations: Any, prices: Prices
+) -> ProblemInfo:
     """The information that a policy gets before the first iteration."""
     unit = jnp.ones_like(state.cost)
     if options.coordinates.scaling == "identity":
@@ -88,7 +90,7 @@ def problem_info(layout: Layout, state: LMState, options: StepOptions, max_itera
         unit=unit,
         focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
         max_iterations=count(max_iterations),
-        prices=Prices(*(jnp.asarray(x, state.cost.dtype) for x in Prices())),
+        prices=Prices(*(jnp.asarray(x, state.cost.dtype) for x in prices)),
     )
     return info
 
@@ -171,6 +173,7 @@ def solve_loop(
     options: StepOptions,
     max_iterations: int,
     limit: Int[AnyArray, ""] | None = None,
+    prices: Prices = Prices(),  # noqa: B008 - immutable
 ) -> tuple[Carry, History]:
     """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes.
 
@@ -182,6 +185,7 @@ def solve_loop(
         options: static options of the step.
         max_iterations: length of the histories, static.
         limit: a lower limit of iterations, not static.
+        prices: of the work of an iteration, for policies that observe them.
 
     Returns:
         Final carry, and histories of length `max_iterations`, zero after the last iteration.
@@ -192,7 +196,7 @@ def solve_loop(
     if state.cost.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise ValueError('the state is float64: call jax.config.update("jax_enable_x64", True) first')
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
-    carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)
+    carry = begin(problem_info(layout, state, options, iteration_limit, prices), policy, state)
 
     def step_of(c: Carry) -> tuple[LMState, StepInfo]:
         effort = effort_of(policy, c.policy)

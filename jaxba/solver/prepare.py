@@ -12,14 +12,15 @@ import jax
 import numpy as np
 
 from jaxba.damping import DampingPolicy
-from jaxba.lm.records import LMState
+from jaxba.damping.policy import observes_prices
+from jaxba.lm.records import LMState, Prices
 from jaxba.lm.step import initial_state
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
-from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.cost_model import choose_linear_solver, prices
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
@@ -66,6 +67,9 @@ class Setup:
 
     dtype: np.dtype[Any]
     """Type of the parameters of the solve."""
+
+    prices: Prices
+    """Of the work of an iteration, NumPy scalars; the default ones for a policy that does not observe them."""
 
     setup_s: float
     """Seconds for the layout and the transfer to the device."""
@@ -152,8 +156,10 @@ def set_up(
         here = problem if offset is None else shift(problem, -offset)
         layout = jax.device_put(layout_for(here, step, capacity, observations))
         start = here if capacity is None else padded_parameters(here, capacity)
+        known = prices(problem, step, observations) if observes_prices(policy) else Prices()
+        known = jax.tree.map(lambda x: np.asarray(x, dtype), known)
         setup_s = time.perf_counter() - started
-    return Setup(problem, layout, step, policy, capacity, offset, start, dtype, setup_s)
+    return Setup(problem, layout, step, policy, capacity, offset, start, dtype, known, setup_s)
 
 
 def _pads(problem: BundleProblem, options: SolveOptions) -> bool:

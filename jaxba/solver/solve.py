@@ -170,7 +170,7 @@ def _run_compiled(setup: Setup, tolerances: Tolerances, max_iterations: int) -> 
         setup.check_cost(state)
         length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
         limit = np.asarray(max_iterations, np.int32)  # a conversion by JAX is a program
-        result = solve_loop(setup.layout, state, setup.policy, tolerances, setup.options, length, limit)
+        result = solve_loop(setup.layout, state, setup.policy, tolerances, setup.options, length, limit, setup.prices)
         carry, history = jax.block_until_ready(result)
     total_s = time.perf_counter() - started - clock.seconds
     return Run(carry, history, float(state.cost), 0, clock.seconds, total_s)
