@@ -61,6 +61,7 @@ class Pendulum:
     """Number of pendulums."""
 
     observation_size = 3
+    privileged_size = 0
     action_size = 1
 
     def reset(self, key: Array) -> tuple[_Swing, Array]:

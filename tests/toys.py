@@ -61,14 +61,22 @@ class Toy:
 
     num_envs: int = dataclasses.field(default=8, metadata={"static": True})
 
+    hides: bool = dataclasses.field(default=False, metadata={"static": True})
+    """Whether only critics see the sign, which then comes last."""
+
     observation_size = 2
     action_size = 1
 
     def _deal(self, key: Array) -> Array:
         return jax.random.rademacher(key, (self.num_envs,), jnp.float64)
 
+    @property
+    def privileged_size(self) -> int:
+        return int(self.hides)
+
     def _see(self, sign: Array, clock: Array) -> Array:
-        return jnp.stack([sign, jnp.where(self.shows_clock, clock, 0.0)], axis=1)
+        features = [sign, jnp.where(self.shows_clock, clock, 0.0)]
+        return jnp.stack(features[::-1] if self.hides else features, axis=1)
 
     def reset(self, key: Array) -> tuple[ToyState, Array]:
         key, deal = jax.random.split(key)
@@ -101,9 +109,6 @@ class Toy:
         return jax.random.uniform(key, (self.num_envs, 1), jnp.float64, -1, 1)
 
 
-CONSTANT = Toy(constant=1.0)
-"""Q = 1."""
-
 SEEN = Toy(slope=1.0)
 """Q(s) = s."""
 
@@ -115,6 +120,9 @@ ACTION = Toy(curvature=1.0, best=0.3)
 
 BOTH = Toy(slope=1.0, curvature=1.0, follow=0.5)
 """Q(s, a) = s - (a - s / 2)^2."""
+
+HIDDEN = Toy(slope=1.0, curvature=1.0, follow=0.5, hides=True)
+"""As `BOTH` for a policy that does not see the sign: its best action is zero, and Q(s, 0) = s - 1 / 4."""
 
 ENDLESS = Toy(slope=1.0, length=2, truncates=True)
 """Every second step cuts off what would go on for ever: Q(s) = s / (1 - gamma).

@@ -3,7 +3,7 @@
 | | |
 | --- | --- |
 | state | a scene of the bank, its current cameras and points, the agent's memory of the episode |
-| observation | `damping.features.observe` |
+| observation | `damping.features.observe`; critics also see the distance to the best known cost |
 | action | numbers in (-1, 1): lambda by `damping.guard.damping_of`, effort by `damping.guard.effort_for` |
 | terminated | accepted cost within `tolerance` of the best known cost, or the limit if `limit_is_failure` |
 | truncated | the limit otherwise |
@@ -14,6 +14,8 @@ Everything is traced once. An episode that ends is followed by one on a random s
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, get_args
@@ -46,6 +48,13 @@ Ladybug-49: three take 3.9 of 12.6 ms."""
 CG_ITERATION_COST = Prices().product
 """The same for an iteration of conjugate gradients, charged if the agent chooses the forcing term."""
 
+USUAL = 8.0
+"""Iterations that Ceres' rule usually takes: prices are paid relative to those of the scene, so that the mean over
+scenes weighs easy and hard ones alike, as a geometric mean does."""
+
+DISTANCE_FLOOR = 1e-6
+"""Relative distance to the best known cost that a critic does not distinguish from zero."""
+
 BONUS_DECAY = 0.01
 """Fraction of the bonus lost with every iteration under the reward `reduction`. Source: Belder et al. 2023."""
 
@@ -59,9 +68,9 @@ class GameConfig:
 
     reward: Reward = "duration"
     """Of an iteration. `duration`: minus a deterministic cost of the iteration. `price`: minus the price of the work
-    that it did, at the prices of the scene (`BankConfig.price_spread`). `constant`: -1. `reduction`: zero, and the
-    bonus shrinks with every iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's
-    reversed roles of state and reward)."""
+    that it did, at the prices of the scene (`BankConfig.price_spread`) and relative to its difficulty (`USUAL`).
+    `constant`: -1. `reduction`: zero, and the bonus shrinks with every iteration. `reversed`: minus log10 of the cost
+    over the best known cost (the paper's reversed roles of state and reward)."""
 
     bonus: float = 10.0
     """Added if the episode ends in success. Source: Belder et al. 2023."""
@@ -131,8 +140,13 @@ class Game:
 
     @property
     def observation_size(self) -> int:
-        """Features of an observation."""
-        return observation_size(self.config.agent)
+        """Features of an observation, with the distance to the best known cost."""
+        return observation_size(self.config.agent) + self.privileged_size
+
+    @property
+    def privileged_size(self) -> int:
+        """Features that only critics see: the distance to the best known cost."""
+        return 1
 
     @property
     def action_size(self) -> int:
@@ -151,8 +165,17 @@ class Game:
 
     def observations(self, state: GameState) -> Float[Array, "envs features"]:
         """What is observed everywhere, for the next actions."""
-        observe_all = jax.vmap(lambda episode: observe(self.config.agent, episode.memory))
-        return jnp.concatenate([observe_all(part) for part in state.episodes])
+        seen = [
+            jax.vmap(functools.partial(self._observe, bank))(part)
+            for bank, part in zip(self.banks, state.episodes, strict=True)
+        ]
+        return jnp.concatenate(seen)
+
+    def _observe(self, bank: Bank, episode: Episode) -> Float[Array, " features"]:
+        distance = episode.state.cost / bank.best_cost[episode.scene] - 1
+        decades = jnp.log10(jnp.maximum(distance, DISTANCE_FLOOR)) / -math.log10(DISTANCE_FLOOR)
+        seen = observe(self.config.agent, episode.memory)
+        return jnp.concatenate([seen, decades[None].astype(seen.dtype)])
 
     def merged(self, chosen: Bool[Array, " envs"], one: GameState, other: GameState) -> GameState:
         """The state with the episodes of `one` where chosen, those of `other` elsewhere, and the key of `one`."""
@@ -210,7 +233,8 @@ class Game:
         limit = after.memory.guard.iteration >= rules.max_iterations
         terminated = success | (limit & rules.limit_is_failure)
         truncated = limit & ~terminated
-        reward = self._reward(step, after.memory, best, success)
+        usual = jnp.clip(bank.ceres_iterations[episode.scene], 1, rules.max_iterations)
+        reward = self._reward(step, after.memory, best, success, usual)
         fresh = self._fresh(bank, key)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
         single = lambda x: jnp.asarray(x, jnp.float32)
@@ -220,10 +244,12 @@ class Game:
             "rejections": single(after.memory.guard.rejections),
             "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
         }
-        observed = lambda episode: observe(rules.agent, episode.memory)
+        observed = functools.partial(self._observe, bank)
         return following, Step(observed(following), single(reward), terminated, truncated, observed(after), metrics)
 
-    def _reward(self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]) -> Array:
+    def _reward(
+        self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""], usual: Array | float = USUAL
+    ) -> Array:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
@@ -231,7 +257,7 @@ class Game:
             inner = CG_ITERATION_COST * step.cg_iterations if rules.agent.effort == "points+forcing" else 0.0
             reward = bonus - (1 + POINT_ITERATION_COST * points + inner)
         elif rules.reward == "price":
-            reward = bonus - memory.info.prices.of(step)
+            reward = bonus - USUAL * memory.info.prices.of(step) / usual
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":

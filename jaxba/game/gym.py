@@ -31,7 +31,7 @@ def observation_space(game: Game) -> spaces.Box:
     """Bounds of one scene's observation."""
     agent = game.config.agent
     limit = FEATURE_LIMIT if agent.observation == "scale-free" else np.inf
-    return spaces.Box(-limit, limit, (game.observation_size,), np.float32)
+    return spaces.Box(-limit, limit, (game.observation_size - game.privileged_size,), np.float32)
 
 
 def action_space(game: Game) -> spaces.Box:
@@ -64,7 +64,7 @@ class _Compiled:
                 self.state, observation = _reset(self.game, key)
             else:
                 self.state, observation = _reset_some(self.game, self.state, key, mask)
-            return np.array(observation)
+            return np.array(self._seen(observation))
 
     def step(self, action: np.ndarray, waiting: np.ndarray | None = None) -> Any:
         """One iteration of every scene that is not waiting: a `Step` of NumPy arrays."""
@@ -76,7 +76,14 @@ class _Compiled:
                 self.state, step = _step(self.game, self.state, given)
             else:
                 self.state, step = _step_some(self.game, self.state, given, ~waiting)
+            step = step._replace(
+                observation=self._seen(step.observation), final_observation=self._seen(step.final_observation)
+            )
             return jax.tree.map(np.array, step)  # copies, which callers may keep and write to
+
+    def _seen(self, observation: Array) -> Array:
+        """Without what only critics see."""
+        return observation[:, : self.game.observation_size - self.game.privileged_size]
 
 
 _reset = jax.jit(lambda game, key: game.reset(key))

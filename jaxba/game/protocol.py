@@ -48,6 +48,11 @@ class Environment(Protocol):
         ...
 
     @property
+    def privileged_size(self) -> int:
+        """How many of these features, the last ones, only critics see in training: a policy will not have them."""
+        ...
+
+    @property
     def action_size(self) -> int:
         """Numbers of an action, each in (-1, 1)."""
         ...

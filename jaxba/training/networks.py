@@ -181,6 +181,11 @@ def sample_action(
     return squash(pre_tanh), log_probability(noise, log_std, pre_tanh)
 
 
+def input_size(actor_params: Any) -> int:
+    """Features that an actor with these parameters sees."""
+    return actor_params["params"]["MLP_0"]["Dense_0"]["kernel"].shape[0]
+
+
 def action_size(actor_params: Any, layers: int) -> int:
     """Numbers of an action of an actor with these parameters and this many hidden layers."""
     return actor_params["params"]["MLP_0"][f"Dense_{layers}"]["bias"].shape[-1] // 2

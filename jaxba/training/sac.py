@@ -58,6 +58,10 @@ class SacConfig:
     learn_temperature: bool = True
     """Whether the temperature is adapted to the target entropy; otherwise it is constant."""
 
+    privileged: bool = True
+    """Whether critics see what the policy does not (`Environment.privileged_size`), an asymmetric actor-critic. Source:
+    Pinto et al. 2017, "Asymmetric Actor Critic for Image-Based Robot Learning"."""
+
     target_entropy: float | None = None
     """Nats, of the action in (-1, 1); if None, minus the numbers of an action. Source: Haarnoja et al. 2018."""
 
@@ -94,6 +98,7 @@ class SacConfig:
             initial_temperature=1.0,
             learn_temperature=False,
             log_std_min=-20.0,
+            privileged=False,
         )
 
 
@@ -127,7 +132,7 @@ def _optimizer(config: SacConfig) -> optax.GradientTransformation:
     return adam if config.max_grad_norm is None else optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
 
 
-def init(config: SacConfig, key: Array, observation_size: int, action_size: int) -> Learner:
+def init(config: SacConfig, key: Array, observation_size: int, action_size: int, privileged_size: int = 0) -> Learner:
     """An untrained agent.
 
     Args:
@@ -135,10 +140,13 @@ def init(config: SacConfig, key: Array, observation_size: int, action_size: int)
         key: of the parameters and all later random numbers.
         observation_size: features of an observation.
         action_size: numbers of an action.
+        privileged_size: how many of the features, the last ones, the actor does not see.
     """
     key, actor_key, critic_key, value_key = jax.random.split(key, 4)
     observation, action = jnp.zeros((1, observation_size), jnp.float32), jnp.zeros((1, action_size), jnp.float32)
-    actor = _actor(config, action_size).init(actor_key, observation)
+    public = observation[:, : observation_size - privileged_size]
+    observation = observation if config.privileged else public
+    actor = _actor(config, action_size).init(actor_key, public)
     critic = _critic(config).init(critic_key, observation, action)
     value = _value(config).init(value_key, observation) if config.variant == "value" else None
     log_temperature = jnp.log(jnp.asarray(config.initial_temperature, jnp.float32))
@@ -165,11 +173,12 @@ def act(
     Args:
         config: static.
         actor: `Learner.actor`.
-        observation: of any floating point type.
+        observation: of any floating point type; what the actor does not see may follow.
         key: of the sample; if None, the action is the hyperbolic tangent of the mean.
     """
     network = _actor(config, networks.action_size(actor, config.layers))
-    mean, log_std = network.apply(actor, jnp.asarray(observation, jnp.float32))
+    seen = jnp.asarray(observation, jnp.float32)[..., : networks.input_size(actor)]
+    mean, log_std = network.apply(actor, seen)
     return networks.squash(mean) if key is None else networks.sample_action(mean, log_std, key)[0]
 
 
@@ -186,6 +195,10 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
         `temperature` (before its step) and, with a value network, `value_loss`.
     """
     observation, action, reward, next_observation, discount = (jnp.asarray(x, jnp.float32) for x in batch)
+    inputs = networks.input_size(learner.actor)
+    public, next_public = observation[:, :inputs], next_observation[:, :inputs]
+    if not config.privileged:
+        observation, next_observation = public, next_public
     key, next_key, policy_key = jax.random.split(learner.key, 3)
     actor_network, critic_network = _actor(config, action.shape[-1]), _critic(config)
     temperature = jnp.exp(learner.log_temperature)
@@ -196,7 +209,7 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
         return optax.apply_updates(params, change)
 
     if config.variant == "twin":
-        mean, log_std = actor_network.apply(learner.actor, next_observation)
+        mean, log_std = actor_network.apply(learner.actor, next_public)
         next_action, next_log = networks.sample_action(mean, log_std, next_key)
         values = critic_network.apply(learner.target, next_observation, next_action)
         future = jnp.min(values, axis=0) - temperature * next_log
@@ -212,7 +225,7 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
     critic = step("critic", learner.critic, gradient)
 
     def actor_loss(params):
-        mean, log_std = actor_network.apply(params, observation)
+        mean, log_std = actor_network.apply(params, public)
         chosen, log_prob = networks.sample_action(mean, log_std, policy_key)
         soft = jnp.min(critic_network.apply(critic, observation, chosen), axis=0) - temperature * log_prob
         return -jnp.mean(soft), (soft, -jnp.mean(log_prob))

@@ -103,7 +103,7 @@ def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> Loo
     chex.assert_shape(observation, (env.num_envs, env.observation_size))
     zero = lambda: jnp.zeros((), jnp.int32)
     state = LoopState(
-        learner=agent.init(sac, learner_key, env.observation_size, env.action_size),
+        learner=agent.init(sac, learner_key, env.observation_size, env.action_size, env.privileged_size),
         replay=ring.init(loop.replay_capacity, env.observation_size, env.action_size),
         env_state=env_state,
         observation=jnp.asarray(observation, jnp.float32),

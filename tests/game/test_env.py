@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.spatial.transform import Rotation
 from support import same_bits, solve
 from tiny_game import AGENT, KIND, RULES, grid, problem_of, tiny_bank, tiny_game
@@ -65,7 +66,7 @@ def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
         assert len({s.sum() for s in seen}) > 5  # sizes differ
 
 
-@pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper"), LARGE])
+@pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper")])
 def test_the_cost_of_a_start_is_what_numpy_says(kind):
     scenes = make_scenes(kind, jax.random.key(2), 12)
     found = np.asarray(initial_costs(kind, scenes))
@@ -155,7 +156,7 @@ def test_a_scene_is_played_as_it_is_solved():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["stba", "deeplm", "ddlm", "poba"])
+@pytest.mark.parametrize("method", ["deeplm", "ddlm"])
 def test_a_scene_is_played_as_it_is_solved_by_every_method(method):
     bank, options = tiny_bank(), make_method(method).options(StepOptions())
     found = play(KIND, bank, CERES, options, 6)
@@ -246,7 +247,7 @@ def test_lanes_do_not_mix_scenes(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["lm", "deeplm"])
+@pytest.mark.parametrize("method", ["lm"])
 def test_a_network_meets_in_a_solve_what_it_meets_in_the_game(method):
     """Each of its lambdas in a solve is the one it chose in the game, so its observations were the same."""
     options = make_method(method).options(StepOptions())
@@ -297,7 +298,8 @@ def random_game(limit_is_failure: bool):
 def test_the_game_keeps_the_contract_of_an_environment():
     game, found = random_game(False)
     assert isinstance(game, Environment)
-    assert (game.num_envs, game.observation_size, game.action_size) == (ENVS, observation_size(AGENT), 1)
+    assert (game.num_envs, game.observation_size, game.action_size) == (ENVS, observation_size(AGENT) + 1, 1)
+    assert game.privileged_size == 1
     for _, seen, _, step in found:
         assert seen.shape == step.observation.shape == step.final_observation.shape == (ENVS, game.observation_size)
         assert seen.dtype == step.observation.dtype == step.reward.dtype == np.float32
@@ -349,7 +351,7 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
     starts = {}
     for scene in range(len(tiny_bank().initial_cost)):
         episode = game.start(game.banks[0], jnp.asarray(scene, jnp.int32))
-        starts[np.asarray(observe(AGENT, episode.memory)).tobytes()] = scene
+        starts[np.asarray(game._observe(game.banks[0], episode)).tobytes()] = scene
     assert len(starts) > 10
     ended = 0
     for k, (before, _, action, step) in enumerate(found):
@@ -364,7 +366,11 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
             if k < 6:
                 episode = jax.tree.map(lambda x, e=e: jnp.asarray(x[e]), before.episodes[0])
                 after, _ = _iterate(game, KIND, game.banks[0], episode, jnp.asarray(action[e, 0]), game.config)
-                np.testing.assert_allclose(step.final_observation[e], observe(AGENT, after.memory), atol=1e-5)
+                np.testing.assert_allclose(step.final_observation[e], game._observe(game.banks[0], after), atol=1e-5)
+                np.testing.assert_allclose(step.final_observation[e, :-1], observe(AGENT, after.memory), atol=1e-5)
+                distance = after.state.cost / game.banks[0].best_cost[after.scene] - 1
+                decades = np.log10(np.maximum(distance, 1e-6)) / 6
+                np.testing.assert_allclose(step.final_observation[e, -1], decades, atol=1e-4)
         if k + 1 < len(found):
             (following,) = found[k + 1][0].episodes
             assert (following.memory.guard.iteration[done] == 0).all()
@@ -530,7 +536,7 @@ def test_a_score_is_what_numpy_makes_of_the_iterations():
     np.testing.assert_allclose(found.failures, 1 / 6)
     np.testing.assert_allclose(found.to_convergence, 2 * (4 + 2 + 4) / 6)
     np.testing.assert_allclose(found.end, np.median([0, 0, 4, -0.75, 0, 0]))
-    np.testing.assert_allclose(found.price, np.mean([4.5, 2, 4.5, 1.5, 2, 3]))
+    np.testing.assert_allclose(found.price, stats.gmean([4.5, 2, 4.5, 1.5, 2, 3]))
 
 
 def test_an_evaluation_is_the_score_of_playing():
