@@ -168,16 +168,16 @@ def _finish(folder: Path, work: Any, best: Any, console: Any, progress: _Progres
     figure = plot_curve(log.read(folder), rules, work.config.game.tolerance)
     files = [folder / POLICY, *save_figure(figure, folder / CURVE)]
     progress.stage("comparing with the rules")
-    scores = work.compare(best.actor)
+    scores, ratios = work.compare(best.actor)
     progress.__exit__()
     count = sum(len(scene_bank.initial_cost) for scene_bank in work.held_out)
-    console.print(_table(scores, work.config.game.tolerance, count))
+    console.print(_table(scores, ratios, work.config.game.tolerance, count))
     console.print(f"best: agent {best.seed + 1} after chunk {best.chunk}")
     console.print(f"wrote {', '.join(str(file) for file in files)}")
     return 0
 
 
-def _table(scores: Mapping[str, Any], tolerance: float, count: int) -> Any:
+def _table(scores: Mapping[str, Any], ratios: Mapping[str, Any], tolerance: float, count: int) -> Any:
     from rich.table import Table
 
     table = Table(
@@ -186,7 +186,17 @@ def _table(scores: Mapping[str, Any], tolerance: float, count: int) -> Any:
         title_style="bold",
     )
     table.add_column("policy", no_wrap=True)
-    for name in ("mean", "geom. mean", "median", "p90", "failures", "converged", "final gap", "price"):
+    for name in (
+        "mean",
+        "geom. mean",
+        "median",
+        "p90",
+        "failures",
+        "converged",
+        "final gap",
+        "price",
+        "learned over it [95%]",
+    ):
         table.add_column(name, justify="right")
     for name, score in scores.items():
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
@@ -197,6 +207,7 @@ def _table(scores: Mapping[str, Any], tolerance: float, count: int) -> Any:
             f"{score.to_convergence:.2f}",
             f"{score.end:.1e}",
             f"{score.price:.2f}",
+            "{:.3f} [{:.3f}, {:.3f}]".format(*ratios[name]) if name in ratios else "",
         )
     return table
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -35,6 +35,11 @@ class AgentPolicy(ABC):
     def min_gain(self) -> float:
         """Gain ratio that a step must exceed."""
         return self.config.min_gain
+
+    @property
+    def observes_prices(self) -> bool:
+        """See `policy.observes_prices`."""
+        return self.config.observes_prices
 
     def effort(self, state: Memory) -> Effort | None:
         """See `policy.effort_of`."""
@@ -110,6 +115,14 @@ class LearnedPolicy(AgentPolicy):
             x = jax.nn.relu(x @ layer.kernel + layer.bias)
         outputs = x @ self.layers[-1].kernel + self.layers[-1].bias
         return jnp.tanh(outputs[: outputs.shape[0] // 2])
+
+
+def without_weights(policy: LearnedPolicy) -> LearnedPolicy:
+    """The policy with all weights zero and the biases of its last layer: one and the same action. Its twin without
+    learning, as far as one is to be had without a search."""
+    zeros = jax.tree.map(jnp.zeros_like, policy.layers)
+    last = zeros[-1]._replace(bias=policy.layers[-1].bias)
+    return replace(policy, layers=(*zeros[:-1], last))
 
 
 def learned_from(config: AgentConfig, actor: Any) -> LearnedPolicy:

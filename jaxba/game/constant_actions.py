@@ -53,7 +53,7 @@ def best_constant_action(
             report(f"constant action {', '.join(f'{x:.2f}' for x in action)}: price {tried[action]:.3f}")
         return tried[action]
 
-    values = _values(config)
+    values = values_of(config)
     at = [len(LAMBDAS) // 2, *(len(choices) - 1 for choices in values[1:])]
     action_at = lambda at: tuple(float(choices[k]) for choices, k in zip(values, at, strict=True))
     for _ in range(ROUNDS):
@@ -67,7 +67,7 @@ def best_constant_action(
     return ConstantAction(action_at(at), config)
 
 
-def _values(config: AgentConfig) -> list[np.ndarray]:
+def values_of(config: AgentConfig) -> list[np.ndarray]:
     """Values of each number of an action that make a difference."""
     values = [LAMBDAS]
     if config.action_size > 1:

@@ -32,17 +32,17 @@ class Score(NamedTuple):
     """Median of the final cost over the best known, less one."""
 
     price: float
-    """Mean price of the iterations to within the tolerance (`Prices`); a failure costs as many plain steps as the limit
-    has, or what was paid if that is more."""
+    """Geometric mean of the price of the iterations to within the tolerance (`Prices`); a failure costs as many plain
+    steps as the limit has, or what was paid if that is more."""
 
 
 def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int) -> Score:
     """The score of a policy's runs on several banks; every scene has the same weight."""
     by_bank = [reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)]
     iterations = np.concatenate(by_bank)
-    counted = np.minimum(np.maximum(iterations, 1), limit)
+    counted = amounts(runs, best, tolerance, limit, priced=False)
     ends = np.concatenate([run.costs[:, -1] / b - 1 for run, b in zip(runs, best, strict=True)])
-    paid = np.concatenate([prices_to(run, reached, limit) for run, reached in zip(runs, by_bank, strict=True)])
+    paid = amounts(runs, best, tolerance, limit, priced=True)
     length = np.concatenate([np.where(run.converged, run.iterations, limit) for run in runs])
     return Score(
         mean=float(counted.mean()),
@@ -52,7 +52,7 @@ def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]],
         failures=float(np.mean(~(iterations <= limit))),
         to_convergence=float(length.mean()),
         end=float(np.median(ends)),
-        price=float(paid.mean()),
+        price=float(np.exp(np.log(paid).mean())),
     )
 
 
@@ -67,6 +67,38 @@ def prices_to(run: Trajectories, iterations: Float[np.ndarray, " scenes"], limit
     at = np.clip(np.maximum(iterations, 1), 1, limit).astype(int)
     paid = np.take_along_axis(run.paid, at[:, None], axis=1)[:, 0]
     return np.where(iterations <= limit, paid, np.maximum(run.paid[:, -1], limit))
+
+
+class Ratio(NamedTuple):
+    """A geometric mean of paired ratios, with its 95% interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+RESAMPLES = 2000
+"""Bootstrap samples; a bound of an interval moves by a fiftieth of its width from one set of samples to another."""
+
+
+def paired_ratio(ours: Float[np.ndarray, " cases"], theirs: Float[np.ndarray, " cases"]) -> Ratio:
+    """Geometric mean of `ours / theirs` over cases that both had, and the percentile interval of a bootstrap over the
+    cases. Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", section 13.3."""
+    logs = np.log(np.asarray(ours) / np.asarray(theirs))
+    rows = np.random.default_rng(0).integers(len(logs), size=(RESAMPLES, len(logs)))
+    low, high = np.percentile(logs[rows].mean(axis=1), [2.5, 97.5])
+    return Ratio(*(float(np.exp(x)) for x in (logs.mean(), low, high)))
+
+
+def amounts(
+    runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int, priced: bool
+) -> np.ndarray:
+    """Of every scene of several banks the price (`Score.price`) or, if not `priced`, the iterations to within the
+    tolerance. Other arguments as for `score`."""
+    reached = [reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)]
+    if not priced:
+        return np.clip(np.concatenate(reached), 1, limit)
+    return np.concatenate([prices_to(run, found, limit) for run, found in zip(runs, reached, strict=True)])
 
 
 def evaluate(
@@ -120,6 +152,14 @@ def virtual_best(runs: Sequence[Trajectories], limit: int) -> Trajectories:
     )
 
 
+def best_costs(runs: Mapping[str, Runs], banks: Sequence[Bank]) -> list[np.ndarray]:
+    """The lowest cost of each scene in the bank and in all runs."""
+    return [
+        np.min([np.asarray(bank.best_cost), *(run[k].costs[:, -1] for run in runs.values())], axis=0)
+        for k, bank in enumerate(banks)
+    ]
+
+
 def scores(
     policies: Mapping[str, Runs], rules: Mapping[str, Runs], banks: Sequence[Bank], tolerance: float, limit: int
 ) -> dict[str, Score]:
@@ -128,9 +168,6 @@ def scores(
     The best cost of a scene is the lowest one of the bank and of all these runs, the same for all scores.
     """
     runs = {**policies, **rules}
-    best = [
-        np.min([np.asarray(bank.best_cost), *(run[k].costs[:, -1] for run in runs.values())], axis=0)
-        for k, bank in enumerate(banks)
-    ]
+    best = best_costs(runs, banks)
     lowest = [virtual_best([run[k] for run in rules.values()], limit) for k in range(len(banks))]
     return {name: score(run, best, tolerance, limit) for name, run in {**runs, "virtual best": lowest}.items()}

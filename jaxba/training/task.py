@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
-from jaxba.damping.learned import LearnedPolicy, boldest, learned_from
+from jaxba.damping.learned import LearnedPolicy, boldest, learned_from, without_weights
 from jaxba.damping.registry import BOLD
 from jaxba.game.constant_actions import best_constant_action
 from jaxba.game.env import Game, make_game
-from jaxba.game.evaluate import Runs, Score, evaluate, play_all, scores
+from jaxba.game.evaluate import Ratio, Runs, Score, amounts, best_costs, evaluate, paired_ratio, play_all, scores
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
@@ -52,6 +52,9 @@ smallest lambda that the game's own guard allows, with the agent's step."""
 
 LEARNED = "learned"
 """Name of the trained policy in tables."""
+
+WEIGHTLESS = "its weights zero"
+"""Name of the trained policy without its weights (`without_weights`)."""
 
 CONSTANT = "constant action"
 """Name of the best constant action on the training scenes, where work has a price."""
@@ -97,10 +100,17 @@ class Task:
         kept = numbers.pop("price" if rules.reward == "price" else "mean")
         return {"score": kept, **numbers}
 
-    def compare(self, actor: Any) -> dict[str, Score]:
-        """Scores of a trained policy and the baselines, relative to the best costs of all of them."""
-        learned = {LEARNED: (self.policy(actor), self.game.options)}
-        return self._scores(_play(self.config, self.held_out, learned))
+    def compare(self, actor: Any) -> tuple[dict[str, Score], dict[str, Ratio]]:
+        """Scores of a trained policy and the baselines, relative to the best costs of all of them; and what the trained
+        policy pays over what each baseline pays, scene by scene: prices, or iterations where work has none."""
+        game, policy = self.config.game, self.policy(actor)
+        policies = {LEARNED: policy, WEIGHTLESS: without_weights(policy)}
+        runs = _play(self.config, self.held_out, {name: (one, self.game.options) for name, one in policies.items()})
+        best = best_costs({**runs, **self.baseline_runs}, self.held_out)
+        paid = lambda run: amounts(run, best, game.tolerance, game.max_iterations, game.reward == "price")
+        others = {name: run for name, run in {**runs, **self.baseline_runs}.items() if name != LEARNED}
+        ratios = {name: paired_ratio(paid(runs[LEARNED]), paid(run)) for name, run in others.items()}
+        return self._scores(runs), ratios
 
     def _scores(self, more: Mapping[str, Runs]) -> dict[str, Score]:
         game = self.config.game
