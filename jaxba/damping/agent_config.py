@@ -87,8 +87,7 @@ class AgentConfig:
     """What an action decides besides lambda. `fixed`: nothing. `points`: its second number, the embedded point
     iterations of the step. `points+forcing`: also, its third number, the forcing term of conjugate gradients.
     `points+repairs`: the third number says, where it is positive, that trials, camera rounds and pattern moves are
-    allowed; what they cost is then observed, too. Once the guard has handed over, a step has all point iterations, the
-    smallest forcing term, and repairs."""
+    allowed; what they cost is then observed, too."""
 
     def __post_init__(self) -> None:
         for name, known in (("observation", Observation), ("guard", GuardMode), ("effort", EffortMode)):

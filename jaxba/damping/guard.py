@@ -10,6 +10,7 @@ An action in (-1, 1) is linear in log10 of lambda. With guard `hand-over` lambda
     after an inexact step     lambda >= last lambda
 
 After `patience` rejections in a row, or `max_rejections` in all, Ceres' rule chooses lambda to the end of the solve.
+The effort stays the agent's.
 """
 
 from __future__ import annotations
@@ -17,7 +18,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -155,8 +155,7 @@ def effort_for(config: AgentConfig, guard: GuardState, action: Float[Array, " ac
         chosen = chosen._replace(forcing=10 ** (low + (high - low) * fraction[2]))
     if config.effort == "points+repairs":
         chosen = chosen._replace(repairs=action[2] > 0)
-    full = full_effort(config, dtype)
-    return jax.tree.map(lambda all_, some: jnp.where(guard.handed_over & config.guarded, all_, some), full, chosen)
+    return chosen
 
 
 def full_effort(config: AgentConfig, dtype: Any) -> Effort | None:

@@ -267,7 +267,7 @@ def make_banks(
         else:
             made = solved(make_scenes(kind, class_key, count, config.dtype))
             rows = np.flatnonzero(made.usable)
-            held = max(1, round(HELD_OUT * len(rows)))
+            held = held_out_count(len(rows))
             banks = [select(made.bank, part) for part in (rows[held:], rows[:held])]
         if any(not len(bank.initial_cost) for bank in banks):
             usable = sum(len(bank.initial_cost) for bank in banks)
@@ -279,8 +279,14 @@ def make_banks(
 MORE_CLASSES = 2**30
 """Offset of the random streams of all classes but the first from those of the agents, which begin at 1 (driver.py)."""
 
-HELD_OUT = 0.1
-"""Fraction of the usable scenes that is held out."""
+HELD_OUT, ENOUGH, MOST_HELD_OUT = 0.1, 200, 1 / 3
+"""Fraction of the usable scenes that is held out; more of them up to a number whose mean says something, but never more
+than the last fraction."""
+
+
+def held_out_count(usable: int) -> int:
+    """Number of held-out scenes among the usable ones."""
+    return max(1, round(HELD_OUT * usable), min(ENOUGH, int(MOST_HELD_OUT * usable)))
 
 
 def reach(

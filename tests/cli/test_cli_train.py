@@ -22,7 +22,7 @@ TINY = [
     *("chunks=4", "evaluate_every=2", "checkpoint_every=1", "envs=[8]"),
     *("bank.classes=[{cameras: 4, points: 12, family: paper}]", "bank.scenes=[160]", "bank.refine_points=0"),
     *("game.max_iterations=12", "game.agent.refine_points=0", "game.agent.trials=1", "game.agent.camera_rounds=0"),
-    "game.agent.pattern_moves=0",
+    *("game.agent.pattern_moves=0", "game.agent.effort=fixed", "game.reward=duration"),
     *("sac.width=8", "sac.batch=16", "loop.replay_capacity=500", "loop.warmup_steps=16", "loop.steps_per_chunk=8"),
 ]
 COMMAND = ["--config", "fast", "--set", *TINY]
@@ -112,7 +112,7 @@ def test_the_policy_file_has_the_best_policy_and_its_origin(finished):
     assert "cameras: 4" in metadata["config"]
     actor = {"params": {"MLP_0": {f"Dense_{k}": x._asdict() for k, x in enumerate(policy.layers)}}}
     work = task.build(load("fast", TINY), finished)
-    assert work.compare(actor)["learned"].mean == pytest.approx(best["held_out/score"], abs=1)
+    assert work.compare(actor)[0]["learned"].mean == pytest.approx(best["held_out/score"], abs=1)
 
 
 def test_a_finished_run_resumed_prints_the_table_again(finished, capsys):
