@@ -6,22 +6,14 @@ import sys
 
 import pytest
 
-from benchmarks import invariants, kill
-
-
-@pytest.mark.slow
-def test_trainings_killed_at_random_end_as_one_that_ran_through(capsys):
-    assert kill.main(["--times", "1", "--seed", "3", "--per-run", "1"]) == 0
-    assert "1 kills of" in capsys.readouterr().out
+from benchmarks import invariants
 
 
 @pytest.mark.slow
 def test_no_cost_rises_and_every_number_is_finite(capsys):
-    assert (
-        invariants.main(["--scenes", "24", "--seed", "5", "--iterations", "12", "--solvers", "ceres,bold,learned"]) == 0
-    )
+    assert invariants.main(["--scenes", "24", "--seed", "5", "--iterations", "12", "--solvers", "learned"]) == 0
     printed = capsys.readouterr().out
-    assert printed.count("everything holds") == 6
+    assert printed.count("everything holds") == 2
     assert "0 costs that rose" in printed
 
 

@@ -27,7 +27,7 @@ from jaxba.structure.padding import capacity_of, padded_parameters
 
 pytestmark = pytest.mark.step
 
-DAMPING = {"diagonal": 1e-2, "identity": 1e4}
+DAMPING = 1e-2
 PLAIN = StepOptions()
 TO_THE_END = ConjugateGradients(forcing=0.0, tolerance=1e-14, max_iterations=5000)
 
@@ -73,29 +73,18 @@ def own_size(problem: BundleProblem, options: StepOptions) -> tuple[Layout, Bund
     return layout_for(problem, options), problem
 
 
-def from_pairs(problem: BundleProblem, _: StepOptions) -> tuple[Layout, BundleProblem]:
-    return build_layout(problem, grid=False), problem
-
-
 FACTORED = {
     "dense": (support.tiny, PLAIN, own_size),
-    "pairs": (support.tiny, PLAIN, from_pairs),
     "band": (sequence, PLAIN, own_size),
-    "few-points": (lambda: support.paper(0), PLAIN, own_size),
     "shared-lenses": (shared, PLAIN, own_size),
     "odd": (support.odd, PLAIN, own_size),
-    "whitened": (support.whitened, PLAIN, own_size),
-    "padded-dense": (support.tiny, PLAIN, padded),
     "manifold": (support.tiny, StepOptions(coordinates=Coordinates(rotation="manifold")), own_size),
-    "identity": (support.tiny, StepOptions(coordinates=Coordinates(scaling="identity")), own_size),
-    "cauchy": (support.odd, StepOptions(loss=Loss("cauchy", 1.7)), own_size),
     "tukey": (support.odd, StepOptions(loss=Loss("tukey", 8.0)), own_size),
     # jax.scipy's conjugate gradients have the derivatives of the solution, in both modes
     "cg": (support.tiny, StepOptions(linear_solver="cg", conjugate_gradients=ConjugateGradients(budget=120)), own_size),
 }
 WITH_LOOPS = {
     "implicit": (support.tiny, StepOptions(linear_solver="implicit", conjugate_gradients=TO_THE_END), own_size),
-    "sparse": (support.odd, StepOptions(linear_solver="sparse", conjugate_gradients=TO_THE_END), own_size),
     "padded-pairs": (support.odd, PLAIN, padded),
 }
 
@@ -119,7 +108,7 @@ def as_function(make, options: StepOptions, lay_out):
         state.cameras,
         state.points,
         jnp.asarray(layout.pixels),
-        jnp.asarray(DAMPING[options.coordinates.scaling]),
+        jnp.asarray(DAMPING),
     )
 
 
@@ -163,13 +152,13 @@ def some_slow(names, fast) -> list:
     return [pytest.param(name, marks=() if name in fast else pytest.mark.slow) for name in names]
 
 
-@pytest.mark.parametrize("name", some_slow([*FACTORED, *WITH_LOOPS], ("pairs", "few-points", "odd", "tukey", "sparse")))
+@pytest.mark.parametrize("name", some_slow([*FACTORED, *WITH_LOOPS], ("odd", "tukey")))
 def test_forward_derivatives_are_finite_and_those_of_differences(name):
     check_forward(*as_function(*{**FACTORED, **WITH_LOOPS}[name]))
 
 
 # backwards is what JAX makes of forwards, but for the rules of factorisations and of loops: one of each
-@pytest.mark.parametrize("name", some_slow(["dense", "band", "few-points", "shared-lenses", "cg"], ("dense",)))
+@pytest.mark.parametrize("name", some_slow(["dense", "shared-lenses", "cg"], ("dense",)))
 def test_reverse_derivatives_are_finite_and_the_transposed_of_the_forward_ones(name):
     function, at = as_function(*FACTORED[name])
     rng = np.random.default_rng(1)
@@ -193,7 +182,7 @@ def test_the_jacobian_is_made_of_forward_derivatives():
     np.testing.assert_allclose(jacobian, gradient, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
 
 
-@pytest.mark.parametrize("loss", some_slow(["squared", "huber", "soft_l1", "cauchy", "tukey"], ("tukey",)))
+@pytest.mark.parametrize("loss", some_slow(["squared", "tukey"], ("tukey",)))
 def test_nothing_is_nan_where_the_residuals_or_all_weights_are_zero(loss):
     """At zero residuals the step is zero, too; far beyond the scale of a loss most or all of the weights are."""
     problem = in_first_camera(support.tiny())

@@ -92,13 +92,8 @@ def call(x, power=1):
     [
         {"policy": "learned", "compilation": "auto"},
         {"policy": "ceres", "dtype": "mixed"},
-        {"policy": "learned", "dtype": "float32"},
-        {"policy": "learned", "method": "stba"},
         {"policy": "learned", "method": "ddlm"},
-        {"policy": "learned", "method": "deeplm"},
-        {"policy": "learned", "linear_solver": "sparse"},
         {"policy": "ceres", "linear_solver": "implicit"},
-        {"policy": "ceres", "method": "poba"},
         {"policy": "learned", "pad": True},
     ],
     ids=str,

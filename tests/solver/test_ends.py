@@ -52,7 +52,7 @@ def test_one_observation_with_a_weight_is_enough_to_begin():
     assert solve(problem, "ceres", loss=Loss("tukey", 2.0)).termination != Termination.NO_WEIGHT
 
 
-@pytest.mark.parametrize("loss", ["squared", "huber", "soft_l1", "cauchy", "tukey"])
+@pytest.mark.parametrize("loss", ["squared", "tukey"])
 def test_a_start_without_residuals_has_converged(loss):
     problem = support.tiny()
     exact = problem.replace(observations=geometry.project(problem))
