@@ -15,7 +15,7 @@ import tyro
 from jaxba.cli import common
 from jaxba.problem.options import LinearSolverChoice
 
-DEFAULT_SOLVERS = "learned,bold,classic,ceres,ceres+refine3,ceres+embedded"
+DEFAULT_SOLVERS = "guarded,learned,bold,classic,ceres,ceres+refine3,ceres+embedded"
 """The shipped policy, its twin without a network, the paper's baseline, and Ceres' rule alone and with embedded
 iterations."""
 

@@ -61,11 +61,11 @@ class Arguments:
     (see jaxba-data). Default: a random scene."""
 
     policy: str = DEFAULT_POLICY
-    """Damping policy, which chooses lambda: learned (the shipped policy for the options of the step), a .safetensors
-    file of jaxba-train, or one of the rules ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton,
-    bold (the smallest lambda that the guard of learned allows), constant:1e-4. Most rules take the first lambda, as in
-    classic:0.03. All may end with +embedded (all embedded iterations, as around learned) or +refineK (K point
-    iterations after each camera step, as --refine-points K)."""
+    """Damping policy, which chooses lambda: guarded (1e-8 until a step fails), learned (the shipped network for the
+    options of the step), bold (the smallest lambda that its guard allows), a .safetensors file of jaxba-train, or one
+    of the rules ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most rules take
+    the first lambda, as in classic:0.03. All may end with +embedded (all embedded iterations, as around learned) or
+    +refineK (K point iterations after each camera step, as --refine-points K)."""
 
     method: str = DEFAULT_METHOD
     """Method that computes a step. lm: Levenberg-Marquardt. stba: random clusters of at most 100 cameras; stba:16: of

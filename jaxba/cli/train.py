@@ -30,8 +30,8 @@ class Arguments:
     """Options of `jaxba-train`."""
 
     config: str | None = None
-    """A preset (default, plain, driver, fast, paper) or the path of a YAML file. A resumed run has its configuration in
-    its folder."""
+    """A preset (default, plain, driver, fast, paper; bal and kitti with --problems) or the path of a YAML file. A
+    resumed run has its configuration in its folder."""
 
     overrides: Annotated[
         tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="KEY=VALUE ...")

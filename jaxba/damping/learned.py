@@ -87,6 +87,27 @@ def boldest(config: AgentConfig) -> ConstantAction:
     return ConstantAction((-1.0,) * config.action_size, config)
 
 
+GUARDED_DECADES, GUARDED_POINTS = -8.0, 1
+"""log10 of lambda and point iterations of `guarded`: the best constant action of the game in which work has a price, on
+512 training scenes, under a guard that leaves lambda free until a step fails (docs/notebook/game.md)."""
+
+
+def guarded() -> ConstantAction:
+    """Nearly Gauss-Newton, with all embedded iterations: one small lambda, until the guard raises it after a rejection
+    or a shortened step."""
+    config = AgentConfig(
+        low=GUARDED_DECADES,
+        first_low=GUARDED_DECADES,
+        descent=FREE_DESCENT,
+        refine_points=GUARDED_POINTS,
+    )
+    return boldest(config)
+
+
+FREE_DESCENT = 11.0
+"""Decades by which lambda may fall where nothing limits it: the whole range of an action."""
+
+
 class Layer(NamedTuple):
     """`x W + b`."""
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from jaxba.damping.learned import ConstantAction, LearnedPolicy, boldest
+from jaxba.damping.learned import ConstantAction, LearnedPolicy, boldest, guarded
 from jaxba.damping.policy import DampingPolicy
 from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
@@ -27,6 +27,9 @@ SHIPPED = {
 BOLD, BOLD_PLAIN, BOLD_DRIVER = "bold", "bold-plain", "bold-driver"
 """No network, but the guard and the step of the shipped policies, in the same order. In the name of a solver, `bold`
 means the one that fits the step."""
+
+GUARDED = "guarded"
+"""The best constant action, see `learned.guarded`; the default policy of a solve."""
 
 _GUARD_OF = {BOLD: LEARNED, BOLD_PLAIN: LEARNED_PLAIN, BOLD_DRIVER: LEARNED_DRIVER}
 
@@ -49,6 +52,7 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
     "theseus": (theseus, "Theseus' adaptive rule: 1e-3, then x1/9 or x11"),
     "schedule": (Schedule, "the paper's cycle 1e-15, 1e-15, 0.194, 0.551"),
     "gauss-newton": (gauss_newton, "next to no damping: 1e-10 throughout"),
+    GUARDED: (guarded, "1e-8 in the same guard, which limits it only after failures; what `learned` has to beat"),
     BOLD: (bold, "the smallest lambda that the guard of `learned` allows: 1e-5, then /32 down to 1e-9"),
 }
 """Factory and one line of description by name."""
@@ -107,7 +111,7 @@ def is_learned(name: str) -> bool:
 
 def brings_embedded(name: str) -> bool:
     """Whether a policy of this name has a configuration with embedded iterations of its own."""
-    return is_learned(name) or name in _GUARD_OF
+    return is_learned(name) or name in _GUARD_OF or name == GUARDED
 
 
 def _shipped(name: str) -> LearnedPolicy:

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxba.damping import DampingPolicy
 from jaxba.damping.policy import observes_prices
+from jaxba.damping.registry import GUARDED
 from jaxba.lm.records import LMState, Prices
 from jaxba.lm.step import initial_state
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -29,7 +30,7 @@ from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
 
-DEFAULT_POLICY = "learned"
+DEFAULT_POLICY = GUARDED
 """Name of the default damping policy."""
 
 PADDED_CAMERAS, PADDED_OBSERVATIONS = 64, 60_000

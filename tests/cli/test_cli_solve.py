@@ -59,7 +59,7 @@ def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
     np.testing.assert_allclose(record["final_cost"], geometry.cost(solved), rtol=1e-10)
     for name in ("observations", "camera_index", "point_index"):
         assert np.array_equal(getattr(solved, name), getattr(support.tiny(), name))
-    assert (record["solver"], record["dtype"], record["termination"]) == ("learned", "float64", "cost")
+    assert (record["solver"], record["dtype"], record["termination"]) == ("guarded", "float64", "cost")
     assert (record["cameras"], record["points"], record["observations"]) == (6, 40, 200)
     costs = [point["cost"] for point in record["trace"]]
     assert costs[0] == record["initial_cost"]

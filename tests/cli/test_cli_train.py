@@ -169,7 +169,7 @@ def test_errors_of_the_configuration_are_one_line(capsys, tmp_path):
     out = str(tmp_path / "run")
     assert "did you mean width" in error_of(capsys, "--set", "sac.with=3", "--out", out)
     assert "unknown key zzz" in error_of(capsys, "--set", "seed=1", "--set", "zzz=1", "seeds=2", "--out", out)
-    assert "known: default, driver, fast" in error_of(capsys, "--config", "fastest", "--out", out)
+    assert "known: bal, default, driver, fast, kitti" in error_of(capsys, "--config", "fastest", "--out", out)
     assert "No such file" in error_of(capsys, "--config", "some/where.yaml", "--out", out)
     assert "holds no run to resume" in error_of(capsys, "--resume", "--out", out)
     assert not (tmp_path / "run").exists()

@@ -26,6 +26,7 @@ from jaxba.cli.solve import Arguments, run, solve_options
 from jaxba.damping.policy import trained_step
 from jaxba.io import read_problem, write_problem
 from jaxba.solver.names import parse_solver
+from jaxba.solver.prepare import DEFAULT_POLICY
 
 # Defaults
 
@@ -47,12 +48,12 @@ def test_every_default_of_the_command_is_that_of_the_options():
 
 def test_the_command_asks_for_the_same_step():
     policy, options = solve_options(Arguments())
-    assert options.step_options(policy) == SolveOptions().step_options(make_policy("learned"))
+    assert options.step_options(policy) == SolveOptions().step_options(make_policy(DEFAULT_POLICY))
 
 
 @pytest.mark.parametrize("function", [jaxba.solve, jaxba.solve_and_retriangulate, jaxba.prepare])
 def test_who_chooses_lambda_is_the_same_everywhere(function):
-    assert inspect.signature(function).parameters["policy"].default == Arguments().policy == "learned"
+    assert inspect.signature(function).parameters["policy"].default == Arguments().policy == DEFAULT_POLICY
 
 
 def test_a_solve_with_defaults_is_what_the_command_writes(tmp_path):
@@ -83,7 +84,7 @@ def test_a_solve_with_a_loss_is_the_one_with_the_trained_step_spelled_out():
 
 def test_what_is_asked_for_wins_over_what_the_policy_was_trained_with():
     refinement, coordinates = Refinement(points=1, trials=2), Coordinates(camera_damping=0.5, rotation="manifold")
-    trained = trained_step(make_policy("learned"))
+    trained = trained_step(make_policy(DEFAULT_POLICY))
     one = prepare(support.tiny(), options=SolveOptions(refinement=refinement)).options
     assert (one.refinement, one.coordinates) == (refinement, trained.coordinates)
     other = prepare(support.tiny(), options=SolveOptions(coordinates=coordinates)).options
