@@ -7,7 +7,7 @@ each is combined with policies for lambda. Every combination solves every proble
 compiled. Counted are the seconds until the cost is within tau of the best that any combination finds, the least of the
 repeats. The tables: for each combination the geometric mean over the problems of its seconds relative to those of the
 virtual best, where a failure counts as `FAILURE`; and for each problem the seconds of its best combination, of the best
-one in all, and of the default of the commands.
+one in all, and of `learned` with its own effort.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ POINTS = (0, 1, 3)
 """Numbers of embedded point iterations."""
 
 SHIPPED = ("learned", 3, True)
-"""The combination that is the default of the commands."""
+"""The step and the policy that ship as `learned`."""
 
 
 @dataclass(frozen=True)
