@@ -15,7 +15,7 @@ from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
 
 TINY = """
 agents:
-  preset: fast
+  preset: paper
   overrides:
     - chunks=1
     - evaluate_every=1
