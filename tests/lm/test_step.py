@@ -49,8 +49,6 @@ SHARES = {
 LOSSES = {name: replace(EXACT, loss=Loss(name, 1.7)) for name in ("huber", "soft_l1", "cauchy", "tukey")}
 PROBLEMS = {
     "paper-0": lambda: support.paper(0),
-    "paper-1": lambda: support.paper(1),
-    "paper-2": lambda: support.paper(2),
     "odd": support.odd,
     "single": support.single,
 }

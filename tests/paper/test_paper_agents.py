@@ -9,7 +9,7 @@ from support import paper, solve
 
 from jaxba import StepOptions
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, make_banks
+from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, held_out_count, make_banks
 from jaxba.io import settings
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
@@ -60,8 +60,13 @@ def split() -> Split:
 def test_held_out_scenes_are_not_training_scenes(split):
     train, held_out = (set(map(bytes, np.asarray(bank.scenes.pixels))) for bank in split)
     assert len(train) == len(split.train.initial_cost)
-    assert len(held_out) == len(split.held_out.initial_cost) == round((len(train) + len(held_out)) / 10)
+    assert len(held_out) == len(split.held_out.initial_cost) == held_out_count(len(train) + len(held_out))
     assert not train & held_out
+
+
+@pytest.mark.parametrize(("usable", "held"), [(1, 1), (60, 20), (600, 200), (900, 200), (4572, 457)])
+def test_a_tenth_is_held_out_or_two_hundred_scenes_but_no_more_than_a_third(usable, held):
+    assert held_out_count(usable) == held
 
 
 def test_scenes_are_neither_solved_at_the_start_nor_unsolvable(split):

@@ -149,6 +149,7 @@ def no_search(_) -> None:
     pytest.fail("a search")
 
 
+@pytest.mark.slow
 def test_a_step_that_asks_the_rays_finds_the_point_by_itself():
     np.testing.assert_allclose(solve(one_diverged(), "learned").final_cost, geometry.cost(solved()), rtol=1e-6)
     assert jaxba.solve(one_diverged(), "ceres", STRANDING).final_cost > 1.1 * geometry.cost(solved())
