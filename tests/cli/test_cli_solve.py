@@ -162,7 +162,7 @@ def test_options_reach_the_solver(tiny, tmp_path, capsys):
     assert "policy classic:0.03 + 3 point iterations, float64" in capsys.readouterr().out
     assert run([str(tiny), "--dtype", "float32", "--max-iterations", "2", "--log", str(log)]) == 0
     record = json.loads(log.read_text())
-    assert (record["solver"], record["dtype"]) == ("learned@float32", "float32")
+    assert (record["solver"], record["dtype"]) == ("guarded@float32", "float32")
     assert run([str(tiny), "--linear-solver", "implicit", "--max-iterations", "2", "--log", str(log)]) == 0
     record = json.loads(log.read_text())
     assert record["cg_iterations"] > 0
