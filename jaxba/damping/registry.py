@@ -29,7 +29,7 @@ BOLD, BOLD_PLAIN, BOLD_DRIVER = "bold", "bold-plain", "bold-driver"
 means the one that fits the step."""
 
 GUARDED = "guarded"
-"""The best constant action, see `learned.guarded`; the default policy of a solve."""
+"""A constant action, see `learned.guarded`; the default policy of a solve."""
 
 _GUARD_OF = {BOLD: LEARNED, BOLD_PLAIN: LEARNED_PLAIN, BOLD_DRIVER: LEARNED_DRIVER}
 
@@ -52,7 +52,7 @@ POLICIES: dict[str, tuple[Callable[[], DampingPolicy], str]] = {
     "theseus": (theseus, "Theseus' adaptive rule: 1e-3, then x1/9 or x11"),
     "schedule": (Schedule, "the paper's cycle 1e-15, 1e-15, 0.194, 0.551"),
     "gauss-newton": (gauss_newton, "next to no damping: 1e-10 throughout"),
-    GUARDED: (guarded, "1e-8 in the same guard, which limits it only after failures; what `learned` has to beat"),
+    GUARDED: (guarded, "1e-8, in a guard that raises it after failures"),
     BOLD: (bold, "the smallest lambda that the guard of `learned` allows: 1e-5, then /32 down to 1e-9"),
 }
 """Factory and one line of description by name."""
