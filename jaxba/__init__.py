@@ -37,6 +37,9 @@ from jaxba.lm.step import initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.methods.registry import METHODS, Method, make_method
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
+from jaxba.problem.camera_models import CAMERA_MODELS, CameraModel, register_camera_model
+from jaxba.problem.constants import Constants
+from jaxba.problem.constraints import hold, release, with_gauge
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
@@ -54,14 +57,17 @@ from jaxba.structure.layout import Layout, build_layout
 __version__ = "0.1.0"
 
 __all__ = [
+    "CAMERA_MODELS",
     "METHODS",
     "POLICIES",
     "AgentConfig",
     "BundleProblem",
+    "CameraModel",
     "Carry",
     "Ceres",
     "Classic",
     "ConjugateGradients",
+    "Constants",
     "Coordinates",
     "DampingPolicy",
     "Effort",
@@ -90,6 +96,7 @@ __all__ = [
     "Tolerances",
     "build_layout",
     "drop_invalid",
+    "hold",
     "initial_state",
     "lm_step",
     "load_policy",
@@ -105,6 +112,8 @@ __all__ = [
     "read_bundler",
     "read_colmap",
     "read_problem",
+    "register_camera_model",
+    "release",
     "retriangulate",
     "save_policy",
     "scene_like",
@@ -112,6 +121,7 @@ __all__ = [
     "solve_and_retriangulate",
     "solve_loop",
     "trained_step",
+    "with_gauge",
     "write_bal",
     "write_bundler",
     "write_colmap",

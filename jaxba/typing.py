@@ -25,9 +25,11 @@ def register_pytree(kind: type[T]) -> type[T]:
     pass to the constructor, so types are checked there, where somebody checks them, and not when JAX rebuilds.
 
     Args:
-        kind: a dataclass; fields with the metadata `{"static": True}` are part of the tree's structure.
+        kind: a dataclass; fields with the metadata `{"static": True}` are part of the tree's structure. Those with
+            `{"host": True}` are not part of the tree, and None when it is rebuilt.
     """
-    data = [field.name for field in fields(kind) if not field.metadata.get("static")]  # pyright: ignore
+    host = [field.name for field in fields(kind) if field.metadata.get("host")]  # pyright: ignore
+    data = [field.name for field in fields(kind) if not field.metadata]  # pyright: ignore
     static = [field.name for field in fields(kind) if field.metadata.get("static")]  # pyright: ignore
 
     def flatten(node):
@@ -39,7 +41,8 @@ def register_pytree(kind: type[T]) -> type[T]:
 
     def unflatten(structure, children):
         node = object.__new__(kind)
-        for name, value in [*zip(data, children, strict=True), *zip(static, structure, strict=True)]:
+        nothing = ((name, None) for name in host)
+        for name, value in [*zip(data, children, strict=True), *zip(static, structure, strict=True), *nothing]:
             object.__setattr__(node, name, value)
         return node
 

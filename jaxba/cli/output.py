@@ -6,6 +6,7 @@ from pathlib import Path
 
 from jaxba.cli import common, table
 from jaxba.io import check_output, formats, is_colmap, is_folder, write_colmap, write_problem
+from jaxba.io.bal import check_bal_lenses
 from jaxba.problem.bundle_problem import BundleProblem
 
 
@@ -47,6 +48,16 @@ def check_outputs(output: str | None, log: str | None, source: str | None) -> No
         raise common.UsageError(f"--output and --log name the same file, {output}")
     if log and source and Path(log).resolve() == Path(source).resolve():
         raise common.UsageError(f"--log names the problem's file, {log}")
+
+
+def check_storable(output: str | None, problem: BundleProblem, source: str | None) -> None:
+    """Checks that the format of the output can hold the problem's lenses.
+
+    Raises:
+        ProblemError: it cannot; one line.
+    """
+    if output and not is_model(output, source) and formats.holds_bal_only(output):
+        check_bal_lenses(problem, output)
 
 
 def write_solution(output: str, problem: BundleProblem, source: str | None) -> None:

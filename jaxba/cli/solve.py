@@ -13,7 +13,7 @@ import tyro
 
 from jaxba.cli import common, table
 from jaxba.cli.interrupt import Interrupt
-from jaxba.cli.output import check_outputs, write_solution
+from jaxba.cli.output import check_outputs, check_storable, write_solution
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import read_problem
@@ -227,6 +227,7 @@ def _solve(args: Arguments) -> int:
     check_outputs(args.output, args.log, path)
     with common.notes_printed():
         problem = _default_scene() if path is None else read_problem(path, strict=args.strict)
+    check_storable(args.output, problem, path)
     common.prepare_process(untraced=True)
     name = args.problem or DEFAULT_SCENE
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))

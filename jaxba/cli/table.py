@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -43,13 +44,33 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     counts = ("camera", problem.num_cameras), ("point", problem.num_points), ("observation", problem.num_observations)
     sizes = ", ".join(counted(count, noun) for noun, count in counts)
-    if problem.lenses is not None:
-        free = np.asarray(problem.lenses.free) & (options.intrinsics == "free")
-        for kind, number in Counter(map(tuple, free.tolist())).most_common():
-            names = [one for one, used in zip(("f", "k1", "k2"), kind, strict=True) if used]
-            sizes += f", {number} lens{'es' * (number > 1)} ({', '.join(names) or 'fixed'})"
+    sizes += "".join(f", {part}" for part in [*_lenses(problem, options), *_constants(problem)])
     how = f"{args.dtype}, {solver}, {compiled(args.compilation, problem)}"
     return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {how}"
+
+
+def _lenses(problem: BundleProblem, options: StepOptions) -> Iterator[str]:
+    """How many lenses there are of each camera model, with the numbers that are optimised."""
+    lenses = problem.lenses
+    if lenses is None:
+        return
+    free = np.asarray(lenses.free) & (options.intrinsics == "free")
+    kinds = ((lenses.model_of(lens), tuple(row)) for lens, row in enumerate(free.tolist()))
+    for (model, moves), number in Counter(kinds).most_common():
+        names = ", ".join(name for name, moved in zip(model.parameters, moves, strict=False) if moved) or "constant"
+        name = "lens" + "es" * (number > 1) if lenses.all_bal else model.name
+        yield f"{number} {name} ({names})"
+
+
+def _constants(problem: BundleProblem) -> list[str]:
+    """What of poses and points is constant."""
+    if problem.constants is None:
+        return []
+    poses = np.asarray(problem.constants.poses)
+    whole, points = int(poses.all(axis=1).sum()), int(np.sum(problem.constants.points))
+    part = int(poses.any(axis=1).sum()) - whole
+    found = (whole, "constant pose"), (part, "partly constant pose"), (points, "constant point")
+    return [counted(count, what) for count, what in found if count]
 
 
 def compiled(compilation: str, problem: BundleProblem) -> str:
@@ -141,7 +162,8 @@ def lost_in_new_model(problem: BundleProblem) -> str:
     """Properties of a problem that a COLMAP model cannot store, as text; empty if there are none."""
     lenses = problem.lenses
     lost = [
-        (lenses is not None and not np.asarray(lenses.free).all(), "which numbers of a lens stay as they are"),
+        (lenses is not None and not np.asarray(lenses.free).all(), "which numbers of a lens are constant"),
+        (problem.constants is not None, "which poses and points are constant"),
         (problem.whitening is not None, "weights of observations"),
     ]
     return ", ".join(what for is_lost, what in lost if is_lost)
@@ -152,7 +174,9 @@ def padding(problem: BundleProblem, solution: Solution) -> str:
     if solution.capacity is not None:
         return f"padded to {solution.capacity}"
     if problem.lenses is not None:
-        why = "the problem has shared or partly fixed lenses"
+        why = "the problem has shared or partly constant lenses"
+    elif problem.constants is not None:
+        why = "part of the problem is constant"
     elif capacity_of(problem) is None:
         why = "the problem is too large"
     else:

@@ -200,7 +200,7 @@ def _local(rig: _Rig, world: Array) -> Float[Array, "cameras points 3"]:
 def _project(rig: _Rig, world: Float[Array, "points 3"]) -> Float[Array, "2 cameras points"]:
     """Pixels of every point in every camera."""
     rotation = jnp.moveaxis(rig.rotation, 0, -1)[..., None]
-    frames = camera.Frames(rotation, _translation(rig.rotation, rig.center).T[..., None], *rig.intrinsics[..., None])
+    frames = camera.Frames(rotation, _translation(rig.rotation, rig.center).T[..., None], rig.intrinsics[..., None])
     return jnp.stack(list(camera.project(frames, world.T[:, None]).pixel))
 
 

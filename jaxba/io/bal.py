@@ -47,17 +47,19 @@ def read_bal(path: StrPath) -> BundleProblem:
 def write_bal(problem: BundleProblem, path: StrPath) -> None:
     """Writes a BAL file that reads back bit by bit; compressed if the name ends in `.bz2`, `.gz` or `.xz`.
 
-    The file is replaced whole or not at all. BAL cannot store covariances, weights or shared intrinsics:
-    `problem.whitening` and `problem.lenses` are **not** written, and the problem reads back without whitening and with
-    free intrinsics of its own for every camera.
+    The file is replaced whole or not at all. BAL cannot store covariances, weights, shared intrinsics or what is
+    constant: these are **not** written, and the problem reads back without whitening and with free intrinsics of its
+    own for every camera.
 
     Args:
         problem: of NumPy or JAX arrays; float32 is written as the float64 of the same value.
         path: the file, replaced if it exists.
 
     Raises:
-        ProblemError: the problem is not valid, for example not finite, or the file cannot be written.
+        ProblemError: the problem is not valid, for example not finite, has lenses that are not BAL's, or the file
+            cannot be written.
     """
+    check_bal_lenses(problem, path)
     arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
     valid = BundleProblem.create(*arrays)
     observations, camera_index, point_index = valid.observations, valid.camera_index, valid.point_index
@@ -71,6 +73,13 @@ def write_bal(problem: BundleProblem, path: StrPath) -> None:
         for numbers in (valid.cameras.ravel(), valid.points.ravel()):
             for start in range(0, numbers.size, _WRITE_ROWS):
                 file.write("".join([f"{v}\n" for v in numbers[start : start + _WRITE_ROWS].tolist()]).encode())
+
+
+def check_bal_lenses(problem: BundleProblem, path: StrPath) -> None:
+    """Raises a ProblemError if a file of BAL's cameras cannot hold a problem."""
+    if problem.lenses is not None and not problem.lenses.all_bal:
+        names = ", ".join(model.name for model in problem.lenses.models)
+        raise ProblemError(f"cannot write {display_name(path)}: it would hold BAL's lenses only, not {names}")
 
 
 def _read(reader: NumberReader) -> BundleProblem:

@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from jaxba.io.bal import check_bal_lenses
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name, open_output
 from jaxba.io.ply import POINT_COLOUR
@@ -64,8 +65,9 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
 
     Raises:
         ProblemError: the problem is not valid, a camera that sees points has focal length 0, which stands for cameras
-            that are not registered, or the file cannot be written.
+            that are not registered, lenses are not BAL's, or the file cannot be written.
     """
+    check_bal_lenses(problem, path)
     arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
     valid = BundleProblem.create(*arrays)
     cameras, camera_index = np.asarray(valid.cameras), np.asarray(valid.camera_index)

@@ -174,6 +174,12 @@ def writer(path: StrPath) -> Writer:
     return write
 
 
+def holds_bal_only(path: StrPath) -> bool:
+    """Whether a file of this name holds cameras of BAL only."""
+    known = by_ending(path)
+    return known is None or known.name != "PLY"
+
+
 def holds_problem(path: StrPath) -> bool:
     """Whether a path is a folder that holds a problem."""
     return is_colmap(path) or (Path(path) / RECONSTRUCTION).is_file()

@@ -22,14 +22,15 @@ from jaxba.structure.camera_ordering import Band
 from jaxba.structure.segment_sums import take_rows
 
 
-def band_rows(band: Band, blocks: Float[Array, "blocks 9 9"]) -> Float[Array, "tiles rows columns"]:
+def band_rows(band: Band, blocks: Float[Array, "blocks width width"]) -> Float[Array, "tiles rows columns"]:
     """The tiles of every row of tiles; the diagonal one is last. Padding gets a unit diagonal."""
     tiles, m, columns = band.blocks.shape
-    rows = take_rows(blocks.reshape(-1, 81), band.blocks).reshape(tiles, m, columns, 9, 9)
-    rows = rows.transpose(0, 1, 3, 2, 4).reshape(tiles, 9 * m, 9 * columns)
-    padding = jnp.repeat(band.camera == band.rank.shape[0], 9, axis=1).astype(rows.dtype)
-    unit = padding[:, :, None] * jnp.eye(9 * m, dtype=rows.dtype)
-    return rows.at[:, :, -9 * m :].add(unit)
+    width = blocks.shape[-1]
+    rows = take_rows(blocks.reshape(-1, width**2), band.blocks).reshape(tiles, m, columns, width, width)
+    rows = rows.transpose(0, 1, 3, 2, 4).reshape(tiles, width * m, width * columns)
+    padding = jnp.repeat(band.camera == band.rank.shape[0], width, axis=1).astype(rows.dtype)
+    unit = padding[:, :, None] * jnp.eye(width * m, dtype=rows.dtype)
+    return rows.at[:, :, -width * m :].add(unit)
 
 
 class BandFactor(NamedTuple):
@@ -39,10 +40,10 @@ class BandFactor(NamedTuple):
     inverses: Float[Array, "tiles size size"]  # of the diagonal tiles
     below: Float[Array, "tiles rest size"]  # the rows of L below each diagonal tile, within the band
 
-    def solve(self, right: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
+    def solve(self, right: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         """Solves `L L^T x = b`."""
         tiles, rest, size = self.below.shape
-        zero = jnp.zeros((1, 9), right.dtype)
+        zero = jnp.zeros((1, right.shape[1]), right.dtype)
         rights = take_rows(jnp.concatenate([right, zero]), self.band.camera).reshape(tiles, size)
 
         def forward(before: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
@@ -62,7 +63,7 @@ class BandFactor(NamedTuple):
         padded = nothing if rest else jnp.zeros(size, right.dtype)
         _, halves = lax.scan(forward if rest else _diagonal_forward, padded, (rights, self.inverses, self.below))
         _, x = lax.scan(backward, nothing, (halves, self.inverses, self.below), reverse=True)
-        return take_rows(x.reshape(-1, 9), self.band.rank)
+        return take_rows(x.reshape(-1, right.shape[1]), self.band.rank)
 
 
 def _diagonal_forward(nothing: Array, row: tuple[Array, Array, Array]) -> tuple[Array, Array]:
@@ -70,7 +71,7 @@ def _diagonal_forward(nothing: Array, row: tuple[Array, Array, Array]) -> tuple[
     return nothing, jnp.matmul(inverse, right_tile, precision="highest")
 
 
-def band_factor(band: Band, blocks: Float[Array, "blocks 9 9"]) -> BandFactor:
+def band_factor(band: Band, blocks: Float[Array, "blocks width width"]) -> BandFactor:
     """Cholesky factor of S; non-finite if S is not positive definite."""
     rows = band_rows(band, blocks)
     _, size, columns = rows.shape
@@ -94,7 +95,7 @@ def band_factor(band: Band, blocks: Float[Array, "blocks 9 9"]) -> BandFactor:
 
 
 def band_factor_and_solve(
-    band: Band, blocks: Float[Array, "blocks 9 9"], right: Float[Array, "cameras 9"]
-) -> Float[Array, "cameras 9"]:
+    band: Band, blocks: Float[Array, "blocks width width"], right: Float[Array, "cameras width"]
+) -> Float[Array, "cameras width"]:
     """Solves `S x = b`; non-finite if S is not positive definite."""
     return band_factor(band, blocks).solve(right)

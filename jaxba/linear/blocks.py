@@ -40,7 +40,7 @@ def pair_products(
     return compute_unfused(lambda partial: prefix_sum(zeros, partial, pairs.levels, 0), partial, index=pairs.sums)
 
 
-def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks square"], width: int) -> Float[Array, "n n"]:
+def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks width width"]) -> Float[Array, "n n"]:
     """The blocks assembled into one matrix, of which only the lower triangle is filled.
 
     Raises:
@@ -48,6 +48,6 @@ def dense_blocks(pairs: PairLayout, blocks: Float[Array, "blocks square"], width
     """
     if pairs.table is None:
         raise ValueError("this layout has no table of blocks: build it with factor=True to factor the system")
-    side = pairs.table.shape[0]
-    dense = take_rows(blocks, pairs.table).reshape(side, side, width, width)
+    side, width = pairs.table.shape[0], blocks.shape[-1]
+    dense = take_rows(blocks.reshape(-1, width**2), pairs.table).reshape(side, side, width, width)
     return dense.transpose(0, 2, 1, 3).reshape(width * side, width * side)

@@ -34,7 +34,7 @@ class Panels(NamedTuple):
     inverses: list[Float[Array, "size size"]]  # of the diagonal blocks
     below: list[Float[Array, "rest size"]]  # the rows of L below each diagonal block
 
-    def solve(self, right: Float[Array, " n"]) -> Float[Array, " n"]:
+    def solve(self, right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         """Solves `L L^T x = b`."""
         halves = []
         for inverse, below in zip(self.inverses, self.below, strict=True):
@@ -67,22 +67,23 @@ def _lower_cholesky_jvp(matrix: tuple[Array], change: tuple[Array]) -> tuple[Arr
     return jax.jvp(factored, matrix, (full,))
 
 
-def factor_and_solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+def factor_and_solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
     """Solves `A x = b` for a symmetric positive definite matrix after Jacobi scaling.
 
     Args:
         matrix: only its lower triangle is read.
-        right: `b`.
+        right: `b`, or several as columns.
 
     Returns:
         The solution; non-finite if the matrix is not positive definite.
     """
     scale = lax.rsqrt(jnp.diagonal(matrix))
     scaled = matrix * scale[:, None] * scale
+    rows = scale if right.ndim == 1 else scale[:, None]
     if matrix.shape[0] < MIN_UNKNOWNS:
-        return _lapack_solve(scaled, right * scale) * scale
+        return _lapack_solve(scaled, right * rows) * rows
     by_panels = lambda a, b: factor_panels(a).solve(b)
-    return lax.platform_dependent(scaled, right * scale, cpu=by_panels, default=_lapack_solve) * scale
+    return lax.platform_dependent(scaled, right * rows, cpu=by_panels, default=_lapack_solve) * rows
 
 
 def _lapack_solve(matrix: Array, right: Array) -> Array:

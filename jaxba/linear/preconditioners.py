@@ -20,6 +20,7 @@ from jaxba.linear.cholesky import lower_cholesky
 from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.linear.two_level import Anchor, coarse_preconditioner
 from jaxba.model.linearize import Linearization
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import Preconditioner
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.fusion import fusion_barrier
@@ -35,7 +36,7 @@ def preconditioner(
     points: PointSystem,
     system: CameraSystem,
     anchor: Anchor,
-    blocks: Float[Array, "blocks 9 9"] | None,
+    blocks: Float[Array, "blocks width width"] | None,
     name: Preconditioner,
 ) -> Operator:
     """`M^-1` as a function of the residual.
@@ -50,21 +51,37 @@ def preconditioner(
         name: which one.
     """
     if name == "jacobi":
-        return block_inverse(system.blocks)
+        return block_inverse(_with_shared_lenses(system, system.blocks))
     if blocks is None or layout.pairs is None:
         diagonal = diagonal_blocks(layout, linear, points, system)
     else:
         diagonal = take_rows(blocks, layout.pairs.diagonal)
-    fine = block_inverse(diagonal)
+    fine = block_inverse(_with_shared_lenses(system, diagonal))
     if name == "schur-jacobi":
         return fine
     coarse = coarse_preconditioner(layout, linear, points, system, anchor)
     return lambda r: fine(r) + coarse(r)
 
 
+def _with_shared_lenses(
+    system: CameraSystem, blocks: Float[Array, "cameras width width"]
+) -> Float[Array, "cameras width width"]:
+    """The blocks, with the mean over its cameras in the place of a shared lens, which then couples with no pose."""
+    unknowns = system.unknowns
+    if unknowns is None:
+        return blocks
+    pose, lens = blocks[:, :POSE_SIZE], blocks[:, POSE_SIZE:, POSE_SIZE:]
+    mean = unknowns.mean(lens.reshape(len(lens), -1)).reshape(lens.shape)
+    shares = jnp.any(jnp.asarray(unknowns.members), axis=1)[:, None, None]
+    zero = jnp.zeros_like(pose[:, :, POSE_SIZE:])
+    coupling = jnp.where(shares, zero, pose[:, :, POSE_SIZE:])
+    upper = jnp.concatenate([pose[:, :, :POSE_SIZE], coupling], axis=2)
+    return jnp.concatenate([upper, jnp.concatenate([coupling.mT, mean], axis=2)], axis=1)
+
+
 def diagonal_blocks(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
-) -> Float[Array, "cameras 9 9"]:
+) -> Float[Array, "cameras width width"]:
     """The diagonal blocks of S, `D_c + sum J_c^T (I - Q Q^T) J_c`.
 
     With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T J_c`, two an
@@ -80,11 +97,11 @@ def diagonal_blocks(
     first, second = linear.camera_jacobian
     columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
     level, *levels = layout.camera_levels
-    gathered = take_rows(as_rows(columns), level).reshape(level.shape[0], -1, 9)
+    gathered = take_rows(as_rows(columns), level).reshape(level.shape[0], -1, len(first))
     return system.only_damping + tree_sum(outer_sum(gathered, gathered), tuple(levels))
 
 
-def block_inverse(blocks: Float[Array, "cameras 9 9"]) -> Callable[[Array], Array]:
+def block_inverse(blocks: Float[Array, "cameras width width"]) -> Callable[[Array], Array]:
     """The product with the inverses of positive definite blocks, which are formed once by Cholesky."""
     factor = lower_cholesky(blocks)
     eye = jnp.broadcast_to(jnp.eye(blocks.shape[-1], dtype=blocks.dtype), blocks.shape)

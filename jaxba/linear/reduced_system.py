@@ -22,11 +22,11 @@ from jaxtyping import Float, Int
 
 from jaxba.linear.band_cholesky import band_factor, band_factor_and_solve
 from jaxba.linear.blocks import dense_blocks, pair_products
+from jaxba.linear.border import Border, border_of, without_shared
 from jaxba.linear.cholesky import factor_and_solve, factor_panels
 from jaxba.linear.conjugate_gradients import conjugate_gradients
 from jaxba.linear.preconditioners import preconditioner
 from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, coupling_by_camera, coupling_rows
-from jaxba.linear.shared_intrinsics_solve import solve_shared_lenses
 from jaxba.linear.two_level import Anchor
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
@@ -54,7 +54,7 @@ def solve_reduced(
     anchor: Anchor,
     options: StepOptions,
     forcing: float | Float[Array, ""],
-) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
+) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
     """Solves `S x = b` for the camera step, in manifold coordinates, with the solver that the options name.
 
     Args:
@@ -71,9 +71,8 @@ def solve_reduced(
     """
     product = lambda x: apply_reduced(layout, linear, points, system, x)
     explicit, grid = options.linear_solver == "explicit", layout.grid
-    if system.shared_lenses is not None:
-        formed = _dense_matrix(layout, linear, points, system)
-        return solve_shared_lenses(system.shared_lenses, formed, system.right), _no_iterations()
+    if explicit and system.unknowns is not None:
+        return _solve_bordered(layout, linear, points, system, options)
     # the system of a scene with few points is small: float32 would save nothing
     if explicit and grid is not None and (not options.mixed_precision or has_few_points(*grid.shape)):
         return solve_dense(grid, linear, points, system), _no_iterations()
@@ -106,7 +105,7 @@ def _solve_iteratively(
     anchor: Anchor,
     options: StepOptions,
     forcing: float | Float[Array, ""],
-) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
+) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
     blocks = None
     apply = lambda x: apply_reduced(layout, linear, points, system, x)
     if options.linear_solver == "sparse":
@@ -115,6 +114,10 @@ def _solve_iteratively(
     precondition = preconditioner(
         layout, linear, points, system, anchor, blocks, options.conjugate_gradients.preconditioner
     )
+    if system.unknowns is not None:  # on the range of T (structure/unknowns.py)
+        project, plain, inverse = system.unknowns.project, apply, precondition
+        apply, precondition = lambda x: project(plain(x)), lambda r: project(inverse(r))
+        system = system._replace(right=project(system.right))
     if options.linear_solver == "cg":
         # it returns no count; below the rounding error its iterations would end as 0 / 0
         budget, least = options.conjugate_gradients.budget, float(jnp.finfo(system.right.dtype).eps)
@@ -123,27 +126,84 @@ def _solve_iteratively(
     return _conjugate_gradients(apply, precondition, system, options, forcing)
 
 
+def _solve_bordered(
+    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, options: StepOptions
+) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
+    """Solves `T^T S T y = T^T b` for shared lenses by a factorisation, and returns `T y`."""
+    assert system.unknowns is not None
+    project = system.unknowns.project
+    product = lambda x: apply_reduced(layout, linear, points, system, x)
+    if not options.mixed_precision:
+        border = border_of(system.unknowns, product, system.right)
+        inner = _factored_without_shared(layout, linear, points, system, border, shifted=False)
+        solved = inner(jnp.concatenate([border.kept(system.right)[:, :, None], border.columns], axis=2))
+        return border.finish(solved[:, :, 0], solved[:, :, 1:], system.right), _no_iterations()
+    linear32, points32, system32 = to_single((linear, points, system))
+    single = lambda x: apply_reduced(layout, linear32, points32, system32, x)
+    border = border_of(system.unknowns, single, system32.right)
+    inner = _factored_without_shared(layout, linear32, points32, system32, border, shifted=True)
+    columns = inner(border.columns)
+
+    def precondition(r: Array) -> Array:
+        r32 = r.astype(jnp.float32)
+        return border.finish(inner(border.kept(r32)[:, :, None])[:, :, 0], columns, r32).astype(r.dtype)
+
+    system = system._replace(right=project(system.right))
+    return _conjugate_gradients(lambda x: project(product(x)), precondition, system, options, CORRECTION_FORCING)
+
+
+def _factored_without_shared(
+    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, border: Border, *, shifted: bool
+) -> Callable[[Array], Array]:
+    """`A^-1` of several columns, where A is S without shared lenses; `shifted` for a float32 preconditioner."""
+    unknowns, cameras = border.unknowns, layout.num_cameras
+    if layout.grid is not None:
+        matrix = dense_system(layout.grid, linear, points, system)
+        every = jnp.arange(cameras)
+        blocks = matrix.reshape(cameras, -1, cameras, matrix.shape[0] // cameras).transpose(0, 2, 1, 3)
+        blocks = blocks.reshape(-1, *blocks.shape[2:])
+        row, column = jnp.repeat(every, cameras), jnp.tile(every, cameras)
+        kept = without_shared(unknowns, blocks, row, column, row == column)
+        matrix = kept.reshape(cameras, cameras, *kept.shape[1:]).transpose(0, 2, 1, 3)
+        matrix = matrix.reshape(cameras * kept.shape[1], -1)
+    else:
+        pairs = _pairs(layout)
+        formed = reduced_blocks(layout, linear, points, system)
+        own = pairs.block_camera < cameras
+        kept = without_shared(unknowns, formed, pairs.block_row, pairs.block_column, own)
+        if pairs.band is not None:
+            if shifted:
+                return jax.vmap(factored(layout, kept), in_axes=2, out_axes=2)
+            return jax.vmap(band_factor(pairs.band, kept).solve, in_axes=2, out_axes=2)
+        matrix = dense_blocks(pairs, kept)
+    flat = lambda x: x.reshape(matrix.shape[0], -1)
+    if shifted:
+        return jax.vmap(factored_dense(matrix), in_axes=2, out_axes=2)
+    return lambda x: factor_and_solve(matrix, flat(x)).reshape(x.shape)
+
+
 def _no_iterations() -> Int[Array, ""]:
     return jnp.zeros((), jnp.int32)
 
 
 def reduced_blocks(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
-) -> Float[Array, "blocks 9 9"]:
+) -> Float[Array, "blocks width width"]:
     """The blocks of the lower triangle of S, in the order of `PairLayout`; the last one is zero."""
     pairs = _pairs(layout)
-    products = pair_products(pairs, coupling_by_camera(layout, points, system), 9)
+    width = system.blocks.shape[-1]
+    products = pair_products(pairs, coupling_by_camera(layout, points, system), width)
 
     def subtracted(own: Array, products: Array) -> Array:
-        own = jnp.concatenate([own.reshape(-1, 81), jnp.zeros((1, 81), own.dtype)])
-        return (take_rows(own, pairs.block_camera) - products).reshape(-1, 9, 9)
+        own = jnp.concatenate([own.reshape(-1, width**2), jnp.zeros((1, width**2), own.dtype)])
+        return (take_rows(own, pairs.block_camera) - products).reshape(-1, width, width)
 
     return compute_unfused(subtracted, system.blocks, products, index=pairs.block_row)
 
 
 def solve_dense(
     grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
-) -> Float[Array, "cameras 9"]:
+) -> Float[Array, "cameras width"]:
     """Solves `S x = b` where most cameras see most points: by S itself, or by Woodbury's identity for few points."""
     if has_few_points(*grid.shape):
         return capacitance_solve(dense_coupling(grid, linear, points), system)
@@ -156,8 +216,8 @@ def dense_coupling(
 ) -> Float[Array, "unknowns columns"]:
     """`W = E L^-T`, so that `S = B + D_c - W W^T`: one row per camera unknown, one column per coordinate of a point."""
     count, cameras = grid.shape
-    rows = take_rows(coupling_rows(linear, points), grid).reshape(count, cameras, 3, 9)
-    return rows.transpose(1, 3, 0, 2).reshape(9 * cameras, 3 * count)
+    rows = take_rows(coupling_rows(linear, points), grid).reshape(count, cameras, 3, -1)
+    return rows.transpose(1, 3, 0, 2).reshape(-1, 3 * count)
 
 
 def dense_system(
@@ -168,28 +228,17 @@ def dense_system(
     wide = dense_coupling(grid, linear, points)
     product = jnp.matmul(wide, wide.T, precision="highest")
     own = system.blocks[:, :, None, :] * jnp.eye(cameras, dtype=product.dtype)[:, None, :, None]
-    return own.reshape(9 * cameras, 9 * cameras) - product
-
-
-def _dense_matrix(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
-) -> Float[Array, "n n"]:
-    """S as one matrix; only its lower triangle is filled."""
-    if layout.grid is not None:
-        return dense_system(layout.grid, linear, points, system)
-    return dense_blocks(_pairs(layout), reduced_blocks(layout, linear, points, system).reshape(-1, 81), 9)
+    return own.reshape(product.shape) - product
 
 
 def factor_blocks(
-    layout: Layout, blocks: Float[Array, "blocks 9 9"], right: Float[Array, "cameras 9"]
-) -> Float[Array, "cameras 9"]:
+    layout: Layout, blocks: Float[Array, "blocks width width"], right: Float[Array, "cameras width"]
+) -> Float[Array, "cameras width"]:
     """Solves `S x = b` by a Cholesky factorisation: of a band if the layout has one, else dense."""
     band = _pairs(layout).band
     if band is not None:
         return band_factor_and_solve(band, blocks, right)
-    return factor_and_solve(dense_blocks(_pairs(layout), blocks.reshape(-1, 81), 9), right.reshape(-1)).reshape(
-        right.shape
-    )
+    return factor_and_solve(dense_blocks(_pairs(layout), blocks), right.reshape(-1)).reshape(right.shape)
 
 
 def factored_dense(matrix: Float[Array, "n n"]) -> Callable[[Array], Array]:
@@ -200,24 +249,24 @@ def factored_dense(matrix: Float[Array, "n n"]) -> Callable[[Array], Array]:
     return lambda r: (scale * panels.solve(scale * r.reshape(-1))).reshape(r.shape)
 
 
-def factored(layout: Layout, blocks: Float[Array, "blocks 9 9"]) -> Callable[[Array], Array]:
+def factored(layout: Layout, blocks: Float[Array, "blocks width width"]) -> Callable[[Array], Array]:
     """`S^-1` in float32, for a preconditioner. The diagonal is scaled to one and shifted, so that the factor exists."""
     pairs = _pairs(layout)
     if pairs.band is None:
-        return factored_dense(dense_blocks(pairs, blocks.reshape(-1, 81), 9))
+        return factored_dense(dense_blocks(pairs, blocks))
     diagonal = jnp.diagonal(take_rows(blocks, pairs.diagonal), axis1=1, axis2=2)  # [cameras, 9]
     scale = lax.rsqrt(diagonal)
     shift = FLOAT32_SHIFT * float(jnp.finfo(blocks.dtype).eps)
     scaled = blocks * take_rows(scale, pairs.block_row)[:, :, None] * take_rows(scale, pairs.block_column)[:, None, :]
     own = (pairs.block_camera < layout.num_cameras).astype(blocks.dtype)
-    scaled = scaled + shift * own[:, None, None] * jnp.eye(9, dtype=blocks.dtype)
+    scaled = scaled + shift * own[:, None, None] * jnp.eye(blocks.shape[-1], dtype=blocks.dtype)
     band = band_factor(pairs.band, scaled)
     return lambda r: scale * band.solve(scale * r)
 
 
 def apply_blocks(
-    layout: Layout, blocks: Float[Array, "blocks 9 9"], x: Float[Array, "cameras 9"]
-) -> Float[Array, "cameras 9"]:
+    layout: Layout, blocks: Float[Array, "blocks width width"], x: Float[Array, "cameras width"]
+) -> Float[Array, "cameras width"]:
     """`S x` with S in blocks of the lower triangle; each block is read once, for itself and for its transpose."""
     pairs = _pairs(layout)
     rows = jnp.einsum("nab,nb->na", blocks, take_rows(x, pairs.block_column))
@@ -237,7 +286,7 @@ def _conjugate_gradients(
     system: CameraSystem,
     options: StepOptions,
     forcing: float | Float[Array, ""],
-) -> tuple[Float[Array, "cameras 9"], Int[Array, ""]]:
+) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
     return conjugate_gradients(
         apply,
         system.right,

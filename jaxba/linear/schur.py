@@ -8,7 +8,7 @@ the reduced camera system
 and the points follow by back-substitution, `d_p = -(C + D_p)^-1 (g_p + E^T d_c)`.
 
 C is block-diagonal, so everything is computed from 3 x 3 factors `C + D_p = L L^T`, one a point. Per observation, with
-Jacobians `J_c` [2, 9] and `J_p` [2, 3]:
+Jacobians `J_c` [2, width] and `J_p` [2, 3]:
 
     Q = J_p L^-T,   Y = J_c^T Q,   h = L^-1 g_p
     S = B + D_c - sum Y Y^T,   b = -sum J_c^T (r - Q h),   d_p = -L^-T (h + sum Y^T d_c)
@@ -35,6 +35,7 @@ from jaxtyping import Float
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.model import camera
 from jaxba.model.linearize import Linearization, normal_entries
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.conventions import components_first
@@ -48,7 +49,7 @@ from jaxba.structure.segment_sums import (
     take_rows,
     tree_sum,
 )
-from jaxba.structure.shared_intrinsics import SharedLenses
+from jaxba.structure.unknowns import Unknowns
 
 
 class RotationCoordinates(NamedTuple):
@@ -58,7 +59,7 @@ class RotationCoordinates(NamedTuple):
     inverse: Float[Array, "cameras 3 3"]
 
     @classmethod
-    def of(cls, cameras: Float[Array, "9 cameras"], options: StepOptions) -> RotationCoordinates:
+    def of(cls, cameras: Float[Array, "parameters cameras"], options: StepOptions) -> RotationCoordinates:
         """The left Jacobian of SO(3) for angle-axis coordinates, the identity for manifold coordinates."""
         if options.coordinates.rotation == "manifold":
             one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
@@ -66,7 +67,7 @@ class RotationCoordinates(NamedTuple):
         to_front = lambda m: jnp.moveaxis(m, -1, 0)
         return cls(to_front(camera.left_jacobian(cameras[:3])), to_front(camera.left_jacobian_inverse(cameras[:3])))
 
-    def from_manifold(self, step: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
+    def from_manifold(self, step: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         """A manifold step in the options' coordinates."""
         rotation = jnp.einsum("cij,cj->ci", self.inverse, step[:, :3])
         return jnp.concatenate([rotation, step[:, 3:]], axis=1)
@@ -85,14 +86,14 @@ class PointSystem(NamedTuple):
 class CameraSystem(NamedTuple):
     """The reduced camera system without the sum of `Y Y^T`, which each solver forms or applies in its own way."""
 
-    blocks: Float[Array, "cameras 9 9"]  # B + D_c, manifold coordinates
-    only_damping: Float[Array, "cameras 9 9"]  # D_c, manifold coordinates
-    gradient: Float[Array, "cameras 9"]  # g_c, manifold coordinates
-    right: Float[Array, "cameras 9"]  # b, right-hand side of the reduced system
-    damping: Float[Array, "cameras 9"]  # D_c, diagonal in the options' coordinates
+    blocks: Float[Array, "cameras width width"]  # B + D_c, manifold coordinates
+    only_damping: Float[Array, "cameras width width"]  # D_c, manifold coordinates
+    gradient: Float[Array, "cameras width"]  # g_c, manifold coordinates
+    right: Float[Array, "cameras width"]  # b, right-hand side of the reduced system
+    damping: Float[Array, "cameras width"]  # D_c, diagonal in the options' coordinates
     # [J_c, r, r - Q h], two rows an observation, sorted by camera (structure/layout.py)
-    rows: Float[Array, "chunks terms 11"] | None = None
-    shared_lenses: SharedLenses | None = None  # shared intrinsics: each camera holds an equal part of their damping
+    rows: Float[Array, "chunks terms columns"] | None = None
+    unknowns: Unknowns | None = None  # with shared lenses: each camera holds an equal part of their damping
 
 
 def eliminate_points(
@@ -154,29 +155,31 @@ def camera_system(
         reduced = linear.residual[k] - sum(points.projected[k][i] * solved[i] for i in range(3))
         rows += [*linear.camera_jacobian[k], linear.residual[k], reduced]
     level, *levels = layout.camera_levels
-    gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, 11)
-    products = tree_sum(outer_sum(gathered[..., :9], gathered), tuple(levels))
-    blocks, gradient, right = products[:, :, :9], products[:, :, 9], -products[:, :, 10]
+    width = len(linear.camera_jacobian[0])
+    gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 2)
+    products = tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
+    blocks, gradient, right = products[:, :, :width], products[:, :, width], -products[:, :, width + 1]
     rotation = jnp.einsum("cji,cjk,ckl->cil", coordinates.forward, blocks[:, :3, :3], coordinates.forward)
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
     )
     factor = options.coordinates.camera_damping * damping
     extra = damping_diagonal(diagonal, factor, options)
-    lenses = layout.lenses if layout.lenses is not None and layout.lenses.shared else None
-    if lenses is not None:
-        whole = damping_diagonal(lenses.total(diagonal[:, 6:]), factor, options)
-        extra = extra.at[:, 6:].set(lenses.spread(whole / jnp.maximum(lenses.counts(), 1)[:, None]))
+    unknowns = layout.unknowns if layout.unknowns is not None and layout.unknowns.shared else None
+    if unknowns is not None:
+        whole = damping_diagonal(unknowns.total(diagonal[:, POSE_SIZE:]), factor, options)
+        count = unknowns.total(jnp.ones_like(diagonal[:, POSE_SIZE:]))
+        extra = extra.at[:, POSE_SIZE:].set(unknowns.spread(whole / count, extra[:, POSE_SIZE:]))
     # a camera without observations gets a unit block, and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     on_manifold = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
-    added = extra[:, :, None] * jnp.eye(9, dtype=extra.dtype)
+    added = extra[:, :, None] * jnp.eye(width, dtype=extra.dtype)
     added = added.at[:, :3, :3].set(on_manifold)
-    return CameraSystem(blocks + added, added, gradient, right, extra, gathered, lenses)
+    return CameraSystem(blocks + added, added, gradient, right, extra, gathered, unknowns)
 
 
 def back_substitute(
-    layout: Layout, linear: Linearization, points: PointSystem, step: Float[Array, "cameras 9"]
+    layout: Layout, linear: Linearization, points: PointSystem, step: Float[Array, "cameras width"]
 ) -> list[Array]:
     """Point step `-L^-T (h + sum Y^T d_c)` of a camera step on the manifold, [3] of (points,)."""
     inner = project_to_points(layout, linear, points, step)
@@ -184,51 +187,53 @@ def back_substitute(
 
 
 def apply_reduced(
-    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, x: Float[Array, "cameras 9"]
-) -> Float[Array, "cameras 9"]:
+    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, x: Float[Array, "cameras width"]
+) -> Float[Array, "cameras width"]:
     """`S x = (B + D_c) x - sum Y (Y^T x)` without forming S, in two passes over the observations."""
     inner = project_to_points(layout, linear, points, x)
     at_slot = take(jnp.stack(inner), layout.slot_point)
 
     def lifted(at_slot: Array, projected: list[list[Array]], first: list[Array], second: list[Array]) -> list[Array]:
         over, under = (sum(row[i] * at_slot[i] for i in range(3)) for row in projected)
-        return [first[a] * over + second[a] * under for a in range(9)]
+        return [a * over + b * under for a, b in zip(first, second, strict=True)]
 
     rows = as_rows(compute_in_one_loop(lifted, at_slot, points.projected, *linear.camera_jacobian))
     return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(rows, layout.camera_levels)
 
 
-def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "sorted 27"]:
-    """`Y^T` [3, 9] of every observation, flattened, sorted by camera (structure/layout.py)."""
+def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "sorted three_width"]:
+    """`Y^T` [3, width] of every observation, flattened, sorted by camera (structure/layout.py)."""
     assert system.rows is not None
     over, under = points.projected
     projected = take_rows(as_rows([*over, *under]), layout.camera_levels[0].reshape(-1)).reshape(-1, 2, 3)
-    return outer_sum(projected, system.rows[..., :9].reshape(-1, 2, 9)).reshape(-1, 27)
+    width = system.blocks.shape[-1]
+    rows = system.rows[..., :width].reshape(-1, 2, width)
+    return outer_sum(projected, rows).reshape(-1, 3 * width)
 
 
-def coupling_rows(linear: Linearization, points: PointSystem) -> Float[Array, "slots 27"]:
-    """`Y^T` [3, 9] of every slot, flattened."""
+def coupling_rows(linear: Linearization, points: PointSystem) -> Float[Array, "slots three_width"]:
+    """`Y^T` [3, width] of every slot, flattened."""
     first, second = linear.camera_jacobian
     over, under = points.projected
-    columns = [first[a] * over[i] + second[a] * under[i] for i in range(3) for a in range(9)]
+    columns = [a * over[i] + b * under[i] for i in range(3) for a, b in zip(first, second, strict=True)]
     return as_rows(columns)
 
 
 def project_to_points(
-    layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras 9"]
+    layout: Layout, linear: Linearization, points: PointSystem, x: Float[Array, "cameras width"]
 ) -> list[Array]:
     """`sum Y^T x` over each point's observations, [3] of (points,)."""
     at_slot = take(components_first(x), layout.slot_camera)
 
     def inner(at_slot: Array, projected: list[list[Array]], jacobian: list[list[Array]]) -> list[Array]:
-        over, under = (sum(row[a] * at_slot[a] for a in range(9)) for row in jacobian)
+        over, under = (sum(a * x for a, x in zip(row, at_slot, strict=True)) for row in jacobian)
         return [projected[0][i] * over + projected[1][i] * under for i in range(3)]
 
     return point_sums(layout, compute_in_one_loop(inner, at_slot, points.projected, linear.camera_jacobian))
 
 
 def jacobian_product(
-    layout: Layout, linear: Linearization, cameras: Float[Array, "cameras 9"], points: Float[Array, "3 points"]
+    layout: Layout, linear: Linearization, cameras: Float[Array, "cameras width"], points: Float[Array, "3 points"]
 ) -> list[Array]:
     """`J d` of every slot for a step on the manifold, [2] of (slots,), pixels."""
     by_camera, by_point = take_each(components_first(cameras), layout.slot_camera), take_each(points, layout.slot_point)
@@ -240,11 +245,11 @@ def jacobian_product(
 def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates) -> Float[Array, ""]:
     """Largest absolute entry of the gradient, in the options' coordinates."""
     rotation = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
-    lens = system.gradient[:, 6:]
-    if system.shared_lenses is not None:
-        lens = system.shared_lenses.total(lens)
+    lens = system.gradient[:, POSE_SIZE:]
+    if system.unknowns is not None:
+        lens = system.unknowns.spread(system.unknowns.total(lens), lens)
     parts = rotation, system.gradient[:, 3:6], lens, jnp.stack(points.gradient)
-    return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts])
+    return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts if part.size])
 
 
 def damping_diagonal(diagonal: Array, damping: Float[Array, "..."], options: StepOptions) -> Array:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 class Step(NamedTuple):
     """A damped step d and the terms of its linear model (lm/damped_step.py)."""
 
-    cameras: Float[Array, "9 cameras"]  # in the coordinates of the options
+    cameras: Float[Array, "parameters cameras"]  # in the coordinates of the options
     points: Float[Array, "3 points"]
     # for the whole problem, or one entry per subproblem that is accepted on its own (refinement/subproblems.py):
     slope: Float[Array, "*parts"]  # -g.d, which is d.(H + D) d if the step solves the damped system; pixels^2

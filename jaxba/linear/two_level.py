@@ -3,8 +3,9 @@
     M^-1 = D^-1 + P (P^T S P)^-1 P^T,    D = the block diagonal of S.
 
 Conjugate gradients are slow on long sequences because of smooth deformations with small eigenvalues: neighbouring
-cameras and their points move together, and residuals hardly change. P spans such motions with ten columns per cluster:
-a similarity (rotation a, translation b, scale s) and a common change of f, k1 and k2.
+cameras and their points move together, and residuals hardly change. P spans such motions with seven columns per cluster
+for a similarity (rotation a, translation b, scale s), and one for a common change of each number of the lenses. All
+clusters that share a lens have the columns of its numbers in common.
 
 A similarity of cameras and points together changes no residual, so that `J_c P = -J_p [a x X, b, s X]`: the columns of
 `S P` follow from the point Jacobians.
@@ -20,23 +21,24 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.linear.blocks import dense_blocks, pair_products
 from jaxba.linear.cholesky import factor_panels
 from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.model.linearize import Linearization
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.camera_clusters import ClusterLayout
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
 
-MODES = 10
-"""Seven of a similarity, then focal length, k1 and k2."""
+SIMILARITY = 7
+"""Columns of a similarity; those of the numbers of lenses follow."""
 
 SHIFT = 64.0
 """Machine epsilons per coarse unknown added to the unit diagonal of the scaled coarse system, which is singular where a
-cluster has one camera: ten columns for nine unknowns."""
+cluster has one camera: it has a column more than unknowns."""
 
 COARSE_PANEL = 256
 """Columns of a panel of the coarse factorisation. Measured with 1280 unknowns: steps as fast as with panels of 128,
@@ -51,7 +53,7 @@ class Anchor(NamedTuple):
     points: Float[Array, "3 points"]
 
 
-def camera_modes(layout: Layout, anchor: Anchor) -> Float[Array, "cameras 9 10"]:
+def camera_modes(layout: Layout, anchor: Anchor, width: int) -> Float[Array, "cameras width modes"]:
     """P: the step of each camera for a motion of its cluster, in manifold coordinates; zero for unseen cameras.
 
     For the similarity `X <- (1 + s) (exp(a) X + b)` of the world, the camera step that keeps all projections is
@@ -59,10 +61,14 @@ def camera_modes(layout: Layout, anchor: Anchor) -> Float[Array, "cameras 9 10"]
     """
     minus_rotation = -jnp.moveaxis(anchor.rotation, -1, 0)
     count = minus_rotation.shape[0]
+    numbers = width - POSE_SIZE
     zeros = lambda *shape: jnp.zeros((count, *shape), minus_rotation.dtype)
-    rotation = jnp.concatenate([minus_rotation, zeros(3, 7)], axis=2)
-    translation = jnp.concatenate([zeros(3, 3), minus_rotation, anchor.translation.T[:, :, None], zeros(3, 3)], axis=2)
-    lens = jnp.broadcast_to(jnp.eye(3, MODES, 7, dtype=minus_rotation.dtype), (count, 3, MODES))
+    rotation = jnp.concatenate([minus_rotation, zeros(3, 4 + numbers)], axis=2)
+    translation = jnp.concatenate(
+        [zeros(3, 3), minus_rotation, anchor.translation.T[:, :, None], zeros(3, numbers)], axis=2
+    )
+    lens = jnp.eye(numbers, SIMILARITY + numbers, SIMILARITY, dtype=minus_rotation.dtype)
+    lens = jnp.broadcast_to(lens, (count, *lens.shape))
     modes = jnp.concatenate([rotation, translation, lens], axis=1)
     return jnp.where(layout.camera_seen[:, None, None], modes, jnp.zeros_like(modes))
 
@@ -72,8 +78,11 @@ def coarse_preconditioner(
 ) -> Callable[[Array], Array]:
     """The product with `P (P^T S P)^-1 P^T`; zero if the coarse system is not positive definite."""
     clusters = _clusters(layout)
-    modes = camera_modes(layout, anchor)
+    tied = None if clusters.tied is None or system.unknowns is None else jnp.asarray(clusters.tied)
+    modes = camera_modes(layout, anchor, system.blocks.shape[-1])
     matrix = coarse_system(layout, linear, points, system, anchor, modes)
+    if tied is not None:
+        matrix = _with_tied_lenses(matrix, tied, modes.shape[-1])
     diagonal = jnp.diagonal(matrix)
     scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 0)
     unknowns = matrix.shape[0]
@@ -84,11 +93,45 @@ def coarse_preconditioner(
 
     def apply(r: Array) -> Array:
         inner = cluster_sum(clusters, jnp.einsum("cam,ca->cm", modes, r))
-        coarse = scale * panels.solve(scale * inner.reshape(-1))
-        coarse = jnp.where(valid, coarse, jnp.zeros_like(coarse)).reshape(-1, MODES)
+        right = inner.reshape(-1)
+        if tied is not None:
+            lens = jnp.matmul(tied.T.astype(r.dtype), inner[:, SIMILARITY:], precision="highest")
+            right = jnp.concatenate([(inner * _keeps(tied, inner)).reshape(-1), lens.reshape(-1)])
+        coarse = scale * panels.solve(scale * right)
+        coarse = jnp.where(valid, coarse, jnp.zeros_like(coarse))
+        own = coarse[: inner.size].reshape(inner.shape)
+        if tied is not None:
+            lens = jnp.matmul(tied.astype(r.dtype), coarse[inner.size :].reshape(lens.shape), precision="highest")
+            own = own.at[:, SIMILARITY:].add(lens)
+        coarse = own
         return jnp.einsum("cam,cm->ca", modes, take_rows(coarse, clusters.label))
 
     return apply
+
+
+def _with_tied_lenses(
+    lower: Float[Array, "unknowns unknowns"], tied: Bool[Array, "clusters lenses"], modes: int
+) -> Float[Array, "more more"]:
+    """The coarse system with an unknown for each number of a shared lens in the place of one for each of its clusters,
+    whose rows become those of the unit matrix."""
+    clusters = len(tied)
+    full = jnp.tril(lower) + jnp.tril(lower, -1).T
+    blocks = full.reshape(clusters, modes, clusters, modes)
+    member = tied.astype(full.dtype)
+    columns = jnp.einsum("cmdk,dl->cmlk", blocks[..., SIMILARITY:], member, precision="highest")
+    corner = jnp.einsum("cl,ckmn->lkmn", member, columns[:, SIMILARITY:], precision="highest")
+    keep = _keeps(tied, jnp.zeros((clusters, modes), full.dtype)).reshape(-1)
+    columns = columns.reshape(clusters * modes, -1) * keep[:, None]
+    full = full * keep[:, None] * keep + jnp.diag(1 - keep)
+    return jnp.block([[full, columns], [columns.T, corner.reshape(columns.shape[1], -1)]])
+
+
+def _keeps(
+    tied: Bool[Array, "clusters lenses"], like: Float[Array, "clusters modes"]
+) -> Float[Array, "clusters modes"]:
+    """0 for the columns of a lens of clusters that are tied, else 1."""
+    lens = jnp.arange(like.shape[1]) >= SIMILARITY
+    return 1 - (jnp.any(tied, axis=1)[:, None] & lens).astype(like.dtype)
 
 
 def coarse_system(
@@ -97,16 +140,16 @@ def coarse_system(
     points: PointSystem,
     system: CameraSystem,
     anchor: Anchor,
-    modes: Float[Array, "cameras 9 10"],
+    modes: Float[Array, "cameras width modes"],
 ) -> Float[Array, "unknowns unknowns"]:
     """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of clusters."""
-    clusters = _clusters(layout)
-    shared = pair_products(clusters.pairs, _shared_rows(layout, linear, points, anchor.points), MODES)
-    own = jnp.einsum("cam,cab,cbn->cmn", modes, system.blocks, modes).reshape(-1, MODES * MODES)
+    clusters, count = _clusters(layout), modes.shape[-1]
+    shared = pair_products(clusters.pairs, _shared_rows(layout, linear, points, anchor.points), count)
+    own = jnp.einsum("cam,cab,cbn->cmn", modes, system.blocks, modes).reshape(-1, count**2)
     own = cluster_sum(clusters, own)
-    own = jnp.concatenate([own, jnp.zeros((1, MODES * MODES), own.dtype)])
+    own = jnp.concatenate([own, jnp.zeros((1, count**2), own.dtype)])
     blocks = take_rows(own, clusters.pairs.block_camera) - shared
-    return dense_blocks(clusters.pairs, blocks, MODES)
+    return dense_blocks(clusters.pairs, blocks.reshape(-1, count, count))
 
 
 def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Float[Array, "clusters k"]:
@@ -117,22 +160,23 @@ def cluster_sum(clusters: ClusterLayout, rows: Float[Array, "cameras k"]) -> Flo
 
 def _shared_rows(
     layout: Layout, linear: Linearization, points: PointSystem, positions: Float[Array, "3 points"]
-) -> Float[Array, "coarse 30"]:
+) -> Float[Array, "coarse rows"]:
     """`(J_c P)^T Q`, transposed and flattened, summed over the observations of each point by each cluster.
 
-    These observations have the point X in common, so that only `J_p^T Q` and the columns of f, k1 and k2 are summed.
+    These observations have the point X in common, so that only `J_p^T Q` and the columns of the lenses are summed.
     """
     clusters = _clusters(layout)
     over, under = points.projected
     (first, second), (high, low) = linear.point_jacobian, linear.camera_jacobian
     moved = [[first[k] * over[i] + second[k] * under[i] for k in range(3)] for i in range(3)]
-    lens = [[high[6 + k] * over[i] + low[6 + k] * under[i] for k in range(3)] for i in range(3)]
+    numbers = range(POSE_SIZE, len(high))
+    lens = [[high[k] * over[i] + low[k] * under[i] for k in numbers] for i in range(3)]
     columns = [column for i in range(3) for column in moved[i] + lens[i]]
     sums = compute_unfused(lambda rows: tree_sum(rows, clusters.levels), as_rows(columns), index=clusters.point).T
     x, y, z = take_each(positions, clusters.point)
     rows = []
     for i in range(3):
-        p, q, r, *own = sums[6 * i : 6 * i + 6]
+        p, q, r, *own = sums.reshape(3, -1, sums.shape[-1])[i]
         rows += [q * z - r * y, r * x - p * z, p * y - q * x, -p, -q, -r, -(p * x + q * y + r * z), *own]
     return as_rows(rows)
 

@@ -23,7 +23,7 @@ from jaxba.linear.cholesky import factor_and_solve, lower_cholesky
 from jaxba.linear.schur import CameraSystem
 
 
-def capacitance_solve(wide: Float[Array, "unknowns columns"], system: CameraSystem) -> Float[Array, "cameras 9"]:
+def capacitance_solve(wide: Float[Array, "unknowns columns"], system: CameraSystem) -> Float[Array, "cameras width"]:
     """Solves `(B - W W^T) x = b`.
 
     Args:
@@ -34,12 +34,13 @@ def capacitance_solve(wide: Float[Array, "unknowns columns"], system: CameraSyst
         The camera step; non-finite if S is not positive definite.
     """
     factor = lower_cholesky(system.blocks)
-    unit = jnp.broadcast_to(jnp.eye(9, dtype=factor.dtype), factor.shape)
-    inverse = solve_triangular(factor, unit, lower=True)  # [cameras, 9, 9]
+    width = factor.shape[-1]
+    unit = jnp.broadcast_to(jnp.eye(width, dtype=factor.dtype), factor.shape)
+    inverse = solve_triangular(factor, unit, lower=True)  # [cameras, width, width]
     # matmul instead of a fused sum: XLA would recompute W for every row of the result
-    scaled = jnp.matmul(inverse, wide.reshape(len(inverse), 9, -1), precision="highest").reshape(wide.shape)
+    scaled = jnp.matmul(inverse, wide.reshape(len(inverse), width, -1), precision="highest").reshape(wide.shape)
     half = jnp.matmul(inverse, system.right[:, :, None], precision="highest").reshape(-1)
     capacitance = jnp.eye(wide.shape[1], dtype=wide.dtype) - jnp.matmul(scaled.T, scaled, precision="highest")
     inner = factor_and_solve(capacitance, jnp.matmul(half, scaled, precision="highest"))
     whole = half + jnp.matmul(scaled, inner, precision="highest")
-    return jnp.matmul(whole.reshape(-1, 1, 9), inverse, precision="highest")[:, 0]
+    return jnp.matmul(whole.reshape(-1, 1, width), inverse, precision="highest")[:, 0]

@@ -51,13 +51,13 @@ from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 def solve_step(
     layout: Layout,
     linear: Linearization,
-    cameras: Float[Array, "9 cameras"],
+    cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
     damping: Float[Array, ""],
     options: StepOptions,
     iteration: int | Int[Array, ""] = 0,
     effort: Effort | None = None,
-    previous: Float[Array, "steps 9 cameras"] | None = None,
+    previous: Float[Array, "steps parameters cameras"] | None = None,
 ) -> Step:
     """Solves `(H + D) d = -g` for cameras and points.
 
@@ -88,6 +88,8 @@ def solve_step(
         solved = solve_reduced(layout, linear, eliminated, reduced, anchor, options, forcing)
         solution = MethodStep(solved[0], None, solved[1], residual_orthogonal=True)
     else:
+        if previous is not None and layout.unknowns is not None:
+            previous = layout.unknowns.restricted(previous)
         system = DampedSystem(layout, linear, eliminated, reduced, damping, cameras, iteration, forcing, previous)
         solution = cast(StepMethod, options.method).solve(system, options)
     manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
@@ -99,8 +101,9 @@ def solve_step(
     if not solution.residual_orthogonal:
         # d.e is not zero: `-g.d - d.H d` takes the place of d.D d, with d.H d = |J d|^2
         damped = slope - sum(jnp.sum(m * m) for m in jacobian_product(layout, linear, manifold_step, point_step))
+    step = components_first(camera_step)
     return Step(
-        components_first(camera_step),
+        step if layout.unknowns is None else layout.unknowns.expanded(step),
         point_step,
         slope,
         damped,

@@ -36,7 +36,7 @@ class DampedSystem(NamedTuple):
     damping: Float[Array, ""]
     """Lambda."""
 
-    parameters: Float[Array, "9 cameras"]
+    parameters: Float[Array, "parameters cameras"]
     """Current cameras."""
 
     iteration: int | Int[Array, ""]
@@ -45,14 +45,14 @@ class DampedSystem(NamedTuple):
     forcing: float | Float[Array, ""]
     """Forcing term of truncated conjugate gradients, where they are used."""
 
-    previous_steps: Float[Array, "steps 9 cameras"] | None
+    previous_steps: Float[Array, "steps parameters cameras"] | None
     """Last changes of the cameras, newest first; None unless they are part of the search space."""
 
 
 class MethodStep(NamedTuple):
     """The step that a method proposes."""
 
-    cameras: Float[Array, "cameras 9"]  # manifold coordinates
+    cameras: Float[Array, "cameras width"]  # manifold coordinates
     points: Float[Array, "3 points"] | None  # None: computed from the cameras by back-substitution
     iterations: Int[Array, ""]  # inner iterations, e.g. of conjugate gradients
     residual_orthogonal: bool  # whether the residual of the damped system is orthogonal to the step
@@ -61,7 +61,7 @@ class MethodStep(NamedTuple):
 class Round(NamedTuple):
     """Result of one round of a method that solves several subproblems, each with its own accept decision."""
 
-    cameras: Float[Array, "9 cameras"]
+    cameras: Float[Array, "parameters cameras"]
     """Cameras after the round."""
 
     points: Float[Array, "3 points"]
@@ -119,7 +119,7 @@ class RoundMethod(MethodTraits, Protocol):
     def round(
         self,
         layout: Layout,
-        cameras: Float[Array, "9 cameras"],
+        cameras: Float[Array, "parameters cameras"],
         points: Float[Array, "3 points"],
         cost: Float[Array, ""],
         damping: Float[Array, ""],

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 class LMState(NamedTuple):
     """Current parameters, in layout order, and their cost."""
 
-    cameras: Float[Array, "9 cameras"]
+    cameras: Float[Array, "parameters cameras"]
     """Camera parameters."""
 
     points: Float[Array, "3 points"]
@@ -20,7 +20,7 @@ class LMState(NamedTuple):
     cost: Float[Array, ""]
     """Pixels^2."""
 
-    previous_steps: Float[Array, "steps 9 cameras"] | None = None
+    previous_steps: Float[Array, "steps parameters cameras"] | None = None
     """Last changes of the cameras, newest first; None if they are not used."""
 
 

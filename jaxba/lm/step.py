@@ -26,7 +26,7 @@ from jaxba.linear.step import Effort, Step
 from jaxba.lm.damped_step import solve_step
 from jaxba.lm.method import Round, RoundMethod
 from jaxba.lm.records import LMState, StepInfo
-from jaxba.model.linearize import Reference, cost, is_weightless, linearize, with_free_lenses
+from jaxba.model.linearize import Reference, cost, is_weightless, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
@@ -63,7 +63,10 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
 
 
 def state_at(
-    cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], cost: Float[Array, ""], options: StepOptions
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "3 points"],
+    cost: Float[Array, ""],
+    options: StepOptions,
 ) -> LMState:
     """The state before the first iteration, with zeros for the previous steps."""
     if not options.kept_steps:
@@ -99,7 +102,7 @@ def lm_step(
         The next state (unchanged after a rejection) and the record of the iteration.
 
     Raises:
-        ValueError: cameras share intrinsics, or some are fixed, and the linear solver is not the explicit one.
+        ValueError: cameras share lenses, and the options have another method than plain LM.
     """
     if not options.single_solve:
         return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, iteration)
@@ -119,7 +122,7 @@ def propose(
     _check_lenses(layout, options)
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
-    linear = with_free_lenses(layout, linear, options.intrinsics)
+    linear = only_free(layout, linear, options.intrinsics)
     step = solve_step(
         layout, linear, state.cameras, state.points, damping, options, iteration, effort, state.previous_steps
     )
@@ -163,9 +166,14 @@ def take_step(
 
 
 def _check_lenses(layout: Layout, options: StepOptions) -> None:
-    """Raises a ValueError for shared or partly fixed intrinsics without the explicit solver."""
-    if layout.lenses is not None and not options.factors_reduced_system:
-        raise ValueError(f"shared or partly fixed lenses need the explicit solver, not {options.solver_name}")
+    """Raises a ValueError for what a method does not support."""
+    unknowns = layout.unknowns
+    if options.method is None or unknowns is None:
+        return
+    if unknowns.shared:
+        raise ValueError(f"shared lenses need plain LM, not {options.solver_name}")
+    if not options.single_solve:
+        raise ValueError(f"{options.solver_name} optimises all numbers of BAL cameras, and nothing else")
 
 
 def _round(

@@ -80,7 +80,7 @@ class DomainDecomposition:
     def round(
         self,
         layout: Layout,
-        cameras: Float[Array, "9 cameras"],
+        cameras: Float[Array, "parameters cameras"],
         points: Float[Array, "3 points"],
         cost: Float[Array, ""],
         damping: Float[Array, ""],
@@ -95,7 +95,7 @@ class DomainDecomposition:
 
 def decomposed_round(
     layout: Layout,
-    cameras: Float[Array, "9 cameras"],
+    cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
     cost: Float[Array, ""],
     damping: Float[Array, ""],

@@ -67,7 +67,7 @@ def solve_normal(
     system: CameraSystem,
     rule: ConjugateGradients,
     forcing: float | Float[Array, ""],
-) -> tuple[Float[Array, "cameras 9"], Float[Array, "3 points"], Int[Array, ""]]:
+) -> tuple[Float[Array, "cameras width"], Float[Array, "3 points"], Int[Array, ""]]:
     """Solves `(H + D) d = -g` for cameras and points together.
 
     Args:
@@ -81,9 +81,9 @@ def solve_normal(
     Returns:
         The camera step (manifold coordinates), the point step, and the number of iterations.
     """
-    cameras = system.gradient.shape[0]
+    cameras, width = system.gradient.shape
     join = lambda c, p: jnp.concatenate([c.reshape(-1), p.reshape(-1)])
-    split = lambda x: (x[: 9 * cameras].reshape(cameras, 9), x[9 * cameras :].reshape(3, -1))
+    split = lambda x: (x[: width * cameras].reshape(cameras, width), x[width * cameras :].reshape(3, -1))
     point_damping = jnp.stack(points.damping)
     inverse = block_inverse(system.blocks)
 

@@ -66,9 +66,9 @@ def series(
     apply: Callable[[Array], Array],
     system: CameraSystem,
     inverse: Callable[[Array], Array],
-    right: Float[Array, "cameras 9"],
+    right: Float[Array, "cameras width"],
     order: int,
-) -> Float[Array, "cameras 9"]:
+) -> Float[Array, "cameras width"]:
     """The first `order + 1` terms of `sum_i (B^-1 W)^i B^-1 b`, a symmetric linear map of b.
 
     Args:

@@ -95,7 +95,7 @@ def clustered_step(
     partition: Partition,
     options: StepOptions,
     repairs: int,
-) -> Float[Array, "cameras 9"]:
+) -> Float[Array, "cameras width"]:
     """The camera step of one STBA iteration, in manifold coordinates.
 
     Args:
@@ -162,11 +162,11 @@ def consensus_gradient(
 
 def split_right_hand_side(
     layout: Layout, linear: Linearization, system: CameraSystem, split: SplitSystem
-) -> Float[Array, "cameras 9"]:
+) -> Float[Array, "cameras width"]:
     """Right-hand side of the split system, `-sum J_c^T (r - Q h)`."""
     inner = [sum(split.projected[k][i] * split.solved[i] for i in range(3)) for k in range(2)]
     first, second = linear.camera_jacobian
-    rows = as_rows([first[a] * inner[0] + second[a] * inner[1] for a in range(9)])
+    rows = as_rows([a * inner[0] + b * inner[1] for a, b in zip(first, second, strict=True)])
     return tree_sum(rows, layout.camera_levels) - system.gradient
 
 
@@ -175,9 +175,9 @@ def solve_clusters(
     linear: Linearization,
     points: PointSystem,
     system: CameraSystem,
-    right: Float[Array, "cameras 9"],
+    right: Float[Array, "cameras width"],
     partition: Partition,
-) -> Float[Array, "cameras 9"]:
+) -> Float[Array, "cameras width"]:
     """Solves the block-diagonal system, one dense factorisation per cluster.
 
     Args:
@@ -192,14 +192,14 @@ def solve_clusters(
         The camera step, in manifold coordinates; non-finite for a cluster whose factorisation failed.
     """
     matrices = cluster_matrices(layout, linear, points, system, partition)
-    padded = jnp.concatenate([right, jnp.zeros((1, 9), right.dtype)])
+    padded = jnp.concatenate([right, jnp.zeros((1, right.shape[1]), right.dtype)])
     rights = take_rows(padded, partition.members).reshape(partition.members.shape[0], -1)
     # large systems are solved one by one on a CPU, where each factorisation uses all cores
     if jax.default_backend() == "cpu" and rights.shape[1] >= MIN_UNKNOWNS:
         steps = lax.map(lambda pair: factor_and_solve(*pair), (matrices, rights))
     else:
         steps = jax.vmap(factor_and_solve)(matrices, rights)
-    steps = steps.reshape(*partition.members.shape, 9)
+    steps = steps.reshape(*partition.members.shape, -1)
     # every camera is in one cluster; padding writes to the extra last row
     return jnp.zeros_like(padded).at[partition.members].set(steps)[:-1]
 
@@ -209,15 +209,15 @@ def cluster_matrices(
 ) -> Float[Array, "clusters n n"]:
     """The diagonal block of each cluster in the split system; only its lower triangle is filled."""
     blocks = reduced_blocks(layout, linear, points, system)
-    blocks = jnp.concatenate([blocks, jnp.eye(9, dtype=blocks.dtype)[None]])
+    blocks = jnp.concatenate([blocks, jnp.eye(blocks.shape[-1], dtype=blocks.dtype)[None]])
     clusters, size = partition.members.shape
     table = take_rows(blocks, partition.blocks)
-    return table.transpose(0, 1, 3, 2, 4).reshape(clusters, 9 * size, 9 * size)
+    return table.transpose(0, 1, 3, 2, 4).reshape(clusters, size * blocks.shape[-1], -1)
 
 
 def richardson(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem, step: Array, rounds: int
-) -> Float[Array, "cameras 9"]:
+) -> Float[Array, "cameras width"]:
     """Richardson iterations `x <- x + B^-1 (b - S x)` on the true reduced camera system.
 
     They converge: each multiplies the error by `B^-1 E C^-1 E^T` (damped B and C), whose spectral radius is below one.

@@ -31,7 +31,7 @@ RIDGE = 64.0
 """Machine epsilons added to the unit diagonal of the scaled Gram matrix, whose vectors may be nearly parallel."""
 
 
-def best_in_span(system: DampedSystem, step: Float[Array, "cameras 9"]) -> Float[Array, "cameras 9"]:
+def best_in_span(system: DampedSystem, step: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
     """The minimum of the damped linear model over the span of a camera step and of the previous steps of the system.
 
     Args:
@@ -78,8 +78,8 @@ def with_previous(
 
 
 def on_manifold(
-    cameras: Float[Array, "9 cameras"], changes: Float[Array, "steps 9 cameras"]
-) -> Float[Array, "steps cameras 9"]:
+    cameras: Float[Array, "parameters cameras"], changes: Float[Array, "steps parameters cameras"]
+) -> Float[Array, "steps cameras width"]:
     """Changes of camera parameters (angle-axis rotations) as steps in manifold coordinates, to first order."""
     jacobian = camera.left_jacobian(cameras[:3])
     rotations = jnp.einsum("ijc,sjc->sci", jacobian, changes[:, :3], precision="highest")

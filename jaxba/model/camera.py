@@ -1,6 +1,7 @@
-"""The BAL camera model and its analytic derivatives.
+"""Projection and its derivatives: of BAL's camera model by formulas, of all others by forward mode.
 
-    P = R X + t,   p = -P.xy / P.z,   z = f (1 + k1 |p|^2 + k2 |p|^4) p
+    P = R X + t,   p = -P.xy / P.z,   z = f (1 + k1 |p|^2 + k2 |p|^4) p      BAL
+                                      z = model(P.x, -P.y, -P.z)             others (problem/camera_models.py)
 
 Arrays are components-first, [3, n], so that vector instructions of a CPU and coalesced reads of a GPU run over
 observations. Rotation matrices are computed once per camera; what is computed per observation has no sine, cosine or
@@ -12,18 +13,32 @@ left perturbation `R <- exp(d) R`, Sola et al. 2018, "A micro Lie theory", eqs. 
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxba.problem.camera_models import CameraModel
 from jaxba.runtime.fusion import compute_unfused, fusion_barrier
 from jaxba.structure.segment_sums import take
+from jaxba.structure.unknowns import Unknowns
 from jaxba.typing import AnyArray
 
 SMALL_ANGLE_SQUARED = 1e-6
 """Squared angle (radians^2) below which functions of the angle are Taylor series, with an error below 1e-20."""
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Models:
+    """The camera models of a problem that has others than BAL's."""
+
+    models: tuple[CameraModel, ...]
 
 
 class Frames(NamedTuple):
@@ -31,9 +46,9 @@ class Frames(NamedTuple):
 
     rotation: Float[Array, "3 3 ..."] | list[list[Array]]  # R, world to camera
     translation: Float[Array, "3 ..."] | list[Array]  # t, scene units
-    focal: Float[Array, "..."]  # pixels
-    k1: Float[Array, "..."]
-    k2: Float[Array, "..."]
+    lens: Float[Array, "numbers ..."] | list[Array]  # f (pixels), k1, k2 of BAL
+    model: Int[Array, "..."] | None = None  # position in the models; None: the only one
+    models: Models | None = None  # None: all cameras are BAL's
 
     def at(self, index: Int[AnyArray, " n"]) -> Frames:
         """The frames of the cameras in `index`.
@@ -42,10 +57,11 @@ class Frames(NamedTuple):
         for every index.
         """
         rotation = jnp.asarray(self.rotation).reshape(9, -1)
-        table = fusion_barrier(jnp.stack([*rotation, *self.translation, self.focal, self.k1, self.k2]))
+        table = fusion_barrier(jnp.stack([*rotation, *self.translation, *self.lens]))
         # not fused with its uses, in which a gather keeps the compiler from vectorising
         table = compute_unfused(take, table, jnp.asarray(index), index=index)
-        return Frames(table[:9].reshape(3, 3, -1), table[9:12], *table[12:])
+        model = None if self.model is None else take(self.model, jnp.asarray(index))
+        return Frames(table[:9].reshape(3, 3, -1), table[9:12], table[12:], model, self.models)
 
 
 class Projection(NamedTuple):
@@ -55,14 +71,15 @@ class Projection(NamedTuple):
     direction: Float[Array, "2 ..."] | list[Array]  # p = -P.xy / P.z
     inverse_depth: Float[Array, "..."]  # 1 / P.z; negative in front of the camera, zero where masked
     radius: Float[Array, "..."]  # |p|^2
-    distortion: Float[Array, "..."]  # d = 1 + k1 |p|^2 + k2 |p|^4
+    distortion: Float[Array, "..."]  # d = 1 + k1 |p|^2 + k2 |p|^4 of BAL, else 1
     rotated: Float[Array, "3 ..."] | list[Array]  # R X
+    local: Float[Array, "3 ..."] | list[Array]  # P; (0, 0, -1) where masked
+    mask: Bool[AnyArray, "..."] | None  # as given
 
     def stacked(self) -> Projection:
         """The same with arrays in place of lists."""
-        stack = lambda rows: jnp.stack(list(rows))
-        pixel, direction, rotated = stack(self.pixel), stack(self.direction), stack(self.rotated)
-        return self._replace(pixel=pixel, direction=direction, rotated=rotated)
+        lists = {name: jnp.stack(list(getattr(self, name))) for name in ("pixel", "direction", "rotated", "local")}
+        return self._replace(**lists)
 
 
 def _coefficients(squared: Array) -> tuple[Array, Array, Array]:
@@ -141,9 +158,18 @@ def _quaternion(angle_axis: Array) -> tuple[Array, Array]:
     return real, first * half
 
 
-def frames(cameras: Float[Array, "9 cameras"]) -> Frames:
-    """Rotation matrices and intrinsics, once per camera and evaluation."""
-    return Frames(rotation_matrix(cameras[:3]), cameras[3:6], cameras[6], cameras[7], cameras[8])
+def frames(cameras: Float[Array, "parameters cameras"], unknowns: Unknowns | None = None) -> Frames:
+    """Rotation matrices and intrinsics, once per camera and evaluation.
+
+    Args:
+        cameras: pose and lens of each camera.
+        unknowns: knows their camera models; None: all are BAL's.
+    """
+    pose_and_lens = rotation_matrix(cameras[:3]), cameras[3:6], cameras[6:]
+    if unknowns is None or unknowns.models is None:
+        return Frames(*pose_and_lens)
+    model = None if unknowns.model is None else jnp.asarray(unknowns.model)
+    return Frames(*pose_and_lens, model, Models(unknowns.models))
 
 
 def project(
@@ -157,21 +183,46 @@ def project(
         mask: where false, the projection and everything derived from it is exactly zero.
 
     Returns:
-        Pixels (BAL axes) and intermediate values, in lists. A point on the camera plane gives non-finite pixels; a
-        point behind the camera is projected like any other, as in BAL.
+        Pixels and intermediate values, in lists. A point on the camera plane gives non-finite pixels; a point behind
+        the camera is projected like any other, as in BAL.
     """
     rotation = frame.rotation
     rotated = [row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in rotation]
-    x, y, z = (rotated[k] + frame.translation[k] for k in range(3))
+    local = x, y, z = [rotated[k] + frame.translation[k] for k in range(3)]
+    if frame.models is not None and mask is not None:
+        local = x, y, z = [jnp.where(mask, row, value) for row, value in zip(local, (0.0, 0.0, -1.0), strict=True)]
     # masked twice: the derivative of the quotient, too, must not see the depth of an empty slot
     inverse = 1 / (z if mask is None else jnp.where(mask, z, jnp.ones_like(z)))
     if mask is not None:
         inverse = jnp.where(mask, inverse, jnp.zeros_like(inverse))
     u, v = -x * inverse, -y * inverse
     radius = u * u + v * v
-    distortion = 1 + radius * (frame.k1 + frame.k2 * radius)
-    scale = frame.focal * distortion
-    return Projection([scale * u, scale * v], [u, v], inverse, radius, distortion, rotated)
+    if frame.models is not None:
+        pixel = list(model_pixel(frame, list(frame.lens), x, y, z))
+        pixel = pixel if mask is None else [jnp.where(mask, row, jnp.zeros_like(row)) for row in pixel]
+        return Projection(pixel, [u, v], inverse, radius, jnp.ones_like(radius), rotated, local, mask)
+    focal, k1, k2 = frame.lens
+    distortion = 1 + radius * (k1 + k2 * radius)
+    scale = focal * distortion
+    return Projection([scale * u, scale * v], [u, v], inverse, radius, distortion, rotated, local, mask)
+
+
+def model_pixel(frame: Frames, lens: list[Array], x: Array, y: Array, z: Array) -> tuple[Array, Array]:
+    """Pixel of a point in the frame of each camera (BAL's axes) by its camera model.
+
+    Args:
+        frame: says which camera has which model.
+        lens: numbers of the lenses.
+        x, y, z: of the points, scene units.
+    """
+    assert frame.models is not None
+    models = frame.models.models
+    pixel = models[-1].project(lens[: len(models[-1])], x, -y, -z)
+    for number, model in enumerate(models[:-1]):
+        assert frame.model is not None
+        own = model.project(lens[: len(model)], x, -y, -z)
+        pixel = tuple(jnp.where(frame.model == number, *pair) for pair in zip(own, pixel, strict=True))
+    return pixel[0], pixel[1]
 
 
 class Derivatives(NamedTuple):
@@ -181,35 +232,80 @@ class Derivatives(NamedTuple):
     point: list[list[Array]]  # [2][3] of [n]
 
 
-def derivatives(frame: Frames, projection: Projection) -> Derivatives:
-    """Analytic Jacobians of `project`, as lists of columns, each of which is one fused expression.
+def derivatives(frame: Frames, projection: Projection, columns: tuple[int, ...] | None = None) -> Derivatives:
+    """Jacobians of `project`, as lists of columns, each of which is one fused expression.
 
-    With the distortion `d = 1 + k1 |p|^2 + k2 |p|^4` and its derivative `e = k1 + 2 k2 |p|^2` by `|p|^2`:
+    Args:
+        frame: camera of each column.
+        projection: what `project` returned for it.
+        columns: numbers of the lens to differentiate by; None: all.
+
+    For BAL's model with `d = 1 + k1 |p|^2 + k2 |p|^4` and its derivative `e = k1 + 2 k2 |p|^2` by `|p|^2`:
 
         dz/dp = f (d I + 2 e p p^T)      dp/dP = -[I | p] / P.z      dz/dt = dz/dP
         dz/dw = -dz/dP [R X]x            dz/dX = dz/dP R             dz/d(f, k1, k2) = (d, f |p|^2, f |p|^4) p
     """
+    by_camera_point, by_lens = (_bal_derivatives if frame.models is None else _model_derivatives)(frame, projection)
+    columns = tuple(range(len(by_lens[0]))) if columns is None else columns
+    qx, qy, qz = projection.rotated
+    rotation = frame.rotation
+    camera, point = [], []
+    for row, numbers in zip(by_camera_point, by_lens, strict=True):
+        a, b, c = row
+        by_rotation = [qy * c - qz * b, qz * a - qx * c, qx * b - qy * a]
+        camera.append([*by_rotation, *row, *(numbers[k]() for k in columns)])
+        point.append([a * rotation[0][k] + b * rotation[1][k] + c * rotation[2][k] for k in range(3)])
+    return Derivatives(camera, point)
+
+
+Rows = tuple[list[list[Array]], list[list[Callable[[], Array]]]]
+"""`dz/dP`, [2][3], and `dz/d numbers of the lens`, [2][numbers], each computed when it is asked for."""
+
+
+def _bal_derivatives(frame: Frames, projection: Projection) -> Rows:
     u, v = projection.direction
     radius, distortion = projection.radius, projection.distortion
-    slope = 2 * (frame.k1 + 2 * frame.k2 * radius)
-    scale = -frame.focal * projection.inverse_depth
+    focal, k1, k2 = frame.lens
+    slope = 2 * (k1 + 2 * k2 * radius)
+    scale = -focal * projection.inverse_depth
     cross = scale * slope * u * v
     radial = scale * (distortion + slope * radius)
     by_camera_point = [
         [scale * (distortion + slope * u * u), cross, radial * u],
         [cross, scale * (distortion + slope * v * v), radial * v],
     ]
-    qx, qy, qz = projection.rotated
-    rotation = frame.rotation
-    camera, point = [], []
-    for row, direction in zip(by_camera_point, (u, v), strict=True):
-        a, b, c = row
-        by_rotation = [qy * c - qz * b, qz * a - qx * c, qx * b - qy * a]
-        by_intrinsics = [
-            distortion * direction,
-            frame.focal * radius * direction,
-            frame.focal * radius * radius * direction,
+    by_lens: list[list[Callable[[], Array]]] = [
+        [
+            lambda p=p: distortion * p,
+            lambda p=p: focal * radius * p,
+            lambda p=p: focal * radius * radius * p,
         ]
-        camera.append([*by_rotation, *row, *by_intrinsics])
-        point.append([a * rotation[0][k] + b * rotation[1][k] + c * rotation[2][k] for k in range(3)])
-    return Derivatives(camera, point)
+        for p in (u, v)
+    ]
+    return by_camera_point, by_lens
+
+
+def _model_derivatives(frame: Frames, projection: Projection) -> Rows:
+    """By forward mode, one number at a time: each derivative then has only the terms that depend on it."""
+    lens, local = list(frame.lens), list(projection.local)
+
+    def rate(function: Callable[[Array], tuple[Array, Array]], at: Array) -> tuple[Array, Array]:
+        rates = jax.jvp(function, (at,), (jnp.ones_like(at),))[1]
+        if projection.mask is None:
+            return rates
+        first, second = (jnp.where(projection.mask, row, jnp.zeros_like(row)) for row in rates)
+        return first, second
+
+    def by_place(k: int) -> tuple[Array, Array]:
+        moved = lambda at: model_pixel(frame, lens, *[at if n == k else row for n, row in enumerate(local)])
+        return rate(moved, local[k])
+
+    @functools.cache
+    def by_number(k: int) -> tuple[Array, Array]:
+        return rate(lambda at: model_pixel(frame, [*lens[:k], at, *lens[k + 1 :]], *local), lens[k])
+
+    places = [by_place(k) for k in range(3)]
+    by_lens: list[list[Callable[[], Array]]] = [
+        [lambda k=k, row=row: by_number(k)[row] for k in range(len(lens))] for row in range(2)
+    ]
+    return [[place[row] for place in places] for row in range(2)], by_lens

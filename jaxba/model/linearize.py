@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from jaxba.model import camera
 from jaxba.model.observations import Views, view_terms
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
 from jaxba.problem.safe_math import safe_sqrt
@@ -35,11 +36,12 @@ class Reference(NamedTuple):
 class Linearization(NamedTuple):
     """Whitened and weighted residuals and Jacobians; everything is zero in empty slots.
 
-    Columns of the camera Jacobian: rotation on the manifold (left perturbation, radians), translation, f, k1, k2.
+    Columns of the camera Jacobian: rotation on the manifold (left perturbation, radians), translation, then the numbers
+    of the lens that are unknown (structure/unknowns.py): f, k1 and k2 of BAL.
     """
 
     residual: list[Array]  # [2] of (slots,), pixels
-    camera_jacobian: list[list[Array]]  # [2][9] of (slots,)
+    camera_jacobian: list[list[Array]]  # [2][width] of (slots,)
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
     costs: Array  # (slots,), pixels squared
     inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
@@ -51,9 +53,9 @@ class Linearization(NamedTuple):
 
 
 @traced_once()
-def slot_frames(layout: Layout, cameras: Float[Array, "9 cameras"]) -> camera.Frames:
+def slot_frames(layout: Layout, cameras: Float[Array, "parameters cameras"]) -> camera.Frames:
     """The camera of every slot; rotation matrices are computed once per camera."""
-    return camera.frames(cameras).at(layout.slot_camera)
+    return camera.frames(cameras, layout.unknowns).at(layout.slot_camera)
 
 
 def view_residuals(views: Views, projection: camera.Projection) -> list[Array]:
@@ -70,7 +72,7 @@ def slot_costs(loss: Loss, residual: list[Array]) -> Float[Array, "*slots"]:
 
 @traced_once("loss")
 def observation_costs(
-    layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
+    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Float[Array, " slots"]:
     """`slot_costs` at the given parameters; zero in empty slots."""
     terms = lambda views: [slot_costs(loss, view_residuals(views, views.projected()))]
@@ -78,7 +80,7 @@ def observation_costs(
 
 
 def cost(
-    layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
+    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Float[Array, ""]:
     """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2."""
     # not fused with the sum: XLA would compile both to a slow library call
@@ -111,14 +113,16 @@ def normal_entries(by_point: list[list[Array]], residual: list[Array]) -> list[A
 
 @traced_once("loss")
 def linearize(
-    layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], loss: Loss
+    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Linearization:
     """Residuals and analytic Jacobians at the given parameters, whitened and weighted by the robust loss."""
+
+    columns = None if layout.unknowns is None else layout.unknowns.columns
 
     def terms(views: Views) -> list[Array]:
         projection = views.projected()
         residual = view_residuals(views, projection)
-        jacobians = camera.derivatives(views.frames, projection)
+        jacobians = camera.derivatives(views.frames, projection, columns)
         by_camera, by_point = _whiten_columns(views, jacobians.camera), _whiten_columns(views, jacobians.point)
         costs = slot_costs(loss, residual)
         rows = [*residual, *by_camera[0], *by_camera[1], *by_point[0], *by_point[1]]
@@ -129,7 +133,9 @@ def linearize(
 
     *rows, costs, inverse_depth = view_terms(layout, slot_frames(layout, cameras), points, terms)
     residual, rows = rows[:2], rows[2:]
-    return Linearization(residual, [rows[:9], rows[9:18]], [rows[18:21], rows[21:24]], costs, inverse_depth)
+    width = (len(rows) - 6) // 2
+    by_camera, by_point = [rows[:width], rows[width : 2 * width]], [rows[-6:-3], rows[-3:]]
+    return Linearization(residual, by_camera, by_point, costs, inverse_depth)
 
 
 def is_weightless(linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:
@@ -141,26 +147,27 @@ def is_weightless(linear: Linearization, cost: Float[Array, ""], loss: Loss) -> 
     return (total(first * first + second * second) == 0) & (cost > 0)
 
 
-def with_free_lenses(
-    layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False
-) -> Linearization:
-    """Sets the Jacobian columns of fixed intrinsics to zero. Their gradient, and so their step, is then zero, too.
+def only_free(layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False) -> Linearization:
+    """Sets the Jacobian columns of what is constant to zero. Its gradient, and so its step, is then zero, too.
 
     Args:
-        layout: knows which intrinsics of each lens are free.
+        layout: knows what is constant.
         linear: with all derivatives.
-        intrinsics: `fixed` fixes all intrinsics.
-        alone: whether cameras are optimised one by one, so that shared intrinsics must be fixed.
+        intrinsics: `fixed`: all intrinsics are constant.
+        alone: whether cameras are optimised one by one, so that shared intrinsics must be constant.
     """
-    lenses = layout.lenses
+    unknowns = layout.unknowns
     zero = jnp.zeros_like(linear.residual[0])
-    if intrinsics == "fixed" or (alone and lenses is not None and lenses.shared):
-        return linear._replace(camera_jacobian=[[*row[:6], zero, zero, zero] for row in linear.camera_jacobian])
-    if lenses is None:
-        return linear
-    free = take(jnp.asarray(lenses.free), layout.slot_camera)
-    masked = lambda row: [jnp.where(free[k], column, zero) for k, column in enumerate(row[6:])]
-    return linear._replace(camera_jacobian=[[*row[:6], *masked(row)] for row in linear.camera_jacobian])
+    by_camera, by_point = linear.camera_jacobian, linear.point_jacobian
+    if intrinsics == "fixed" or (alone and unknowns is not None and unknowns.shared):
+        by_camera = [[*row[:POSE_SIZE], *[zero] * (len(row) - POSE_SIZE)] for row in by_camera]
+    if unknowns is not None and unknowns.free is not None:
+        free = take(jnp.asarray(unknowns.free), layout.slot_camera)
+        by_camera = [[jnp.where(free[k], column, zero) for k, column in enumerate(row)] for row in by_camera]
+    if unknowns is not None and unknowns.free_points is not None:
+        moves = take(jnp.asarray(unknowns.free_points), layout.slot_point)
+        by_point = [[jnp.where(moves, column, zero) for column in row] for row in by_point]
+    return linear._replace(camera_jacobian=by_camera, point_jacobian=by_point)
 
 
 def _whiten(slots: Layout | Views, pair: list[Array]) -> list[Array]:

@@ -6,13 +6,15 @@ indices in range.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.problem.intrinsics import Lenses, checked_lenses
+from jaxba.problem.constants import Constants, checked_constants
+from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
+from jaxba.problem.labels import Labels
 from jaxba.typing import AnyArray, register_pytree
 
 CAMERA_SIZE = 9
@@ -40,17 +42,21 @@ class BundleProblem:
 
         P = R(w) X + t,    p = -P.xy / P.z,    z = f (1 + k1 |p|^2 + k2 |p|^4) p
 
+    With lenses of other camera models (`jaxba.CAMERA_MODELS`) a camera is `[w, t, numbers]`, and z the model's pixel of
+    the point (P.x, -P.y, -P.z): poses look down -z as BAL's do, and pixels are those of the model.
+
     Source: Agarwal et al. 2010, "Bundle Adjustment in the Large".
     """
 
-    cameras: Float[AnyArray, "cameras 9"]
-    """Angle-axis (radians), translation (scene units), focal length (pixels), k1, k2."""
+    cameras: Float[AnyArray, "cameras parameters"]
+    """Angle-axis (radians), translation (scene units), and the lens: f (pixels), k1 and k2, or the numbers of its
+    camera model, with zeros after them where another model has more."""
 
     points: Float[AnyArray, "points 3"]
     """Positions in scene units."""
 
     observations: Float[AnyArray, "observations 2"]
-    """Measured pixels, origin at the image centre, x to the right, y upwards."""
+    """Measured pixels; of a BAL lens with the origin at the image centre, x to the right, y upwards."""
 
     camera_index: Int[AnyArray, " observations"]
     """Camera of each observation, int32."""
@@ -62,7 +68,14 @@ class BundleProblem:
     """`Sigma^(-1/2)` of each observation (1 / pixels); None: the identity."""
 
     lenses: Lenses | None = None
-    """Shared and fixed intrinsics; None: every camera has its own, and all are optimised (BAL)."""
+    """Shared and fixed intrinsics, and camera models; None: every camera has its own BAL lens, and all of it is
+    optimised."""
+
+    constants: Constants | None = None
+    """Constant poses and points; None: all are optimised."""
+
+    labels: Labels | None = field(default=None, metadata={"host": True})
+    """What the file calls images, lenses and points; None if nothing does."""
 
     @classmethod
     def create(
@@ -76,11 +89,12 @@ class BundleProblem:
         covariance: Any = None,
         weight: Any = None,
         lenses: Lenses | None = None,
+        constants: Constants | None = None,
     ) -> BundleProblem:
         """Checks the arrays and returns a problem of float64 and int32 NumPy arrays.
 
         Args:
-            cameras: shape (cameras, 9).
+            cameras: shape (cameras, 9), or (cameras, 6 + numbers of the largest camera model).
             points: shape (points, 3).
             observations: shape (observations, 2), pixels.
             camera_index: shape (observations,), integers in [0, cameras).
@@ -89,17 +103,18 @@ class BundleProblem:
                 positive definite. The cost then uses `|Sigma^(-1/2) r|^2`.
             weight: optional, shape (observations,), non-negative; multiplies the squared
                 residual, like the covariance `I / weight`. Excludes `covariance`.
-            lenses: optional; which cameras share f, k1 and k2, and which of these are optimised.
+            lenses: optional; which cameras share intrinsics, of which models these are, and which are optimised.
+            constants: optional; poses and points that are not optimised.
 
         Raises:
             ProblemError: shapes differ, an index is out of range, a number is not finite, there
-                are no observations, a covariance is not positive definite, or cameras of one lens differ in f, k1 or
-                k2.
+                are no observations, a covariance is not positive definite, or cameras of one lens differ in their
+                intrinsics.
         """
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
         problem = cls(
-            cameras=_floats("cameras", cameras, CAMERA_SIZE),
+            cameras=_floats("cameras", cameras, POSE_SIZE + lens_size(lenses)),
             points=_floats("points", points, POINT_SIZE),
             observations=_floats("observations", observations, 2),
             camera_index=_indices("camera_index", camera_index, len(cameras)),
@@ -112,12 +127,14 @@ class BundleProblem:
             if len(getattr(problem, name)) != count:
                 raise ProblemError(f"{name} has {len(getattr(problem, name))} entries for {count} observations")
         whitening = _whitening(covariance, weight, count)
-        if lenses is not None:
-            try:
+        try:
+            if lenses is not None:
                 lenses = checked_lenses(lenses, np.asarray(problem.cameras))
-            except ValueError as error:
-                raise ProblemError(str(error)) from None
-        return replace(problem, whitening=whitening, lenses=lenses)
+            if constants is not None:
+                constants = checked_constants(constants, problem.num_cameras, problem.num_points)
+        except ValueError as error:
+            raise ProblemError(str(error)) from None
+        return replace(problem, whitening=whitening, lenses=lenses, constants=constants)
 
     @property
     def num_cameras(self) -> int:

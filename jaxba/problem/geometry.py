@@ -91,7 +91,7 @@ def bal_rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n
     return np.where(valid, rotations.as_rotvec(), np.nan)
 
 
-def camera_centers(cameras: Float[Array, "cameras 9"]) -> Float[np.ndarray, "cameras 3"]:
+def camera_centers(cameras: Float[Array, "cameras parameters"]) -> Float[np.ndarray, "cameras 3"]:
     """Positions of the cameras in the scene, `c = -R^T t`, in scene units."""
     cameras = np.asarray(cameras, dtype=np.float64)
     return -np.einsum("nji,nj->ni", rotation_matrices(cameras[:, :3]), cameras[:, 3:6])
@@ -131,9 +131,20 @@ def project(problem: BundleProblem) -> Float[np.ndarray, "observations 2"]:
     """
     predicted = np.empty((problem.num_observations, 2))
     intrinsics = np.asarray(problem.cameras, dtype=np.float64)[:, 6:]
+    lenses = problem.lenses
     for part, camera, local in _camera_frames(problem):
-        with np.errstate(invalid="ignore", over="ignore"):
-            predicted[part] = distort(-perspective(local), intrinsics[camera])
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            if lenses is None or lenses.all_bal:
+                predicted[part] = distort(-perspective(local), intrinsics[camera])
+                continue
+            model_of = np.zeros(len(camera), int)
+            if lenses.model is not None:
+                model_of = np.asarray(lenses.model)[np.asarray(lenses.index)[camera]]
+            for number, model in enumerate(lenses.models):
+                own = model_of == number
+                numbers = list(intrinsics[camera[own], : len(model)].T)
+                pixels = model.project(numbers, *(local[own] * COLMAP_FLIP).T)
+                predicted[part.start : part.start + len(own)][own] = np.stack(pixels, axis=1)
     return predicted
 
 

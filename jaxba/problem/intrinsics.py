@@ -1,21 +1,24 @@
-"""Shared and fixed intrinsics.
+"""Lenses: which cameras share intrinsics, of which camera model they are, and which of their numbers are optimised.
 
-A *lens* is one set of intrinsics f, k1 and k2, which several cameras (images) can share. In BAL every camera has a lens
-of its own. In a COLMAP model all images of one physical camera share their intrinsics, and its camera model may have no
-distortion, or one that is not optimised.
+A *lens* is one set of intrinsics, which several cameras (images) can share. In BAL every camera has a lens of its own.
+In a COLMAP model all images of one physical camera share their intrinsics.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Int
 
+from jaxba.problem.camera_models import BAL, CameraModel
 from jaxba.typing import AnyArray, register_pytree
 
-LENS_SIZE = 3
-"""Parameters of a lens: f (pixels), k1, k2."""
+POSE_SIZE = 6
+"""Parameters of a pose: angle-axis (radians) and translation (scene units). Those of the lens follow in a camera."""
+
+LENS_SIZE = len(BAL)
+"""Parameters of a BAL lens: f (pixels), k1, k2."""
 
 
 @register_pytree
@@ -24,19 +27,39 @@ class Lenses:
     """The lenses of a problem's cameras."""
 
     index: Int[AnyArray, " cameras"]
-    """Lens of each camera, int32. Cameras with the same lens have equal f, k1 and k2, before and after a solve."""
+    """Lens of each camera, int32. Cameras with the same lens have equal intrinsics, before and after a solve."""
 
-    free: Bool[AnyArray, "lenses 3"]
-    """Which of f, k1 and k2 of each lens are optimised."""
+    free: Bool[AnyArray, "lenses numbers"]
+    """Which numbers of each lens are optimised: as many as the largest of the models has."""
+
+    model: Int[AnyArray, " lenses"] | None = None
+    """Model of each lens, a position in `models`; None: all are of the first."""
+
+    models: tuple[CameraModel, ...] = field(default=(BAL,), metadata={"static": True})
+    """The camera models of the problem."""
 
     @property
     def shared(self) -> bool:
         """Whether two cameras have the same lens."""
         return len(np.unique(self.index)) < len(self.index)
 
+    @property
+    def all_bal(self) -> bool:
+        """Whether all lenses are of BAL's model."""
+        return self.models == (BAL,)
+
+    def model_of(self, lens: int) -> CameraModel:
+        """The camera model of a lens."""
+        return self.models[0 if self.model is None else int(self.model[lens])]
+
     def of(self, cameras: Int[np.ndarray, " kept"]) -> Lenses:
         """The same for a subset of the cameras; the numbering of the lenses is unchanged."""
         return replace(self, index=np.asarray(self.index)[cameras])
+
+
+def lens_size(lenses: Lenses | None) -> int:
+    """Number of intrinsics of each camera of a problem with these lenses."""
+    return LENS_SIZE if lenses is None else max(map(len, lenses.models))
 
 
 def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
@@ -44,23 +67,38 @@ def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
 
     Args:
         lenses: lenses of a problem.
-        cameras: its cameras, shape (cameras, 9).
+        cameras: its cameras, shape (cameras, 6 + numbers).
 
     Raises:
-        ValueError: shapes differ, an index is out of range, or cameras with the same lens differ in f, k1 or k2. The
-            message is one line.
+        ValueError: shapes differ, an index is out of range, or cameras with the same lens differ in their intrinsics.
+            The message is one line.
     """
     index, free = np.asarray(lenses.index), np.asarray(lenses.free)
     if index.shape != (len(cameras),) or index.dtype.kind not in "iu":
         raise ValueError(f"lenses must name a lens for each of {len(cameras)} cameras, not {index.dtype}{index.shape}")
-    if free.ndim != 2 or free.shape[1] != LENS_SIZE or free.dtype != bool:
-        raise ValueError(f"lenses must say of f, k1 and k2 what is free, shape (n, 3), not {free.dtype}{free.shape}")
+    size = lens_size(lenses)
+    names = "f, k1 and k2" if lenses.all_bal else f"{size} numbers"
+    if free.ndim != 2 or free.shape[1] != size or free.dtype != bool:
+        raise ValueError(f"lenses must say of {names} what is free, shape (n, {size}), not {free.dtype}{free.shape}")
     bad = np.flatnonzero((index < 0) | (index >= len(free)))
     if bad.size:
         raise ValueError(f"camera {bad[0]} has lens {index[bad[0]]}, outside 0..{len(free) - 1}")
+    model = np.zeros(len(free), int) if lenses.model is None else np.asarray(lenses.model)
+    if model.shape != (len(free),) or model.dtype.kind not in "iu":
+        raise ValueError(f"lenses must name a model for each of {len(free)} lenses, not {model.dtype}{model.shape}")
+    bad = np.flatnonzero((model < 0) | (model >= len(lenses.models)))
+    if bad.size:
+        raise ValueError(f"lens {bad[0]} has model {model[bad[0]]}, outside 0..{len(lenses.models) - 1}")
+    beyond = np.arange(size) >= np.array([len(one) for one in lenses.models])[model][:, None]
     _, first, group = np.unique(index, return_index=True, return_inverse=True)
-    other = np.flatnonzero((cameras[first[group], 6:] != cameras[:, 6:]).any(axis=1))
+    other = np.flatnonzero((cameras[first[group], POSE_SIZE:] != cameras[:, POSE_SIZE:]).any(axis=1))
     if other.size:
         pair = f"{first[group[other[0]]]} and {other[0]}"
-        raise ValueError(f"cameras {pair} share lens {index[other[0]]}, but differ in f, k1 or k2")
-    return Lenses(np.ascontiguousarray(index, np.int32), np.ascontiguousarray(free))
+        differ = names.replace("and", "or") if lenses.all_bal else "their intrinsics"
+        raise ValueError(f"cameras {pair} share lens {index[other[0]]}, but differ in {differ}")
+    return replace(
+        lenses,
+        index=np.ascontiguousarray(index, np.int32),
+        free=np.ascontiguousarray(free & ~beyond),
+        model=None if lenses.model is None else np.ascontiguousarray(model, np.int32),
+    )

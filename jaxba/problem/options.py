@@ -181,7 +181,7 @@ class StepOptions:
     """Coordinates of the step and of its damping."""
 
     intrinsics: Intrinsics = "free"
-    """Whether f, k1 and k2 are optimised, as in BAL, or `fixed`, which needs the explicit solver."""
+    """Whether intrinsics are optimised, as in BAL, or `fixed`."""
 
     loss: Loss = field(default_factory=Loss)
     """Robust loss of the squared whitened residual."""
@@ -193,8 +193,6 @@ class StepOptions:
     def __post_init__(self) -> None:
         _check_known("linear_solver", self.linear_solver, LinearSolver)
         _check_known("intrinsics", self.intrinsics, Intrinsics)
-        if self.intrinsics == "fixed" and (self.method is not None or self.linear_solver != "explicit"):
-            raise ValueError(f"intrinsics 'fixed' need the explicit solver, not {self.solver_name}")
 
     @property
     def solver_name(self) -> str:

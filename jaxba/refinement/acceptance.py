@@ -65,7 +65,7 @@ class Work(NamedTuple):
 class Candidate(NamedTuple):
     """Proposed parameters, with the accept decision for every subproblem."""
 
-    cameras: Float[Array, "9 cameras"]
+    cameras: Float[Array, "parameters cameras"]
     """Proposed cameras."""
 
     points: Float[Array, "3 points"]
@@ -96,7 +96,7 @@ class Comparison(NamedTuple):
     parts: Subproblems
     """The subproblems, each with its own accept decision."""
 
-    cameras: Float[Array, "9 cameras"]
+    cameras: Float[Array, "parameters cameras"]
     """Cameras before the step."""
 
     points: Float[Array, "3 points"]
@@ -132,7 +132,7 @@ class Comparison(NamedTuple):
 
 def comparison(
     parts: Subproblems,
-    cameras: Float[Array, "9 cameras"],
+    cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
     cost: Float[Array, "*parts"],
     reference: Reference,
@@ -168,7 +168,7 @@ def comparison(
 
 def assess(
     against: Comparison,
-    cameras: Float[Array, "9 cameras"],
+    cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
     step_fraction: Float[Array, "*parts"],
     work: Work,

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
-from jaxba.model.linearize import linearize, observation_costs, with_free_lenses
+from jaxba.model.linearize import linearize, observation_costs, only_free
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.refinement.retraction import keep_focal_signs
 from jaxba.runtime import loops
@@ -22,8 +22,8 @@ DAMPINGS = (1e-6, 1e-2)
 
 
 def refine_cameras(
-    layout: Layout, cameras: Float[Array, "9 cameras"], points: Float[Array, "3 points"], options: StepOptions
-) -> Float[Array, "9 cameras"]:
+    layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], options: StepOptions
+) -> Float[Array, "parameters cameras"]:
     """One damped Gauss-Newton step of every camera on its own, accepted if that camera's own cost falls.
 
     Args:
@@ -36,12 +36,13 @@ def refine_cameras(
         New cameras; the total cost is never larger than before.
     """
     linear = linearize(layout, cameras, points, options.loss)
-    linear = with_free_lenses(layout, linear, options.intrinsics, alone=True)
+    linear = only_free(layout, linear, options.intrinsics, alone=True)
     rows = [entry for k in range(2) for entry in (*linear.camera_jacobian[k], linear.residual[k])]
     level, *levels = layout.camera_levels
-    gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, 10)
-    products = tree_sum(outer_sum(gathered[..., :9], gathered), tuple(levels))
-    blocks, gradient = products[:, :, :9], products[:, :, 9]
+    width = len(linear.camera_jacobian[0])
+    gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 1)
+    products = tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
+    blocks, gradient = products[:, :, :width], products[:, :, width]
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
@@ -50,8 +51,9 @@ def refine_cameras(
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         best, done, attempt_number = carry
-        damped = blocks + (dampings[attempt_number] * diagonal)[:, :, None] * jnp.eye(9, dtype=blocks.dtype)
+        damped = blocks + (dampings[attempt_number] * diagonal)[:, :, None] * jnp.eye(width, dtype=blocks.dtype)
         step = -components_first(solve_positive(damped, gradient))
+        step = step if layout.unknowns is None else layout.unknowns.expanded(step)
         # the Jacobian, and so the step, is in manifold coordinates
         trial = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
         costs = observation_costs(layout, trial, points, options.loss)

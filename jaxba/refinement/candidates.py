@@ -44,12 +44,12 @@ class Search(NamedTuple):
     best: Candidate
     """The last rejected candidate or, once one was accepted, the one with the lowest cost."""
 
-    cameras: Float[Array, "9 cameras"]
+    cameras: Float[Array, "parameters cameras"]
     """Origin of the next candidate."""
 
     points: Float[Array, "3 points"]
 
-    direction: tuple[Float[Array, "9 cameras"], Float[Array, "3 points"]]
+    direction: tuple[Float[Array, "parameters cameras"], Float[Array, "3 points"]]
     """The step, or the change by the first accepted candidate."""
 
     length: Float[Array, "*parts"]
@@ -70,7 +70,7 @@ class Search(NamedTuple):
 
 def best_candidate(
     parts: Subproblems,
-    cameras: Float[Array, "9 cameras"],
+    cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
     cost: Float[Array, "*parts"],
     reference: Reference,
@@ -141,7 +141,7 @@ def first_search(cameras: Any, points: Any, cost: Any, step: Step) -> Search:
     return Search(initial, cameras, points, (step.cameras, step.points), one, yes, initial, none, no)
 
 
-def _assess_next(against: Comparison, search: Search, refined: Float[Array, "9 cameras"]) -> Candidate:
+def _assess_next(against: Comparison, search: Search, refined: Float[Array, "parameters cameras"]) -> Candidate:
     """Evaluates the next candidate or, where that is due, a camera round of the last one."""
     parts, best = against.parts, search.best
     lengths = parts.of_cameras(search.length)
@@ -167,7 +167,7 @@ def _is_full_step(search: Search) -> Bool[Array, "*parts"]:
     return ~search.best.accepted & (search.length == 1)
 
 
-def next_search(against: Comparison, search: Search, refined: Float[Array, "9 cameras"]) -> Search:
+def next_search(against: Comparison, search: Search, refined: Float[Array, "parameters cameras"]) -> Search:
     """Evaluates a candidate or a camera round, and decides what comes after it.
 
     Args:

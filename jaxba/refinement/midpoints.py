@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
@@ -25,7 +26,8 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take_each
 
 UNDISTORTIONS = 10
-"""Fixed-point iterations that remove the distortion of a pixel. They need not converge: point iterations follow."""
+"""Iterations that remove the distortion of a pixel: of a fixed point for BAL, of Newton's method for other models. They
+need not converge: point iterations follow."""
 
 FEW_UNDISTORTIONS = 3
 """The same within an iteration of the solver, where it is done for every candidate."""
@@ -37,9 +39,9 @@ def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDIST
     Args:
         layout: the problem's observations.
         frames: camera of every slot (`linearize.slot_frames`).
-        undistortions: fixed-point iterations that remove the distortion.
+        undistortions: iterations that remove the distortion.
     """
-    zeros = jnp.zeros((3, layout.num_points), frames.focal.dtype)
+    zeros = jnp.zeros((3, layout.num_points), frames.lens[0].dtype)
     sums = point_passes(layout, frames)(zeros, functools.partial(_ray_terms, undistortions))
 
     def solved(sums: list[Array]) -> list[Array]:
@@ -51,13 +53,8 @@ def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDIST
 
 def _ray_terms(undistortions: int, views: Views) -> list[Array]:
     """Of every observation the six lower entries of `I - u u^T`, row by row, and the three of `(I - u u^T) c`."""
-    frame, pixel = views.frames, [row.astype(views.frames.focal.dtype) for row in views.pixels]
-    scaled = [row / frame.focal for row in pixel]
-    undistorted = scaled
-    for _ in range(undistortions):
-        squared = undistorted[0] * undistorted[0] + undistorted[1] * undistorted[1]
-        factor = 1 / (1 + squared * (frame.k1 + squared * frame.k2))
-        undistorted = [row * factor for row in scaled]
+    frame = views.frames
+    undistorted = (_undistorted if frame.models is None else _undistorted_by_model)(views, undistortions)
     inverse_norm = 1 / jnp.sqrt(undistorted[0] * undistorted[0] + undistorted[1] * undistorted[1] + 1)
     camera_ray = [undistorted[0] * inverse_norm, undistorted[1] * inverse_norm, -inverse_norm]
     to_world = lambda vector: [sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)]
@@ -66,6 +63,33 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
     matrix = [(1.0 if i == j else 0.0) - ray[i] * ray[j] for i in range(3) for j in range(i + 1)]
     right = [center[i] - ray[i] * along for i in range(3)]
     return [jnp.where(views.mask, row, jnp.zeros_like(row)) for row in [*matrix, *right]]
+
+
+def _undistorted(views: Views, iterations: int) -> list[Array]:
+    """The points of the plane z = -1 that BAL lenses see at the pixels, by fixed-point iterations."""
+    focal, k1, k2 = views.frames.lens
+    scaled = [row.astype(focal.dtype) / focal for row in views.pixels]
+    plane = scaled
+    for _ in range(iterations):
+        squared = plane[0] * plane[0] + plane[1] * plane[1]
+        factor = 1 / (1 + squared * (k1 + squared * k2))
+        plane = [row * factor for row in scaled]
+    return plane
+
+
+def _undistorted_by_model(views: Views, iterations: int) -> list[Array]:
+    """The same for lenses of any camera model, by Newton's method from the optical axis."""
+    frame, lens = views.frames, list(views.frames.lens)
+    depth = -jnp.ones_like(lens[0])
+    pixel_at = lambda x, y: camera.model_pixel(frame, lens, x, y, depth)
+    x, y = jnp.zeros_like(lens[0]), jnp.zeros_like(lens[0])
+    for _ in range(iterations):
+        found, by_x = jax.jvp(lambda x, y=y: pixel_at(x, y), (x,), (jnp.ones_like(x),))
+        _, by_y = jax.jvp(lambda y, x=x: pixel_at(x, y), (y,), (jnp.ones_like(y),))
+        u, v = (value - pixel for value, pixel in zip(found, views.pixels, strict=True))
+        inverse = 1 / (by_x[0] * by_y[1] - by_x[1] * by_y[0])
+        x, y = x - inverse * (by_y[1] * u - by_y[0] * v), y - inverse * (by_x[0] * v - by_x[1] * u)
+    return [x, y]
 
 
 class Starts(NamedTuple):
@@ -107,6 +131,8 @@ def choose_starts(
     )
     diverged = (own_lost > 0) | has_receded(own_inverse_depth, previous.inverse_depth_sum)
     possible = (lost == 0) & ~has_receded(other_inverse_depth, previous.inverse_depth_sum) & jnp.isfinite(costs)
+    if layout.unknowns is not None and layout.unknowns.free_points is not None:
+        possible = possible & layout.unknowns.free_points
     better = possible & ((costs < own) | diverged)
     return Starts(jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points))
 

@@ -1,7 +1,7 @@
 """Retraction: how a camera step is added to the current cameras.
 
 Rotations: `R <- exp(w) R`, or addition of angle-axis vectors. Intrinsics: addition to (f, k1, k2), or to
-(f, k1 / f^2, k2 / f^4).
+(f, k1 / f^2, k2 / f^4); those of other camera models than BAL's are always added as they are.
 
 The distortion parameters k1 and k2 multiply powers of the *normalised* image radius. If f and all depths grow together,
 which hardly changes the image when cameras move forwards or are far away, the distortion in pixels stays the same only
@@ -17,6 +17,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba.model import camera
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout
 
@@ -26,12 +27,15 @@ step is meaningless there. Measured: less gain with 0.1; no difference without a
 
 
 def move_cameras(
-    layout: Layout, cameras: Float[Array, "9 cameras"], step: Float[Array, "9 cameras"], options: StepOptions
-) -> Float[Array, "9 cameras"]:
+    layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
+    step: Float[Array, "parameters cameras"],
+    options: StepOptions,
+) -> Float[Array, "parameters cameras"]:
     """Adds a step to cameras, in the coordinates of the options.
 
     Args:
-        layout: knows which intrinsics of a lens are fixed.
+        layout: knows which intrinsics are constant, and the camera models.
         cameras: current cameras.
         step: camera step in the coordinates of the options.
         options: `Coordinates.rotation` and `lens_step`, and `intrinsics`.
@@ -39,19 +43,27 @@ def move_cameras(
     moved = cameras + step
     if options.coordinates.rotation == "manifold":
         moved = moved.at[:3].set(camera.compose_left(step[:3], cameras[:3]))
-    if options.coordinates.lens_step == "file" or options.intrinsics == "fixed":
+    unknowns = layout.unknowns
+    plain = options.coordinates.lens_step == "file" or options.intrinsics == "fixed"
+    if plain or (unknowns is not None and unknowns.models is not None):
         return moved
     growth = step[6] / cameras[6]
     near = jnp.abs(growth) <= MAX_FOCAL_CHANGE  # false for a focal length of zero
     for row, power in ((7, 2), (8, 4)):
         # (k / f^power + its change to first order) times the new f^power
         kept = (1 + growth) ** power * (moved[row] - power * growth * cameras[row])
-        free = near if layout.lenses is None else near & layout.lenses.free[row - 6]
+        free = near
+        if unknowns is not None and row - POSE_SIZE not in unknowns.columns:
+            continue
+        if unknowns is not None and unknowns.free is not None:
+            free = near & unknowns.free[POSE_SIZE + unknowns.columns.index(row - POSE_SIZE)]
         moved = moved.at[row].set(jnp.where(free, kept, moved[row]))
     return moved
 
 
-def keep_focal_signs(before: Float[Array, "9 cameras"], after: Float[Array, "9 cameras"]) -> Bool[Array, " cameras"]:
+def keep_focal_signs(
+    before: Float[Array, "parameters cameras"], after: Float[Array, "parameters cameras"]
+) -> Bool[Array, " cameras"]:
     """Whether the focal length of each camera keeps its sign; false where it becomes zero.
 
     A mirrored image can fit for a while, and the iterations do not lead back; no file of cameras may hold one. A camera
@@ -61,8 +73,8 @@ def keep_focal_signs(before: Float[Array, "9 cameras"], after: Float[Array, "9 c
 
 
 def step_between(
-    cameras: Float[Array, "9 cameras"], moved: Float[Array, "9 cameras"], options: StepOptions
-) -> Float[Array, "9 cameras"]:
+    cameras: Float[Array, "parameters cameras"], moved: Float[Array, "parameters cameras"], options: StepOptions
+) -> Float[Array, "parameters cameras"]:
     """The step for which `move_cameras` leads from `cameras` to `moved`, to first order."""
     change = moved - cameras
     if options.coordinates.rotation == "manifold":

@@ -44,7 +44,7 @@ class Subproblems(Protocol):
 
     def refine(
         self,
-        cameras: Float[Array, "9 cameras"],
+        cameras: Float[Array, "parameters cameras"],
         points: Float[Array, "3 points"],
         previous: PreviousPoints,
         options: StepOptions,
@@ -81,7 +81,7 @@ class Whole(NamedTuple):
 
     def refine(
         self,
-        cameras: Float[Array, "9 cameras"],
+        cameras: Float[Array, "parameters cameras"],
         points: Float[Array, "3 points"],
         previous: PreviousPoints,
         options: StepOptions,
@@ -131,7 +131,7 @@ class Clusters(NamedTuple):
 
     def refine(
         self,
-        cameras: Float[Array, "9 cameras"],
+        cameras: Float[Array, "parameters cameras"],
         points: Float[Array, "3 points"],
         previous: PreviousPoints,
         options: StepOptions,

@@ -43,7 +43,7 @@ def try_candidate(
     min_gain: Float[Array, ""],
     effort: Effort | None,
     search: Search,
-    refined: Float[Array, "9 cameras"],
+    refined: Float[Array, "parameters cameras"],
 ) -> tuple[Search, Int[Array, ""]]:
     """One turn of the search for the candidate of a step, and what comes next. Arguments as for `next_search`."""
     against = comparison(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
@@ -52,7 +52,7 @@ def try_candidate(
     return search, following
 
 
-def camera_round(layout: Layout, candidate: Candidate, options: StepOptions) -> Float[Array, "9 cameras"]:
+def camera_round(layout: Layout, candidate: Candidate, options: StepOptions) -> Float[Array, "parameters cameras"]:
     """The cameras of a candidate, each re-optimised on its own."""
     return refine_cameras(layout, candidate.cameras, candidate.points, options)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxba.lm.records import Prices
 from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemError
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import LinearSolver, LinearSolverChoice, StepOptions
 from jaxba.structure.camera_ordering import camera_order, is_banded
 from jaxba.structure.density import has_dense_shape, has_small_capacitance
@@ -95,10 +96,6 @@ INEXACT_ITERATIONS = 1.2
 """Iterations to convergence with truncated conjugate gradients, relative to a factorisation. Measured: geometric mean
 over bulani1, bulani2, bulani4 and the policies ceres, ceres+refine3 and learned, which range from 0.8 to 2.0."""
 
-SHARED_LENS_MATRICES = 5
-"""Matrices of the size of the reduced camera system in memory for shared lenses: the system, its symmetric completion,
-the sums over lenses, these scaled, their factor."""
-
 DENSE_MATRICES = 4
 """Matrices of that size in memory for a dense factorisation: the system, a copy of its blocks, its transpose, its
 factor."""
@@ -113,8 +110,8 @@ BYTES_PER_OBSERVATION = 1100.0
 BYTES_PER_PAIR = 16.0
 """Index arrays with padding; the products are computed in batches."""
 
-BYTES_PER_BLOCK = 3 * 81 * 8.0
-"""A block of 81 numbers, its partial sums and its sum."""
+MATRICES_PER_BLOCK = 3
+"""Numbers in memory per number of a block: its own, its partial sums and its sum."""
 
 MAX_COUNTED_PAIRS = 20_000_000
 """Most pairs for which blocks are counted, which takes less than a second."""
@@ -144,25 +141,27 @@ def work(
     order = observations or ObservationOrder.of(problem)
     counts, observed = count_pairs(problem, order), problem.num_observations
     every = Work(step=1.0, observation=observed)
-    blocks = _bytes_of_blocks(counts)
+    blocks = _bytes_of_blocks(counts, _width(problem))
     solvers = {"implicit": every._replace(coarse=observed, implicit=products * observed)}
     if blocks <= MAX_BYTES:
         solvers["sparse"] = every._replace(coarse=observed, block=products * counts.blocks, pair=counts.pairs)
-    explicit, needed = _factoring(order, counts, blocks)
+    explicit, needed = _factoring(order, counts, blocks, _width(problem))
     if needed <= MAX_BYTES:
         solvers["explicit"] = explicit._replace(step=1.0, observation=observed)
     return solvers
 
 
-def _factoring(observations: ObservationOrder, counts: PairCounts, blocks: float) -> tuple[Work, float]:
+def _factoring(observations: ObservationOrder, counts: PairCounts, blocks: float, width: int) -> tuple[Work, float]:
     """Work of forming and factoring the system, and the memory that it needs, bytes.
 
     Args:
         observations: sorted observations of the problem.
         counts: pairs and blocks.
         blocks: memory of the blocks, bytes.
+        width: unknowns of a camera.
     """
-    unknowns, band, points = 9.0 * observations.num_cameras, 9.0 * counts.bandwidth, observations.num_observed_points
+    unknowns, band = float(width * observations.num_cameras), float(width * counts.bandwidth)
+    points = observations.num_observed_points
     if _is_dense(observations):
         if has_small_capacitance(points + 1, observations.num_cameras):
             side, inner = 3.0 * (points + 1), unknowns
@@ -257,55 +256,63 @@ def choose_linear_solver(
     Args:
         problem: determines the choice of `auto`.
         options: options of the step.
-        asked: `auto` or a name. Methods have their own solver; fixed or shared intrinsics need the explicit one.
+        asked: `auto` or a name. Methods have their own solver.
         observations: the sorted observations of the problem, if they are known already.
 
     Raises:
         ValueError: a linear solver is requested by name for a method.
-        ProblemError: intrinsics are shared or partly fixed, and another solver than the explicit one is requested; or a
-            factorisation needs more memory than the machine has.
+        ProblemError: a method is asked for that does not support the problem; or a factorisation needs more memory than
+            the machine has.
     """
     if options.method is not None and asked != "auto":
         raise ValueError(f"linear solver {asked!r} is for plain LM steps; {options.method.name} has its own")
-    if problem.lenses is not None and options.intrinsics == "free":
-        if options.method is not None or asked not in ("auto", "explicit"):
-            refused = asked if options.method is None else f"by {options.method.name}"
-            raise ProblemError(f"shared or partly fixed lenses need plain LM, solved explicitly, not {refused}")
-        asked = "explicit"
     if options.method is not None:
+        _check_method(problem, options)
         return options
-    if asked == "auto" and options.intrinsics == "free":
+    if asked == "auto":
         return replace(options, linear_solver=choose(problem, observations))  # `choose` respects MAX_BYTES
-    asked = "explicit" if asked == "auto" else asked
     if asked == "explicit":
         _check_memory(problem, observations)
     return replace(options, linear_solver=asked)
 
 
+def _check_method(problem: BundleProblem, options: StepOptions) -> None:
+    """Raises a `ProblemError` if a method does not support a problem."""
+    assert options.method is not None
+    lenses, name = problem.lenses, options.method.name
+    if lenses is not None and lenses.shared and options.intrinsics == "free":
+        raise ProblemError(f"shared lenses need plain LM, not {name}")
+    if not options.single_solve and not (lenses is None and problem.constants is None and options.intrinsics == "free"):
+        raise ProblemError(f"{name} optimises all numbers of BAL cameras, and nothing else")
+
+
 def _check_memory(problem: BundleProblem, observations: ObservationOrder | None) -> None:
-    """Raises a `ProblemError` if a factorisation, dense for shared lenses, needs more memory than the machine has."""
+    """Raises a `ProblemError` if a factorisation needs more memory than the machine has."""
     try:
         available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):
         return
-    shared = problem.lenses is not None and problem.lenses.shared
-    matrices = SHARED_LENS_MATRICES if shared else DENSE_MATRICES
-    needed = matrices * 8.0 * (CAMERA_SIZE * problem.num_cameras) ** 2
-    if not shared:
-        observations = observations or ObservationOrder.of(problem)
-        most = observations.num_pairs
-        needed += _bytes_of_blocks(PairCounts(most, min(most, problem.num_cameras**2), 0))
-        if needed > available:  # an upper bound: count blocks and look for a band
-            counts = count_pairs(problem, observations)
-            needed = _factoring(observations, counts, _bytes_of_blocks(counts))[1]
+    width = _width(problem)
+    observations = observations or ObservationOrder.of(problem)
+    most = observations.num_pairs
+    needed = DENSE_MATRICES * 8.0 * (width * problem.num_cameras) ** 2
+    needed += _bytes_of_blocks(PairCounts(most, min(most, problem.num_cameras**2), 0), width)
+    if needed > available:  # an upper bound: count blocks and look for a band
+        counts = count_pairs(problem, observations)
+        needed = _factoring(observations, counts, _bytes_of_blocks(counts, width), width)[1]
     if needed > available:
-        suffix, hint = (" with shared lenses", "; with fixed intrinsics they may take less") if shared else ("", "")
         raise ProblemError(
-            f"{problem.num_cameras} cameras{suffix} take some {needed / 1e9:.0f} GB to "
-            f"solve by a factorisation, more than the {available / 1e9:.0f} GB of this machine{hint}"
+            f"{problem.num_cameras} cameras take some {needed / 1e9:.0f} GB to "
+            f"solve by a factorisation, more than the {available / 1e9:.0f} GB of this machine"
         )
 
 
-def _bytes_of_blocks(counts: PairCounts) -> float:
+def _bytes_of_blocks(counts: PairCounts, width: int) -> float:
     """Memory of the blocks and of the index arrays that form them."""
-    return counts.pairs * BYTES_PER_PAIR + counts.blocks * BYTES_PER_BLOCK
+    return counts.pairs * BYTES_PER_PAIR + counts.blocks * MATRICES_PER_BLOCK * 8.0 * width**2
+
+
+def _width(problem: BundleProblem) -> int:
+    """Unknowns of a camera's block."""
+    lenses = problem.lenses
+    return CAMERA_SIZE if lenses is None else POSE_SIZE + int(np.asarray(lenses.free).any(axis=0).sum())

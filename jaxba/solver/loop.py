@@ -19,7 +19,7 @@ from jaxba.lm.damped_step import largest_diagonal
 from jaxba.lm.records import LMState, Prices, StepInfo
 from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
-from jaxba.model.linearize import linearize, with_free_lenses
+from jaxba.model.linearize import linearize, only_free
 from jaxba.problem.options import StepOptions
 from jaxba.structure.layout import Layout, num_partitions
 from jaxba.structure.segment_sums import point_sum
@@ -80,7 +80,7 @@ def problem_info(
     unit = jnp.ones_like(state.cost)
     if options.coordinates.scaling == "identity":
         linear = linearize(layout, state.cameras, state.points, options.loss)
-        unit = largest_diagonal(layout, with_free_lenses(layout, linear, "free"))
+        unit = largest_diagonal(layout, only_free(layout, linear, "free"))
     count = lambda n: jnp.asarray(n, jnp.int32)
     info = ProblemInfo(
         cost=state.cost,

@@ -17,6 +17,7 @@ from jaxba.damping.registry import GUARDED
 from jaxba.lm.records import LMState, Prices
 from jaxba.lm.step import initial_state
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.runtime import process
@@ -206,4 +207,8 @@ def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: 
     order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = order < problem.num_points
     points[order[real]] = items_first(np.asarray(state.points, np.float64))[real]
+    if problem.constants is not None:
+        constant = np.asarray(problem.constants.poses)
+        cameras[:, :POSE_SIZE] = np.where(constant, problem.cameras[:, :POSE_SIZE], cameras[:, :POSE_SIZE])
+        points = np.where(np.asarray(problem.constants.points)[:, None], problem.points, points)
     return problem.replace(cameras=cameras, points=points)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
@@ -45,6 +45,10 @@ class ClusterLayout:
     pairs: PairLayout
     """Pairs of coarse slots of one point, which form the blocks of the coarse system."""
 
+    tied: Bool[AnyArray, "clusters lenses"] | None
+    """Which clusters have a shared lens, each at most one: their changes of it are one unknown. None: nothing is
+    tied."""
+
 
 def cluster_layout(
     camera: Int[np.ndarray, " observations"],
@@ -54,8 +58,11 @@ def cluster_layout(
     points: int,
     slot_point: Int[np.ndarray, " slots"],
     empty: int,
+    shared_lens: Bool[np.ndarray, "cameras lenses"] | None = None,
 ) -> ClusterLayout:
     """Clusters the cameras and lists the pairs of clusters with common points.
+
+    Clusters are split by shared lenses, unless that makes more than twice `MAX_CLUSTERS`.
 
     Args:
         camera: camera of each observation; observations are sorted by point, then by camera.
@@ -65,11 +72,18 @@ def cluster_layout(
         points: number of points.
         slot_point: point of each slot, in layout order.
         empty: an empty slot.
+        shared_lens: which cameras have which lens of those that several have.
     """
     from jaxba.structure.agglomeration import agglomerate, shared_points  # SciPy: its import takes 0.2 s
 
     num_clusters = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
     label = agglomerate(shared_points(camera, point, cameras, points)[0], cameras, num_clusters)
+    tied = None
+    if shared_lens is not None:
+        tied = np.hstack([shared_lens, ~shared_lens.any(axis=1, keepdims=True)])
+        parts, split = np.unique(label * tied.shape[1] + tied.argmax(axis=1), return_inverse=True)
+        pure = len(parts) <= 2 * MAX_CLUSTERS
+        label, tied = (split, np.eye(tied.shape[1], dtype=bool)[parts % tied.shape[1], :-1]) if pure else (label, None)
     clusters = int(label.max()) + 1
     order = sorted_by(label[camera], clusters)
     order = order[sorted_by(point[order], points)]
@@ -85,6 +99,7 @@ def cluster_layout(
         levels=sum_tree(slot[order], np.append(counts, 0), empty, fitting_width(counts)),
         point=slot_point[np.append(slot[order][first], empty)],
         pairs=pair_layout(keys % clusters, coarse, seen_by, start, clusters, len(keys), factor=True, banded=False),
+        tied=tied,
     )
 
 

@@ -35,9 +35,9 @@ from jaxba.structure.density import is_dense
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.random_partitions import Partition, partition_layout
-from jaxba.structure.shared_intrinsics import SharedLenses, shared_lenses_of
 from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
+from jaxba.structure.unknowns import Unknowns, unknowns_of
 from jaxba.typing import AnyArray, register_pytree
 
 CAMERA_CHUNK = 8
@@ -91,8 +91,8 @@ class Layout:
     partitions: Partition | None
     """Random partitions of the cameras, along a leading axis; None if no method uses them."""
 
-    lenses: SharedLenses | None
-    """Shared and fixed intrinsics; None if every camera has its own intrinsics and optimises all of them."""
+    unknowns: Unknowns | None
+    """Camera models, and what is shared or constant; None if all numbers of all BAL cameras and points are unknown."""
 
     buckets: tuple[Bucket, ...] = field(metadata={"static": True})
     """Shape of each bucket; empty for a layout with fixed capacity."""
@@ -122,7 +122,7 @@ def build_layout(
     grid: bool = True,
     partitions: int | None = None,
     capacity: Capacity | None = None,
-    lenses: bool = True,
+    fixed_intrinsics: bool = False,
     observations: ObservationOrder | None = None,
 ) -> Layout:
     """Assigns a problem's observations to slots and builds the index arrays of their sums.
@@ -137,7 +137,7 @@ def build_layout(
             cheaper (structure/density.py).
         partitions: largest number of cameras in a cluster, to draw random partitions of the cameras; needs pairs.
         capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it is a band.
-        lenses: whether the problem's lenses matter; they do not if all intrinsics are fixed.
+        fixed_intrinsics: whether all intrinsics are constant.
         observations: the sorted observations of the problem, if they are known already.
 
     Returns:
@@ -181,10 +181,9 @@ def build_layout(
         slot_grid = np.full((columns, cameras), empty, np.int32)
         slot_grid[slot_point[slot], camera] = slot
     pair_lists = None
-    shared_lenses = shared_lenses_of(problem.lenses, seen > 0) if lenses and problem.lenses is not None else None
+    members = np.concatenate([np.asarray(points) for points in assignment.members])
+    unknowns = unknowns_of(problem, seen > 0, members, fixed=fixed_intrinsics)
     if pairs and slot_grid is None:
-        # a shared lens couples cameras without common points
-        banded = shared_lenses is None or not shared_lenses.shared
         slots_by_camera = camera_levels[0].ravel()
         sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot
         sorted_index[slots_by_camera] = np.arange(len(slots_by_camera))
@@ -197,7 +196,6 @@ def build_layout(
             cameras,
             empty_index,
             factor=factor,
-            banded=banded,
             capacity=capacity,
         )
     drawn_partitions = None
@@ -207,6 +205,10 @@ def build_layout(
         drawn_partitions = partition_layout(
             camera, point, slot, cameras, len(tracks), slot_point, empty, pair_lists, largest=partitions
         )
+    camera_clusters = None
+    if clusters:
+        shared = None if unknowns is None or unknowns.members is None else np.asarray(unknowns.members)
+        camera_clusters = cluster_layout(camera, point, slot, cameras, len(tracks), slot_point, empty, shared)
     return Layout(
         slot_camera=slot_camera,
         slot_point=slot_point,
@@ -219,9 +221,9 @@ def build_layout(
         camera_seen=seen > 0,
         pairs=pair_lists,
         grid=slot_grid,
-        clusters=cluster_layout(camera, point, slot, cameras, len(tracks), slot_point, empty) if clusters else None,
+        clusters=camera_clusters,
         partitions=drawn_partitions,
-        lenses=shared_lenses,
+        unknowns=unknowns,
         buckets=assignment.buckets,
     )
 
@@ -240,7 +242,7 @@ def layout_for(
         clusters=options.uses_camera_clusters,
         partitions=options.cluster_cameras,
         capacity=capacity,
-        lenses=options.intrinsics == "free",
+        fixed_intrinsics=options.intrinsics == "fixed",
         observations=observations,
     )
 

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from jaxba import BundleProblem, Loss, StepOptions, initial_state
 from jaxba.linear.preconditioners import diagonal_blocks, preconditioner
 from jaxba.linear.schur import RotationCoordinates, camera_system, eliminate_points
-from jaxba.linear.two_level import MODES, Anchor, camera_modes, cluster_sum, coarse_system
+from jaxba.linear.two_level import SIMILARITY, Anchor, camera_modes, cluster_sum, coarse_system
 from jaxba.model import camera
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates
@@ -28,6 +28,8 @@ from jaxba.runtime.compilation import compiler_options
 from jaxba.runtime.process import single_blas_thread
 from jaxba.structure import camera_clusters
 from jaxba.structure.layout import layout_for
+
+MODES = SIMILARITY + 3
 
 MANIFOLD = StepOptions(linear_solver="implicit", coordinates=Coordinates(rotation="manifold"))
 IDENTITY = Coordinates(rotation="manifold", scaling="identity")
@@ -110,7 +112,7 @@ def everything(layout, problem, damping, more, options: StepOptions):
     system = system._replace(blocks=system.blocks + more)
     frames = camera.frames(state.cameras)
     anchor = Anchor(frames.rotation, frames.translation, state.points)
-    modes = camera_modes(layout, anchor)
+    modes = camera_modes(layout, anchor, 9)
     rule = options.conjugate_gradients.preconditioner
     apply = preconditioner(layout, linear, points, system, anchor, None, rule)
     unit = jnp.eye(9 * layout.num_cameras).reshape(-1, layout.num_cameras, 9)

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from jaxba import ConjugateGradients, Coordinates, Loss, Refinement, StepOptions, make_method
+from jaxba import ConjugateGradients, Coordinates, Loss, Refinement, StepOptions
 
 
 @pytest.mark.parametrize(
@@ -15,12 +15,6 @@ from jaxba import ConjugateGradients, Coordinates, Loss, Refinement, StepOptions
         (StepOptions, {"linear_solver": "dense"}, "linear_solver must be one of explicit"),
         (StepOptions, {"linear_solver": "auto"}, "linear_solver must be one of explicit"),
         (StepOptions, {"intrinsics": "known"}, "intrinsics must be one of free, fixed, not 'known'"),
-        (
-            StepOptions,
-            {"intrinsics": "fixed", "linear_solver": "implicit"},
-            "intrinsics 'fixed' need the explicit solver, not implicit",
-        ),
-        (StepOptions, {"intrinsics": "fixed", "method": make_method("poba")}, "explicit solver, not poba"),
         (Coordinates, {"scaling": "none"}, "scaling must be one of diagonal, identity, not 'none'"),
         (Coordinates, {"rotation": "quaternion"}, "rotation must be one of angle-axis, manifold, not 'quaternion'"),
         (Coordinates, {"lens_step": "zoom"}, "lens_step must be one of file, pixels, not 'zoom'"),

@@ -64,6 +64,6 @@ def test_trees_hold_whatever_jax_puts_in_the_place_of_arrays(make):
 
 def test_types_are_checked_where_people_call():
     with pytest.raises(jaxtyping.TypeCheckError):
-        BundleProblem(np.zeros((1, 8)), np.zeros((1, 3)), np.zeros((1, 2)), np.zeros(1, int), np.zeros(1, int))
+        BundleProblem(np.zeros((1, 9)), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1, int), np.zeros(1, int))
     with pytest.raises(jaxtyping.TypeCheckError):
-        Lenses(np.zeros(3, int), np.ones((1, 2), bool))
+        Lenses(np.zeros(3, int), np.ones((1, 3), int))

@@ -5,8 +5,7 @@ without COLMAP. Source: COLMAP, doc/cameras.rst and doc/format.rst.
 """
 
 from jaxba.io.colmap.folder import is_colmap
-from jaxba.io.colmap.lenses import MODELS
 from jaxba.io.colmap.read import read_colmap
 from jaxba.io.colmap.write import write_colmap
 
-__all__ = ["MODELS", "is_colmap", "read_colmap", "write_colmap"]
+__all__ = ["is_colmap", "read_colmap", "write_colmap"]

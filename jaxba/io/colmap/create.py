@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.colmap.records import KEY, POINT, TRACK, WXYZ, Camera, Image, Model, Points, pose_of
+from jaxba.io.colmap.records import CAMERA_MODELS, KEY, POINT, TRACK, WXYZ, Camera, Image, Model, Points, pose_of
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, colmap_quaternions
@@ -30,19 +30,20 @@ def create_model(problem: BundleProblem, target: str) -> Model:
     cameras, camera_index, point_index = (
         np.asarray(part) for part in (valid.cameras, valid.camera_index, valid.point_index)
     )
+    general = valid.lenses is not None and not valid.lenses.all_bal
     wrong = np.flatnonzero(~(cameras[:, 6] > 0))
     if wrong.size:
         at = f"f of camera {wrong[0]} is {cameras[wrong[0], 6]:g}"
         raise ProblemError(f"cannot write {target}: {at}, and COLMAP's focal lengths are positive")
     lens = np.arange(len(cameras)) if valid.lenses is None else np.asarray(valid.lenses.index)
     _, first, lens = np.unique(lens, return_index=True, return_inverse=True)
-    pixels = np.asarray(valid.observations) * COLMAP_FLIP[:2]
+    pixels = np.asarray(valid.observations) * (1.0 if general else COLMAP_FLIP[:2])
     half = np.ones((len(first), 2))
-    np.maximum.at(half, lens[camera_index], np.ceil(np.abs(pixels)))
+    np.maximum.at(half, lens[camera_index], np.ceil(np.abs(pixels) / (2.0 if general else 1.0)))
     if half.max() > _LARGEST_HALF:
         raise ProblemError(f"cannot write {target}: a pixel is {half.max():g} from the centre of its image")
     keys = np.empty(len(pixels), KEY)
-    keys["xy"], keys["point"] = pixels + half[lens[camera_index]], point_index + 1
+    keys["xy"], keys["point"] = pixels + (0.0 if general else half[lens[camera_index]]), point_index + 1
     by_image, image_ends = _grouped(camera_index, len(cameras))
     by_point, point_ends = _grouped(point_index, len(valid.points))
     key_number = np.empty(len(pixels), np.int64)
@@ -62,11 +63,21 @@ def create_model(problem: BundleProblem, target: str) -> Model:
         )
     }
     free = np.ones((len(first), LENS_SIZE), bool)
-    if valid.lenses is not None:
-        free = np.asarray(valid.lenses.free)[np.asarray(valid.lenses.index)[first]]
-    lenses = {
-        number: _camera(number, *row) for number, row in enumerate(zip(cameras[first, 6:], free, half, strict=True), 1)
-    }
+    of_problem = valid.lenses
+    if of_problem is not None:
+        free = np.asarray(of_problem.free)[np.asarray(of_problem.index)[first]]
+    rows = enumerate(zip(cameras[first, 6:], free, half, strict=True), 1)
+    if of_problem is not None and general:
+        models = [of_problem.model_of(int(of_problem.index[at])) for at in first]
+        for model in models:
+            if model.name not in CAMERA_MODELS:
+                raise ProblemError(f"cannot write {target}: COLMAP has no camera model {model.name}")
+        lenses = {
+            number: Camera(number, model.name, *(int(2 * x) for x in size), tuple(numbers[: len(model)].tolist()))
+            for (number, (numbers, _, size)), model in zip(rows, models, strict=True)
+        }
+    else:
+        lenses = {number: _camera(number, *row) for number, row in rows}
     return Model(target, ".bin", lenses, images, Points(heads, tracks), None, None)
 
 

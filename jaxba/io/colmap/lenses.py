@@ -1,85 +1,90 @@
-"""Lenses of COLMAP as those of a problem: what is optimised, and pixels relative to the principal point.
+"""Lenses of COLMAP as those of a problem.
 
-Parameters that a model lacks stay zero. Lenses of all other models are held: their pixels are undistorted once, and
-residuals are weighted so that to first order they are those of the distorted image, in pixels. Only these need
-pycolmap.
+A model whose lenses are all of `AS_BAL` becomes a BAL problem, with pixels relative to the principal point: the
+derivatives of BAL's camera are formulas, and its blocks are small. Any other keeps its pixels, and its lenses their own
+camera models and numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.io.colmap.records import CAMERA_MODELS, Camera, Model
-from jaxba.io.files import reason
-from jaxba.problem import geometry
+from jaxba.problem import camera_models
 from jaxba.problem.bundle_problem import ProblemError
-from jaxba.problem.geometry import COLMAP_FLIP
+from jaxba.problem.intrinsics import LENS_SIZE, Lenses
 
-MODELS = {
+AS_BAL = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": ("f", "fy", "cx", "cy"),
     "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
 }
-"""Camera models that can be optimised, and their parameters. PINHOLE keeps the ratio of its focal lengths."""
+"""Camera models that are BAL's but for the principal point and numbers that stay zero, and their parameters."""
 
 PARAMETERS = ("f", "k1", "k2")
-"""Parameters of a problem's lens."""
+"""Parameters of a BAL lens."""
 
 LARGEST_RATIO = 1e6
-"""Of the focal lengths of a PINHOLE, and of the scales of an image in two directions. Covariances hold the squares, and
-are singular to rounding beyond it."""
-
-_STEP = 1e-6  # in the image plane, for the derivative of a distortion that is not optimised
-_LARGEST_MISS = 0.1  # pixels, from a pixel to that of its direction; COLMAP gives some direction for any pixel
-_SMALLEST_DETERMINANT = 1e-6  # of that derivative; below it the image folds over itself
-
-
-class Seen(NamedTuple):
-    """Observations of one lens."""
-
-    pixels: Float[np.ndarray, "n 2"]
-    """Relative to the principal point, y downwards; undistorted where the lens is held."""
-
-    whitening: Float[np.ndarray, "n 2 2"]
-
-    valid: Bool[np.ndarray, " n"]
-    """False where the lens has no direction for the pixel."""
+"""Of the focal lengths of a lens; a larger one is damage."""
 
 
 def check_lens(model: Model, camera: Camera) -> None:
-    """Refuses a lens without a focal length, or with parameters that cannot be.
+    """Refuses a lens with parameters that cannot be.
 
     Raises:
         ProblemError: it cannot be used; one line that names file and camera.
     """
-    name = f"{model.file('cameras')}: camera {camera.id}"
     focals = np.array(camera.params[: CAMERA_MODELS[camera.model].focals])
-    if not len(focals):
-        raise ProblemError(f"{name}: {camera.model} has no focal length and cannot be used")
     possible = np.isfinite(camera.params).all() and (focals > 0).all()
-    if not possible or focals.max() / LARGEST_RATIO > focals.min():
+    if not possible or (len(focals) and focals.max() / LARGEST_RATIO > focals.min()):
         shown = ", ".join(f"{value:g}" for value in camera.params)
+        name = f"{model.file('cameras')}: camera {camera.id}"
         raise ProblemError(f"{name} has impossible parameters: {shown} ({camera.model})")
 
 
-def intrinsics(camera: Camera) -> tuple[list[float], list[bool]]:
-    """Numbers f, k1 and k2 of a lens, and which of them are optimised."""
-    named = _named(camera)
-    if named is None:
-        return [mean_focal(camera), 0.0, 0.0], [False] * len(PARAMETERS)
-    return [named.get(one, 0.0) for one in PARAMETERS], [one in named for one in PARAMETERS]
+def are_bal(cameras: Sequence[Camera], *, refine_principal_point: bool) -> bool:
+    """Whether lenses can be those of a BAL problem."""
+    return not refine_principal_point and all(camera.model in AS_BAL for camera in cameras)
 
 
-def mean_focal(camera: Camera) -> float:
-    """The mean of the focal lengths."""
-    return float(np.mean(camera.params[: CAMERA_MODELS[camera.model].focals]))
+def lenses_of(
+    cameras: Sequence[Camera], index: np.ndarray, *, refine_principal_point: bool
+) -> tuple[Float[np.ndarray, "lenses numbers"], Lenses | None]:
+    """Numbers of lenses, and the lenses of a problem.
+
+    As in COLMAP, focal lengths and distortion are optimised, and principal points only if asked for; nothing of a model
+    without a focal length.
+
+    Args:
+        cameras: those of the lenses.
+        index: lens of each image.
+        refine_principal_point: whether principal points are optimised.
+
+    Returns:
+        The lenses are None if every image has its own, and all of it is optimised.
+    """
+    if are_bal(cameras, refine_principal_point=refine_principal_point):
+        named = [dict(zip(AS_BAL[camera.model], camera.params, strict=True)) for camera in cameras]
+        numbers = np.array([[one.get(name, 0.0) for name in PARAMETERS] for one in named]).reshape(-1, LENS_SIZE)
+        free = np.array([[name in one for name in PARAMETERS] for one in named]).reshape(-1, LENS_SIZE)
+        unshared = len(np.unique(index)) == len(index)
+        return numbers, None if unshared and free.all() else Lenses(index, free)
+    names = sorted({camera.model for camera in cameras})
+    models = tuple(camera_models.CAMERA_MODELS[name] for name in names)
+    size = max(map(len, models))
+    numbers, free = np.zeros((len(cameras), size)), np.zeros((len(cameras), size), bool)
+    for at, camera in enumerate(cameras):
+        model = camera_models.CAMERA_MODELS[camera.model]
+        numbers[at, : len(model)] = camera.params
+        if model.focal:
+            moves = [*model.focal, *model.distortion, *(model.principal_point if refine_principal_point else ())]
+            free[at, moves] = True
+    model_index = np.array([names.index(camera.model) for camera in cameras])
+    return numbers, Lenses(index, free, model_index, models)
 
 
 def principal_point(camera: Camera) -> tuple[float, float]:
@@ -88,93 +93,21 @@ def principal_point(camera: Camera) -> tuple[float, float]:
     return camera.params[at], camera.params[at + 1]
 
 
-def seen_through(model: Model, camera: Camera, pixels: Float[np.ndarray, "n 2"]) -> Seen:
-    """Pixels of a model as a problem has them.
+def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool) -> Camera:
+    """A camera with new numbers, where its model has them; all else stays as it is, bit by bit.
 
-    Raises:
-        ProblemError: the lens needs pycolmap, which is not installed.
+    Args:
+        camera: the old one.
+        lens: its numbers in the problem.
+        bal: whether these are BAL's.
     """
-    named = _named(camera)
-    if named is None:
-        with _pycolmap_camera(model, camera) as lens:
-            return _undistorted(lens, mean_focal(camera), pixels)
-    ratio = named.get("fy", named["f"]) / named["f"]
-    whitening = np.tile(np.diag([1.0, ratio]), (len(pixels), 1, 1))
-    with np.errstate(over="ignore"):
-        observations = (pixels - principal_point(camera)) / [1.0, ratio]
-    return Seen(observations, whitening, finite_rows(observations))
-
-
-def with_lens(camera: Camera, lens: Float[np.ndarray, " 3"]) -> Camera:
-    """A camera with new f, k1 and k2, where its model has them; all else stays as it is, bit by bit."""
-    values = _named(camera)
-    if values is None:
-        return camera
+    if not bal:
+        return replace(camera, params=tuple(lens[: len(camera.params)].tolist()))
+    values = dict(zip(AS_BAL[camera.model], camera.params, strict=True))
     new = dict(zip(PARAMETERS, lens.tolist(), strict=True))
-    if "fy" in values and values["f"] != new["f"]:
-        values["fy"] *= new["f"] / values["f"]
-    return replace(camera, params=tuple(new.get(one, values[one]) for one in MODELS[camera.model]))
-
-
-def project(model: Model, camera: Camera, plane: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Pixels of points in the image plane.
-
-    Raises:
-        ProblemError: the lens needs pycolmap, which is not installed.
-    """
-    named = _named(camera)
-    if named is None:
-        with _pycolmap_camera(model, camera) as lens:
-            return _image(lens, plane)
-    lens = np.tile([named.get(one, 0.0) for one in PARAMETERS], (len(plane), 1))
-    with np.errstate(over="ignore", invalid="ignore"):
-        return geometry.distort(plane, lens) * [1.0, named.get("fy", named["f"]) / named["f"]] + principal_point(camera)
+    return replace(camera, params=tuple(new.get(one, values[one]) for one in AS_BAL[camera.model]))
 
 
 def finite_rows(values: Float[np.ndarray, "n width"]) -> Bool[np.ndarray, " n"]:
     """Whether all numbers of a row are finite."""
     return np.asarray(np.isfinite(values).all(axis=1))
-
-
-def _named(camera: Camera) -> dict[str, float] | None:
-    names = MODELS.get(camera.model)
-    return None if names is None else dict(zip(names, camera.params, strict=True))
-
-
-@contextmanager
-def _pycolmap_camera(model: Model, camera: Camera) -> Iterator[Any]:
-    name = f"{model.file('cameras')}: camera {camera.id}"
-    try:
-        import pycolmap
-    except (ImportError, RuntimeError):
-        raise ProblemError(f"{name}: {camera.model} lenses need pycolmap: pip install jaxba[colmap]") from None
-    size = {"width": camera.width, "height": camera.height}
-    try:
-        yield pycolmap.Camera(camera_id=camera.id, model=camera.model, params=list(camera.params), **size)
-    except Exception as error:  # exceptions of C++ arrive as any of Python's
-        raise ProblemError(f"{name}: COLMAP says: {reason(error)}") from error
-
-
-def _image(lens: Any, plane: np.ndarray) -> np.ndarray:
-    return np.asarray(lens.img_from_cam(np.column_stack([plane, np.ones(len(plane))])))
-
-
-def _undistorted(lens: Any, focal: float, pixels: Float[np.ndarray, "n 2"]) -> Seen:
-    """Undistorted pixels, and the derivatives of the distorted pixels with respect to them."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        plane = np.asarray(lens.cam_from_img(pixels))
-        steps = _STEP * np.eye(2)
-        rates = [(_image(lens, plane + step) - _image(lens, plane - step)) / (2 * _STEP * focal) for step in steps]
-        rates = np.stack(rates, axis=2)
-        undistorted = focal * plane
-        valid = finite_rows(np.column_stack([undistorted, rates.reshape(-1, 4)]))
-        valid &= np.abs(_image(lens, plane) - pixels).max(axis=1, initial=0.0) < _LARGEST_MISS
-        rates = np.where(valid[:, None, None], rates, np.eye(2))
-        determinant, square = np.abs(np.linalg.det(rates)), np.square(rates).sum(axis=(1, 2))
-        # the sum of squares over the determinant is the ratio of the singular values, plus its inverse
-        valid &= (determinant >= _SMALLEST_DETERMINANT) & (square <= LARGEST_RATIO * np.minimum(determinant, 1.0))
-    return Seen(
-        np.where(valid[:, None], undistorted, 0.0),
-        np.where(valid[:, None, None], rates @ np.diag(COLMAP_FLIP[:2]), np.eye(2)),
-        valid,
-    )

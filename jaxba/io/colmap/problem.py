@@ -1,12 +1,11 @@
 """The bundle adjustment problem of a COLMAP model, and where its parts stand in the model.
 
-COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards; pixels of a problem are relative to the
-principal point, which is not optimised.
+COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards: poses of a problem are BAL's. Where its
+lenses are BAL's, too, its pixels are relative to the principal point, which is not optimised (lenses.py).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,7 +19,6 @@ from jaxba.io.colmap.wording import note
 from jaxba.io.files import display_name
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations
-from jaxba.problem.intrinsics import LENS_SIZE, Lenses
 
 _EDGE = 0.01
 """A principal point is at the edge of an image within this fraction of its size."""
@@ -42,15 +40,16 @@ class Assembled(NamedTuple):
     points: Int[np.ndarray, " points"]
     """Positions in `model.points.heads`."""
 
-    pixels: Float[np.ndarray, "observations 2"]
-    """Pixels of the observations as the model has them."""
-
     notes: list[str]
     """What was left out or mended, one line each."""
 
 
-def assemble(model: Model) -> Assembled:
+def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:
     """The problem of a model.
+
+    Args:
+        model: the model.
+        refine_principal_point: whether principal points are optimised.
 
     Raises:
         ProblemError: a rig of several cameras, a lens that cannot be used, or nothing is observed.
@@ -61,8 +60,7 @@ def assemble(model: Model) -> Assembled:
         lenses.check_lens(model, model.cameras[camera])
     views, found = find_views(table)
     views, odd = _finite(table, views)
-    views, seen, folded = _through_lenses(table, views)
-    notes += found + odd + folded
+    notes += found + odd
     if not len(views.key):
         raise ProblemError("; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]]))
     sees = np.bincount(views.image, minlength=len(images)) > 0
@@ -73,8 +71,11 @@ def assemble(model: Model) -> Assembled:
     images = [image for image, kept in zip(images, sees, strict=True) if kept]
     camera_index, point_index = (np.cumsum(sees) - 1)[views.image], (np.cumsum(observed) - 1)[views.point]
     points = table.points["xyz"][observed]
-    problem, cameras = _problem(model, images, points, seen, camera_index, point_index)
-    return Assembled(problem, images, cameras, table.order[observed], table.keys["xy"][views.key], notes)
+    pixels = table.keys["xy"][views.key]
+    problem, cameras = _problem(
+        model, images, points, pixels, camera_index, point_index, refine_principal_point=refine_principal_point
+    )
+    return Assembled(problem, images, cameras, table.order[observed], notes)
 
 
 def hints(model: Model) -> list[str]:
@@ -147,59 +148,37 @@ def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
     return views.of(visible), notes
 
 
-def _through_lenses(table: Ordered, views: Views) -> tuple[Views, lenses.Seen, list[str]]:
-    """Views in the range of their lenses, what these see, and notes on the others."""
-    model, notes = table.model, []
-    pixels = table.keys["xy"][views.key]
-    used = sorted({image.camera for image in table.images})
-    lens = np.searchsorted(used, [image.camera for image in table.images])[views.image] if used else views.image
-    seen = lenses.Seen(np.empty_like(pixels), np.empty((len(pixels), 2, 2)), np.empty(len(pixels), bool))
-    for number, at in _groups(lens, len(used)) if used else ():
-        camera = model.cameras[used[number]]
-        for whole, part in zip(seen, lenses.seen_through(model, camera, pixels[at]), strict=True):
-            whole[at] = part
-        what = f"left out, outside of the range of camera {camera.id} ({camera.model})"
-        notes += note(model.file("images"), views.key[at[~seen.valid[at]]], "key-point", what, table.key_name)
-    return views.of(seen.valid), lenses.Seen(*(part[seen.valid] for part in seen)), notes
-
-
 def _problem(
     model: Model,
     images: list[Image],
     points: Float[np.ndarray, "points 3"],
-    seen: lenses.Seen,
+    pixels: Float[np.ndarray, "observations 2"],
     camera_index: Int[np.ndarray, " observations"],
     point_index: Int[np.ndarray, " observations"],
+    *,
+    refine_principal_point: bool,
 ) -> tuple[BundleProblem, list[int]]:
     """The problem, and the ids of the cameras of its lenses."""
     cameras = sorted({image.camera for image in images})
     lens = np.searchsorted(cameras, [image.camera for image in images])
-    numbers = [lenses.intrinsics(model.cameras[camera]) for camera in cameras]
-    intrinsics, free = (np.array(part).reshape(-1, LENS_SIZE) for part in zip(*numbers, strict=True))
+    used = [model.cameras[camera] for camera in cameras]
+    intrinsics, of_problem = lenses.lenses_of(used, lens, refine_principal_point=refine_principal_point)
+    if of_problem is None or of_problem.all_bal:
+        centers = np.array([lenses.principal_point(camera) for camera in used])[lens[camera_index]]
+        with np.errstate(over="ignore"):  # what is not finite is refused below
+            pixels = (pixels - centers) * COLMAP_FLIP[:2]
     poses = [image.pose for image in images]
     rotations = bal_rotations(quaternions(poses)[:, XYZW])
     translations = np.array([pose.tvec for pose in poses]) * COLMAP_FLIP
-    covariance = None
-    if (seen.whitening != np.eye(2)).any():
-        root = np.linalg.inv(seen.whitening)
-        covariance = root @ root.transpose(0, 2, 1)
-        covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
     try:
         problem = BundleProblem.create(
             np.hstack([rotations, translations, intrinsics[lens]]),
             points,
-            seen.pixels * COLMAP_FLIP[:2],
+            pixels,
             camera_index,
             point_index,
-            covariance=covariance,
-            lenses=None if len(cameras) == len(images) and free.all() else Lenses(lens, free),
+            lenses=of_problem,
         )
     except ProblemError as error:
         raise ProblemError(f"{display_name(model.folder)}: {error}") from error
     return problem, cameras
-
-
-def _groups(numbers: np.ndarray, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Every number below `count`, with its positions in `numbers`."""
-    order = np.argsort(numbers, kind="stable")
-    return enumerate(np.split(order, np.searchsorted(numbers[order], np.arange(1, count))))

@@ -2,33 +2,46 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from jaxba.io.colmap.folder import read_model
-from jaxba.io.colmap.problem import assemble, hints
+from jaxba.io.colmap.problem import Assembled, assemble, hints
+from jaxba.io.colmap.records import Model
 from jaxba.io.files import StrPath
 from jaxba.io.notes import report
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.labels import Labels
 
 
-def read_colmap(folder: StrPath, *, strict: bool = False) -> BundleProblem:
+def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point: bool = False) -> BundleProblem:
     """Reads a COLMAP model, binary or text.
 
-    Cameras are the registered images, by id, and points are sorted by id. Intrinsics of the models SIMPLE_PINHOLE,
-    PINHOLE, SIMPLE_RADIAL and RADIAL are optimised, shared by their images. Those of any other model are fixed: their
-    pixels are undistorted once, and residuals are weighted so that to first order they are those of the distorted
-    image, in pixels; this needs the extra `colmap`.
+    Cameras are the registered images, by id, and points are sorted by id. Lenses keep their camera models and numbers;
+    as in COLMAP, focal lengths and distortion are optimised, shared by the images of a camera. If all are
+    SIMPLE_PINHOLE, SIMPLE_RADIAL or RADIAL and principal points stay, they become BAL's lenses, which are faster.
 
     What is wrong with one view, point or image only is left out, and a `ProblemWarning` says what and how many.
 
     Args:
         folder: of the model.
         strict: refuse a model of which a part would be left out.
+        refine_principal_point: whether principal points are optimised, too. COLMAP's default is no.
 
     Raises:
         ProblemError: no model, one whose structure is damaged, rigs of several cameras, nothing is observed, or a part
             would be left out and `strict`; one line that names the file, and the record by its own id.
     """
     model = read_model(folder)
-    assembled = assemble(model)
+    assembled = assemble(model, refine_principal_point=refine_principal_point)
     report(assembled.notes, strict=strict)
     report(hints(model))
-    return assembled.problem
+    return assembled.problem.replace(labels=_labels(model, assembled))
+
+
+def _labels(model: Model, assembled: Assembled) -> Labels:
+    return Labels(
+        tuple(image.name.decode("utf-8", "surrogateescape") for image in assembled.images),
+        np.array([image.id for image in assembled.images]),
+        np.array(assembled.cameras),
+        model.points.heads["id"][assembled.points],
+    )

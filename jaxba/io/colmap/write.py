@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxba.io.colmap import lenses
 from jaxba.io.colmap.create import create_model, mean_errors
@@ -41,9 +40,10 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     the other model is text and the folder holds no binary one.
 
     Without another model, image, camera and point ids count from 1, and images are called `image0001.jpg` and so on.
-    Each lens is a RADIAL camera, or SIMPLE_RADIAL or SIMPLE_PINHOLE where k2, or k1 and k2, are zero and held. Image
-    sizes are made up: the principal point is the centre of the smallest even size that holds all pixels of the lens,
-    and pixels are relative to the upper left corner. Weights and which numbers are held cannot be stored.
+    Each BAL lens is a RADIAL camera, or SIMPLE_RADIAL or SIMPLE_PINHOLE where k2, or k1 and k2, are zero and constant.
+    Its image size is made up: its principal point is the centre of the smallest even size that holds all its pixels,
+    which are relative to the upper left corner. Other lenses keep their pixels, models and numbers. Weights, and what
+    is constant, cannot be stored.
 
     Args:
         problem: as `read_colmap` made it from the other model, with optimised cameras and points; any, without one.
@@ -59,7 +59,7 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
         _save(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
         return
     model = read_model(like)
-    assembled = assemble(model)
+    assembled = assemble(model, refine_principal_point=_is_general(problem))
     counts = problem.num_cameras, problem.num_points, problem.num_observations
     old = assembled.problem
     if counts != (old.num_cameras, old.num_points, old.num_observations):
@@ -81,12 +81,17 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
     for number, image in enumerate(assembled.images):
         lens = new_lenses.setdefault(image.camera, cameras[number, 6:])
         if (lens != cameras[number, 6:]).any():
-            raise ProblemError(f"cannot write {target}: images of camera {image.camera} have different f, k1 or k2")
-    new_cameras = {identity: lenses.with_lens(model.cameras[identity], lens) for identity, lens in new_lenses.items()}
+            raise ProblemError(f"cannot write {target}: images of camera {image.camera} have different intrinsics")
+    new_cameras = {
+        identity: lenses.with_lens(model.cameras[identity], lens, bal=not _is_general(problem))
+        for identity, lens in new_lenses.items()
+    }
     for camera in new_cameras.values():
         _check_lens(camera, target)
     quaternions = colmap_quaternions(cameras[:, :3])[:, WXYZ]
     poses = [pose_of(row) for row in np.hstack([quaternions, cameras[:, 3:6] * COLMAP_FLIP])]
+    same = (cameras[:, :6] == np.asarray(assembled.problem.cameras)[:, :6]).all(axis=1)
+    poses = [image.pose if kept else pose for image, pose, kept in zip(assembled.images, poses, same, strict=True)]
     new_images = {
         image.id: replace(model.images[image.id], pose=pose)
         for image, pose in zip(assembled.images, poses, strict=True)
@@ -102,7 +107,9 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
         frames = {**frames, **moved}
     heads = model.points.heads.copy()
     heads["xyz"][assembled.points] = points
-    heads["error"][assembled.points] = _errors(model, assembled, problem, new_cameras)
+    with np.errstate(over="ignore", invalid="ignore"):
+        difference = geometry.project(problem) - np.asarray(problem.observations)
+    heads["error"][assembled.points] = mean_errors(difference, np.asarray(problem.point_index), problem.num_points)
     return replace(
         model,
         cameras={**model.cameras, **new_cameras},
@@ -115,26 +122,14 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
 def _check_lens(camera: Camera, target: str) -> None:
     """Refuses a lens that `read_colmap` would refuse."""
     focals = camera.params[: CAMERA_MODELS[camera.model].focals]
-    if not np.isfinite(camera.params).all() or min(focals) <= 0:
+    if not np.isfinite(camera.params).all() or min(focals, default=1.0) <= 0:
         shown = ", ".join(f"{value:g}" for value in camera.params)
         raise ProblemError(f"cannot write {target}: camera {camera.id} would have impossible parameters: {shown}")
 
 
-def _errors(
-    model: Model, assembled: Assembled, problem: BundleProblem, cameras: dict[int, Camera]
-) -> Float[np.ndarray, " points"]:
-    """Mean reprojection error of each point in the images of the model."""
-    plain = np.array(problem.cameras, np.float64)
-    plain[:, 6:] = [1.0, 0.0, 0.0]
-    plane = geometry.project(problem.replace(cameras=plain)) * COLMAP_FLIP[:2]
-    projected = np.empty_like(assembled.pixels)
-    used = np.array([image.camera for image in assembled.images])[np.asarray(problem.camera_index)]
-    for identity, camera in cameras.items():
-        seen = used == identity
-        projected[seen] = lenses.project(model, camera, plane[seen])
-    with np.errstate(over="ignore", invalid="ignore"):
-        difference = projected - assembled.pixels
-    return mean_errors(difference, np.asarray(problem.point_index), problem.num_points)
+def _is_general(problem: BundleProblem) -> bool:
+    """Whether a problem's lenses have camera models of their own."""
+    return problem.lenses is not None and not problem.lenses.all_bal
 
 
 def _with_rigs(model: Model) -> Model:

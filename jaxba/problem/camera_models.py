@@ -1,0 +1,243 @@
+"""Camera models: functions from a point in the camera's frame and the numbers of its lens to a pixel.
+
+The frame is that of COLMAP and OpenCV: x to the right, y downwards, z forwards. A model is written once, for NumPy and
+JAX, elementwise over arrays of any shape; its derivatives come by forward mode (`jaxba.model.camera`).
+
+Perspective models project to `(u, v) = (x, y) / z`. Fisheye models project to `theta (x, y) / r` with
+`r^2 = x^2 + y^2` and `theta = atan2(r, z)`. Both then distort (u, v) and map it to `(fx u + cx, fy v + cy)`.
+
+Source: COLMAP 4.2, src/colmap/sensor/models.h, whose names, numbers and order of parameters these are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+FOV_SMALL = 1e-4
+"""Squared radius or squared omega below which FOV is a series, as in COLMAP."""
+
+NEARLY_ON_AXIS = 1e-20
+"""`r^2 / z^2` below which a fisheye projects as a pinhole: the difference is below rounding."""
+
+Pixel = tuple[Any, Any]
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """A camera model. Hashable: a problem's models are part of its compiled programs."""
+
+    name: str
+    """Name in the registry and in files of COLMAP."""
+
+    parameters: tuple[str, ...]
+    """Names of the numbers of a lens, in COLMAP's order: `f` or `fx`, `fy`; `cx`, `cy`; then distortion."""
+
+    project: Callable[[Sequence[Any], Any, Any, Any], Pixel]
+    """From the numbers of lenses, and x, y and z of points in the camera's frame, to pixels."""
+
+    def __len__(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    @property
+    def focal(self) -> tuple[int, ...]:
+        """Positions of the focal lengths."""
+        return self._named("f", "fx", "fy")
+
+    @property
+    def principal_point(self) -> tuple[int, ...]:
+        """Positions of the principal point."""
+        return self._named("cx", "cy")
+
+    @property
+    def distortion(self) -> tuple[int, ...]:
+        """Positions of all other parameters."""
+        return tuple(sorted(set(range(len(self))) - set(self.focal) - set(self.principal_point)))
+
+    def _named(self, *names: str) -> tuple[int, ...]:
+        return tuple(k for k, name in enumerate(self.parameters) if name in names)
+
+
+CAMERA_MODELS: dict[str, CameraModel] = {}
+"""All camera models by name."""
+
+
+def register_camera_model(name: str, parameters: str, project: Callable[..., Pixel]) -> CameraModel:
+    """Adds a camera model to `CAMERA_MODELS`.
+
+    Args:
+        name: of the model.
+        parameters: names of the numbers of a lens, separated by spaces. Focal lengths are called `f`, or `fx` and `fy`;
+            the principal point `cx` and `cy`; everything else counts as distortion.
+        project: from a sequence of these numbers, and x, y and z in the camera's frame (x right, y down, z forwards,
+            scene units), to the two coordinates of a pixel. Written with operators and functions of
+            `x.__array_namespace__()`, it serves NumPy and JAX.
+
+    Raises:
+        ValueError: another model has the name.
+    """
+    model = CameraModel(name, tuple(parameters.split()), project)
+    if CAMERA_MODELS.get(name, model) != model:
+        raise ValueError(f"there is a camera model {name} already")
+    CAMERA_MODELS[name] = model
+    return model
+
+
+def _bal(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
+    """BAL's camera: pixels have y upwards. Source: Agarwal et al. 2010, "Bundle Adjustment in the Large"."""
+    f, k1, k2 = lens
+    u, v = x / z, y / z
+    r2 = u * u + v * v
+    scale = f * (1 + r2 * (k1 + r2 * k2))
+    return scale * u, -scale * v
+
+
+def _perspective(x: Any, y: Any, z: Any) -> Pixel:
+    return x / z, y / z
+
+
+def _equidistant(x: Any, y: Any, z: Any) -> Pixel:
+    """`theta (x, y) / r`, smooth on the axis."""
+    xp = x.__array_namespace__()
+    r2 = x * x + y * y
+    near = r2 < NEARLY_ON_AXIS * z * z
+    r = xp.sqrt(xp.where(near, xp.ones_like(r2), r2))
+    scale = xp.where(near, 1 / xp.where(near, z, xp.ones_like(z)), xp.atan2(r, z) / r)
+    return scale * x, scale * y
+
+
+def _radial(u: Any, v: Any, coefficients: Sequence[Any]) -> tuple[Any, Any]:
+    """`1 + k1 r^2 + k2 r^4 + ...` and r^2."""
+    r2 = u * u + v * v
+    total = 0.0
+    for k in reversed(coefficients):
+        total = r2 * (k + total)
+    return 1 + total, r2
+
+
+def _tangential(u: Any, v: Any, r2: Any, p1: Any, p2: Any) -> Pixel:
+    return 2 * p1 * u * v + p2 * (r2 + 2 * u * u), 2 * p2 * u * v + p1 * (r2 + 2 * v * v)
+
+
+def _no_distortion(u: Any, v: Any) -> Pixel:
+    return u, v
+
+
+def _polynomial(u: Any, v: Any, *k: Any) -> Pixel:
+    factor, _ = _radial(u, v, k)
+    return factor * u, factor * v
+
+
+def _brown(u: Any, v: Any, k1: Any, k2: Any, p1: Any, p2: Any) -> Pixel:
+    """Source: Brown 1966, "Decentering distortion of lenses"."""
+    factor, r2 = _radial(u, v, (k1, k2))
+    du, dv = _tangential(u, v, r2, p1, p2)
+    return factor * u + du, factor * v + dv
+
+
+def _rational(u: Any, v: Any, k1: Any, k2: Any, p1: Any, p2: Any, k3: Any, k4: Any, k5: Any, k6: Any) -> Pixel:
+    factor, r2 = _radial(u, v, (k1, k2, k3))
+    factor = factor / _radial(u, v, (k4, k5, k6))[0]
+    du, dv = _tangential(u, v, r2, p1, p2)
+    return factor * u + du, factor * v + dv
+
+
+def _thin_prism(u: Any, v: Any, k1: Any, k2: Any, p1: Any, p2: Any, k3: Any, k4: Any, sx1: Any, sy1: Any) -> Pixel:
+    factor, r2 = _radial(u, v, (k1, k2, k3, k4))
+    du, dv = _tangential(u, v, r2, p1, p2)
+    return factor * u + du + sx1 * r2, factor * v + dv + sy1 * r2
+
+
+def _rad_tan_thin_prism(u: Any, v: Any, *numbers: Any) -> Pixel:
+    """Source: Project Aria, "Fisheye62" with thin prism terms."""
+    *k, p0, p1, s0, s1, s2, s3 = numbers
+    factor, _ = _radial(u, v, k)
+    u, v = factor * u, factor * v
+    r2 = u * u + v * v
+    du, dv = _tangential(u, v, r2, p1, p0)
+    return u + du + r2 * (s0 + r2 * s1), v + dv + r2 * (s2 + r2 * s3)
+
+
+def _field_of_view(u: Any, v: Any, omega: Any) -> Pixel:
+    """`atan(2 r tan(omega / 2)) / (r omega)`. Source: Devernay and Faugeras 2001, "Straight lines have to be
+    straight"; the two series are COLMAP's."""
+    xp = u.__array_namespace__()
+    r2, omega2 = u * u + v * v, omega * omega
+    flat, near = omega2 < FOV_SMALL, r2 < FOV_SMALL
+    safe = xp.where(flat, xp.ones_like(omega), omega)
+    tangent = xp.tan(safe / 2)
+    r = xp.sqrt(xp.where(near, xp.ones_like(r2), r2))
+    factor = xp.atan(2 * r * tangent) / (r * safe)
+    factor = xp.where(near, -2 * tangent * (4 * r2 * tangent * tangent - 3) / (3 * safe), factor)
+    factor = xp.where(flat, 1 + omega2 * r2 / 3 - omega2 / 12, factor)
+    return factor * u, factor * v
+
+
+def _division(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
+    """The distorted point whose undistorted one is `(u, v) / (1 + k r^2)`. Source: Fitzgibbon 2001, "Simultaneous
+    linear estimation of multiple view geometry and lens distortion"."""
+    *focal, cx, cy, k = lens
+    xp = x.__array_namespace__()
+    scale = 2 / (z + xp.sqrt(z * z - 4 * k * (x * x + y * y)))
+    return focal[0] * scale * x + cx, focal[-1] * scale * y + cy
+
+
+def _enhanced_unified(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
+    """Source: Khomutenko et al. 2016, "An Enhanced Unified Camera Model"."""
+    fx, fy, cx, cy, alpha, beta = lens
+    xp = x.__array_namespace__()
+    depth = alpha * xp.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z
+    return fx * x / depth + cx, fy * y / depth + cy
+
+
+def _equirectangular(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
+    width, height = lens
+    xp = x.__array_namespace__()
+    pi = 3.141592653589793
+    return width * (xp.atan2(x, z) / (2 * pi) + 0.5), height * (xp.atan2(y, xp.sqrt(x * x + z * z)) / pi + 0.5)
+
+
+def _distorted(
+    to_plane: Callable[[Any, Any, Any], Pixel], distort: Callable[..., Pixel], focals: int
+) -> Callable[[Sequence[Any], Any, Any, Any], Pixel]:
+    """A model that projects to the plane, distorts there, and scales to pixels."""
+
+    def project(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
+        cx, cy, *coefficients = lens[focals:]
+        u, v = distort(*to_plane(x, y, z), *coefficients)
+        return lens[0] * u + cx, lens[focals - 1] * v + cy
+
+    return project
+
+
+_ONE, _TWO = "f cx cy", "fx fy cx cy"
+
+BAL = register_camera_model("BAL", "f k1 k2", _bal)
+"""The model of BAL, with analytic derivatives in a solve where all lenses are of it."""
+
+register_camera_model("SIMPLE_PINHOLE", _ONE, _distorted(_perspective, _no_distortion, 1))
+register_camera_model("PINHOLE", _TWO, _distorted(_perspective, _no_distortion, 2))
+register_camera_model("SIMPLE_RADIAL", f"{_ONE} k1", _distorted(_perspective, _polynomial, 1))
+register_camera_model("RADIAL", f"{_ONE} k1 k2", _distorted(_perspective, _polynomial, 1))
+register_camera_model("OPENCV", f"{_TWO} k1 k2 p1 p2", _distorted(_perspective, _brown, 2))
+register_camera_model("OPENCV_FISHEYE", f"{_TWO} k1 k2 k3 k4", _distorted(_equidistant, _polynomial, 2))
+register_camera_model("FULL_OPENCV", f"{_TWO} k1 k2 p1 p2 k3 k4 k5 k6", _distorted(_perspective, _rational, 2))
+register_camera_model("FOV", f"{_TWO} omega", _distorted(_perspective, _field_of_view, 2))
+register_camera_model("SIMPLE_RADIAL_FISHEYE", f"{_ONE} k1", _distorted(_equidistant, _polynomial, 1))
+register_camera_model("RADIAL_FISHEYE", f"{_ONE} k1 k2", _distorted(_equidistant, _polynomial, 1))
+register_camera_model(
+    "THIN_PRISM_FISHEYE", f"{_TWO} k1 k2 p1 p2 k3 k4 sx1 sy1", _distorted(_equidistant, _thin_prism, 2)
+)
+register_camera_model(
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+    f"{_TWO} k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
+    _distorted(_equidistant, _rad_tan_thin_prism, 2),
+)
+register_camera_model("SIMPLE_DIVISION", f"{_ONE} k", _division)
+register_camera_model("DIVISION", f"{_TWO} k", _division)
+register_camera_model("SIMPLE_FISHEYE", _ONE, _distorted(_equidistant, _no_distortion, 1))
+register_camera_model("FISHEYE", _TWO, _distorted(_equidistant, _no_distortion, 2))
+register_camera_model("EUCM", f"{_TWO} alpha beta", _enhanced_unified)
+register_camera_model("EQUIRECTANGULAR", "width height", _equirectangular)

@@ -1,0 +1,181 @@
+"""What of a problem is optimised: `hold` and `release` say it, `with_gauge` fixes position, orientation and scale.
+
+What is constant comes back bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool
+
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.constants import ROTATION, Constants, constants_of
+from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+
+Which = Literal["all"] | Iterable[int] | Iterable[str]
+"""Positions, names of images, a mask, or all of them."""
+
+Gauge = Literal["free", "two-cameras", "three-points"]
+
+GROUPS = ("focal", "principal_point", "distortion")
+"""Groups of the numbers of a lens, as COLMAP's options name them."""
+
+
+def hold(
+    problem: BundleProblem,
+    *,
+    poses: Which = (),
+    rotations: Which = (),
+    points: Which = (),
+    lenses: Which = (),
+    numbers: Iterable[str] = (),
+) -> BundleProblem:
+    """The problem with more of it constant.
+
+    Args:
+        problem: any problem.
+        poses: images whose pose is constant.
+        rotations: images whose rotation is constant; they still move.
+        points: constant points.
+        lenses: constant lenses: positions in `problem.lenses`, or of cameras where every camera has its own.
+        numbers: what is constant in every lens: `focal`, `principal_point`, `distortion`, or the name of a number of a
+            camera model such as `k2`.
+
+    Raises:
+        ValueError: no such image, lens, point or number; one line.
+    """
+    constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
+    constants.poses[_mask(problem, poses, problem.num_cameras, "image")] = True
+    constants.poses[np.ix_(_mask(problem, rotations, problem.num_cameras, "image"), ROTATION)] = True
+    constants.points[_mask(problem, points, problem.num_points, "point")] = True
+    changed = _with_constants(problem, constants)
+    own = _lenses(problem)
+    free = np.array(own.free)
+    free[_mask(problem, lenses, len(free), "lens")] = False
+    free &= ~_named(own, numbers)
+    return changed if (free == own.free).all() else changed.replace(lenses=replace(own, free=free))
+
+
+def release(problem: BundleProblem, *, numbers: Iterable[str]) -> BundleProblem:
+    """The problem with numbers of all its lenses optimised. Arguments and errors as for `hold`.
+
+    The principal point of a BAL lens is no number of it: read COLMAP models with `refine_principal_point=True`.
+    """
+    own = _lenses(problem)
+    return problem.replace(lenses=replace(own, free=np.asarray(own.free) | _named(own, numbers)))
+
+
+def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
+    """The problem with its position, orientation and scale fixed.
+
+    A cost of pixels alone does not change when the whole scene is moved, turned and scaled. `two-cameras`: the pose of
+    the observed camera that is nearest to the middle of all, and one number of the translation of the one that is
+    farthest from it, are constant: the seven degrees of freedom of a similarity, and nothing else. `three-points`:
+    three points that many images see and that are far apart are constant. `free`: nothing is. Source: COLMAP,
+    `BundleAdjustmentGauge`.
+
+    Raises:
+        ValueError: no such gauge.
+        ProblemError: fewer than two cameras, or three points, are observed.
+    """
+    if gauge not in get_args(Gauge):
+        raise ValueError(f"gauge must be one of {', '.join(get_args(Gauge))}, not {gauge!r}")
+    if gauge == "free":
+        return problem
+    constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
+    if gauge == "two-cameras":
+        _fix_two_cameras(problem, constants)
+    else:
+        _fix_three_points(problem, constants)
+    return _with_constants(problem, constants)
+
+
+def _fix_two_cameras(problem: BundleProblem, constants: Constants) -> None:
+    seen = np.unique(problem.camera_index)
+    if len(seen) < 2:
+        raise ProblemError("a gauge of two cameras needs two that see points")
+    centers = geometry.camera_centers(problem.cameras)[seen]
+    first = int(np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
+    second = int(np.argmax(np.linalg.norm(centers - centers[first], axis=1)))
+    constants.poses[seen[first]] = True
+    # its distance from the first camera along the axis of its own on which that is largest
+    rotation = geometry.rotation_matrices(np.asarray(problem.cameras)[seen[second : second + 1], :3])[0]
+    axis = int(np.argmax(np.abs(rotation @ (centers[second] - centers[first]))))
+    constants.poses[seen[second], 3 + axis] = True
+
+
+def _fix_three_points(problem: BundleProblem, constants: Constants) -> None:
+    tracks = np.bincount(problem.point_index, minlength=problem.num_points)
+    seen = np.flatnonzero(tracks >= max(2, int(np.median(tracks[tracks > 0])) if tracks.any() else 0))
+    if len(seen) < 3:
+        raise ProblemError("a gauge of three points needs three that two images see")
+    points = np.asarray(problem.points)[seen]
+    away = lambda at: np.linalg.norm(points - points[at], axis=1)
+    first = int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    # far, but not the farthest, which are the least certain
+    second = int(np.argsort(away(first))[len(seen) * 3 // 4])
+    line = (points[second] - points[first]) / max(away(first)[second], np.finfo(float).tiny)
+    off_line = np.linalg.norm(np.cross(points - points[first], line), axis=1)
+    off_line[[first, second]] = -1.0
+    third = int(np.argsort(off_line)[max(2, len(seen) * 3 // 4)])
+    constants.points[seen[[first, second, third]]] = True
+
+
+def _with_constants(problem: BundleProblem, constants: Constants) -> BundleProblem:
+    anything = constants.poses.any() or constants.points.any()
+    return problem.replace(constants=constants if anything else None)
+
+
+def _lenses(problem: BundleProblem) -> Lenses:
+    """The lenses of a problem, also where every camera has its own BAL lens."""
+    if problem.lenses is not None:
+        return problem.lenses
+    count = problem.num_cameras
+    return Lenses(np.arange(count, dtype=np.int32), np.ones((count, LENS_SIZE), bool))
+
+
+def _mask(problem: BundleProblem, which: Which, count: int, what: str) -> Bool[np.ndarray, " n"]:
+    if isinstance(which, str):
+        if which != "all":
+            raise ValueError(f"which {what} must be 'all' or a list, not {which!r}")
+        return np.ones(count, bool)
+    chosen = which if isinstance(which, np.ndarray) else list(which)
+    mask = np.zeros(count, bool)
+    if len(chosen) and isinstance(chosen[0], str):
+        if problem.labels is None or what != "image":
+            raise ValueError(f"this problem has no names of {what} parts: give positions")
+        chosen = problem.labels.images_at(chosen)
+    if isinstance(chosen, np.ndarray) and chosen.dtype == bool:
+        if chosen.shape != mask.shape:
+            raise ValueError(f"a mask of {what} parts has shape {chosen.shape}, not {mask.shape}")
+        return chosen
+    at = np.asarray(chosen, np.int64)
+    bad = at[(at < 0) | (at >= count)]
+    if len(bad):
+        raise ValueError(f"there is no {what} {bad[0]}: there are {count}")
+    mask[at] = True
+    return mask
+
+
+def _named(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "lenses numbers"]:
+    """The numbers of each lens that are meant."""
+    free = np.asarray(lenses.free)
+    meant = np.zeros(free.shape, bool)
+    for name in numbers:
+        of_models = [
+            getattr(model, name)
+            if name in GROUPS
+            else tuple(k for k, parameter in enumerate(model.parameters) if parameter == name)
+            for model in lenses.models
+        ]
+        if name not in GROUPS and not any(of_models):
+            known = dict.fromkeys(parameter for model in lenses.models for parameter in model.parameters)
+            raise ValueError(f"no lens has a number {name!r}; there are {', '.join([*GROUPS, *known])}")
+        for lens in range(len(free)):
+            meant[lens, list(of_models[0 if lenses.model is None else int(lenses.model[lens])])] = True
+    return meant

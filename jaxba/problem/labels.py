@@ -1,0 +1,55 @@
+"""What a file calls the parts of a problem: names and ids of its images, ids of its lenses and points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int, Integer
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Names and ids of the parts of a problem, in its order."""
+
+    names: tuple[str, ...]
+    """Names of images."""
+
+    images: Int[np.ndarray, " cameras"]
+    """Ids of images."""
+
+    lenses: Int[np.ndarray, " lenses"]
+    """Ids of lenses; COLMAP calls them cameras."""
+
+    points: Integer[np.ndarray, " points"]
+    """Ids of points."""
+
+    def images_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
+        """Positions of images by name or id.
+
+        Raises:
+            ValueError: there is no such image; one line.
+        """
+        by_name = {name: at for at, name in enumerate(self.names)}
+        by_id = {int(number): at for at, number in enumerate(self.images)}
+        found = [(by_name if isinstance(one, str) else by_id).get(one, -1) for one in wanted]  # type: ignore[call-overload]
+        return _positions(list(wanted), found, "image")
+
+    def lenses_at(self, wanted: Iterable[int]) -> Int[np.ndarray, " wanted"]:
+        """Positions of lenses by id. Raises as `images_at`."""
+        by_id = {int(number): at for at, number in enumerate(self.lenses)}
+        return _positions(list(wanted), [by_id.get(one, -1) for one in wanted], "camera")
+
+    def points_at(self, wanted: Iterable[int]) -> Int[np.ndarray, " wanted"]:
+        """Positions of points by id. Raises as `images_at`."""
+        by_id = {int(number): at for at, number in enumerate(self.points)}
+        return _positions(list(wanted), [by_id.get(one, -1) for one in wanted], "point")
+
+
+def _positions(wanted: list, found: list[int], what: str) -> np.ndarray:
+    missing = [one for one, at in zip(wanted, found, strict=True) if at < 0]
+    if missing:
+        more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise ValueError(f"there is no {what} {missing[0]!r}{more}")
+    return np.array(found, np.int64)

@@ -1,0 +1,151 @@
+"""What is unknown: the numbers of cameras and points that a solve moves, and which cameras share theirs.
+
+Every camera has a block of unknowns: six of its pose, and those numbers of its lens that some lens optimises
+(`columns`). What is constant has zero columns in the Jacobian; its gradient, and so its step, is then exactly zero.
+
+Let T be the matrix that copies the parameters y of shared lenses (and the poses) to the cameras, `d = T y`. The damped
+system `(H + D) d = -g` becomes
+
+    T^T (H + D) T y = -T^T g.
+
+T leaves points alone, so they are eliminated as usual. A factorisation has the shared lenses as a border of the reduced
+camera system S (linear/border.py). Conjugate gradients work on S itself, between projections on the range of T: with
+the orthogonal projector P, which averages over the cameras of a lens,
+
+    P S P d = P b    has the solution    d = T y.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.camera_models import CameraModel
+from jaxba.problem.intrinsics import POSE_SIZE, lens_size
+from jaxba.typing import AnyArray, register_pytree
+
+
+@register_pytree
+@dataclass(frozen=True)
+class Unknowns:
+    """The unknowns of a problem, where they are not just all numbers of all BAL cameras and points."""
+
+    members: Bool[AnyArray, "cameras lenses"] | None
+    """Whether an observed camera has this lens, for each lens that several observed cameras have; None if there is
+    none."""
+
+    free: Bool[AnyArray, "width cameras"] | None
+    """Which unknowns of each camera's block are optimised; None: all."""
+
+    free_points: Bool[AnyArray, " points"] | None
+    """Which points are optimised, in layout order; None: all."""
+
+    model: Int[AnyArray, " cameras"] | None
+    """Camera model of each camera, a position in `models`; None if there is only one."""
+
+    models: tuple[CameraModel, ...] | None = field(metadata={"static": True})
+    """Camera models; None if all are BAL's."""
+
+    all_shared: bool = field(metadata={"static": True})
+    """Whether every observed camera has one of these lenses."""
+
+    columns: tuple[int, ...] = field(metadata={"static": True})
+    """Numbers of a lens that are part of a camera's block, ascending."""
+
+    size: int = field(metadata={"static": True})
+    """Number of all intrinsics of a camera."""
+
+    @property
+    def shared(self) -> bool:
+        """Whether several cameras have a lens in common of which something is optimised."""
+        return self.members is not None
+
+    @property
+    def width(self) -> int:
+        """Number of unknowns in a camera's block."""
+        return POSE_SIZE + len(self.columns)
+
+    def total(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "lenses numbers"]:
+        """Sums over the cameras of each shared lens: the product with `T^T`."""
+        assert self.members is not None
+        return jnp.matmul(self.members.T.astype(values.dtype), values, precision="highest")
+
+    def spread(
+        self, values: Float[Array, "lenses numbers"], own: Float[Array, "cameras numbers"]
+    ) -> Float[Array, "cameras numbers"]:
+        """The values of its shared lens for each camera that has one, its own for the others: the product with T."""
+        assert self.members is not None
+        at = jnp.argmax(jnp.asarray(self.members), axis=1)
+        return jnp.where(jnp.any(self.members, axis=1)[:, None], values[at], own)
+
+    def mean(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "cameras numbers"]:
+        """The mean over the cameras with the same lens."""
+        count = jnp.sum(self.members, axis=0, dtype=values.dtype)
+        return self.spread(self.total(values) / count[:, None], values)
+
+    def project(self, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
+        """The orthogonal projection P on the range of T."""
+        if self.members is None:
+            return x
+        return jnp.concatenate([x[:, :POSE_SIZE], self.mean(x[:, POSE_SIZE:])], axis=1)
+
+    def restricted(self, changes: Float[Array, "*steps parameters cameras"]) -> Float[Array, "*steps width cameras"]:
+        """The unknowns of changes of all numbers of cameras."""
+        rows = [*range(POSE_SIZE), *(POSE_SIZE + column for column in self.columns)]
+        return changes[..., np.array(rows), :]
+
+    def expanded(self, step: Float[Array, "width ..."]) -> Float[Array, "parameters ..."]:
+        """A step of camera blocks, with zeros for the numbers that are not part of them."""
+        if len(self.columns) == self.size:
+            return step
+        zero, place = jnp.zeros_like(step[0]), {column: POSE_SIZE + k for k, column in enumerate(self.columns)}
+        lens = [step[place[k]] if k in place else zero for k in range(self.size)]
+        return jnp.concatenate([step[:POSE_SIZE], jnp.stack(lens)])
+
+
+def unknowns_of(
+    problem: BundleProblem, seen: Bool[np.ndarray, " cameras"], order: Int[np.ndarray, " points"], *, fixed: bool
+) -> Unknowns | None:
+    """The unknowns of a problem, for its layout.
+
+    Args:
+        problem: a checked problem.
+        seen: whether each camera has an observation; padding cameras have none.
+        order: point of the problem at each position in layout order; out of range for padding.
+        fixed: whether all intrinsics are constant.
+
+    Returns:
+        None if all numbers of all cameras and points are optimised, as in BAL.
+    """
+    lenses, constants = problem.lenses, problem.constants
+    if lenses is None and constants is None and not fixed:
+        return None
+    size, count = lens_size(lenses), problem.num_cameras
+    index = np.arange(count) if lenses is None else np.asarray(lenses.index)
+    lens_free = np.ones((count, size), bool) if lenses is None else np.asarray(lenses.free)[index]
+    lens_free = lens_free & (not fixed)
+    columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
+    pose_free = np.ones((count, POSE_SIZE), bool)
+    free_points = None
+    if constants is not None:
+        pose_free = ~np.asarray(constants.poses)
+        if np.asarray(constants.points).any():
+            free_points = np.append(~np.asarray(constants.points), True)[np.minimum(order, problem.num_points)]
+    free = np.hstack([pose_free, lens_free[:, columns]])
+    members = model = None
+    shared, times = np.unique(index[seen[:count]], return_counts=True)
+    shared = shared[times > 1]
+    if lenses is not None and columns and len(shared):
+        members = (index[:, None] == shared) & seen[:count, None]
+    all_shared = bool((times > 1).all())
+    models = None if lenses is None or lenses.all_bal else lenses.models
+    if models is not None and len(models) > 1:
+        assert lenses is not None
+        assert lenses.model is not None
+        model = np.asarray(lenses.model)[index]
+    return Unknowns(members, None if free.all() else free.T, free_points, model, models, all_shared, columns, size)
