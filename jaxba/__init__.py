@@ -42,11 +42,13 @@ from jaxba.problem.constants import Constants
 from jaxba.problem.constraints import hold, release, with_gauge
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.losses import Loss
+from jaxba.problem.measured import with_lens_priors, with_position_priors, with_rotation_priors
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.covariance import Covariance, covariance
 from jaxba.solver.loop import Carry, History, solve_loop
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Prepared, prepare
@@ -69,6 +71,7 @@ __all__ = [
     "ConjugateGradients",
     "Constants",
     "Coordinates",
+    "Covariance",
     "DampingPolicy",
     "Effort",
     "Geometric",
@@ -95,6 +98,7 @@ __all__ = [
     "Termination",
     "Tolerances",
     "build_layout",
+    "covariance",
     "drop_invalid",
     "hold",
     "initial_state",
@@ -122,6 +126,9 @@ __all__ = [
     "solve_loop",
     "trained_step",
     "with_gauge",
+    "with_lens_priors",
+    "with_position_priors",
+    "with_rotation_priors",
     "write_bal",
     "write_bundler",
     "write_colmap",

@@ -9,18 +9,22 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
 from jaxba.cli import common, table
+from jaxba.cli.colmap_options import translated
+from jaxba.cli.constraints import constrained
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.output import check_outputs, check_storable, write_solution
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
-from jaxba.io import read_problem
+from jaxba.io import is_colmap, read_colmap, read_problem
 from jaxba.io.files import open_output, stream_number
 from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.constraints import Gauge
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import (
     ConjugateGradients,
@@ -33,6 +37,7 @@ from jaxba.problem.options import (
 from jaxba.runtime.compilation import Compilation
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.covariance import covariance
 from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.solver.prepare import DEFAULT_POLICY
@@ -128,6 +133,21 @@ class Arguments:
     """free: optimise focal length and distortion of every camera, as in BAL, or of every lens, as in COLMAP. fixed:
     keep them, for calibrated cameras; the linear solver must be explicit."""
 
+    refine_principal_point: bool = False
+    """Optimise principal points of a COLMAP model, too."""
+
+    constant: tuple[str, ...] = ()
+    """What stays as it is: poses, rotations, points, focal, distortion, principal-point, or numbers of lenses such as
+    k2."""
+
+    gauge: Gauge | None = None
+    """Fix position, orientation and scale. two-cameras: the pose of one camera, and a number of another's translation.
+    three-points: three points. Default: free, or what --constraints says."""
+
+    constraints: str | None = None
+    """YAML file of constants and priors by the model's own names and ids, with the keys constant_poses,
+    constant_rotations, constant_points, constant_cameras, constant_numbers, position_priors and gauge."""
+
     loss: Literal["squared", "huber", "soft_l1", "cauchy", "tukey"] = "squared"
     """Robust loss function of the squared residual."""
 
@@ -142,6 +162,10 @@ class Arguments:
     strict: bool = False
     """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point."""
 
+    covariance: str | None = None
+    """Output file (.npz) of covariances: poses, lenses, points, points_given_cameras. It needs a gauge, constants or
+    priors that fix position, orientation and scale."""
+
     log: str | None = None
     """Output file of a JSON record of the solve, compressed by its ending."""
 
@@ -154,7 +178,11 @@ def main() -> None:
 def run(argv: Sequence[str] | None = None) -> int:
     """Runs the command. Exit status: 0 if a solution was found and written, 2 for bad input, 130 after a second
     Ctrl-C."""
-    return common.run_command(Arguments, _run, "Bundle adjustment of one problem.", argv)
+    try:
+        words = translated(sys.argv[1:] if argv is None else argv)
+    except common.UsageError as error:
+        return common.print_error(str(error))
+    return common.run_command(Arguments, _run, "Bundle adjustment of one problem.", words)
 
 
 def solver_name(args: Arguments) -> SolverName:
@@ -226,8 +254,12 @@ def _solve(args: Arguments) -> int:
     path = None if args.problem is None else resolve(args.problem)
     check_outputs(args.output, args.log, path)
     with common.notes_printed():
-        problem = _default_scene() if path is None else read_problem(path, strict=args.strict)
+        problem = _default_scene() if path is None else _read(args, path)
+        problem = constrained(problem, args.constant, args.gauge, args.constraints)
     check_storable(args.output, problem, path)
+    common.check_writable("--covariance", args.covariance)
+    if args.covariance and problem.constants is None and problem.priors is None:
+        raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
     common.prepare_process(untraced=True)
     name = args.problem or DEFAULT_SCENE
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
@@ -237,6 +269,8 @@ def _solve(args: Arguments) -> int:
         common.print_line(table.padding(problem, solution))
     if args.output:
         write_solution(args.output, solution.problem, path)
+    if args.covariance:
+        _write_covariance(args.covariance, solution.problem, options.loss)
     if args.log:
         from jaxba.bench.records import record_to_json
         from jaxba.bench.run import record_of
@@ -246,6 +280,22 @@ def _solve(args: Arguments) -> int:
             file.write(json.dumps(record_to_json(record), allow_nan=False).encode() + b"\n")
         common.print_line(f"wrote {args.log}")
     return 0
+
+
+def _read(args: Arguments, path: str) -> BundleProblem:
+    if args.refine_principal_point:
+        if not is_colmap(path):
+            raise common.UsageError("--refine-principal-point is for COLMAP models")
+        return read_colmap(path, strict=args.strict, refine_principal_point=True)
+    return read_problem(path, strict=args.strict)
+
+
+def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
+    found = covariance(problem, loss=loss)
+    with open_output(path) as file:
+        arrays = ("poses", "lenses", "points", "points_given_cameras")
+        np.savez_compressed(file, **{name: getattr(found, name) for name in arrays})
+    common.print_line(f"wrote {path}")
 
 
 def _default_scene() -> BundleProblem:

@@ -65,7 +65,7 @@ def read(kind: Kind, name: str) -> dict[str, Any]:
         SettingsError: no such configuration or base, no YAML, no mapping, or files that extend each other in a circle.
     """
     path = find(kind, name)
-    data = _read_file(path, name)
+    data = read_file(path, name)
     shown, visited, layers = [name], [path.resolve()], [data]
     while BASE in data:
         base = data.pop(BASE)
@@ -73,7 +73,7 @@ def read(kind: Kind, name: str) -> dict[str, Any]:
             raise SettingsError(f"{shown[-1]}: {BASE} must be a name or the path of a file, is {base!r}")
         try:
             path = find(kind, base, path.parent)
-            data = _read_file(path, display_name(base))
+            data = read_file(path, display_name(base))
         except SettingsError as error:
             raise SettingsError(f"{shown[-1]}: {BASE}: {error}") from None
         shown.append(display_name(base))
@@ -109,7 +109,12 @@ def _folder(kind: Kind) -> Path:
     return installed if installed.is_dir() else _PACKAGE.parent / "configs" / kind
 
 
-def _read_file(path: Path, name: str) -> dict[str, Any]:
+def read_file(path: Path, name: str) -> dict[str, Any]:
+    """The mapping in a YAML file; an empty file says nothing.
+
+    Raises:
+        SettingsError: it cannot be read, or is no mapping; `name` says which file.
+    """
     try:
         text = decode(path.read_bytes())
     except UnicodeDecodeError:

@@ -82,7 +82,7 @@ def _with_shared_lenses(
 def diagonal_blocks(
     layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "cameras width width"]:
-    """The diagonal blocks of S, `D_c + sum J_c^T (I - Q Q^T) J_c`.
+    """The diagonal blocks of S, `D_c` (and priors) `+ sum J_c^T (I - Q Q^T) J_c`.
 
     With the Cholesky factor `F F^T = I - Q Q^T` this is a sum of outer products of the rows of `F^T J_c`, two an
     observation, which stays positive semi-definite under rounding. If a camera sees a point twice, the product of the
@@ -98,7 +98,7 @@ def diagonal_blocks(
     columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
     level, *levels = layout.camera_levels
     gathered = take_rows(as_rows(columns), level).reshape(level.shape[0], -1, len(first))
-    return system.only_damping + tree_sum(outer_sum(gathered, gathered), tuple(levels))
+    return system.own + tree_sum(outer_sum(gathered, gathered), tuple(levels))
 
 
 def block_inverse(blocks: Float[Array, "cameras width width"]) -> Callable[[Array], Array]:

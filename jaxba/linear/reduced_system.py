@@ -114,8 +114,9 @@ def _solve_iteratively(
     precondition = preconditioner(
         layout, linear, points, system, anchor, blocks, options.conjugate_gradients.preconditioner
     )
-    if system.unknowns is not None:  # on the range of T (structure/unknowns.py)
-        project, plain, inverse = system.unknowns.project, apply, precondition
+    unknowns = layout.unknowns
+    if unknowns is not None and (unknowns.shared or unknowns.free is not None):  # on the range of T
+        project, plain, inverse = unknowns.project, apply, precondition
         apply, precondition = lambda x: project(plain(x)), lambda r: project(inverse(r))
         system = system._replace(right=project(system.right))
     if options.linear_solver == "cg":

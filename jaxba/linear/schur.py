@@ -87,7 +87,7 @@ class CameraSystem(NamedTuple):
     """The reduced camera system without the sum of `Y Y^T`, which each solver forms or applies in its own way."""
 
     blocks: Float[Array, "cameras width width"]  # B + D_c, manifold coordinates
-    only_damping: Float[Array, "cameras width width"]  # D_c, manifold coordinates
+    own: Float[Array, "cameras width width"]  # the part of it that is no sum over observations: D_c, and priors
     gradient: Float[Array, "cameras width"]  # g_c, manifold coordinates
     right: Float[Array, "cameras width"]  # b, right-hand side of the reduced system
     damping: Float[Array, "cameras width"]  # D_c, diagonal in the options' coordinates
@@ -159,6 +159,9 @@ def camera_system(
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 2)
     products = tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
     blocks, gradient, right = products[:, :, :width], products[:, :, width], -products[:, :, width + 1]
+    priors = linear.priors
+    if priors is not None:
+        blocks, gradient, right = blocks + priors.blocks, gradient + priors.gradient, right - priors.gradient
     rotation = jnp.einsum("cji,cjk,ckl->cil", coordinates.forward, blocks[:, :3, :3], coordinates.forward)
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
@@ -175,7 +178,8 @@ def camera_system(
     on_manifold = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
     added = extra[:, :, None] * jnp.eye(width, dtype=extra.dtype)
     added = added.at[:, :3, :3].set(on_manifold)
-    return CameraSystem(blocks + added, added, gradient, right, extra, gathered, unknowns)
+    own = added if priors is None else added + priors.blocks
+    return CameraSystem(blocks + added, own, gradient, right, extra, gathered, unknowns)
 
 
 def back_substitute(

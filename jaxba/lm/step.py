@@ -170,8 +170,9 @@ def _check_lenses(layout: Layout, options: StepOptions) -> None:
     unknowns = layout.unknowns
     if options.method is None or unknowns is None:
         return
-    if unknowns.shared:
-        raise ValueError(f"shared lenses need plain LM, not {options.solver_name}")
+    if unknowns.shared or unknowns.priors is not None:
+        what = "shared lenses" if unknowns.shared else "priors"
+        raise ValueError(f"{what} need plain LM, not {options.solver_name}")
     if not options.single_solve:
         raise ValueError(f"{options.solver_name} optimises all numbers of BAL cameras, and nothing else")
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 
 from jaxba.model import camera
 from jaxba.model.observations import Views, view_terms
+from jaxba.model.priors import PriorTerms, prior_costs, prior_terms
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
@@ -31,6 +32,7 @@ class Reference(NamedTuple):
 
     costs: Array  # (slots,), pixels^2
     inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
+    prior_costs: Array | None = None  # (cameras,), of what is known besides the pixels; None: nothing
 
 
 class Linearization(NamedTuple):
@@ -45,11 +47,13 @@ class Linearization(NamedTuple):
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
     costs: Array  # (slots,), pixels squared
     inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
+    priors: PriorTerms | None = None  # of cameras alone; None: there are no priors
+    prior_costs: Array | None = None  # (cameras,)
 
     @property
     def reference(self) -> Reference:
         """The part of it that does not need derivatives."""
-        return Reference(self.costs, self.inverse_depth)
+        return Reference(self.costs, self.inverse_depth, self.prior_costs)
 
 
 @traced_once()
@@ -82,9 +86,25 @@ def observation_costs(
 def cost(
     layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Float[Array, ""]:
-    """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2."""
+    """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2, and that of the priors."""
     # not fused with the sum: XLA would compile both to a slow library call
-    return compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
+    of_pixels = compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
+    return with_prior_costs(layout, cameras, of_pixels[None]).sum() if _has_priors(layout) else of_pixels
+
+
+def with_prior_costs(
+    layout: Layout, cameras: Float[Array, "parameters cameras"], terms: Float[Array, " terms"]
+) -> Float[Array, " more"]:
+    """Terms of the cost, followed by those of the priors of every camera if there are any."""
+    if not _has_priors(layout):
+        return terms
+    assert layout.unknowns is not None
+    assert layout.unknowns.priors is not None
+    return jnp.concatenate([terms, prior_costs(layout.unknowns.priors, cameras)])
+
+
+def _has_priors(layout: Layout) -> bool:
+    return layout.unknowns is not None and layout.unknowns.priors is not None
 
 
 def point_terms(views: Views, loss: Loss) -> list[Array]:
@@ -135,7 +155,12 @@ def linearize(
     residual, rows = rows[:2], rows[2:]
     width = (len(rows) - 6) // 2
     by_camera, by_point = [rows[:width], rows[width : 2 * width]], [rows[-6:-3], rows[-3:]]
-    return Linearization(residual, by_camera, by_point, costs, inverse_depth)
+    found = Linearization(residual, by_camera, by_point, costs, inverse_depth)
+    unknowns = layout.unknowns
+    if unknowns is None or unknowns.priors is None:
+        return found
+    priors = unknowns.priors
+    return found._replace(priors=prior_terms(priors, unknowns, cameras), prior_costs=prior_costs(priors, cameras))
 
 
 def is_weightless(linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:

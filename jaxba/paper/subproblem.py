@@ -50,6 +50,9 @@ def sub_problem(
         point_index=np.searchsorted(used, point_index[keep]).astype(np.int32),
         whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
         lenses=None if problem.lenses is None else problem.lenses.of(kept),
+        constants=None if problem.constants is None else problem.constants.of(kept, used),
+        priors=None,
+        labels=None,
     )
 
 

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
+from jaxba.problem.priors import Priors
 from jaxba.typing import AnyArray, register_pytree
 
 CAMERA_SIZE = 9
@@ -73,6 +74,9 @@ class BundleProblem:
 
     constants: Constants | None = None
     """Constant poses and points; None: all are optimised."""
+
+    priors: Priors | None = None
+    """What is known of cameras besides the pixels; None: nothing."""
 
     labels: Labels | None = field(default=None, metadata={"host": True})
     """What the file calls images, lenses and points; None if nothing does."""

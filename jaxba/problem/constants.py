@@ -26,6 +26,10 @@ class Constants:
     points: Bool[AnyArray, " points"]
     """Constant points."""
 
+    def of(self, cameras: Any = slice(None), points: Any = slice(None)) -> Constants:
+        """The same for a subset of the cameras and points."""
+        return Constants(np.asarray(self.poses)[cameras], np.asarray(self.points)[points])
+
 
 def checked_constants(constants: Constants, cameras: int, points: int) -> Constants | None:
     """Checks constants and returns them as NumPy arrays; None if nothing is constant.

@@ -17,7 +17,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constants import ROTATION, Constants, constants_of
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
 
-Which = Literal["all"] | Iterable[int] | Iterable[str]
+Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray
 """Positions, names of images, a mask, or all of them."""
 
 Gauge = Literal["free", "two-cameras", "three-points"]
@@ -54,10 +54,10 @@ def hold(
     constants.poses[np.ix_(_mask(problem, rotations, problem.num_cameras, "image"), ROTATION)] = True
     constants.points[_mask(problem, points, problem.num_points, "point")] = True
     changed = _with_constants(problem, constants)
-    own = _lenses(problem)
+    own = every_lens(problem)
     free = np.array(own.free)
     free[_mask(problem, lenses, len(free), "lens")] = False
-    free &= ~_named(own, numbers)
+    free &= ~number_columns(own, numbers)
     return changed if (free == own.free).all() else changed.replace(lenses=replace(own, free=free))
 
 
@@ -66,8 +66,8 @@ def release(problem: BundleProblem, *, numbers: Iterable[str]) -> BundleProblem:
 
     The principal point of a BAL lens is no number of it: read COLMAP models with `refine_principal_point=True`.
     """
-    own = _lenses(problem)
-    return problem.replace(lenses=replace(own, free=np.asarray(own.free) | _named(own, numbers)))
+    own = every_lens(problem)
+    return problem.replace(lenses=replace(own, free=np.asarray(own.free) | number_columns(own, numbers)))
 
 
 def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
@@ -131,7 +131,7 @@ def _with_constants(problem: BundleProblem, constants: Constants) -> BundleProbl
     return problem.replace(constants=constants if anything else None)
 
 
-def _lenses(problem: BundleProblem) -> Lenses:
+def every_lens(problem: BundleProblem) -> Lenses:
     """The lenses of a problem, also where every camera has its own BAL lens."""
     if problem.lenses is not None:
         return problem.lenses
@@ -162,8 +162,12 @@ def _mask(problem: BundleProblem, which: Which, count: int, what: str) -> Bool[n
     return mask
 
 
-def _named(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "lenses numbers"]:
-    """The numbers of each lens that are meant."""
+def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "lenses numbers"]:
+    """The numbers of each lens that names or groups mean.
+
+    Raises:
+        ValueError: no lens has such a number; one line.
+    """
     free = np.asarray(lenses.free)
     meant = np.zeros(free.shape, bool)
     for name in numbers:

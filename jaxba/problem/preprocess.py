@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Float
 
@@ -98,7 +100,10 @@ def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProbl
     seen, placed = _observed(problem)
     cameras[seen, 3:6] -= rotation_matrices(cameras[seen, :3]) @ offset  # t = -R c
     points[placed] += offset
-    return problem.replace(cameras=cameras, points=points)
+    priors = problem.priors
+    if priors is not None:
+        priors = dataclasses.replace(priors, positions=np.asarray(priors.positions) + offset)
+    return problem.replace(cameras=cameras, points=points, priors=priors)
 
 
 def perturb(
@@ -172,6 +177,8 @@ def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> B
         camera_index=np.asarray(problem.camera_index)[keep],
         point_index=number[point_index[keep]],
         whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
+        constants=None if problem.constants is None else problem.constants.of(points=used),
+        labels=None,
     )
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
 from jaxba.model.linearize import linearize, observation_costs, only_free
+from jaxba.model.priors import prior_costs, prior_terms
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.refinement.retraction import keep_focal_signs
 from jaxba.runtime import loops
@@ -43,11 +44,17 @@ def refine_cameras(
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 1)
     products = tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
     blocks, gradient = products[:, :, :width], products[:, :, width]
+    unknowns = layout.unknowns
+    priors = None if unknowns is None else unknowns.priors
+    if unknowns is not None and priors is not None:
+        terms = prior_terms(priors, unknowns, cameras, alone=True)
+        blocks, gradient = blocks + terms.blocks, gradient + terms.gradient
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
     own_cost = lambda costs: compute_unfused(each_sum, costs, index=layout.slot_camera)
-    before = own_cost(linear.costs)
+    of_priors = lambda cameras: 0.0 if priors is None else prior_costs(priors, cameras)
+    before = own_cost(linear.costs) + of_priors(cameras)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         best, done, attempt_number = carry
@@ -57,7 +64,7 @@ def refine_cameras(
         # the Jacobian, and so the step, is in manifold coordinates
         trial = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
         costs = observation_costs(layout, trial, points, options.loss)
-        better = (own_cost(costs) < before) & ~done & keep_focal_signs(cameras, trial)
+        better = (own_cost(costs) + of_priors(trial) < before) & ~done & keep_focal_signs(cameras, trial)
         return jnp.where(better, trial, best), done | better, attempt_number + 1
 
     # a loop instead of unrolled attempts: half as much to compile

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.model.linearize import Reference, observation_costs, slot_frames
+from jaxba.model.linearize import Reference, observation_costs, slot_frames, with_prior_costs
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import refine_from_starts
 from jaxba.refinement.points import PreviousPoints, refine_points
@@ -77,7 +77,8 @@ class Whole(NamedTuple):
 
     def terms(self, reference: Reference, previous: PreviousPoints, options: StepOptions) -> Float[Array, " terms"]:
         """See `Subproblems`."""
-        return previous.costs if options.refinement.points else reference.costs
+        terms = previous.costs if options.refinement.points else reference.costs
+        return terms if reference.prior_costs is None else jnp.concatenate([terms, reference.prior_costs])
 
     def refine(
         self,
@@ -89,8 +90,10 @@ class Whole(NamedTuple):
     ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
         """See `Subproblems`."""
         if options.refinement.points:
-            return _refined(self.layout, cameras, points, previous, options, search)
-        return points, observation_costs(self.layout, cameras, points, options.loss)
+            points, terms = _refined(self.layout, cameras, points, previous, options, search)
+        else:
+            terms = observation_costs(self.layout, cameras, points, options.loss)
+        return points, with_prior_costs(self.layout, cameras, terms)
 
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
         """See `Subproblems`."""

@@ -91,7 +91,8 @@ class Setup:
         """The problem with the parameters of a state, as NumPy float64; what is not optimised is copied exactly."""
         if self.offset is None:
             return write_back(self.problem, self.layout, state, self.options)
-        return shift(write_back(shift(self.problem, -self.offset), self.layout, state, self.options), self.offset)
+        found = shift(write_back(shift(self.problem, -self.offset), self.layout, state, self.options), self.offset)
+        return found.replace(priors=self.problem.priors, **_exact(self.problem, found))
 
 
 @dataclass(frozen=True)
@@ -182,6 +183,18 @@ def _check_policy(policy: object) -> None:
         raise ValueError(f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)")
     if jax.tree_util.treedef_is_leaf(jax.tree.structure(policy)):
         raise ValueError(f"policy {name} is no pytree: decorate its dataclass with jax.tree_util.register_dataclass")
+
+
+def _exact(problem: BundleProblem, found: BundleProblem) -> dict[str, np.ndarray]:
+    """Cameras and points of a problem that was shifted and back, where what is constant is as it was bit for bit. Parts
+    of a translation are constant only where the rotation is: else they are those of the shifted scene."""
+    cameras, points = np.array(found.cameras), np.array(found.points)
+    if problem.constants is not None:
+        poses = np.asarray(problem.constants.poses)
+        constant = poses & poses[:, :1]
+        cameras[:, :POSE_SIZE] = np.where(constant, problem.cameras[:, :POSE_SIZE], cameras[:, :POSE_SIZE])
+        points = np.where(np.asarray(problem.constants.points)[:, None], problem.points, points)
+    return {"cameras": cameras, "points": points}
 
 
 def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:

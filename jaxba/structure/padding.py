@@ -91,10 +91,11 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
         observations: its sorted observations, if they are known already.
 
     Returns:
-        The capacity; None for problems with lenses (problem/intrinsics.py) or constants, with more than `MAX_CAMERAS`
-        or `MAX_PAIRS`, or with more observations or points than `MAX_OBSERVATIONS`.
+        The capacity; None for problems with lenses (problem/intrinsics.py), constants or priors, with more than
+        `MAX_CAMERAS` or `MAX_PAIRS`, or with more observations or points than `MAX_OBSERVATIONS`.
     """
-    if problem.lenses is not None or problem.constants is not None or problem.num_cameras > MAX_CAMERAS:
+    general = problem.lenses is not None or problem.constants is not None or problem.priors is not None
+    if general or problem.num_cameras > MAX_CAMERAS:
         return None
     observations = observations or ObservationOrder.of(problem)
     needed = slots_for(observations.tracks)

@@ -27,7 +27,22 @@ from jaxtyping import Bool, Float, Int
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.camera_models import CameraModel
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
+from jaxba.problem.losses import Loss
 from jaxba.typing import AnyArray, register_pytree
+
+
+@register_pytree
+@dataclass(frozen=True)
+class CameraPriors:
+    """Priors of a problem (problem/priors.py), one row for each camera; of a shared lens in that of one camera."""
+
+    positions: Float[AnyArray, "cameras 3"]
+    position_whitening: Float[AnyArray, "cameras 3 3"]
+    rotations: Float[AnyArray, "cameras 3"]
+    rotation_whitening: Float[AnyArray, "cameras 3 3"]
+    lenses: Float[AnyArray, "cameras numbers"]
+    lens_weight: Float[AnyArray, "cameras numbers"]
+    position_loss: Loss = field(metadata={"static": True})
 
 
 @register_pytree
@@ -47,6 +62,9 @@ class Unknowns:
 
     model: Int[AnyArray, " cameras"] | None
     """Camera model of each camera, a position in `models`; None if there is only one."""
+
+    priors: CameraPriors | None
+    """Priors of the cameras; None if there are none."""
 
     models: tuple[CameraModel, ...] | None = field(metadata={"static": True})
     """Camera models; None if all are BAL's."""
@@ -89,7 +107,9 @@ class Unknowns:
         return self.spread(self.total(values) / count[:, None], values)
 
     def project(self, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
-        """The orthogonal projection P on the range of T."""
+        """The orthogonal projection P on the range of T, without what is constant."""
+        if self.free is not None:
+            x = jnp.where(jnp.asarray(self.free).T, x, jnp.zeros_like(x))
         if self.members is None:
             return x
         return jnp.concatenate([x[:, :POSE_SIZE], self.mean(x[:, POSE_SIZE:])], axis=1)
@@ -123,7 +143,7 @@ def unknowns_of(
         None if all numbers of all cameras and points are optimised, as in BAL.
     """
     lenses, constants = problem.lenses, problem.constants
-    if lenses is None and constants is None and not fixed:
+    if lenses is None and constants is None and problem.priors is None and not fixed:
         return None
     size, count = lens_size(lenses), problem.num_cameras
     index = np.arange(count) if lenses is None else np.asarray(lenses.index)
@@ -148,4 +168,25 @@ def unknowns_of(
         assert lenses is not None
         assert lenses.model is not None
         model = np.asarray(lenses.model)[index]
-    return Unknowns(members, None if free.all() else free.T, free_points, model, models, all_shared, columns, size)
+    priors = None if problem.priors is None else _camera_priors(problem, index, seen)
+    free_numbers = None if free.all() else free.T
+    return Unknowns(members, free_numbers, free_points, model, priors, models, all_shared, columns, size)
+
+
+def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> CameraPriors:
+    """Cameras that nothing sees have no priors: they are not optimised."""
+    priors = problem.priors
+    assert priors is not None
+    observed = np.flatnonzero(seen[: len(index)])
+    first = np.zeros(len(index), bool)
+    first[observed[np.unique(index[observed], return_index=True)[1]]] = True
+    seen = seen[: len(index)]
+    return CameraPriors(
+        np.asarray(priors.positions),
+        np.asarray(priors.position_whitening) * seen[:, None, None],
+        np.asarray(priors.rotations),
+        np.asarray(priors.rotation_whitening) * seen[:, None, None],
+        np.asarray(priors.lenses)[index],
+        np.asarray(priors.lens_weight)[index] * first[:, None],
+        priors.position_loss,
+    )

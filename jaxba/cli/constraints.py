@@ -1,0 +1,87 @@
+"""What `jaxba-solve` holds constant and knows besides the pixels, by options and by a YAML file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxba.cli.common import UsageError
+from jaxba.io.configurations import SettingsError, read_file
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.constraints import Gauge, hold, with_gauge
+from jaxba.problem.losses import Loss
+from jaxba.problem.measured import with_position_priors
+
+PARTS = ("poses", "rotations", "points")
+"""What `--constant` names besides numbers of lenses."""
+
+KEYS = {
+    "constant_poses": "names or ids of images",
+    "constant_rotations": "names or ids of images",
+    "constant_points": "ids of points",
+    "constant_cameras": "ids of cameras, which images share",
+    "constant_numbers": "focal, principal_point, distortion or names such as k2",
+    "position_priors": "positions: {name or id: [x, y, z]}, stddev, loss and loss_scale",
+    "gauge": "free, two-cameras or three-points",
+}
+"""Keys of the file, and what they hold."""
+
+
+def constrained(
+    problem: BundleProblem, constant: tuple[str, ...], gauge: Gauge | None, file: str | None
+) -> BundleProblem:
+    """The problem with what the options and the file say.
+
+    Raises:
+        UsageError: something is not in the problem; one line that names the option or the key.
+        ProblemError: as the functions of `jaxba` that do it.
+    """
+    settings = {} if file is None else _read(file)
+    try:
+        numbers = [one.replace("-", "_") for one in constant if one not in PARTS]
+        parts: dict[str, Any] = {part: "all" for part in PARTS if part in constant}
+        problem = hold(problem, numbers=numbers, **parts)
+    except ValueError as error:
+        raise UsageError(f"--constant: {error}") from None
+    for key, value in settings.items():
+        try:
+            problem = _apply(problem, key, value)
+        except (ValueError, TypeError, AttributeError) as error:
+            raise UsageError(f"--constraints {file}: {key}: {error}") from None
+    wanted = gauge or settings.get("gauge", "free")
+    return with_gauge(problem, wanted)
+
+
+def _read(file: str) -> dict[str, Any]:
+    try:
+        settings = read_file(Path(file), file)
+    except SettingsError as error:
+        raise UsageError(f"--constraints {error}") from None
+    unknown = [key for key in settings if key not in KEYS]
+    if unknown:
+        raise UsageError(f"--constraints {file}: unknown key {unknown[0]!r}; there are {', '.join(KEYS)}")
+    return settings
+
+
+def _apply(problem: BundleProblem, key: str, value: Any) -> BundleProblem:
+    labels = problem.labels
+    images = lambda wanted: np.array(wanted, np.int64) if labels is None else labels.images_at(wanted)
+    if key == "constant_poses":
+        return hold(problem, poses=images(value))
+    if key == "constant_rotations":
+        return hold(problem, rotations=images(value))
+    if key == "constant_points":
+        return hold(problem, points=np.array(value, np.int64) if labels is None else labels.points_at(value))
+    if key == "constant_cameras":
+        return hold(problem, lenses=np.array(value, np.int64) if labels is None else labels.lenses_at(value))
+    if key == "constant_numbers":
+        return hold(problem, numbers=value)
+    if key == "position_priors":
+        positions = value["positions"]
+        spread = np.broadcast_to(np.asarray(value.get("stddev", 1.0), np.float64), 3)
+        loss = Loss(value.get("loss", "squared"), float(value.get("loss_scale", 1.0)))
+        at = images(list(positions)).tolist()
+        return with_position_priors(problem, list(positions.values()), np.diag(spread**2), images=at, loss=loss)
+    return problem  # the gauge comes last

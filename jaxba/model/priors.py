@@ -1,0 +1,79 @@
+"""Priors in the linear model: residuals of cameras alone, and the normal equations that they add.
+
+The residuals (problem/priors.py) depend on one camera each; a shared lens has those of its first camera only. They are
+differentiated by forward mode in the coordinates of the camera Jacobian: left perturbation of the rotation,
+translation, numbers of the lens.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxba.model import camera
+from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.structure.unknowns import CameraPriors, Unknowns
+
+
+class PriorTerms(NamedTuple):
+    """Normal equations of the priors, as those of `CameraSystem`."""
+
+    blocks: Float[Array, "cameras width width"]
+    gradient: Float[Array, "cameras width"]
+
+
+def prior_costs(priors: CameraPriors, cameras: Float[Array, "parameters cameras"]) -> Float[Array, " cameras"]:
+    """The cost of the priors of each camera, pixels^2 by the weights."""
+    position, others = _residuals(priors, cameras)
+    squared = jnp.sum(position * position, axis=0)
+    loss = priors.position_loss
+    return 0.5 * ((squared if loss.trivial else loss(squared)[0]) + jnp.sum(others * others, axis=0))
+
+
+def prior_terms(
+    priors: CameraPriors, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], *, alone: bool = False
+) -> PriorTerms:
+    """Hessian `J^T J` and gradient `J^T r` of the priors of each camera, weighted by the robust loss.
+
+    Args:
+        priors: priors of the cameras.
+        unknowns: which numbers are part of a camera's block, and which are constant.
+        cameras: current cameras.
+        alone: whether cameras are optimised one by one, so that shared lenses are constant.
+    """
+
+    def at(step: Float[Array, "width cameras"]) -> tuple[Array, Array]:
+        full = unknowns.expanded(step)
+        moved = (cameras + full).at[:3].set(camera.compose_left(full[:3], cameras[:3]))
+        return _residuals(priors, moved)
+
+    zero = jnp.zeros((unknowns.width, cameras.shape[1]), cameras.dtype)
+    residual = at(zero)
+    columns = [jax.jvp(at, (zero,), (zero.at[k].set(1),))[1] for k in range(unknowns.width)]
+    free = jnp.ones(zero.shape, bool) if unknowns.free is None else jnp.asarray(unknowns.free)
+    if alone and unknowns.shared:
+        free = free.at[POSE_SIZE:].set(False)
+    weight = jnp.ones_like(zero[0])
+    if not priors.position_loss.trivial:
+        weight = priors.position_loss(jnp.sum(residual[0] * residual[0], axis=0))[1]
+    blocks, gradient = 0.0, 0.0
+    for part, scale in ((0, weight), (1, jnp.ones_like(weight))):
+        rows = jnp.stack([column[part] for column in columns]) * free[:, None]  # [width, residuals, cameras]
+        blocks = blocks + jnp.einsum("arc,brc,c->cab", rows, rows, scale, precision="highest")
+        gradient = gradient + jnp.einsum("arc,rc,c->ca", rows, residual[part], scale, precision="highest")
+    return PriorTerms(jnp.asarray(blocks), jnp.asarray(gradient))
+
+
+def _residuals(priors: CameraPriors, cameras: Float[Array, "parameters cameras"]) -> tuple[Array, Array]:
+    """Whitened residuals of the position, [3, cameras], and of rotation and lens, [3 + numbers, cameras]."""
+    rotation = camera.rotation_matrix(cameras[:3])
+    center = -jnp.einsum("jic,jc->ic", rotation, cameras[3:6], precision="highest")
+    position = jnp.einsum("cij,jc->ic", priors.position_whitening, center - priors.positions.T, precision="highest")
+    turned = camera.compose_left(cameras[:3], -priors.rotations.T)
+    turned = jnp.einsum("cij,jc->ic", priors.rotation_whitening, turned, precision="highest")
+    lens = priors.lens_weight.T * (cameras[POSE_SIZE:] - priors.lenses.T)
+    return position, jnp.concatenate([turned, lens])

@@ -1,0 +1,103 @@
+"""COLMAP's own names of options, and a file of constants and priors, on the command line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import support
+
+from jaxba import BundleProblem, hold, read_problem, with_gauge, write_colmap
+from jaxba.cli.colmap_options import translated
+from jaxba.cli.solve import run
+
+
+@pytest.fixture
+def model(tmp_path):
+    write_colmap(support.tiny(), tmp_path / "m")
+    return tmp_path / "m"
+
+
+def test_colmaps_options_are_those_of_the_command():
+    words = "--input_path in --output_path=out --BundleAdjustment.refine_focal_length 0 "
+    words += "--BundleAdjustment.refine_extra_params=false --BundleAdjustment.refine_principal_point 0 "
+    words += (
+        "--BundleAdjustmentCeres.max_num_iterations 7 --BundleAdjustmentCeres.loss_function_type CAUCHY --dtype mixed"
+    )
+    wanted = "in --output out --max-iterations 7 --loss cauchy --dtype mixed --constant focal distortion"
+    assert translated(words.split()) == wanted.split()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--BundleAdjustment.refine_focal_length", "--BundleAdjustment.refine_focal_length needs a value"),
+        ("--BundleAdjustment.refine_focal_length 2", "refine_focal_length must be 0 or 1, not '2'"),
+        ("--BundleAdjustment.use_gpu 1", "--BundleAdjustment.use_gpu is not an option here; of COLMAP's are refine_"),
+        ("--constant k9", "--constant: no lens has a number 'k9'; there are focal, principal_point"),
+        ("--covariance c.npz", "--covariance needs --gauge, constants or priors"),
+        ("--refine-principal-point", "--refine-principal-point is for COLMAP models"),
+        ("--constraints none.yaml", "--constraints none.yaml: No such file"),
+    ],
+)
+def test_what_cannot_be_is_one_line(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    support_file = tmp_path / "p.txt"
+    from jaxba import write_bal
+
+    write_bal(support.tiny(), support_file)
+    assert run([str(support_file), *words.split()]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_file_of_constants_names_images_and_points_of_the_model(model, tmp_path, capsys):
+    problem = read_problem(model)
+    (tmp_path / "c.yaml").write_text(
+        "constant_poses: [image0001.jpg, 3]\nconstant_points: [2]\nconstant_numbers: [k2]\ngauge: free\n"
+    )
+    out, spread = str(tmp_path / "out"), tmp_path / "c.npz"
+    words = [
+        "--constraints",
+        str(tmp_path / "c.yaml"),
+        "--output",
+        out,
+        "--covariance",
+        str(spread),
+        "--policy",
+        "ceres",
+    ]
+    assert run([str(model), *words]) == 0
+    assert "2 constant poses, 1 constant point" in capsys.readouterr().out
+    found = read_problem(out)
+    assert (found.cameras[[0, 2], :6] == problem.cameras[[0, 2], :6]).all()
+    assert (found.points[1] == problem.points[1]).all()
+    assert (found.cameras[:, 8] == problem.cameras[:, 8]).all()
+    assert (found.cameras[1, :6] != problem.cameras[1, :6]).all()
+    with np.load(spread) as arrays:
+        assert (arrays["poses"][0] == 0).all()
+        assert (arrays["poses"][1].diagonal() > 0).all()
+
+
+def test_priors_of_the_file_pull_images_to_their_positions(model, tmp_path):
+    from jaxba.problem import geometry
+
+    problem = read_problem(model)
+    goal = 3.0 * geometry.camera_centers(problem.cameras) + 7.0
+    rows = "\n".join(f"    {i}: [{', '.join(map(str, c))}]" for i, c in zip(problem.labels.images, goal, strict=True))
+    (tmp_path / "c.yaml").write_text(f"position_priors:\n  stddev: 0.01\n  positions:\n{rows}\n")
+    assert run([str(model), "--constraints", str(tmp_path / "c.yaml"), "--output", str(tmp_path / "out")]) == 0
+    centers = geometry.camera_centers(read_problem(tmp_path / "out").cameras)
+    np.testing.assert_allclose(centers, goal, atol=0.3)
+    (tmp_path / "c.yaml").write_text("constant_images: [1]\n")
+    assert run([str(model), "--constraints", str(tmp_path / "c.yaml")]) == 2
+
+
+def test_options_say_the_same_as_the_functions_of_python(model):
+    problem = read_problem(model)
+    from jaxba.cli.constraints import constrained
+
+    wanted: BundleProblem = with_gauge(hold(problem, rotations="all", numbers=["focal"]), "two-cameras")
+    found = constrained(problem, ("rotations", "focal"), "two-cameras", None)
+    assert (found.constants.poses == wanted.constants.poses).all()
+    assert (found.lenses.free == wanted.lenses.free).all()

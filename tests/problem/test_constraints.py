@@ -1,0 +1,228 @@
+"""Constants, gauge and priors: the step is that of the dense problem, and what is constant stays bit for bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import support
+from scipy.optimize import least_squares
+
+from jaxba import (
+    BundleProblem,
+    Constants,
+    Loss,
+    ProblemError,
+    SolveOptions,
+    StepOptions,
+    covariance,
+    hold,
+    release,
+    solve,
+    with_gauge,
+    with_lens_priors,
+    with_position_priors,
+    with_rotation_priors,
+)
+from jaxba.methods.registry import make_method
+from jaxba.problem import geometry
+from jaxba.problem.options import ConjugateGradients, Coordinates
+from jaxba.solver.prepare import prepare
+
+EXACT = ConjugateGradients(forcing=0.0, tolerance=1e-13)
+
+
+def held() -> BundleProblem:
+    """Two constant poses, a constant rotation, a constant number of every lens, a constant lens and two points."""
+    problem = hold(support.tiny(), poses=[0, 3], rotations=[1], points=[2, 5], lenses=[2], numbers=["k2"])
+    return problem
+
+
+def constant_numbers(problem: BundleProblem) -> np.ndarray:
+    """Which of all parameters, cameras first, are constant."""
+    cameras = np.zeros(problem.cameras.shape, bool)
+    cameras[:, :6] = problem.constants.poses
+    cameras[:, 6:] = ~problem.lenses.free[problem.lenses.index]
+    return np.concatenate([cameras.ravel(), np.repeat(problem.constants.points, 3)])
+
+
+@pytest.mark.parametrize("solver", ["explicit", "sparse", "implicit", "poba"])
+def test_a_step_is_that_of_the_dense_problem_without_the_columns_of_constants(solver):
+    problem = held()
+    options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT) if solver != "poba" else StepOptions()
+    layout, before = support.start(problem, options)
+    after, _ = support.step(layout, before, 1e-3, options, min_gain=-np.inf)
+    found = support.difference(problem, support.back(problem, before, after), options)
+    residual, jacobian = support.linear(support.tiny(), options)
+    moves = ~constant_numbers(problem)
+    small = jacobian[:, moves]
+    stacked = np.vstack([small, np.diag(np.sqrt(1e-3 * np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)))])
+    right = np.concatenate([-residual, np.zeros(small.shape[1])])
+    wanted = np.zeros(len(moves))
+    wanted[moves] = np.linalg.lstsq(stacked, right, rcond=None)[0]
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-7 * np.abs(wanted).max())
+    assert (found[~moves] == 0).all()
+
+
+@pytest.mark.parametrize("policy", ["ceres", "guarded"])
+def test_what_is_constant_comes_back_bit_for_bit_and_the_rest_moves(policy):
+    problem = held()
+    far = problem.replace(points=problem.points + 1e5)  # solved in a frame of its own
+    cameras = np.array(problem.cameras)
+    cameras[:, 3:6] -= geometry.rotation_matrices(cameras[:, :3]) @ np.full(3, 1e5)
+    for start in (problem, far.replace(cameras=cameras)):
+        after = solve(start, policy).problem
+        same = after.cameras == start.cameras
+        constant = constant_numbers(problem)
+        assert same.ravel()[constant[: same.size]].all()
+        assert (after.points == start.points).all(axis=1)[[2, 5]].all()
+        assert not same.ravel()[~constant[: same.size]].any()
+
+
+@pytest.mark.parametrize("gauge", ["two-cameras", "three-points"])
+def test_a_gauge_leaves_the_cost_that_is_found_without_it(gauge):
+    problem = support.tiny()
+    fixed = with_gauge(problem, gauge)
+    numbers = fixed.constants.poses.sum() + 3 * fixed.constants.points.sum()
+    assert numbers == (7 if gauge == "two-cameras" else 9)
+    options = SolveOptions(max_iterations=300)
+    free, found = solve(problem, "ceres", options), solve(fixed, "ceres", options)
+    if gauge == "two-cameras":
+        np.testing.assert_allclose(found.final_cost, free.final_cost, rtol=1e-5)
+    else:
+        assert found.final_cost >= free.final_cost * (1 - 1e-5)
+    covariance(found.problem)
+    with pytest.raises(ProblemError, match="7 directions of the cameras are not determined"):
+        covariance(free.problem)
+
+
+def test_names_of_groups_and_numbers_say_what_of_lenses_is_constant():
+    problem = hold(support.tiny(), numbers=["distortion"])
+    assert problem.lenses.free.tolist() == [[True, False, False]] * 6
+    assert release(problem, numbers=["k1"]).lenses.free.tolist() == [[True, True, False]] * 6
+    with pytest.raises(ValueError, match="no lens has a number 'k9'; there are focal, principal_point"):
+        hold(problem, numbers=["k9"])
+    with pytest.raises(ValueError, match="there is no image 6: there are 6"):
+        hold(problem, poses=[6])
+
+
+def test_methods_refuse_what_they_do_not_support():
+    constant, known = held(), with_lens_priors(support.tiny(), {"k1": 0.1})
+    with pytest.raises(ProblemError, match="ddlm optimises all numbers of BAL cameras, and nothing else"):
+        solve(constant, "ceres", SolveOptions(method=make_method("ddlm")))
+    with pytest.raises(ProblemError, match="priors need plain LM, not stba"):
+        solve(known, "ceres", SolveOptions(method=make_method("stba")))
+
+
+# Priors
+
+
+def known() -> BundleProblem:
+    """Positions of four images under a robust loss, rotations of all, and lenses that are believed."""
+    problem, rng = support.tiny(), np.random.default_rng(3)
+    centers = geometry.camera_centers(problem.cameras)
+    spread = np.diag([0.01, 0.02, 0.03])
+    problem = with_position_priors(
+        problem,
+        centers[:4] + 0.3 * rng.normal(size=(4, 3)),
+        spread,
+        images=[0, 1, 2, 3],
+        loss=Loss("huber"),
+        align=False,
+    )
+    turned = problem.cameras[:, :3] + 0.05 * rng.normal(size=(6, 3))
+    return with_lens_priors(with_rotation_priors(problem, turned, 0.01 * np.eye(3)), {"focal": 20.0, "k1": 0.05})
+
+
+def prior_residuals(problem: BundleProblem) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    priors, cameras = problem.priors, np.asarray(problem.cameras)
+    away = geometry.camera_centers(cameras) - priors.positions
+    position = np.einsum("nij,nj->ni", priors.position_whitening, away)
+    turned = (Rotation.from_rotvec(cameras[:, :3]) * Rotation.from_rotvec(priors.rotations).inv()).as_rotvec()
+    rotation = np.einsum("nij,nj->ni", priors.rotation_whitening, turned)
+    lens = priors.lens_weight * (cameras[:, 6:] - priors.lenses)
+    norms = np.sum(position**2, axis=1)
+    huber = np.sqrt(np.where(norms > 1, 2 * np.sqrt(norms) - 1, norms))
+    return np.concatenate([huber, rotation.ravel(), lens.ravel()])
+
+
+def whole_residuals(problem: BundleProblem) -> np.ndarray:
+    return np.concatenate([geometry.residuals(problem).ravel(), prior_residuals(problem)])
+
+
+@pytest.mark.parametrize(("policy", "solver"), [("ceres", "explicit"), ("guarded", "implicit")])
+def test_scipy_finds_nothing_below_the_end_of_a_solve_with_priors(policy, solver):
+    problem = known()
+    solution = solve(problem, policy, SolveOptions(linear_solver=solver, max_iterations=200))
+    np.testing.assert_allclose(solution.initial_cost, 0.5 * np.sum(whole_residuals(problem) ** 2), rtol=1e-9)
+    np.testing.assert_allclose(solution.final_cost, 0.5 * np.sum(whole_residuals(solution.problem) ** 2), rtol=1e-9)
+    end = solution.problem
+
+    def residuals(x):
+        cameras = x[: end.cameras.size].reshape(end.cameras.shape)
+        return whole_residuals(end.replace(cameras=cameras, points=x[end.cameras.size :].reshape(-1, 3)))
+
+    start = np.concatenate([end.cameras.ravel(), end.points.ravel()])
+    truth = least_squares(residuals, start, x_scale="jac", max_nfev=5)
+    np.testing.assert_allclose(solution.final_cost, truth.cost, rtol=2e-6)
+
+
+def test_a_scene_is_aligned_with_measured_positions_of_which_some_are_wrong():
+    problem = support.tiny()
+    centers = geometry.camera_centers(problem.cameras)
+    turn = geometry.rotation_matrices(np.array([[0.3, -0.5, 1.1]]))[0]
+    measured = 2.5 * centers @ turn.T + [10.0, -20.0, 5.0]
+    wrong = measured.copy()
+    wrong[1] += 100.0
+    aligned = with_position_priors(problem, wrong, np.eye(3))
+    np.testing.assert_allclose(np.delete(geometry.camera_centers(aligned.cameras), 1, 0), np.delete(measured, 1, 0))
+    np.testing.assert_allclose(geometry.cost(aligned), geometry.cost(problem), rtol=1e-9)
+    with pytest.raises(ProblemError, match="at least three images"):
+        with_position_priors(problem, measured[:2], np.eye(3), images=[0, 1])
+    with pytest.raises(ProblemError, match="covariance of position 0 is not symmetric positive definite"):
+        with_position_priors(problem, measured, -np.eye(3))
+
+
+# Covariance
+
+
+def test_covariances_are_those_of_the_dense_inverse():
+    problem = with_gauge(solve(held(), "ceres").problem, "two-cameras")
+    found = covariance(problem)
+    _, jacobian = support.linear(problem, StepOptions(coordinates=Coordinates(rotation="manifold")))
+    moves = ~constant_numbers(problem)
+    whole = np.zeros((len(moves), len(moves)))
+    whole[np.ix_(moves, moves)] = np.linalg.inv(jacobian[:, moves].T @ jacobian[:, moves])
+    cameras = problem.cameras.size
+    for camera in range(6):
+        at = slice(9 * camera, 9 * camera + 6)
+        np.testing.assert_allclose(found.poses[camera], whole[at, at], rtol=1e-5, atol=1e-14)
+        lens = slice(9 * camera + 6, 9 * camera + 9)
+        np.testing.assert_allclose(found.lenses[camera], whole[lens, lens], rtol=1e-5, atol=1e-14)
+    for point in range(problem.num_points):
+        at = slice(cameras + 3 * point, cameras + 3 * point + 3)
+        np.testing.assert_allclose(found.points[point], whole[at, at], rtol=1e-5, atol=1e-14)
+        own = jacobian[:, at].T @ jacobian[:, at]
+        wanted = np.zeros((3, 3)) if problem.constants.points[point] else np.linalg.inv(own)
+        np.testing.assert_allclose(found.points_given_cameras[point], wanted, rtol=1e-7, atol=1e-14)
+    pair = np.r_[9:15, 36:42]
+    np.testing.assert_allclose(found.between(1, 4), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-14)
+
+
+def test_the_covariance_of_a_relative_pose_does_not_depend_on_the_gauge():
+    solved = solve(support.tiny(), "ceres", SolveOptions(max_iterations=300)).problem
+
+    def fixed(whole: int, part: int) -> BundleProblem:
+        poses = np.zeros((6, 6), bool)
+        poses[whole], poses[part, 3] = True, True
+        return solved.replace(constants=Constants(poses, np.zeros(solved.num_points, bool)))
+
+    first, second = covariance(fixed(0, 5)), covariance(fixed(3, 2))
+    scale = first.relative_pose(1, 4)[:3, :3], second.relative_pose(1, 4)[:3, :3]
+    np.testing.assert_allclose(*scale, rtol=1e-4, atol=1e-12)  # of the rotation, whatever the scale
+
+
+def test_prepare_takes_what_is_constant_and_known():
+    assert prepare(known()).layout.unknowns.priors is not None
+    assert prepare(held()).layout.unknowns.free is not None
