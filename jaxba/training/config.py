@@ -108,8 +108,6 @@ def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None
             f"game.agent.effort: {effort!r} has no effect on method {method}, "
             "whose rounds always have all point iterations"
         )
-    if effort == "points+forcing" and options.truncated is None:
-        raise ValueError("game.agent.effort: a forcing term needs conjugate gradients, as method deeplm has them")
 
 
 def _check_agent(sac: SacConfig) -> None:
