@@ -214,10 +214,8 @@ class Game:
         for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
             part, start = action[start : start + count], start + count
 
-            def one(episode: Episode, action: Array, key: Array, kind=kind, bank=bank) -> tuple[Episode, Step]:
-                return self._play(kind, bank, episode, action, key)
-
-            episodes, step = step_groups(one, episodes, part, jax.random.split(k, count))
+            play = functools.partial(self._play, kind)
+            episodes, step = step_groups(play, episodes, part, jax.random.split(k, count), shared=bank)
             parts.append(step)
             after.append(episodes)
         return GameState(tuple(after), key), jax.tree.map(lambda *x: jnp.concatenate(x), *parts)

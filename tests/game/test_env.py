@@ -27,7 +27,7 @@ from jaxba.game.env import POINT_ITERATION_COST, Game, GameConfig
 from jaxba.game.evaluate import evaluate, play_all, score, scores
 from jaxba.game.protocol import Environment
 from jaxba.game.random_scenes import MIN_VIEWS, MOST_CAMERAS, MOST_POINTS, SceneClass, _angle_axis, make_scenes
-from jaxba.game.rollout import Trajectories, play
+from jaxba.game.rollout import GROUP, Trajectories, play, step_groups
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, select
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState
@@ -170,6 +170,17 @@ def test_a_scene_is_played_as_it_is_solved_by_every_method(method):
         alone = solve(problem_of(KIND, bank.scenes, k), "ceres", options, max_iterations=6)
         count = min(4, alone.iterations)
         np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [3, GROUP + 1])
+def test_agents_that_play_side_by_side_step_in_groups_as_each_alone(count):
+    shared, scenes = jnp.asarray([2.0, 3.0]), jnp.arange(3.0 * count).reshape(3, count)
+    one = lambda shared, x, y: (shared @ jnp.stack([x, y]), x > 1)
+    step = lambda x, y: step_groups(one, x, y, shared=shared)
+    found = jax.jit(jax.vmap(step, (0, None)))(scenes, scenes[0])
+    for agent in range(3):
+        chex.assert_trees_all_equal(jax.tree.map(lambda x, k=agent: x[k], found), step(scenes[agent], scenes[0]))
+    np.testing.assert_array_equal(found[0], 2 * scenes + 3 * scenes[0])
 
 
 @pytest.mark.slow
