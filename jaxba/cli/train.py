@@ -18,10 +18,13 @@ DEFAULT_CONFIG = "default"
 POLICY = "policy.safetensors"
 """File of the best policy."""
 
+OF_AGENT = "policy-{}.safetensors"
+"""File of an agent's policy, if there are several agents."""
+
 CURVE = "curve"
 """Stem of the files with the learning curve."""
 
-FILE_WIDTH = 120
+FILE_WIDTH = 160
 """Width of the table in characters if the output is not a terminal."""
 
 
@@ -40,6 +43,10 @@ class Arguments:
 
     out: str | None = None
     """Folder of the run. Default: runs/NAME for the configuration NAME."""
+
+    seeds: int | None = None
+    """Agents that are trained side by side from other random numbers, the setting of this name. Each has a policy file;
+    the policy of the best one on training scenes is written once more."""
 
     problems: tuple[str, ...] = ()
     """Real problems to train on: BAL files, COLMAP models, output of jaxba-kitti. Scenes are windows of neighbouring
@@ -71,6 +78,7 @@ def _train(args: Arguments) -> int:
 
     jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
     overrides = tuple(item for group in args.overrides for item in group)
+    overrides += () if args.seeds is None else (f"seeds={args.seeds}",)
     name = args.config or DEFAULT_CONFIG
     folder = Path(args.out or Path("runs") / Path(name).stem)
     try:
@@ -95,11 +103,11 @@ def _train(args: Arguments) -> int:
             progress.rules = work.rules
             interrupt.graceful = True
 
-            def keep(best: driver.Best) -> None:
-                _write_policy(folder, config, work, best)
+            def keep(best: tuple[driver.Best, ...]) -> None:
+                _write_policies(folder, config, work, best)
                 progress.best = best
 
-            hooks = driver.Hooks(progress.stage, progress.row, keep, lambda: interrupt.requested)
+            hooks = driver.Hooks(progress.stage, progress.rows, keep, lambda: interrupt.requested)
             outcome = driver.train(config, work.game, work.evaluate, folder, hooks)
             interrupt.graceful = False
         except KeyboardInterrupt:
@@ -141,43 +149,51 @@ def _again(folder: Path) -> str:
     return f"jaxba-train --out {folder} --resume"
 
 
-def _write_policy(folder: Path, config: Any, work: Any, best: Any) -> None:
+def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -> list[Path]:
+    """Writes the policy of every agent if there are several, and that of the best agent; the files."""
     from jaxba import __version__
     from jaxba.damping.policy_file import save_policy
     from jaxba.training.config import to_yaml
+    from jaxba.training.driver import best_of
 
-    metadata = {
-        "jaxba": __version__,
-        "config": to_yaml(config),
-        "agent_number": str(best.seed),
-        "chunk": str(best.chunk),
-        "held_out_iterations": f"{best.score:.4f}",
-    }
-    save_policy(folder / POLICY, work.policy(best.actor), metadata)
+    files = {folder / OF_AGENT.format(one.agent + 1): one for one in best} if len(best) > 1 else {}
+    files[folder / POLICY] = best_of(best)
+    for path, one in files.items():
+        metadata = {
+            "jaxba": __version__,
+            "config": to_yaml(config),
+            "agent_number": str(one.agent),
+            "chunk": str(one.chunk),
+            "training_score": f"{one.score:.4f}",
+        }
+        save_policy(path, work.policy(one.actor), metadata)
+    return list(files)
 
 
-def _finish(folder: Path, work: Any, best: Any, console: Any, progress: _Progress) -> int:
-    """Writes the policy and the learning curve, and prints the comparison with the rules."""
+def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, progress: _Progress) -> int:
+    """Writes the policies and the learning curve, and prints the comparison with the rules."""
     from jaxba.bench.plots import save_figure
     from jaxba.cli.training_curve import plot_curve
     from jaxba.training import log
+    from jaxba.training.driver import best_of
 
-    _write_policy(folder, work.config, work, best)
+    files = _write_policies(folder, work.config, work, best)
     paid = work.config.game.reward == "price"
     rules = {name: {**one._asdict(), "score": one.price if paid else one.mean} for name, one in work.rules.items()}
     figure = plot_curve(log.read(folder), rules, work.config.game.tolerance)
-    files = [folder / POLICY, *save_figure(figure, folder / CURVE)]
+    files += save_figure(figure, folder / CURVE)
     progress.stage("comparing with the rules")
-    scores, ratios = work.compare(best.actor)
+    compared = work.compare([one.actor for one in best])
     progress.__exit__()
     count = sum(len(scene_bank.initial_cost) for scene_bank in work.held_out)
-    console.print(_table(scores, ratios, work.config.game.tolerance, count))
-    console.print(f"best: agent {best.seed + 1} after chunk {best.chunk}")
+    console.print(_table(compared, work.config.game.tolerance, count))
+    chosen = best_of(best)
+    console.print(f"best on training scenes: agent {chosen.agent + 1} after chunk {chosen.chunk}")
     console.print(f"wrote {', '.join(str(file) for file in files)}")
     return 0
 
 
-def _table(scores: Mapping[str, Any], ratios: Mapping[str, Any], tolerance: float, count: int) -> Any:
+def _table(compared: Any, tolerance: float, count: int) -> Any:
     from rich.table import Table
 
     table = Table(
@@ -186,6 +202,8 @@ def _table(scores: Mapping[str, Any], ratios: Mapping[str, Any], tolerance: floa
         title_style="bold",
     )
     table.add_column("policy", no_wrap=True)
+    agents = len(next(iter(compared.by_agent.values())))
+    single = [f"{k + 1}" for k in range(agents)] if agents > 1 else []
     for name in (
         "mean",
         "geom. mean",
@@ -195,10 +213,12 @@ def _table(scores: Mapping[str, Any], ratios: Mapping[str, Any], tolerance: floa
         "converged",
         "final gap",
         "price",
-        "learned over it [95%]",
+        *single,
+        "trained over it [95%]",
     ):
         table.add_column(name, justify="right")
-    for name, score in scores.items():
+    for name, score in compared.scores.items():
+        own = [f"{x:.2f}" for x in compared.by_agent.get(name, ())] or [""] * agents
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
         table.add_row(
             name,
@@ -207,7 +227,8 @@ def _table(scores: Mapping[str, Any], ratios: Mapping[str, Any], tolerance: floa
             f"{score.to_convergence:.2f}",
             f"{score.end:.1e}",
             f"{score.price:.2f}",
-            "{:.3f} [{:.3f}, {:.3f}]".format(*ratios[name]) if name in ratios else "",
+            *(own if single else ()),
+            "{:.3f} [{:.3f}, {:.3f}]".format(*compared.ratios[name]) if name in compared.ratios else "",
         )
     return table
 
@@ -220,7 +241,7 @@ class _Progress:
 
         self.console, self.config = console, config
         self.rules: Mapping[str, Any] = {}
-        self.best: Any = None  # the best policy that this process has trained
+        self.best: Sequence[Any] = ()  # the best policies that this process has trained
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=20),
@@ -249,35 +270,37 @@ class _Progress:
         if not self.console.is_terminal:
             self.console.print(description)
 
-    def row(self, row: Mapping[str, Any]) -> None:
-        """Reports a finished chunk, by its row of the training log."""
-        config = self.config
-        done = row["seed"] * config.chunks + row["chunk"]
-        total = config.seeds * config.chunks
+    def rows(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Reports a finished chunk, by its rows of the training log."""
+        row, total = rows[0], self.config.chunks
         now = f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s"
-        if row["episodes"]:
-            now += f", {row['episode/length']:.1f} iterations (Ceres' rule {row['episode/ceres']:.1f})"
-        description = f"agent {row['seed'] + 1}/{config.seeds}, chunk {row['chunk']}/{config.chunks}"
+        ended = [(one["episode/length"], one["episode/ceres"]) for one in rows if one["episodes"]]
+        if ended:
+            length, rule = (sum(x) / len(ended) for x in zip(*ended, strict=True))
+            now += f", {length:.1f} iterations (Ceres' rule {rule:.1f})"
+        description = f"chunk {row['chunk']}/{total}"
         if self._bar.tasks[0].total is None:
-            self._bar.reset(self._task, total=total, completed=done - 1)
-        self._bar.update(self._task, description=description, total=total, completed=done, now=now)
+            self._bar.reset(self._task, total=total, completed=row["chunk"] - 1)
+        self._bar.update(self._task, description=description, total=total, completed=row["chunk"], now=now)
         if not self.console.is_terminal:
             self.console.print(f"{description}: {now}, {row['wall_s']:.0f} s")
-        if row.get("held_out/score") is not None:
-            self.console.print(f"{description}: {self._held_out(row)}")
+        if "held_out/score" in row:
+            self.console.print(f"{description}: {self._held_out(rows)}")
 
-    def _held_out(self, row: Mapping[str, Any]) -> str:
+    def _held_out(self, rows: Sequence[Mapping[str, Any]]) -> str:
         from jaxba.training.task import CONSTANT
 
-        score = row["held_out/score"]
+        values = lambda name: [row[name] for row in rows if row.get(name) is not None]
+        mean = lambda name: sum(values(name)) / len(rows)
         paid = self.config.game.reward == "price"
-        text = f"held out {score:.2f} {'plain steps paid' if paid else 'iterations'}"
-        if row.get("held_out/p90") is not None:
-            text += f", p90 {row['held_out/p90']:.0f}, failures {100 * row['held_out/failures']:.1f} %"
+        text = f"held out {mean('held_out/score'):.2f} {'plain steps paid' if paid else 'iterations'}"
+        if len(rows) > 1:
+            text += f" ({min(values('held_out/score')):.2f} to {max(values('held_out/score')):.2f})"
+        text += f", p90 {mean('held_out/p90'):.0f}, failures {100 * mean('held_out/failures'):.1f} %"
         shown = [name for name in ("ceres", "ceres+embedded", CONSTANT) if name in self.rules]
         rules = [f"{name} {self.rules[name].price if paid else self.rules[name].mean:.2f}" for name in shown]
         if rules:
             text += f" ({', '.join(rules)})"
-        if self.best is not None and (self.best.seed, self.best.chunk) == (row["seed"], row["chunk"]):
+        if any(one.chunk == rows[0]["chunk"] for one in self.best):
             text += ", best so far"
         return text

@@ -15,7 +15,7 @@ SHOWN = {"score": "mean iterations", "p90": "90th percentile of the iterations",
 
 
 def plot_curve(rows: Sequence[Row], rules: Mapping[str, Mapping[str, float]], tolerance: float) -> Figure:
-    """Held-out scores of every agent over its updates.
+    """Mean held-out scores over the updates of an agent, and the range of several agents.
 
     Args:
         rows: of the log; those without an evaluation are left out.
@@ -24,16 +24,22 @@ def plot_curve(rows: Sequence[Row], rules: Mapping[str, Mapping[str, float]], to
     """
     figure = Figure(figsize=(12.0, 4.4), layout="constrained")
     panels = figure.subplots(1, len(SHOWN))
-    seeds = sorted({row["seed"] for row in rows})
-    handles = []
-    for k, seed in enumerate(seeds):
-        style = {"color": COLOURS[(1 + k) % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)], "markersize": 3.5}
-        own_rows = [row for row in rows if row["seed"] == seed and row.get("held_out/score") is not None]
-        for axes, field in zip(panels, SHOWN, strict=True):
-            points = [(row["updates"], row.get(f"held_out/{field}")) for row in own_rows]
-            points = [(x, _shown(field, y)) for x, y in points if y is not None]
-            axes.plot([x for x, _ in points], [y for _, y in points], zorder=3, linewidth=1.6, **style)
-        handles.append(Line2D([], [], linewidth=1.6, label=f"learned, agent {seed + 1}", **style))
+    scored = [row for row in rows if row.get("held_out/score") is not None]
+    updates = sorted({row["updates"] for row in scored})
+    agents = len({row["seed"] for row in rows})
+    style = {"color": COLOURS[1 % len(COLOURS)], "linewidth": 1.6}
+    for axes, field in zip(panels, SHOWN, strict=True):
+        name = f"held_out/{field}"
+        found = {x: [row[name] for row in scored if row["updates"] == x and row.get(name) is not None] for x in updates}
+        shown = [(x, [_shown(field, y) for y in ys]) for x, ys in found.items() if ys]
+        places, values = [x for x, _ in shown], [ys for _, ys in shown]
+        if agents > 1:
+            low, high = [min(ys) for ys in values], [max(ys) for ys in values]
+            axes.fill_between(places, low, high, color=style["color"], alpha=0.25, linewidth=0)
+        means = [sum(ys) / len(ys) for ys in values]
+        axes.plot(places, means, zorder=3, marker=MARKERS[0], markersize=3.5, **style)
+    label = "trained" if agents == 1 else f"trained, mean and range of {agents} agents"
+    handles = [Line2D([], [], label=label, marker=MARKERS[0], markersize=3.5, **style)]
     for k, (name, numbers) in enumerate(rules.items()):
         color = COLOURS[0] if k < len(LINES) else COLOURS[-1]
         style = {"color": color, "linestyle": LINES[k % len(LINES)], "linewidth": 1.0}

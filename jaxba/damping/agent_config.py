@@ -9,7 +9,7 @@ from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions
 
 Observation = Literal["scale-free", "paper", "duration"]
 GuardMode = Literal["off", "hand-over"]
-EffortMode = Literal["fixed", "points", "points+forcing", "points+repairs"]
+EffortMode = Literal["fixed", "points+repairs"]
 
 LARGEST_ESCALATION = 12.0
 """Decades; more than the whole range of lambda would have no further effect."""
@@ -84,10 +84,9 @@ class AgentConfig:
     """Earlier steps that are combined with the new one, if the method supports it, `Refinement.previous_steps`."""
 
     effort: EffortMode = "fixed"
-    """What an action decides besides lambda. `fixed`: nothing. `points`: its second number, the embedded point
-    iterations of the step. `points+forcing`: also, its third number, the forcing term of conjugate gradients.
-    `points+repairs`: the third number says, where it is positive, that trials, camera rounds and pattern moves are
-    allowed; what they cost is then observed, too."""
+    """What an action decides besides lambda. `fixed`: nothing. `points+repairs`: its second number, the embedded point
+    iterations of the step; the third says, where it is positive, that trials, camera rounds and pattern moves are
+    allowed. What they cost is then observed, too."""
 
     def __post_init__(self) -> None:
         for name, known in (("observation", Observation), ("guard", GuardMode), ("effort", EffortMode)):
@@ -133,7 +132,7 @@ class AgentConfig:
     @property
     def action_size(self) -> int:
         """Numbers of an action: lambda, and what `effort` adds."""
-        return {"fixed": 1, "points": 2}.get(self.effort, 3)
+        return 1 if self.effort == "fixed" else 3
 
     @property
     def observes_prices(self) -> bool:

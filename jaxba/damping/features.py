@@ -97,7 +97,7 @@ def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
         smallest_accepted=number(FIRST_DAMPING),
         largest_rejected=number(config.low),
         guard=initial_guard(dtype),
-        effort=full_effort(config, dtype),
+        effort=full_effort(config),
     )
 
 
@@ -121,9 +121,8 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
         _scaled_decades(memory.largest_rejected),
     ]
     if memory.effort is not None:
-        points, forcing, repairs = memory.effort
-        solve += [points / config.refine_points, *([] if forcing is None else [_log(forcing) + 1])]
-        solve += [] if repairs is None else [repairs.astype(points.dtype)]
+        points, repairs = memory.effort
+        solve += [points / config.refine_points, repairs.astype(points.dtype)]
     if config.observes_prices:
         solve += [_log(price) + 1 for price in memory.info.prices]
     features = jnp.concatenate([memory.steps.reshape(-1), jnp.stack([jnp.asarray(x) for x in solve])])

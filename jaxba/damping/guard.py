@@ -31,9 +31,6 @@ from jaxba.refinement.backtracking import SHORTER
 FIRST_DAMPING = -4.0
 """log10 of the lambda at which Ceres' rule starts. Source: Ceres initial_trust_region_radius 1e4."""
 
-FORCING = (-3.0, -0.3)
-"""log10 of the smallest and the largest forcing term that an action can choose: DeepLM's, and one half."""
-
 INEXACT_FRACTION = 0.1
 """A step is inexact if damping's share of its curvature is below this fraction of the forcing term. A smaller lambda
 then changes nothing but the number of iterations of conjugate gradients. On random scenes of 600 to 1,197 cameras 0.01
@@ -149,22 +146,14 @@ def effort_for(config: AgentConfig, guard: GuardState, action: Float[Array, " ac
         return None
     dtype = guard.damping.dtype
     fraction = 0.5 + 0.5 * action.astype(dtype)
-    chosen = Effort(jnp.round(fraction[1] * config.refine_points).astype(jnp.int32), None)
-    if config.effort == "points+forcing":
-        low, high = FORCING
-        chosen = chosen._replace(forcing=10 ** (low + (high - low) * fraction[2]))
-    if config.effort == "points+repairs":
-        chosen = chosen._replace(repairs=action[2] > 0)
-    return chosen
+    return Effort(jnp.round(fraction[1] * config.refine_points).astype(jnp.int32), action[2] > 0)
 
 
-def full_effort(config: AgentConfig, dtype: Any) -> Effort | None:
-    """All point iterations, the smallest forcing term, and repairs; None if the effort is fixed."""
+def full_effort(config: AgentConfig) -> Effort | None:
+    """All point iterations, and repairs; None if the effort is fixed."""
     if config.effort == "fixed":
         return None
-    forcing = jnp.asarray(10 ** FORCING[0], dtype) if config.effort == "points+forcing" else None
-    repairs = jnp.ones((), bool) if config.effort == "points+repairs" else None
-    return Effort(jnp.asarray(config.refine_points, jnp.int32), forcing, repairs)
+    return Effort(jnp.asarray(config.refine_points, jnp.int32), jnp.ones((), bool))
 
 
 def _scale(config: AgentConfig) -> tuple[float, float]:

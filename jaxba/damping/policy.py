@@ -47,9 +47,9 @@ class DampingPolicy(Protocol):
     A policy is a frozen dataclass and a pytree: its numbers are traced, so that changing one never
     recompiles, and its class selects the code. Both functions are pure and jittable.
 
-    A policy may have two more functions. `effort(state)` gives the point iterations and the forcing term of the next
-    iteration (`jaxba.linear.step.Effort`). `step_options(base)` gives the `StepOptions` that it was made for, which
-    `solve` uses unless its options say otherwise.
+    A policy may have two more functions. `effort(state)` gives the point iterations of the next iteration, and
+    whether it may have repairs (`jaxba.linear.step.Effort`). `step_options(base)` gives the `StepOptions` that it was
+    made for, which `solve` uses unless its options say otherwise.
     """
 
     @property
@@ -77,7 +77,7 @@ def observes_prices(policy: DampingPolicy) -> bool:
 
 
 def effort_of(policy: DampingPolicy, state: Any) -> Effort | None:
-    """Point iterations and forcing term of the next iteration; None if `StepOptions` decide them."""
+    """Point iterations of the next iteration, and whether it may have repairs; None if `StepOptions` decide them."""
     return policy.effort(state) if decides_effort(policy) else None  # pyright: ignore[reportAttributeAccessIssue]
 
 

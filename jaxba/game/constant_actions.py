@@ -69,11 +69,6 @@ def best_constant_action(
 
 def values_of(config: AgentConfig) -> list[np.ndarray]:
     """Values of each number of an action that make a difference."""
-    values = [LAMBDAS]
-    if config.action_size > 1:
-        values.append(np.linspace(-1.0, 1.0, config.refine_points + 1))
-    if config.effort == "points+repairs":
-        values.append(np.array([-1.0, 1.0]))
-    if config.effort == "points+forcing":
-        values.append(np.linspace(-1.0, 1.0, 5))
-    return values
+    if config.effort == "fixed":
+        return [LAMBDAS]
+    return [LAMBDAS, np.linspace(-1.0, 1.0, config.refine_points + 1), np.array([-1.0, 1.0])]

@@ -34,7 +34,7 @@ from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 from jaxba.typing import register_pytree
@@ -44,9 +44,6 @@ Reward = Literal["duration", "constant", "reduction", "reversed", "price"]
 POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
 Ladybug-49: three take 3.9 of 12.6 ms."""
-
-CG_ITERATION_COST = Prices().product
-"""The same for an iteration of conjugate gradients, charged if the agent chooses the forcing term."""
 
 USUAL = 8.0
 """Iterations that Ceres' rule usually takes: prices are paid relative to those of the scene, so that the mean over
@@ -217,10 +214,8 @@ class Game:
         for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
             part, start = action[start : start + count], start + count
 
-            def one(episode: Episode, action: Array, key: Array, kind=kind, bank=bank) -> tuple[Episode, Step]:
-                return self._play(kind, bank, episode, action, key)
-
-            episodes, step = step_groups(one, episodes, part, jax.random.split(k, count))
+            play = functools.partial(self._play, kind)
+            episodes, step = step_groups(play, episodes, part, jax.random.split(k, count), shared=bank)
             parts.append(step)
             after.append(episodes)
         return GameState(tuple(after), key), jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
@@ -254,8 +249,7 @@ class Game:
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
             points = self.options.refinement.points if memory.effort is None else memory.effort.point_iterations
-            inner = CG_ITERATION_COST * step.cg_iterations if rules.agent.effort == "points+forcing" else 0.0
-            reward = bonus - (1 + POINT_ITERATION_COST * points + inner)
+            reward = bonus - (1 + POINT_ITERATION_COST * points)
         elif rules.reward == "price":
             reward = bonus - USUAL * memory.info.prices.of(step) / usual
         elif rules.reward == "constant":

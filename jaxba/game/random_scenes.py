@@ -17,6 +17,8 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.model import camera
+from jaxba.structure.density import DENSE_UNKNOWNS
+from jaxba.structure.track_buckets import TILED_POINTS
 
 SceneFamily = Literal["wide", "paper", "windows"]
 """`wide`: all motions, depths, noises and starts below. `paper`: every camera sees every point.
@@ -48,6 +50,12 @@ START_ROTATION, START_CENTER, START_DEPTH = (1e-5, 0.03), (1e-3, 0.3), (1e-3, 0.
 neighbouring cameras, depths of points relative to the true ones."""
 
 
+MOST_CAMERAS, MOST_POINTS = DENSE_UNKNOWNS // 9, TILED_POINTS - 2
+"""Of a class, 56 and 510. Its scenes share the layout of one in which every camera sees every point: a single bucket of
+points, with slots ordered camera by camera, and a dense product that forms the reduced camera system. Layouts of larger
+problems have tiles and pairs; from which sizes on was measured on real problems."""
+
+
 @dataclass(frozen=True)
 class SceneClass:
     """Scenes of equal shape."""
@@ -62,10 +70,9 @@ class SceneClass:
     """Distributions that the scenes are drawn from."""
 
     def __post_init__(self) -> None:
-        if self.cameras < 4 or self.points < 10 or 9 * self.cameras > 512:
-            raise ValueError(
-                f"a class of scenes has 4 to 56 cameras and at least 10 points, not {self.cameras} and {self.points}"
-            )
+        if not (4 <= self.cameras <= MOST_CAMERAS and 10 <= self.points <= MOST_POINTS):
+            sizes = f"4 to {MOST_CAMERAS} cameras and 10 to {MOST_POINTS} points"
+            raise ValueError(f"a class of scenes has {sizes}, not {self.cameras} and {self.points}")
 
 
 class Scenes(NamedTuple):

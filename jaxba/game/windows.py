@@ -50,9 +50,11 @@ def read_windows(
         for part, cameras, wanted in zip(parts, places(linked), (share - held, held), strict=True):
             if len(cameras) >= FEWEST_CAMERAS:
                 part.extend(window(problem, kind, linked, cameras, rng) for _ in range(wanted))
+    shuffle = np.random.default_rng([seed, len(paths)]).permutation  # so that the first windows are of all problems
+    train, held_out = ([part[k] for k in shuffle(len(part))] for part in parts)
     typed = lambda x: jnp.asarray(x, None if x.dtype == bool else dtype)
     stack = lambda part: Scenes(*(typed(np.stack([getattr(one, name) for one in part])) for name in Scenes._fields))
-    return stack(parts[0]), stack(parts[1])
+    return stack(train), stack(held_out)
 
 
 def read_all(paths: Sequence[str]) -> list[BundleProblem]:

@@ -33,5 +33,4 @@ class Effort(NamedTuple):
     """Limits of one iteration, for policies that choose them anew each time. Traced, so a change compiles nothing."""
 
     point_iterations: Int[Array, ""]  # replaces Refinement.points, which is its maximum
-    forcing: Float[Array, ""] | None  # replaces ConjugateGradients.forcing; None: no change
-    repairs: Bool[Array, ""] | None = None  # whether camera rounds, trials and pattern moves may be made; None: yes
+    repairs: Bool[Array, ""]  # whether camera rounds, trials and pattern moves may be made

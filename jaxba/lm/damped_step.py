@@ -37,7 +37,7 @@ from jaxba.linear.schur import (
     jacobian_product,
     largest_gradient,
 )
-from jaxba.linear.step import Effort, Step
+from jaxba.linear.step import Step
 from jaxba.linear.two_level import Anchor
 from jaxba.lm.method import DampedSystem, MethodStep, StepMethod
 from jaxba.model import camera
@@ -56,7 +56,6 @@ def solve_step(
     damping: Float[Array, ""],
     options: StepOptions,
     iteration: int | Int[Array, ""] = 0,
-    effort: Effort | None = None,
     previous: Float[Array, "steps parameters cameras"] | None = None,
 ) -> Step:
     """Solves `(H + D) d = -g` for cameras and points.
@@ -69,7 +68,6 @@ def solve_step(
         damping: lambda, dimensionless for diagonal scaling.
         options: linear solver or method, scaling and coordinates.
         iteration: number of the iteration; selects the random clusters of methods that use them.
-        effort: overrides the forcing term of conjugate gradients.
         previous: last changes of the cameras, if the step is to be optimal in the span that includes them.
 
     Returns:
@@ -77,8 +75,6 @@ def solve_step(
     """
     truncated = options.truncated
     forcing = options.conjugate_gradients.forcing if truncated is None else truncated.forcing
-    if effort is not None and effort.forcing is not None:
-        forcing = effort.forcing
     coordinates = RotationCoordinates.of(cameras, options)
     eliminated = eliminate_points(layout, linear, damping, options)
     reduced = camera_system(layout, linear, eliminated, coordinates, damping, options)

@@ -96,7 +96,7 @@ def lm_step(
         options: static options of the step.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
         iteration: number of the iteration, from 0; methods with random clusters use other ones in each.
-        effort: overrides the point iterations and the forcing term of the options; ignored by the method `ddlm`.
+        effort: overrides the point iterations and the repairs of the options; ignored by the method `ddlm`.
 
     Returns:
         The next state (unchanged after a rejection) and the record of the iteration.
@@ -106,7 +106,7 @@ def lm_step(
     """
     if not options.single_solve:
         return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, iteration)
-    proposal = propose(layout, state, damping, options, iteration, effort)
+    proposal = propose(layout, state, damping, options, iteration)
     return try_step(layout, state, damping, proposal, options, min_gain, effort)
 
 
@@ -116,16 +116,13 @@ def propose(
     damping: Float[Array, ""],
     options: StepOptions,
     iteration: int | Int[Array, ""] = 0,
-    effort: Effort | None = None,
 ) -> Proposal:
     """First part of `lm_step`: linearise and solve the damped system. Arguments as for `lm_step`."""
     _check_lenses(layout, options)
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = only_free(layout, linear, options.intrinsics)
-    step = solve_step(
-        layout, linear, state.cameras, state.points, damping, options, iteration, effort, state.previous_steps
-    )
+    step = solve_step(layout, linear, state.cameras, state.points, damping, options, iteration, state.previous_steps)
     return Proposal(step, linear.reference, is_weightless(linear, state.cost, options.loss))
 
 

@@ -98,13 +98,12 @@ def trained(
         _copy_shared_scenes(config, folder, own, report)
         work = task.build(settings, own)
         played = game(config, agent, settings, scenes(config, folder, report)[0])
-        note = lambda row: report(f"{agent.name} {seed + 1}: {row['chunk']} of {settings.chunks} parts")
-        outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(row=note))
+        note = lambda rows: report(f"{agent.name} {seed + 1}: {rows[0]['chunk']} of {settings.chunks} parts")
+        outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
     except (driver.TrainError, train_configs.SettingsError) as error:
         raise ProblemError(str(error)) from None
-    if outcome.best is None:
-        raise AssertionError("a finished training has been evaluated")
-    save_policy(own / POLICY, work.policy(outcome.best.actor), {"config": train_configs.to_yaml(settings)})
+    (best,) = outcome.best  # of one agent
+    save_policy(own / POLICY, work.policy(best.actor), {"config": train_configs.to_yaml(settings)})
     shutil.rmtree(own / driver.CHECKPOINTS, ignore_errors=True)
     (own / task.BANK).unlink(missing_ok=True)
     return load_policy(own / POLICY), True
@@ -113,8 +112,8 @@ def trained(
 def scenes(config: PaperConfig, folder: Path, report: Callable[[str], None]) -> tuple[Bank, Bank]:
     """Scenes for training, and scenes for the tables, which are used neither for training nor to choose a checkpoint.
 
-    The second set is the last part of the shared bank. It is as large as the set by which checkpoints are chosen, so
-    that one compiled program serves both.
+    The second set is the last part of the shared bank. It is as large as the set by which checkpoints are chosen, the
+    first part of it (`Task.chosen_on`), so that one compiled program serves both.
 
     Raises:
         ProblemError: there are too few scenes.

@@ -71,7 +71,7 @@ INTERPRETATIONS: tuple[tuple[str, str, str], ...] = (
     (
         "choice of the policy",
         "code: fewest iterations seen in training",
-        "fewest on held-out scenes; the tables use a third set of scenes, and all seeds",
+        "fewest on training scenes; the tables use other scenes, and all seeds",
     ),
     ("success", "within 100 iterations", "the same; a failure counts as 100 in every mean"),
     (

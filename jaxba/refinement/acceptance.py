@@ -147,7 +147,7 @@ def comparison(
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     predicted = step.predicted(jnp.ones_like(cost))
     matters = predicted > NEGLIGIBLE * cost
-    if effort is not None and effort.repairs is not None:
+    if effort is not None:
         matters = matters & effort.repairs
     previous = PreviousPoints.of(parts.layout, points, reference)
     return Comparison(

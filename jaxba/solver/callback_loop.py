@@ -90,7 +90,7 @@ class _Loop(NamedTuple):
         min_gain = np.asarray(self.policy.min_gain, state.cost.dtype)
         if options.single_solve:
             arguments = (self.layout, state, carry.damping)
-            proposal = call(part(propose), *arguments, options, carry.iteration, effort)
+            proposal = call(part(propose), *arguments, options, carry.iteration)
             arguments = (*arguments, proposal, options, min_gain, effort)
             if has_repairs(options):
                 state, step = try_step_by_parts(call, part, *arguments)

@@ -34,8 +34,8 @@ class TrainConfig:
     """Of all random numbers: the scenes, and with the number of an agent its training."""
 
     seeds: int = 1
-    """Agents trained one after the other on the same scenes with one compiled program; the best one on held-out scenes
-    is kept. Training them in one batch would not be faster on a CPU and would hold all replay buffers at once."""
+    """Agents trained side by side on the same scenes, in one program over an axis of agents. Their replay buffers are
+    held at once."""
 
     chunks: int = 40
     """Length of each agent's training in calls of the compiled loop, each of `loop.steps_per_chunk` vector steps."""
@@ -108,8 +108,6 @@ def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None
             f"game.agent.effort: {effort!r} has no effect on method {method}, "
             "whose rounds always have all point iterations"
         )
-    if effort == "points+forcing" and options.truncated is None:
-        raise ValueError("game.agent.effort: a forcing term needs conjugate gradients, as method deeplm has them")
 
 
 def _check_agent(sac: SacConfig) -> None:

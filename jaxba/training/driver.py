@@ -1,39 +1,43 @@
 """The training driver: compiled chunks, evaluations between them, checkpoints, and bitwise identical resuming.
 
 A run has a folder with `config.yaml`, `metrics.jsonl`, `tensorboard/` and `checkpoints/`. A checkpoint holds the loop's
-state, the best policy so far, and its score. A run that is resumed goes on from the last checkpoint that can be read,
-removes from the log what was written after it, and repeats that, with the same numbers.
+state, the best policy of every agent so far, and its score. A run that is resumed goes on from the last checkpoint that
+can be read, removes from the log what was written after it, and repeats that, with the same numbers.
+
+All agents of a run are trained side by side, in one program over an axis of agents.
 """
 
 from __future__ import annotations
 
 import glob
-import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxba.io import settings
 from jaxba.runtime.atomic import TEMPORARY, write_text
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig, load, to_yaml
 from jaxba.training.log import Log, Row
-from jaxba.training.sac import Learner
-from jaxba.training.train_loop import LoopState, run_chunk, start
+from jaxba.training.train_loop import LoopState, run_agents, start_agents
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
 
-_METADATA = ("seed", "chunk", "wall_s", "evaluated", "best")
+_METADATA = ("chunk", "wall_s", "evaluated", "best")
 """What a checkpoint holds besides arrays."""
 
 CHANGEABLE = ("chunks", "keep", "checkpoint_every")
-"""Settings that a resumed run may change; `chunks` only with one seed, since all agents are trained equally long."""
+"""Settings that a resumed run may change."""
+
+SCORE = "training/score"
+"""The metric by which policies are chosen: lower is better."""
 
 
 class TrainError(ValueError):
@@ -41,11 +45,11 @@ class TrainError(ValueError):
 
 
 class Best(NamedTuple):
-    """The best policy on held-out scenes."""
+    """The best policy of an agent on training scenes."""
 
     actor: Any  # parameters
     score: float  # lower is better
-    seed: int
+    agent: int  # its number, from 0
     chunk: int
 
 
@@ -53,8 +57,13 @@ class Outcome(NamedTuple):
     """Result of a call of `train`."""
 
     finished: bool  # false if `Hooks.stop` ended it
-    best: Best | None  # None if nothing was evaluated yet
-    state: LoopState  # of the last agent
+    best: tuple[Best, ...]  # of every agent; empty if nothing was evaluated yet
+    state: LoopState  # of all agents, on a leading axis
+
+
+def best_of(policies: Sequence[Best]) -> Best:
+    """The one with the lowest score."""
+    return min(policies, key=lambda best: best.score)
 
 
 @dataclass(frozen=True)
@@ -64,11 +73,11 @@ class Hooks:
     stage: Callable[[str], None] = lambda _: None
     """Called with a line of text when something begins that takes a while."""
 
-    row: Callable[[Row], None] = lambda _: None
-    """Called with every row of the log."""
+    rows: Callable[[list[Row]], None] = lambda _: None
+    """Called after each chunk with its rows of the log, one of every agent."""
 
-    best: Callable[[Best], None] = lambda _: None
-    """Called with every policy that is better than all before."""
+    best: Callable[[tuple[Best, ...]], None] = lambda _: None
+    """Called with the best policies of all agents whenever one of them is new."""
 
     stop: Callable[[], bool] = lambda: False
     """Called after each chunk; if it returns true, the run is saved and ends."""
@@ -100,10 +109,9 @@ def prepare_folder(
             raise TrainError(f"{folder} holds no run to resume")
         old = load(str(path))
         new = config or load(str(path), overrides)
-        allowed = CHANGEABLE if old.seeds == 1 else CHANGEABLE[1:]
-        changed = [key for key in settings.differences(old, new) if key not in allowed]
+        changed = [key for key in settings.differences(old, new) if key not in CHANGEABLE]
         if changed:
-            free = ", ".join(allowed)
+            free = ", ".join(CHANGEABLE)
             raise TrainError(f"{folder} was begun with another {changed[0]}; a resumed run may change {free}")
         config = new
     if config is None:
@@ -126,7 +134,7 @@ def _others(folder: Path) -> bool:
 def train(
     config: TrainConfig,
     env: Any,
-    evaluate: Callable[[Learner], Mapping[str, float]],
+    evaluate: Callable[[Any], Mapping[str, float]],
     folder: Path,
     hooks: Hooks | None = None,
 ) -> Outcome:
@@ -135,7 +143,7 @@ def train(
     Args:
         config: of the run; `bank` and `game` are not used.
         env: a `protocol.Environment`.
-        evaluate: metrics of a learner, deterministic; `score` is one of them, lower is better.
+        evaluate: metrics of an actor's parameters by their names in the log, deterministic; `SCORE` is one of them.
         folder: see `prepare_folder`.
         hooks: callbacks.
 
@@ -155,26 +163,27 @@ class _Run:
     def __init__(self, config: TrainConfig, env: Any, evaluate: Any, folder: Path, hooks: Hooks) -> None:
         self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
         self.folder = folder / CHECKPOINTS
-        self.seed, self.chunk, self.wall_s = 0, 0, 0.0
-        self.evaluated = 0  # chunk of the agent after which it was evaluated last
-        self.best: Best | None = None
-        like = jax.eval_shape(lambda: start(config.sac, config.loop, env, self._key()))
-        self.step = 0
+        self.chunk, self.wall_s = 0, 0.0
+        self.evaluated = 0  # chunk after which the agents were evaluated last
+        self.best: tuple[Best, ...] = ()
+        like = jax.eval_shape(lambda: start_agents(config.sac, config.loop, env, self._keys()))
         if checkpoint.steps(self.folder):
             self._restore_latest(like)
         else:
             self._begin()
         hooks.stage("compiling the training loop")
-        self._compiled = run_chunk.lower(config.sac, config.loop, env, self.state).compile()
-        self.log = Log(folder, self.seed, self.chunk, hooks.stage)
+        self._compiled = run_agents.lower(config.sac, config.loop, env, self.state).compile()
+        self.log = Log(folder, self.chunk, hooks.stage)
 
-    def _key(self) -> Any:
-        """Random key of the agent; scenes have another one."""
-        return jax.random.fold_in(jax.random.key(self.config.seed), 1 + self.seed)
+    def _keys(self) -> Any:
+        """Random keys of the agents; scenes have another one."""
+        return jax.vmap(jax.random.fold_in, (None, 0))(
+            jax.random.key(self.config.seed), 1 + jnp.arange(self.config.seeds)
+        )
 
     def _begin(self) -> None:
-        self.hooks.stage(f"filling the replay buffer of agent {self.seed + 1}")
-        fresh = start(self.config.sac, self.config.loop, self.env, self._key())
+        self.hooks.stage("filling the replay buffer")
+        fresh = start_agents(self.config.sac, self.config.loop, self.env, self._keys())
         self.state: LoopState = checkpoint.unpack(
             checkpoint.pack(fresh), fresh
         )  # the same memory layout as after a checkpoint
@@ -197,75 +206,87 @@ class _Run:
     def _restore(self, step: int, like: Any) -> None:
         arrays, metadata = checkpoint.restore(self.folder, step)
         try:
-            seed, chunk, wall_s, evaluated, best = (metadata[name] for name in _METADATA)
+            chunk, wall_s, evaluated, best = (metadata[name] for name in _METADATA)
             tree: dict[str, Any] = {"state": like}
-            if best is not None:
+            if best:
                 tree["best"] = like.learner.actor
             tree = checkpoint.unpack(arrays, tree)
-            self.best = None if best is None else Best(tree["best"], **best)
+            found = [Best(_agent(tree["best"], k), agent=k, **one) for k, one in enumerate(best)]
         except (KeyError, TypeError) as error:
             raise checkpoint.CheckpointError(f"checkpoint {step} was written by another version: {error}") from None
-        self.state, self.step = tree["state"], step
-        self.seed, self.chunk, self.wall_s, self.evaluated = seed, chunk, wall_s, evaluated
+        self.state, self.best = tree["state"], tuple(found)
+        self.chunk, self.wall_s, self.evaluated = chunk, wall_s, evaluated
 
     def _save(self) -> None:
         tree: dict[str, Any] = {"state": self.state}
-        if self.best is not None:
-            tree["best"] = self.best.actor
-        best = None if self.best is None else {k: getattr(self.best, k) for k in ("score", "seed", "chunk")}
-        values = self.seed, self.chunk, self.wall_s, self.evaluated, best
-        metadata: dict[str, Any] = dict(zip(_METADATA, values, strict=True))
+        if self.best:
+            tree["best"] = jax.tree.map(lambda *x: jnp.stack(x), *(one.actor for one in self.best))
+        best = [{"score": one.score, "chunk": one.chunk} for one in self.best]
+        metadata: dict[str, Any] = dict(zip(_METADATA, (self.chunk, self.wall_s, self.evaluated, best), strict=True))
         try:
-            checkpoint.save(self.folder, self.step, checkpoint.pack(tree), metadata, self.config.keep)
+            checkpoint.save(self.folder, self.chunk, checkpoint.pack(tree), metadata, self.config.keep)
         except checkpoint.CheckpointError as error:
             raise TrainError(f"{error}; --resume goes on from the one before") from None
 
     def finish(self) -> Outcome:
-        """Trains the remaining chunks of all agents."""
+        """Trains the remaining chunks."""
         config = self.config
-        while True:
-            while self.chunk < config.chunks:
-                self._advance()
-                stopping = self.hooks.stop()
-                if stopping or self.chunk % config.checkpoint_every == 0 or self.chunk == config.chunks:
-                    self._save()
-                if stopping:
-                    return Outcome(False, self.best, self.state)
-            if self.evaluated != self.chunk:  # `chunks` was larger when the run began
-                self.hooks.stage("evaluating the last policy")
-                self._evaluate()
-            if self.seed + 1 >= config.seeds:
-                return Outcome(True, self.best, self.state)
-            self.seed, self.chunk, self.evaluated = self.seed + 1, 0, 0
-            self._begin()
+        while self.chunk < config.chunks:
+            self._advance()
+            stopping = self.hooks.stop()
+            if stopping or self.chunk % config.checkpoint_every == 0 or self.chunk == config.chunks:
+                self._save()
+            if stopping:
+                return Outcome(False, self.best, self.state)
+        if self.evaluated != self.chunk:  # `chunks` was larger when the run began
+            self.hooks.stage("evaluating the last policies")
+            self._evaluate()
+        return Outcome(True, self.best, self.state)
 
     def _advance(self) -> None:
-        """One chunk, its evaluation if one is due, and its row of the log."""
-        steps, updates = int(self.state.env_steps), int(self.state.updates)
+        """One chunk, its evaluation if one is due, and its rows of the log."""
+        before = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
         wall, cpu = time.perf_counter(), time.process_time()
         self.state, found = self._compiled(self.env, self.state)
-        means = {name: float(value) for name, value in found.items()}
+        means = jax.tree.map(np.asarray, found)
         seconds, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        self.chunk, self.step = self.chunk + 1, self.step + 1
+        self.chunk += 1
         self.wall_s += seconds
-        if not all(math.isfinite(means[name]) for name in ("critic_loss", "actor_loss", "q_mean")):
-            raise TrainError(f"chunk {self.chunk} of agent {self.seed + 1}: the losses are not finite any more")
-        row: Row = {"seed": self.seed, "chunk": self.chunk, "env_steps": int(self.state.env_steps)}
-        row |= {"updates": int(self.state.updates), "wall_s": self.wall_s, "chunk_s": seconds}
-        row |= {"steps_per_s": (row["env_steps"] - steps) / seconds}
-        row |= {"updates_per_s": (row["updates"] - updates) / seconds, "cpu_per_wall": cpu / seconds, **means}
+        bad = np.flatnonzero(~np.all([np.isfinite(means[x]) for x in ("critic_loss", "actor_loss", "q_mean")], axis=0))
+        if len(bad):
+            raise TrainError(f"chunk {self.chunk} of agent {bad[0] + 1}: the losses are not finite any more")
+        counts = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
+        steps, updates = (float(np.sum(new - old)) / seconds for new, old in zip(counts, before, strict=True))
+        clocks = {"wall_s": self.wall_s, "chunk_s": seconds, "steps_per_s": steps, "updates_per_s": updates}
+        clocks |= {"cpu_per_wall": cpu / seconds}
+        rows: list[Row] = []
+        for k in range(self.config.seeds):
+            row: Row = {"seed": k, "chunk": self.chunk, "env_steps": int(counts[0][k]), "updates": int(counts[1][k])}
+            rows.append({**row, **clocks, **{name: float(value[k]) for name, value in means.items()}})
         if self.chunk % self.config.evaluate_every == 0 or self.chunk == self.config.chunks:
             wall = time.perf_counter()
-            row |= {f"held_out/{name}": value for name, value in self._evaluate().items()}
-            row["evaluate_s"] = time.perf_counter() - wall
-        self.hooks.row(self.log.write(row))
+            for row, scores in zip(rows, self._evaluate(), strict=True):
+                row |= scores
+            seconds = time.perf_counter() - wall
+            rows = [{**row, "evaluate_s": seconds} for row in rows]
+        self.hooks.rows([self.log.write(row) for row in rows])
 
-    def _evaluate(self) -> dict[str, float]:
-        """Scores of the current policy, which is kept if it is better than all before."""
-        scores = {name: float(value) for name, value in self.evaluate(self.state.learner).items()}
+    def _evaluate(self) -> list[dict[str, float]]:
+        """Metrics of every agent's policy, which is kept if it is better than all before of this agent."""
+        found, best = [], []
+        for k in range(self.config.seeds):
+            actor = _agent(self.state.learner.actor, k)
+            scores = {name: float(value) for name, value in self.evaluate(actor).items()}
+            better = not self.best or scores[SCORE] < self.best[k].score
+            best.append(Best(actor, scores[SCORE], k, self.chunk) if better else self.best[k])
+            found.append(scores)
         self.evaluated = self.chunk
-        if self.best is None or scores["score"] < self.best.score:
-            actor = jax.tree.map(jnp.copy, self.state.learner.actor)  # the next chunk donates the state's memory
-            self.best = Best(actor, scores["score"], self.seed, self.chunk)
+        if any(one.chunk == self.chunk for one in best):
+            self.best = tuple(best)
             self.hooks.best(self.best)
-        return scores
+        return found
+
+
+def _agent(tree: Any, number: int) -> Any:
+    """A copy of one agent's part: the next chunk donates the memory of all."""
+    return jax.tree.map(lambda x: jnp.copy(x[number]), tree)

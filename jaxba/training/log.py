@@ -24,13 +24,12 @@ Row = dict[str, Any]
 class Log:
     """Appends rows, after removing those that a killed run wrote after its last checkpoint, and damaged ones."""
 
-    def __init__(self, folder: Path, seed: int, chunk: int, report: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(self, folder: Path, chunk: int, report: Callable[[str], None] = lambda _: None) -> None:
         """Opens the log of a run.
 
         Args:
             folder: of the run.
-            seed: number of the agent that is trained next.
-            chunk: chunks that this agent has done.
+            chunk: chunks that are done.
             report: called with a line of text if damaged lines are dropped.
 
         Raises:
@@ -38,10 +37,10 @@ class Log:
         """
         self.path = folder / FILE
         self._boards = folder / BOARD
-        self._board: tuple[int, _Board] | None = None
-        self._purge = {seed: chunk + 1} if seed or chunk else {}
+        self._open: dict[int, _Board] = {}
+        self._purge = chunk + 1 if chunk else 0
         lines, damaged = _lines(self.path)
-        kept = [line for line, row in lines if (row["seed"], row["chunk"]) <= (seed, chunk)]
+        kept = [line for line, row in lines if row["chunk"] <= chunk]
         if damaged and kept:
             report(f"{self.path}: {damaged} damaged line{'s' * (damaged > 1)} dropped")
         with atomic_write(self.path) as file:
@@ -60,18 +59,16 @@ class Log:
         board.flush()
         return clean
 
-    def _writer(self, seed: int) -> _Board:
-        if self._board is None or self._board[0] != seed:
-            if self._board:
-                self._board[1].close()
-            self._board = seed, _Board(self._boards / f"seed{seed}", self._purge.pop(seed, 0))
-        return self._board[1]
+    def _writer(self, agent: int) -> _Board:
+        if agent not in self._open:
+            self._open[agent] = _Board(self._boards / f"seed{agent}", self._purge)
+        return self._open[agent]
 
     def close(self) -> None:
         """Closes all files."""
         self._file.close()
-        if self._board:
-            self._board[1].close()
+        for board in self._open.values():
+            board.close()
 
 
 class _Board:

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,19 +17,19 @@ import numpy as np
 
 from jaxba.damping import DampingPolicy, make_policy
 from jaxba.damping.learned import LearnedPolicy, boldest, learned_from, without_weights
-from jaxba.damping.registry import BOLD
+from jaxba.damping.policy import trained_step
+from jaxba.damping.registry import BOLD, GUARDED, LEARNED
 from jaxba.game.constant_actions import best_constant_action
 from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Ratio, Runs, Score, amounts, best_costs, evaluate, paired_ratio, play_all, scores
 from jaxba.game.rollout import Trajectories
-from jaxba.game.scene_bank import Bank, Split, make_banks
+from jaxba.game.scene_bank import Bank, Split, make_banks, select
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.atomic import atomic_write
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig
 from jaxba.training.driver import TrainError
-from jaxba.training.sac import Learner
 
 BANK = "bank.npz"
 RULES = "rules.npz"
@@ -46,11 +46,14 @@ BASELINES = (
     f"ceres{EMBEDDED}",
     f"constant:1e-8{EMBEDDED}",
     BOLD,
+    GUARDED,
+    LEARNED,
 )
 """What a trained policy is compared with. Without the ending, rules have plain steps of the method. `bold` is the
-smallest lambda that the game's own guard allows, with the agent's step."""
+smallest lambda that the game's own guard allows, with the agent's step. `guarded` and `learned` are what ships, with
+their own steps and guards."""
 
-LEARNED = "learned"
+TRAINED = "trained"
 """Name of the trained policy in tables."""
 
 WEIGHTLESS = "its weights zero"
@@ -58,6 +61,20 @@ WEIGHTLESS = "its weights zero"
 
 CONSTANT = "constant action"
 """Name of the best constant action on the training scenes, where work has a price."""
+
+
+class Comparison(NamedTuple):
+    """Trained policies on the held-out scenes."""
+
+    scores: dict[str, Score]
+    """By name: of every agent if there are several, of all agents (means) and of their twins, and of the baselines."""
+
+    ratios: dict[str, Ratio]
+    """What the trained policies pay over what each other row pays, scene by scene, the geometric mean over agents:
+    prices, or iterations where work has none."""
+
+    by_agent: dict[str, list[float]]
+    """The same for every agent, over its own twin."""
 
 
 @dataclass(frozen=True)
@@ -79,42 +96,59 @@ class Task:
     @cached_property
     def rules(self) -> dict[str, Score]:
         """Scores of the baselines, and of their `virtual best`."""
-        return self._scores({})
+        game = self.config.game
+        return scores({}, self.baseline_runs, self.held_out, game.tolerance, game.max_iterations)
 
     def policy(self, actor: Any) -> LearnedPolicy:
         """The policy of an actor's parameters."""
         return learned_from(self.config.game.agent, actor)
 
-    def evaluate(self, learner: Learner) -> dict[str, float]:
-        """On the held-out scenes. `score` is the mean number of iterations, the limit for a failure."""
+    @cached_property
+    def chosen_on(self) -> tuple[Bank, ...]:
+        """Training scenes by which policies are chosen: the first ones, as many as are held out."""
+        sizes = [
+            min(len(bank.initial_cost), len(one.initial_cost))
+            for bank, one in zip(self.game.banks, self.held_out, strict=True)
+        ]
+        return tuple(select(bank, np.arange(size)) for bank, size in zip(self.game.banks, sizes, strict=True))
+
+    def evaluate(self, actor: Any) -> dict[str, float]:
+        """Scores of a policy by their names in the log. `training/score` chooses among policies: on training scenes,
+        the mean number of iterations, the limit for a failure, or the price. Those on held-out scenes are for the eye
+        alone."""
         rules = self.config.game
-        found = evaluate(
-            self.config.bank.classes,
-            self.held_out,
-            self.policy(learner.actor),
-            self.game.options,
-            rules.tolerance,
-            rules.max_iterations,
-        )
-        numbers = found._asdict()
-        kept = numbers.pop("price" if rules.reward == "price" else "mean")
-        return {"score": kept, **numbers}
+        kept = "price" if rules.reward == "price" else "mean"
+        found = {}
+        for name, banks in (("training", self.chosen_on), ("held_out", self.held_out)):
+            arguments = self.policy(actor), self.game.options, rules.tolerance, rules.max_iterations
+            scored = evaluate(self.config.bank.classes, banks, *arguments)
+            fields = scored._asdict()
+            found |= {f"{name}/score": fields.pop(kept)} | {f"{name}/{field}": x for field, x in fields.items()}
+        return found
 
-    def compare(self, actor: Any) -> tuple[dict[str, Score], dict[str, Ratio]]:
-        """Scores of a trained policy and the baselines, relative to the best costs of all of them; and what the trained
-        policy pays over what each baseline pays, scene by scene: prices, or iterations where work has none."""
-        game, policy = self.config.game, self.policy(actor)
-        policies = {LEARNED: policy, WEIGHTLESS: without_weights(policy)}
-        runs = _play(self.config, self.held_out, {name: (one, self.game.options) for name, one in policies.items()})
-        best = best_costs({**runs, **self.baseline_runs}, self.held_out)
-        paid = lambda run: amounts(run, best, game.tolerance, game.max_iterations, game.reward == "price")
-        others = {name: run for name, run in {**runs, **self.baseline_runs}.items() if name != LEARNED}
-        ratios = {name: paired_ratio(paid(runs[LEARNED]), paid(run)) for name, run in others.items()}
-        return self._scores(runs), ratios
-
-    def _scores(self, more: Mapping[str, Runs]) -> dict[str, Score]:
-        game = self.config.game
-        return scores(more, self.baseline_runs, self.held_out, game.tolerance, game.max_iterations)
+    def compare(self, actors: Sequence[Any]) -> Comparison:
+        """Trained policies and their twins without weights beside the baselines, relative to the best costs of all."""
+        game, limits = self.config.game, (self.config.game.tolerance, self.config.game.max_iterations)
+        trained = [self.policy(actor) for actor in actors]
+        play = lambda policy: _play(self.config, self.held_out, {"": (policy, self.game.options)})[""]
+        groups = {
+            TRAINED: [play(policy) for policy in trained],
+            WEIGHTLESS: [play(without_weights(policy)) for policy in trained],
+        }
+        alone = {f"{name} {k + 1}": run for name, runs in groups.items() for k, run in enumerate(runs)}
+        best = best_costs({**alone, **self.baseline_runs}, self.held_out)
+        found = scores(alone, self.baseline_runs, self.held_out, *limits)
+        means = {name: [found.pop(f"{name} {k + 1}") for k in range(len(actors))] for name in groups}
+        each = {f"{TRAINED} {k + 1}": one for k, one in enumerate(means[TRAINED])} if len(actors) > 1 else {}
+        mean = {name: Score(*(float(x) for x in np.mean(rows, axis=0))) for name, rows in means.items()}
+        paid = lambda runs: np.log([amounts(run, best, *limits, game.reward == "price") for run in runs])
+        ours, ratios, by_agent = paid(groups[TRAINED]), {}, {}
+        others = {WEIGHTLESS: groups[WEIGHTLESS], **{name: [run] for name, run in self.baseline_runs.items()}}
+        for name, runs in others.items():
+            theirs = paid(runs)
+            ratios[name] = paired_ratio(np.exp(ours.mean(axis=0)), np.exp(theirs.mean(axis=0)))
+            by_agent[name] = [float(x) for x in np.exp(np.mean(ours - theirs, axis=1))]
+        return Comparison({**each, **mean, **found}, ratios, by_agent)
 
 
 def build(
@@ -177,8 +211,8 @@ def baseline_policies(
     Args:
         config: of the run.
         options: of the agent's step.
-        names: as in `BASELINES`. Those with embedded iterations are left out if the agent's step has none; the rule
-            that belongs to the method comes first.
+        names: as in `BASELINES`. Those with embedded iterations, `guarded` and `learned` are left out if the agent's
+            step has none; the rule that belongs to the method comes first.
     """
     plain = config.step_options
     coordinates = replace(options.coordinates, camera_damping=plain.coordinates.camera_damping)
@@ -192,6 +226,12 @@ def baseline_policies(
         rule = name.removesuffix(EMBEDDED)
         if name == BOLD:
             found[name] = boldest(config.game.agent), options
+        elif name in (GUARDED, LEARNED):
+            if has_embedded:
+                policy = make_policy(name)
+                made_for = trained_step(policy)
+                step = replace(plain, refinement=made_for.refinement, coordinates=made_for.coordinates)
+                found[name] = policy, step
         elif rule == name:
             found[name] = make_policy(rule), plain
         elif has_embedded:

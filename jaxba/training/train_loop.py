@@ -164,3 +164,24 @@ def run_chunk(
     for name, values in sums.items():
         metrics[f"episode/{name}"] = jnp.sum(values) / jnp.maximum(metrics["episodes"], 1)
     return state, metrics
+
+
+@functools.partial(jax.jit, static_argnames=("sac", "loop"))
+def start_agents(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
+    """`start` for several agents, which share the environment's scenes; the state has a first axis of agents.
+
+    Args:
+        sac: static.
+        loop: static.
+        env: a pytree.
+        keys: one of each agent.
+    """
+    return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
+
+
+@functools.partial(jax.jit, static_argnames=("sac", "loop"), donate_argnames=("state",))
+def run_agents(
+    sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
+) -> tuple[LoopState, dict[str, Float[Array, " agents"]]]:
+    """`run_chunk` for the agents of `start_agents`; the state is donated, too."""
+    return jax.vmap(lambda one: run_chunk(sac, loop, env, one))(state)

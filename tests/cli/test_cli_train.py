@@ -104,22 +104,22 @@ def test_the_policy_file_has_the_best_policy_and_its_origin(finished):
     policy = load_policy(finished / "policy.safetensors")
     assert policy.config == load("fast", TINY).game.agent
     scored = [row for row in log.read(finished) if "held_out/score" in row]
-    best = min(scored, key=lambda row: row["held_out/score"])
+    best = min(scored, key=lambda row: row["training/score"])
     with safe_open(finished / "policy.safetensors", framework="numpy") as file:
         metadata = file.metadata()
     assert metadata["chunk"] == str(best["chunk"])
-    assert metadata["held_out_iterations"] == f"{best['held_out/score']:.4f}"
+    assert metadata["training_score"] == f"{best['training/score']:.4f}"
     assert "cameras: 4" in metadata["config"]
     actor = {"params": {"MLP_0": {f"Dense_{k}": x._asdict() for k, x in enumerate(policy.layers)}}}
     work = task.build(load("fast", TINY), finished)
-    assert work.compare(actor)[0]["learned"].mean == pytest.approx(best["held_out/score"], abs=1)
+    assert work.compare([actor]).scores["trained"].mean == pytest.approx(best["held_out/score"], abs=1)
 
 
 def test_a_finished_run_resumed_prints_the_table_again(finished, capsys):
     before = (finished / "metrics.jsonl").read_bytes()
     assert run(["--out", str(finished), "--resume"]) == 0
     output = capsys.readouterr().out
-    for name in ("learned", "ceres", "virtual best", "policy.safetensors"):
+    for name in ("trained", "ceres", "virtual best", "policy.safetensors"):
         assert name in output
     assert (finished / "metrics.jsonl").read_bytes() == before
 

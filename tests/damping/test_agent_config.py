@@ -18,7 +18,7 @@ def _config(effort: str, refine_points: int, **other) -> AgentConfig:
 
 configs = st.builds(
     _config,
-    effort=st.sampled_from(["fixed", "points", "points+forcing"]),
+    effort=st.sampled_from(["fixed", "points+repairs"]),
     observation=st.sampled_from(["scale-free", "paper", "duration"]),
     history=st.integers(1, 20),
     low=st.floats(-15, -3),

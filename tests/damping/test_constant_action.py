@@ -87,10 +87,10 @@ def test_guarded_has_one_lambda_until_a_step_fails_and_the_embedded_iterations_o
 
 
 def test_the_boldest_action_has_the_least_effort():
-    config = AgentConfig(effort="points+forcing")
+    config = AgentConfig(effort="points+repairs")
     assert boldest(config).action == (-1.0, -1.0, -1.0)
     state, _ = boldest(config).init(info())
-    assert int(state.effort.point_iterations) == 0
+    assert (int(state.effort.point_iterations), bool(state.effort.repairs)) == (0, False)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Policies that decide with lambda what an iteration may cost: point iterations and the forcing term."""
+"""Policies that decide with lambda what an iteration may cost: point iterations and repairs."""
 
 from __future__ import annotations
 
@@ -17,23 +17,20 @@ from tiny_game import AGENT, KIND, RULES, tiny_bank, tiny_game
 from jaxba import Schedule, StepOptions, lm_step
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import begin, observation_size, observe
-from jaxba.damping.guard import FORCING, effort_for
+from jaxba.damping.guard import effort_for
 from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
 from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
 from jaxba.game import constant_actions
-from jaxba.game.env import CG_ITERATION_COST, POINT_ITERATION_COST, make_game
+from jaxba.game.env import POINT_ITERATION_COST, make_game
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import draw_prices
 from jaxba.io.settings import SettingsError
 from jaxba.linear.step import Effort
 from jaxba.lm.records import Prices
-from jaxba.methods.deeplm import GlobalConjugateGradients
-from jaxba.problem.options import ConjugateGradients, Refinement
+from jaxba.problem.options import Refinement
 from jaxba.training import config as configs
 
-POINTS = replace(AGENT, effort="points", refine_points=3)
-BOTH = replace(POINTS, effort="points+forcing")
-PAID = replace(POINTS, effort="points+repairs")
+PAID = replace(AGENT, effort="points+repairs", refine_points=3)
 ALL = Refinement(points=1, trials=4, camera_rounds=3, pattern_moves=2)
 
 _step = jax.jit(lm_step, static_argnames=("options",))
@@ -42,8 +39,8 @@ _jitted_play = jax.jit(lambda game, state, action: game.step(state, action))
 _effort_for = jax.jit(effort_for, static_argnums=0)
 
 
-def effort(points: int, forcing: float | None = None) -> Effort:
-    return Effort(jnp.asarray(points, jnp.int32), None if forcing is None else jnp.asarray(forcing))
+def effort(points: int, repairs: bool = True) -> Effort:
+    return Effort(jnp.asarray(points, jnp.int32), jnp.asarray(repairs))
 
 
 # The step
@@ -71,32 +68,6 @@ def test_a_step_with_fewer_point_iterations_is_that_of_options_with_fewer_and_co
     assert none.cost > costs[0]
 
 
-def implicit(forcing: float) -> StepOptions:
-    rule = ConjugateGradients(forcing=forcing)
-    return StepOptions(linear_solver="implicit", refinement=Refinement(points=1), conjugate_gradients=rule)
-
-
-def deeplm(forcing: float) -> StepOptions:
-    method = GlobalConjugateGradients(ConjugateGradients(forcing=forcing))
-    return StepOptions(method=method, refinement=Refinement(points=1))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [deeplm])
-def test_a_step_with_another_forcing_term_is_that_of_options_with_it(options):
-    own = 1e-3
-    layout, state = start(tiny(), options(own))
-    iterations = []
-    for forcing, chosen in ((0.5, effort(1, 0.5)), (1e-6, effort(1, 1e-6)), (own, effort(1))):
-        expected, one = step(layout, state, 1e-6, options(forcing))
-        found, other = _step(layout, state, jnp.asarray(1e-6), options(own), effort=chosen)
-        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
-        assert int(one.cg_iterations) == int(other.cg_iterations)
-        np.testing.assert_allclose([one.forcing, other.forcing], forcing)
-        iterations.append(int(other.cg_iterations))
-    assert iterations[0] < iterations[2] < iterations[1]
-
-
 def test_a_step_without_repairs_is_that_of_options_without_them_and_counts_its_work():
     layout, state = start(tiny(), StepOptions(refinement=ALL))
     costs, repairs = [], []
@@ -106,7 +77,7 @@ def test_a_step_without_repairs_is_that_of_options_without_them_and_counts_its_w
             state,
             jnp.asarray(damping),
             StepOptions(refinement=ALL),
-            effort=effort(1)._replace(repairs=jnp.asarray(allowed)),
+            effort=effort(1, allowed),
         )
         (found, few), (_, many) = run(False), run(True)
         expected, plain = step(layout, state, damping, StepOptions(refinement=Refinement(points=1)))
@@ -134,18 +105,15 @@ def after_step(**work: int):
 # The agent
 
 
-def _chosen(config: AgentConfig, memory, *action: float) -> tuple[int, float | None]:
+def _chosen(config: AgentConfig, memory, *action: float) -> tuple[int, bool]:
     found = _effort_for(config, memory.guard, jnp.asarray(action, jnp.float32))
-    return int(found.point_iterations), None if found.forcing is None else float(jnp.log10(found.forcing))
+    return int(found.point_iterations), bool(found.repairs)
 
 
-def test_an_action_ranges_from_no_point_iteration_to_all_and_over_the_forcing_terms():
-    assert (AGENT.action_size, POINTS.action_size, BOTH.action_size) == (1, 2, 3)
-    memory = begin(BOTH, info())
-    found = [_chosen(BOTH, memory, 0.3, share, share) for share in (-1, -0.4, 0.4, 1)]
-    assert [points for points, _ in found] == [0, 1, 2, 3]
-    np.testing.assert_allclose([forcing for _, forcing in found], np.interp([-1, -0.4, 0.4, 1], [-1, 1], FORCING))
-    assert _chosen(POINTS, begin(POINTS, info()), 0.3, -1) == (0, None)
+def test_an_action_ranges_from_no_point_iteration_to_all():
+    assert (AGENT.action_size, PAID.action_size) == (1, 3)
+    memory = begin(PAID, info())
+    assert [_chosen(PAID, memory, 0.3, share, -1)[0] for share in (-1, -0.4, 0.4, 1)] == [0, 1, 2, 3]
     assert effort_for(AGENT, begin(AGENT, info()).guard, jnp.zeros(1)) is None
 
 
@@ -164,25 +132,22 @@ def test_prices_are_observed_where_work_is_paid():
 
 
 def test_the_effort_stays_the_agents_where_the_guards_rule_chooses_lambda():
-    config = replace(BOTH, patience=2)
+    config = replace(PAID, patience=2)
     memory = begin(config, info())
     for accepted in (REJECTED, REJECTED, ACCEPTED):
         memory = after(config, memory, accepted, -3.0)
-        np.testing.assert_allclose(_chosen(config, memory, -1, -1, 1), (0, FORCING[1]))
+        assert _chosen(config, memory, -1, -1, 1) == (0, True)
     assert memory.guard.handed_over
 
 
 def test_the_effort_of_the_last_step_is_observed():
-    for config in (POINTS, BOTH):
-        memory = begin(config, info())
-        seen = []
-        for share in (-1.0, 1.0):
-            chosen = effort_for(config, memory.guard, jnp.full(config.action_size, share, jnp.float32))
-            seen.append(np.asarray(observe(config, after(config, memory._replace(effort=chosen), ACCEPTED, -3.0))))
-            assert seen[-1].shape == (observation_size(config),)
-        assert observation_size(config) == observation_size(AGENT) + config.action_size - 1
-        different = np.flatnonzero(seen[0] != seen[1])
-        np.testing.assert_array_equal(different, np.arange(observation_size(AGENT), observation_size(config)))
+    memory, seen = begin(PAID, info()), []
+    for share in (-1.0, 1.0):
+        chosen = effort_for(PAID, memory.guard, jnp.full(3, share, jnp.float32))
+        seen.append(np.asarray(observe(PAID, after(PAID, memory._replace(effort=chosen), ACCEPTED, -3.0))))
+        assert seen[-1].shape == (observation_size(PAID),)
+    assert observation_size(PAID) == observation_size(AGENT) + 2 + len(Prices._fields)
+    np.testing.assert_array_equal(np.flatnonzero(seen[0] != seen[1]), observation_size(AGENT) + np.arange(2))
 
 
 # Policies
@@ -191,9 +156,9 @@ def test_the_effort_of_the_last_step_is_observed():
 @pytest.mark.slow
 def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_one_does(tmp_path):
     """In both loops of a solve, and after it was written to a file and read."""
-    config = replace(POINTS, guard="off")
+    config = replace(PAID, guard="off")
     zero = [Layer(0 * layer.kernel, 0 * layer.bias) for layer in random_policy(4, config).layers]
-    bias = np.arctanh([1 / 6, -0.4]).astype(np.float32)  # a lambda of 1e-3, and one of three
+    bias = np.arctanh([1 / 6, -0.4, 0.5]).astype(np.float32)  # a lambda of 1e-3, one of three, and repairs
     zero[-1] = zero[-1]._replace(bias=np.concatenate([bias, bias]))
     path = tmp_path / "two.safetensors"
     save_policy(path, LearnedPolicy(tuple(zero), config))
@@ -210,11 +175,11 @@ def test_a_policy_that_always_wants_one_point_iteration_solves_as_a_rule_with_on
 
 def test_a_file_with_too_few_numbers_for_its_effort_is_refused(tmp_path):
     path = tmp_path / "wrong.safetensors"
-    policy = random_policy(4, POINTS)
+    policy = random_policy(4, PAID)
     last = policy.layers[-1]
     short = (*policy.layers[:-1], last._replace(kernel=last.kernel[:, :2], bias=last.bias[:2]))
     save_policy(path, replace(policy, layers=short))
-    with pytest.raises(PolicyFileError, match="must give 4 numbers, not 2"):
+    with pytest.raises(PolicyFileError, match="must give 6 numbers, not 2"):
         load_policy(path)
 
 
@@ -223,33 +188,16 @@ def test_a_file_with_too_few_numbers_for_its_effort_is_refused(tmp_path):
 
 @pytest.mark.slow
 def test_an_iteration_is_paid_by_the_point_iterations_that_the_action_chose():
-    game = tiny_game(replace(RULES, agent=replace(POINTS, guard="off")), 6)
-    assert game.action_size == 2
+    game = tiny_game(replace(RULES, agent=replace(PAID, guard="off", trials=1, camera_rounds=0, pattern_moves=0)), 6)
+    assert game.action_size == 3
     state, seen = _jitted_reset(game, jax.random.key(0))
     assert seen.shape == (6, game.observation_size)
     share = jnp.asarray([-1, -0.4, 0.4, 1, -1, 1], jnp.float32)
-    action = jnp.stack([jnp.full(6, 0.9, jnp.float32), share], axis=1)  # a lambda that reaches no goal
+    action = jnp.stack([jnp.full(6, 0.9, jnp.float32), share, share], axis=1)  # a lambda that reaches no goal
     _, found = _jitted_play(game, state, action)
     price = -RULES.scale * (1 + POINT_ITERATION_COST * np.array([0, 1, 2, 3, 0, 3]))
     np.testing.assert_allclose(found.reward - RULES.scale * RULES.bonus * found.metrics["success"], price, rtol=1e-5)
-    assert game.demonstrate(state, jax.random.key(1)).shape == (6, 2)
-
-
-@pytest.mark.slow
-def test_an_iteration_is_paid_by_its_conjugate_gradients_where_the_action_chooses_the_forcing_term():
-    config = replace(RULES, agent=replace(BOTH, guard="off", refine_points=1))
-    game = make_game(config, [KIND], [tiny_bank()], [4], StepOptions(method=GlobalConjugateGradients()))
-    state, _ = _jitted_reset(game, jax.random.key(0))
-    paid = []
-    for forcing in (-1.0, 1.0):
-        action = jnp.broadcast_to(jnp.asarray([0.9, 1.0, forcing], jnp.float32), (4, 3))
-        _, found = _jitted_play(game, state, action)
-        net = found.reward - RULES.scale * RULES.bonus * found.metrics["success"]
-        iterations = (-net / RULES.scale - 1 - POINT_ITERATION_COST) / CG_ITERATION_COST
-        np.testing.assert_allclose(iterations, np.round(iterations), atol=1e-3)
-        paid.append(np.asarray(iterations))
-    assert (paid[0] > paid[1] + 0.5).all()
-    assert (paid[1] > 0.5).all()
+    assert game.demonstrate(state, jax.random.key(1)).shape == (6, 3)
 
 
 def test_work_is_paid_at_the_prices_of_the_scene():
@@ -291,18 +239,12 @@ def test_the_best_constant_action_is_searched_one_number_after_the_other(monkeyp
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (("game.agent.effort=all",), "effort must be one of fixed, points"),
-        (("game.agent={effort: points, refine_points: 0}",), "needs embedded point iterations"),
-        (("game.agent.effort=points", "method=ddlm"), "has no effect on method ddlm"),
-        (("game.agent.effort=points+forcing",), "needs conjugate gradients"),
+        (("game.agent.effort=all",), r"effort must be one of fixed, points\+repairs"),
+        (("game.agent={effort: points+repairs, refine_points: 0}",), "needs embedded point iterations"),
+        (("game.agent.effort=points+repairs", "method=ddlm"), "has no effect on method ddlm"),
     ],
 )
 def test_an_effort_that_cannot_be_chosen_is_refused_in_one_line(changes, message):
     with pytest.raises(SettingsError, match=message) as found:
         configs.load("default", changes)
     assert "\n" not in str(found.value)
-
-
-def test_an_effort_that_the_method_has_is_taken():
-    chosen = configs.load("default", ("game.agent.effort=points+forcing", "method=deeplm"))
-    assert chosen.game.agent.action_size == 3

@@ -26,8 +26,8 @@ from jaxba.damping.learned import Layer, LearnedPolicy
 from jaxba.game.env import POINT_ITERATION_COST, Game, GameConfig
 from jaxba.game.evaluate import evaluate, play_all, score, scores
 from jaxba.game.protocol import Environment
-from jaxba.game.random_scenes import MIN_VIEWS, SceneClass, _angle_axis, make_scenes
-from jaxba.game.rollout import Trajectories, play
+from jaxba.game.random_scenes import MIN_VIEWS, MOST_CAMERAS, MOST_POINTS, SceneClass, _angle_axis, make_scenes
+from jaxba.game.rollout import GROUP, Trajectories, play, step_groups
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, select
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState
@@ -42,8 +42,8 @@ LIMIT = 25
 
 # Scenes
 
-LARGE = pytest.param(SceneClass(40, 400), marks=pytest.mark.slow, id="large")
-"""A large class of scenes; forty of them are 600,000 slots."""
+LARGE = pytest.param(SceneClass(MOST_CAMERAS, MOST_POINTS), marks=pytest.mark.slow, id="large")
+"""The largest class of scenes; forty of them are 1.1 million slots."""
 
 
 @pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper"), LARGE])
@@ -64,6 +64,12 @@ def test_scenes_have_the_shape_of_their_class_and_enough_views(kind):
         assert seen.all()
     else:
         assert len({s.sum() for s in seen}) > 5  # sizes differ
+
+
+@pytest.mark.parametrize("sizes", [(MOST_CAMERAS + 1, 40), (10, MOST_POINTS + 1), (3, 40), (10, 9)])
+def test_a_class_that_is_too_large_or_too_small_is_refused(sizes):
+    with pytest.raises(ValueError, match="a class of scenes has 4 to 56 cameras and 10 to 510 points, not"):
+        SceneClass(*sizes)
 
 
 @pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper")])
@@ -166,10 +172,21 @@ def test_a_scene_is_played_as_it_is_solved_by_every_method(method):
         np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
 
 
+@pytest.mark.parametrize("count", [3, GROUP + 1])
+def test_agents_that_play_side_by_side_step_in_groups_as_each_alone(count):
+    shared, scenes = jnp.asarray([2.0, 3.0]), jnp.arange(3.0 * count).reshape(3, count)
+    one = lambda shared, x, y: (shared @ jnp.stack([x, y]), x > 1)
+    step = lambda x, y: step_groups(one, x, y, shared=shared)
+    found = jax.jit(jax.vmap(step, (0, None)))(scenes, scenes[0])
+    for agent in range(3):
+        chex.assert_trees_all_equal(jax.tree.map(lambda x, k=agent: x[k], found), step(scenes[agent], scenes[0]))
+    np.testing.assert_array_equal(found[0], 2 * scenes + 3 * scenes[0])
+
+
 @pytest.mark.slow
 def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
-    """Forty cameras and four hundred points, as no preset has them."""
-    kind, options = SceneClass(40, 400), StepOptions(refinement=Refinement(points=3))
+    """As no preset has them."""
+    kind, options = SceneClass(MOST_CAMERAS, MOST_POINTS), StepOptions(refinement=Refinement(points=3))
     scenes = make_scenes(kind, jax.random.key(5), 4)
     costs = initial_costs(kind, scenes)
     found = play(kind, Bank(scenes, costs, costs, info_of(kind, scenes, costs, 6), costs), CERES, options, 6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from jaxba import make_policy
@@ -22,6 +24,14 @@ def test_rules_have_plain_steps_or_the_agents_embedded_iterations():
     assert policies["ceres"] == (make_policy("ceres"), config.step_options)
     assert policies["ceres+embedded"] == (make_policy("ceres"), options)
     assert policies["constant:1e-8+embedded"] == (make_policy("constant:1e-8"), options)
+
+
+def test_what_ships_has_its_own_step_on_the_games_unknowns():
+    _, options, policies = found("bal", "bank.intrinsics=fixed")
+    policy, step = policies["guarded"]
+    assert policy == make_policy("guarded")
+    assert step == replace(options, refinement=replace(options.refinement, points=1))
+    assert policies["learned"][1] == options
 
 
 @pytest.mark.parametrize("preset", ["default", "plain", "paper"])
