@@ -25,6 +25,7 @@ from jaxtyping import Float
 from jaxba.linear.cholesky import factor_and_solve
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.structure.unknowns import Unknowns
+from jaxba.typing import AnyArray
 
 
 class Border(NamedTuple):
@@ -76,7 +77,7 @@ def border_of(unknowns: Unknowns, product: Callable[[Array], Array], like: Float
 
 
 def without_shared(
-    unknowns: Unknowns, blocks: Float[Array, "blocks width width"], row: Array, column: Array, own: Array
+    unknowns: Unknowns, blocks: Float[Array, "blocks width width"], row: AnyArray, column: AnyArray, own: AnyArray
 ) -> Float[Array, "blocks kept kept"]:
     """The blocks of A from those of S.
 

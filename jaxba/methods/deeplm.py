@@ -92,7 +92,7 @@ def solve_normal(
         product = jacobian_product(layout, linear, c, p)
         transposed = lambda first, second: [a * product[0] + b * product[1] for a, b in zip(first, second, strict=True)]
         by_camera = tree_sum(as_rows(transposed(*linear.camera_jacobian)), layout.camera_levels)
-        by_camera = by_camera + jnp.einsum("cab,cb->ca", system.only_damping, c)
+        by_camera = by_camera + jnp.einsum("cab,cb->ca", system.own, c)
         return join(by_camera, jnp.stack(point_sums(layout, transposed(*linear.point_jacobian))) + point_damping * p)
 
     def precondition(x: Array) -> Array:

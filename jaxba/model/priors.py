@@ -73,7 +73,7 @@ def _residuals(priors: CameraPriors, cameras: Float[Array, "parameters cameras"]
     rotation = camera.rotation_matrix(cameras[:3])
     center = -jnp.einsum("jic,jc->ic", rotation, cameras[3:6], precision="highest")
     position = jnp.einsum("cij,jc->ic", priors.position_whitening, center - priors.positions.T, precision="highest")
-    turned = camera.compose_left(cameras[:3], -priors.rotations.T)
+    turned = camera.compose_left(cameras[:3], -jnp.asarray(priors.rotations.T))
     turned = jnp.einsum("cij,jc->ic", priors.rotation_whitening, turned, precision="highest")
     lens = priors.lens_weight.T * (cameras[POSE_SIZE:] - priors.lenses.T)
     return position, jnp.concatenate([turned, lens])

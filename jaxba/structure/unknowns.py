@@ -103,7 +103,7 @@ class Unknowns:
 
     def mean(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "cameras numbers"]:
         """The mean over the cameras with the same lens."""
-        count = jnp.sum(self.members, axis=0, dtype=values.dtype)
+        count = jnp.sum(jnp.asarray(self.members), axis=0, dtype=values.dtype)
         return self.spread(self.total(values) / count[:, None], values)
 
     def project(self, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:

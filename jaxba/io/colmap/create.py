@@ -73,7 +73,9 @@ def create_model(problem: BundleProblem, target: str) -> Model:
             if model.name not in CAMERA_MODELS:
                 raise ProblemError(f"cannot write {target}: COLMAP has no camera model {model.name}")
         lenses = {
-            number: Camera(number, model.name, *(int(2 * x) for x in size), tuple(numbers[: len(model)].tolist()))
+            number: Camera(
+                number, model.name, int(2 * size[0]), int(2 * size[1]), tuple(numbers[: len(model)].tolist())
+            )
             for (number, (numbers, _, size)), model in zip(rows, models, strict=True)
         }
     else:
