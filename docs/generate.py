@@ -19,7 +19,7 @@ ROOT = Path(__file__).parent.parent
 
 MARKER = re.compile(r"^<!-- (fields|options) of: ([\w.]+) -->$", re.MULTILINE)
 
-GENERATED = ("paper.md", "reference/api/")
+GENERATED = ("results/paper.md", "reference/api/")
 """Pages, or folders of pages, that are made from something else and so are not counted."""
 
 

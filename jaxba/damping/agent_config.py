@@ -21,8 +21,8 @@ class AgentConfig:
 
     observation: Observation = "scale-free"
     """`scale-free`: decreases, gain ratios and lambdas of the last steps as ratios and logarithms. `paper`: the last
-    errors. `duration`: minus the duration of each of the last iterations, which is one for every iteration by the
-    game's deterministic clock (the paper's reversed roles of state and reward)."""
+    errors. `duration`: minus the duration of each of the last iterations by the game's clock (`damping/clock.py`; the
+    paper's reversed roles of state and reward)."""
 
     history: int = 5
     """Number of past steps in an observation. Source of the default: the paper's state size."""

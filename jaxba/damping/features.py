@@ -12,6 +12,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.clock import duration
 from jaxba.damping.guard import FIRST_DAMPING, GuardState, full_effort, initial_guard, update_guard
 from jaxba.damping.policy import ProblemInfo
 from jaxba.linear.step import Effort
@@ -151,7 +152,7 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     row = jnp.clip(row, -FEATURE_LIMIT, FEATURE_LIMIT).astype(dtype)
     error = {
         "paper": lambda: jnp.minimum(_rms_error(memory.info, step.cost), PAPER_LIMIT),
-        "duration": lambda: -jnp.ones((), dtype),
+        "duration": lambda: -duration(step),
         "scale-free": lambda: jnp.zeros((), dtype),
     }[config.observation]()
     shifted = lambda old, new: jnp.concatenate([new[None].astype(dtype), old[:-1]])

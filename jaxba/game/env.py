@@ -26,6 +26,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.clock import duration
 from jaxba.damping.features import Memory, begin, observation_size, observe, record
 from jaxba.damping.guard import GuardState, action_of, damping_of, effort_for
 from jaxba.damping.rules import Ceres
@@ -39,7 +40,7 @@ from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
 from jaxba.typing import register_pytree
 
-Reward = Literal["duration", "constant", "reduction", "reversed", "price"]
+Reward = Literal["duration", "constant", "reduction", "reversed", "price", "clock"]
 
 POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
@@ -64,7 +65,8 @@ class GameConfig:
     """What the agent observes and decides."""
 
     reward: Reward = "duration"
-    """Of an iteration. `duration`: minus a deterministic cost of the iteration. `price`: minus the price of the work
+    """Of an iteration. `duration`: minus a deterministic cost of the iteration. `clock`: minus its duration by a clock,
+    which varies as measured ones do (`damping/clock.py`). `price`: minus the price of the work
     that it did, at the prices of the scene (`BankConfig.price_spread`) and relative to its difficulty (`USUAL`).
     `constant`: -1. `reduction`: zero, and the bonus shrinks with every iteration. `reversed`: minus log10 of the cost
     over the best known cost (the paper's reversed roles of state and reward)."""
@@ -252,6 +254,8 @@ class Game:
             reward = bonus - (1 + POINT_ITERATION_COST * points)
         elif rules.reward == "price":
             reward = bonus - USUAL * memory.info.prices.of(step) / usual
+        elif rules.reward == "clock":
+            reward = bonus - duration(step)
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":

@@ -21,8 +21,8 @@ from jaxba.structure.density import DENSE_UNKNOWNS
 from jaxba.structure.track_buckets import TILED_POINTS
 
 SceneFamily = Literal["wide", "paper", "windows"]
-"""`wide`: all motions, depths, noises and starts below. `paper`: every camera sees every point.
-`windows`: not random, but cut from real problems (game/windows.py)."""
+"""`wide`: all motions, depths, noises and starts below. `paper`: random cameras that all see all random
+points. `windows`: not random, but cut from real problems (game/windows.py)."""
 
 MOTIONS = ("forward", "lateral", "orbit", "photos")
 """Motions of the cameras of a wide scene, equally often."""
@@ -48,6 +48,11 @@ CANDIDATES = 3
 START_ROTATION, START_CENTER, START_DEPTH = (1e-5, 0.03), (1e-3, 0.3), (1e-3, 0.25)
 """Sigmas of the error of the start, log-uniform per scene: rotations in radians, centres in units of the distance of
 neighbouring cameras, depths of points relative to the true ones."""
+
+PAPER_START = (0.2, 2.0, 2.0)
+"""Sigmas of the error of the start of a scene of the family `paper`: rotations in radians, camera centres and points in
+lengths, where points fill a cube of side 4. Chosen so that lambda matters: on 790 usable scenes of 10 x 10
+Gauss-Newton takes 7 iterations to convergence in the median and fails on 6%, Ceres' rule takes 8.1 in the mean."""
 
 
 MOST_CAMERAS, MOST_POINTS = DENSE_UNKNOWNS // 9, TILED_POINTS - 2
@@ -317,23 +322,27 @@ def _angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
 
 
 def _paper_scene(kind: SceneClass, key: Array) -> Scenes:
-    """Cameras on a line, all of which see all points; focal length 500 pixels, noise of half a pixel.
+    """Random cameras around random points, all of which they see; focal length 500 pixels, noise of half a pixel.
 
-    Source: the released code of Belder et al. 2023 (cameras on x in [-2, 2], identity rotation; errors of the start
-    0.005 on quaternions, 0.05 on centres, 0.01 on points), but with errors of mean zero, and with the Gaussian noise of
-    the paper's equation 1, without which the best cost is zero and a relative tolerance is meaningless.
+    Source: the text of Belder et al. 2023, which draws points and camera poses at random and names no distribution:
+    here points in a cube, and cameras in all directions around it that look at a random place in it, with a random
+    roll. The noise is that of the paper's equation 1, without which the best cost would be zero and a relative
+    tolerance meaningless. The text does not say either how far off a start is (`PAPER_START`).
     """
-    a, b, c, d, e, f = jax.random.split(key, 6)
-    center = jnp.zeros((kind.cameras, 3)).at[:, 0].set(jax.random.uniform(a, (kind.cameras,), minval=-2, maxval=2))
-    low, high = jnp.array([-2.0, -2.0, -10.0]), jnp.array([2.0, 2.0, -4.0])
-    world = jax.random.uniform(b, (kind.points, 3), minval=low, maxval=high)
+    keys = iter(jax.random.split(key, 10))
+    normal = lambda *shape: jax.random.normal(next(keys), shape)
+    world = jax.random.uniform(next(keys), (kind.points, 3), minval=-2.0, maxval=2.0)
+    away = jax.random.uniform(next(keys), (kind.cameras, 1), minval=6.0, maxval=12.0)
+    direction = normal(kind.cameras, 3)
+    center = away * direction / jnp.linalg.norm(direction, axis=1, keepdims=True)
+    target = jax.random.uniform(next(keys), (kind.cameras, 3), minval=-1.0, maxval=1.0)
+    rotation = _look_at(target - center, normal(kind.cameras, 3))
     lens = jnp.zeros((3, kind.cameras)).at[0].set(500.0)
-    rig = _Rig(jnp.broadcast_to(jnp.eye(3), (kind.cameras, 3, 3)), center, lens)
-    pixels = _measure(rig, world, jnp.asarray(0.5), jnp.asarray(0.0), c)
-    half = lambda k, shape: jax.random.uniform(k, shape, minval=-0.5, maxval=0.5)
-    rotation = _turns(2 * 0.01 * half(d, (kind.cameras, 3)))
-    cameras = _camera_columns(rotation, center + 0.05 * half(e, center.shape), lens)
-    start = cameras, world + 0.01 * half(f, world.shape)
+    pixels = _measure(_Rig(rotation, center, lens), world, jnp.asarray(0.5), jnp.asarray(0.0), next(keys))
+    turn, shift, move = PAPER_START
+    turned = _turns(turn * normal(kind.cameras, 3)) @ rotation
+    cameras = _camera_columns(turned, center + shift * normal(kind.cameras, 3), lens)
+    start = cameras, world + move * normal(kind.points, 3)
     return _assemble(start, pixels, jnp.ones((kind.cameras, kind.points), bool))
 
 

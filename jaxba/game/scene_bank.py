@@ -51,6 +51,9 @@ MAX_ERROR_ANGLE = 0.2
 """Largest root mean square error of a scene that is solved at all, relative to the focal length. It is larger if points
 are close to the plane of a camera."""
 
+PAPER_ERROR_ANGLE = 1.0
+"""The same for the family `paper`, whose starts are far away."""
+
 EASY_ENOUGH = 40
 """Iterations in which at least one rule must come within 1e-3 of the best cost of a usable scene."""
 
@@ -193,7 +196,8 @@ def solve_scenes(
     initial = initial_costs(kind, scenes)
     info = info_of(kind, scenes, initial, limit)
     error = jnp.sqrt(2 * initial / jnp.maximum(info.observations, 1))
-    keep = np.flatnonzero((error < MAX_ERROR_ANGLE * info.focal) & (info.observations >= MIN_OBSERVATIONS))
+    largest = PAPER_ERROR_ANGLE if kind.family == "paper" else MAX_ERROR_ANGLE
+    keep = np.flatnonzero((error < largest * info.focal) & (info.observations >= MIN_OBSERVATIONS))
     scenes, initial, info = jax.tree.map(lambda x: x[keep], (scenes, initial, info))
     if warm_share:
         scenes, initial = warm_starts(kind, scenes, initial, jax.random.fold_in(key, count), warm_share, options)

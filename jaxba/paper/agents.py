@@ -12,9 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxba.bench.sources import Source
 from jaxba.damping import LearnedPolicy, load_policy, save_policy
 from jaxba.game.env import Game, make_game
 from jaxba.game.scene_bank import Bank, Split, select
+from jaxba.paper import real_problems
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions
@@ -27,7 +29,7 @@ POLICY = "policy.safetensors"
 """File of a trained policy."""
 
 SCENES = "scenes"
-"""Folder of the scenes, which all agents share."""
+"""Folder of the synthetic scenes, which all agents but those for real problems share."""
 
 BASELINES = ("ceres",)
 """What training logs are compared with; the tables have baselines of their own."""
@@ -46,13 +48,36 @@ class Agent:
     few_scenes: bool = False
     """Whether it is trained on as few scenes as the paper's agent."""
 
+    problems: tuple[str, ...] = ()
+    """Files of real problems, on windows of which it is trained; on the synthetic scenes if empty."""
+
 
 OURS = Agent("agent")
 """The paper's agent, as the configuration interprets the paper."""
 
+SECONDS = 5.5
+"""Mean duration of an iteration by the clock, against a bonus of 10. Source: the paper's table on BAL, 110 s of 20
+iterations of classic."""
+
+BY_THE_CLOCK = ("game.reward=clock", f"game.scale={SECONDS}", f"game.bonus={10 / SECONDS}")
+"""Reward of minus the duration in seconds, and a bonus of 10: the scale is a factor on both."""
+
 FEW = Agent("agent-ten", few_scenes=True)
 REDUCTION = Agent("agent-reduction", ("game.reward=reduction",))
+CLOCK = Agent("agent-clock", BY_THE_CLOCK)
 REVERSED = Agent("agent-reversed", ("game.reward=reversed", "game.agent.observation=duration"))
+
+WINDOWS = ("bank.classes=[{cameras: 10, points: 40}]", "bank.scenes=[400]")
+"""Windows of an agent that is trained on real problems. Ten points, as in the synthetic scenes, would leave most
+cameras of a window with too few observations."""
+
+
+def trained_elsewhere(config: PaperConfig, source: Source) -> Agent | None:
+    """The agent for a real problem, trained on other ones (`real_problems.training_files`); None if there are none."""
+    left_out, files = real_problems.training_files(config.real, source)
+    if not files:
+        return None
+    return Agent(f"agent-without-{left_out}", (*WINDOWS, *BY_THE_CLOCK), problems=files)
 
 
 def with_state_size(size: int) -> Agent:
@@ -67,7 +92,14 @@ def train_config(config: PaperConfig, agent: Agent, seed: int) -> TrainConfig:
         SettingsError: an override is invalid.
     """
     found = train_configs.load(config.agents.preset, (*config.agents.overrides, *agent.overrides, "seeds=1"))
+    found = train_configs.with_problems(found, agent.problems) if agent.problems else found
     return replace(found, seed=config.seed + seed)  # seed of the agent; the scenes are shared
+
+
+def updates(config: PaperConfig) -> int:
+    """Updates of the networks in a training run."""
+    found = train_config(config, OURS, 0)
+    return found.chunks * found.loop.steps_per_chunk * found.loop.updates_per_step
 
 
 def trained(
@@ -95,9 +127,9 @@ def trained(
     begun = (own / driver.CONFIG).is_file()
     try:
         settings = driver.prepare_folder(own, wanted, resume=begun)
-        _copy_shared_scenes(config, folder, own, report)
+        _copy_shared_scenes(config, agent, folder, own, report)
         work = task.build(settings, own)
-        played = game(config, agent, settings, scenes(config, folder, report)[0])
+        played = work.game if agent.problems else game(config, agent, settings, scenes(config, folder, report)[0])
         note = lambda rows: report(f"{agent.name} {seed + 1}: {rows[0]['chunk']} of {settings.chunks} parts")
         outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
     except (driver.TrainError, train_configs.SettingsError) as error:
@@ -118,7 +150,7 @@ def scenes(config: PaperConfig, folder: Path, report: Callable[[str], None]) -> 
     Raises:
         ProblemError: there are too few scenes.
     """
-    split = _shared_scenes(config, folder, report)
+    split = _shared_scenes(config, OURS, folder, report)
     count = len(split.train.initial_cost)
     kept = len(split.held_out.initial_cost)
     if count <= kept:
@@ -134,19 +166,25 @@ def game(config: PaperConfig, agent: Agent, settings: TrainConfig, train_on: Ban
     return make_game(settings.game, settings.bank.classes, [train_on], settings.envs, options)
 
 
-def _shared_scenes(config: PaperConfig, folder: Path, report: Callable[[str], None]) -> Split:
-    """The scenes of the run. Generates them if the folder does not have them yet."""
-    shared = folder / SCENES
+def _shared_scenes(config: PaperConfig, agent: Agent, folder: Path, report: Callable[[str], None]) -> Split:
+    """The scenes of an agent's training runs. Generates them if the folder does not have them yet."""
+    shared = _scenes_folder(agent, folder)
     if not all((shared / name).is_file() for name in (task.BANK, task.RULES)):
         shared.mkdir(parents=True, exist_ok=True)
-        task.build(train_config(config, OURS, 0), shared, report, BASELINES)
+        task.build(train_config(config, agent if agent.problems else OURS, 0), shared, report, BASELINES)
     return task.read_banks(shared / task.BANK)[0]
 
 
-def _copy_shared_scenes(config: PaperConfig, folder: Path, own: Path, report: Callable[[str], None]) -> None:
+def _scenes_folder(agent: Agent, folder: Path) -> Path:
+    return folder / (f"{SCENES}-{agent.name}" if agent.problems else SCENES)
+
+
+def _copy_shared_scenes(
+    config: PaperConfig, agent: Agent, folder: Path, own: Path, report: Callable[[str], None]
+) -> None:
     """Copies the scenes of the run into the folder of a training run."""
-    _shared_scenes(config, folder, report)
+    _shared_scenes(config, agent, folder, report)
     for name in (task.BANK, task.RULES):
         if not (own / name).is_file():
-            with open(folder / SCENES / name, "rb") as source, atomic_write(own / name) as file:
+            with open(_scenes_folder(agent, folder) / name, "rb") as source, atomic_write(own / name) as file:
                 shutil.copyfileobj(source, file)

@@ -7,6 +7,7 @@ or a fraction (all solves succeed). The report states the rules (`CRITERION`).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -36,7 +37,10 @@ CRITERION = (
     f"A **fraction** is *reproduced* within {100 * FRACTION_TOLERANCE:.0f} percentage points, *partly* within "
     f"{100 * PARTLY_FRACTION_TOLERANCE:.0f}. A claim about iterations or seconds is *not* reproduced, whatever the "
     "numbers, if the fraction of problems on which the method succeeds is lower than that of the other method by more "
-    "than five percentage points."
+    "than five percentage points, and *not run* if it was not run on all of them. An **error** is *reproduced* if ours "
+    "is larger by less than the paper's difference on every problem, *partly* if on half of them, else *not*. "
+    "The column `to f*(1+1e-3)` compares the iterations until the cost is within 1e-3 of the best known one; verdicts "
+    "are by the stop rule, as the paper's numbers."
 )
 
 
@@ -56,44 +60,58 @@ class Claim:
     status: Status
     """Whether it is reproduced, by `CRITERION`."""
 
+    near: str = "-"
+    """The same as `ours` in iterations to f*(1+1e-3)."""
+
+
+def is_less_successful(one: Row, other: Row) -> bool:
+    """Whether a method succeeds so much less often than another one that fewer iterations or seconds are no gain."""
+    return one.success < other.success - FRACTION_TOLERANCE
+
+
+def _comparable(one: float, other: float, rows: tuple[Row, Row]) -> bool:
+    """Whether two means are positive numbers, over the same number of problems."""
+    return math.isfinite(one) and math.isfinite(other) and min(one, other) > 0 and rows[0].solves == rows[1].solves
+
 
 def ratio_claim(text: str, paper: float, ours: Row | None, base: Row | None) -> Claim:
     """The claim that `ours` takes the fraction `paper` of the iterations of `base`."""
-    if ours is None or base is None or not (math.isfinite(ours.iterations) and base.iterations > 0):
+    if ours is None or base is None or not _comparable(ours.iterations, base.iterations, (ours, base)):
         return Claim(text, f"{paper:.2f}", "-", "not run")
     found = ours.iterations / base.iterations
     status: Status = "reproduced" if found <= RATIO_TOLERANCE * paper else "partly" if found <= PARTLY_RATIO else "not"
     detail = f"{found:.2f} ({ours.iterations:.1f} / {base.iterations:.1f})"
-    if ours.success < base.success - FRACTION_TOLERANCE:
+    if is_less_successful(ours, base):
         status, detail = "not", f"{detail}, success {100 * ours.success:.0f} % against {100 * base.success:.0f} %"
-    return Claim(text, f"{paper:.2f}", detail, status)
+    near = f"{ours.near / base.near:.2f} ({ours.near:.1f} / {base.near:.1f})"
+    return Claim(text, f"{paper:.2f}", detail, status, near)
 
 
 def time_claim(text: str, paper: float, ours: Row | None, base: Row | None) -> Claim:
     """The claim that `ours` takes the fraction `paper` of the seconds of `base`, by the rule of `ratio_claim`."""
-    if ours is None or base is None or not (ours.seconds > 0 and base.seconds > 0):
+    if ours is None or base is None or not _comparable(ours.seconds, base.seconds, (ours, base)):
         return Claim(text, f"{paper:.2f}", "-", "not run")
     found = ours.seconds / base.seconds
     status: Status = "reproduced" if found <= RATIO_TOLERANCE * paper else "partly" if found <= PARTLY_RATIO else "not"
     detail = f"{found:.2f} ({number(ours.seconds)} / {number(base.seconds)} s)"
-    if ours.success < base.success - FRACTION_TOLERANCE:
+    if is_less_successful(ours, base):
         status, detail = "not", f"{detail}, success {100 * ours.success:.0f} % against {100 * base.success:.0f} %"
     return Claim(text, f"{paper:.2f}", detail, status)
 
 
 def order_claim(text: str, paper: str, better: Row | None, worse: Row | None) -> Claim:
     """The claim that `better` takes fewer iterations than `worse`."""
-    if better is None or worse is None or not math.isfinite(better.iterations + worse.iterations):
+    if better is None or worse is None or not _comparable(better.iterations, worse.iterations, (better, worse)):
         return Claim(text, paper, "-", "not run")
     clear = better.iterations <= PARTLY_RATIO * worse.iterations
     clear &= better.high < worse.low or not (better.seeds or worse.seeds)
     status: Status = "not" if better.iterations >= worse.iterations else "reproduced" if clear else "partly"
-    if better.success < worse.success - FRACTION_TOLERANCE:
+    if is_less_successful(better, worse):
         status = "not"
     detail = f"{better.iterations:.1f} against {worse.iterations:.1f}"
     if min(better.success, worse.success) < 1:
         detail += f", success {100 * better.success:.0f} % and {100 * worse.success:.0f} %"
-    return Claim(text, paper, detail, status)
+    return Claim(text, paper, detail, status, f"{better.near:.1f} against {worse.near:.1f}")
 
 
 def fraction_claim(text: str, paper: float, ours: float) -> Claim:
@@ -105,3 +123,18 @@ def fraction_claim(text: str, paper: float, ours: float) -> Claim:
         "reproduced" if gap <= FRACTION_TOLERANCE else "partly" if gap <= PARTLY_FRACTION_TOLERANCE else "not"
     )
     return Claim(text, f"{100 * paper:.0f} %", f"{100 * ours:.0f} %", status)
+
+
+def error_claim(text: str, paper: float, excess: Sequence[float]) -> Claim:
+    """The claim that an error is larger by less than `paper` on every problem.
+
+    Args:
+        text: the claim in words.
+        paper: the paper's difference.
+        excess: by how much ours is larger, for each problem.
+    """
+    if not excess:
+        return Claim(text, f"< {paper:g}", "-", "not run")
+    within = sum(x < paper for x in excess)
+    status: Status = "reproduced" if within == len(excess) else "partly" if 2 * within >= len(excess) else "not"
+    return Claim(text, f"< {paper:g}", f"on {within} of {len(excess)} problems, at most {max(excess):+.2g}", status)

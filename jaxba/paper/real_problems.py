@@ -52,7 +52,7 @@ def find(config: FamilyConfig) -> FamilyProblems:
     found, missing = [], []
     for entry in config.files:
         paths = _paths(entry)
-        found += [Source(_label(path), config.name, path) for path in paths]
+        found += [Source(label(path), config.name, path) for path in paths]
         if not paths:
             missing.append(entry)
     sub_problems = tuple(
@@ -73,14 +73,29 @@ def families(config: RealConfig) -> list[FamilyProblems]:
 
 
 def bal(config: RealConfig) -> tuple[Source, ...]:
-    """The complete BAL problems on this machine, or their sub-problems if the configuration has no complete ones."""
-    found = families(config)
-    return tuple(source for family in found for source in family.whole) or bal_and_sub_problems(config)
-
-
-def bal_and_sub_problems(config: RealConfig) -> tuple[Source, ...]:
-    """The complete BAL problems on this machine and their sub-problems."""
+    """The BAL problems on this machine and their sub-problems."""
     return tuple(source for family in families(config) for source in family.all)
+
+
+def lens_is_known(config: RealConfig, source: Source) -> bool:
+    """Whether only poses and points are unknown, as in the paper: on KITTI, whose cameras are calibrated."""
+    return source.family == config.kitti.name
+
+
+def training_files(config: RealConfig, source: Source) -> tuple[str, tuple[str, ...]]:
+    """What an agent may be trained on that is judged on a problem: the other families of BAL, or the other files of
+    KITTI.
+
+    Returns:
+        Name of what is left out, and the paths of the rest; none for a problem of neither data set.
+    """
+    if lens_is_known(config, source):
+        files = _files(config.kitti)
+        return label(source.location), tuple(path for path in files if path != source.location)
+    if source.family not in [family.name for family in config.bal]:
+        return source.name, ()
+    others = [family for family in config.bal if family.name != source.family]
+    return source.family, tuple(path for family in others for path in _files(family))
 
 
 def reason_without_bal(config: RealConfig) -> str:
@@ -89,6 +104,10 @@ def reason_without_bal(config: RealConfig) -> str:
     if not reasons:
         return "not run: the configuration names no problem of BAL"
     return "" if "" in reasons else NOT_SET if NOT_SET in reasons else reasons[0]
+
+
+def _files(config: FamilyConfig) -> list[str]:
+    return [path for entry in config.files for path in _paths(entry)]
 
 
 def _paths(entry: str) -> list[str]:
@@ -102,5 +121,6 @@ def _paths(entry: str) -> list[str]:
     return sorted(path for path in glob.glob(expanded) if Path(path).is_file())
 
 
-def _label(path: str) -> str:
+def label(path: str) -> str:
+    """The name of a problem's file without its endings."""
     return _SUFFIXES.sub("", Path(path).name)

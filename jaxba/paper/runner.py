@@ -7,36 +7,43 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import jax
 import numpy as np
 
 from jaxba.bench import profile
 from jaxba.bench.records import Record
-from jaxba.bench.run import record_of
+from jaxba.bench.run import RunSettings, record_of, run_solver
 from jaxba.bench.sources import Source
 from jaxba.damping import DampingPolicy
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import Bank, reach
-from jaxba.paper import agents, rows, zero_net
+from jaxba.paper import agents, real_problems, rows, zero_net
 from jaxba.paper.agents import Agent
 from jaxba.paper.config import PaperConfig
 from jaxba.paper.rows import NEAR, Row
 from jaxba.paper.schedule import LENGTH
 from jaxba.paper.store import Play, Store
+from jaxba.peers import require
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import LinearSolverChoice, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.callback_loop import IterationRecord
-from jaxba.solver.names import SolverName, parse_solver
+from jaxba.solver.names import SolverName, SolverNameError, parse_solver
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.solve import solve
 
 LIMIT = profile.ITERATION_LIMIT
 
+ELSEWHERE = "agent-elsewhere"
+"""Name of the agents that are trained on other real problems."""
+
 TEST = "test"
 """Name of the scenes of the tables in records."""
+
+Build: TypeAlias = Callable[[int], tuple[DampingPolicy, SolveOptions]]
+"""Gives policy and options of a training run."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +53,25 @@ class Method:
     name: str
     """Name in records."""
 
-    build: Callable[[int], tuple[DampingPolicy, SolveOptions]]
+    build: Build
     """Gives policy and options of a training run, by its number; rules ignore the number. This may train the policy, so
     it is called only if something has to be run."""
 
     seeds: int = 0
     """Number of training runs; 0 for a rule."""
+
+    peer: SolverName | None = None
+    """Another library that solves real problems, in place of `build`."""
+
+    build_for: Callable[[Source], Build | None] | None = None
+    """Gives `build` for one real problem, None if there is none, where it depends on the problem."""
+
+    def on(self, source: Source) -> Method | None:
+        """The method for one problem, None if there is none."""
+        if self.build_for is None:
+            return self
+        build = self.build_for(source)
+        return None if build is None else replace(self, build=build)
 
     @property
     def numbers(self) -> range:
@@ -72,7 +92,7 @@ def method_named(name: str) -> Method:
         policy, options = parsed.build()
         return policy, replace(options, linear_solver=cast(LinearSolverChoice, linear if slash else "auto"))
 
-    return Method(name, build, 0)
+    return Method(name, build, 0, parsed if parsed.peer else None)
 
 
 class Runner:
@@ -108,6 +128,19 @@ class Runner:
 
         name = agent.name if method == "lm" else f"{method}+{agent.name}"
         return Method(name, build, self.config.agents.seeds)
+
+    def agent_trained_elsewhere(self, method: str = "lm") -> Method:
+        """The method with agents trained on windows of real problems other than the one to solve."""
+
+        def build_for(source: Source) -> Build | None:
+            agent = agents.trained_elsewhere(self.config, source)
+            return None if agent is None else self.agent(agent, method).build
+
+        def build(_: int) -> tuple[DampingPolicy, SolveOptions]:
+            raise AssertionError("depends on the problem")
+
+        name = ELSEWHERE if method == "lm" else f"{method}+{ELSEWHERE}"
+        return Method(name, build, self.config.agents.seeds, build_for=build_for)
 
     def zero_net(self) -> Method:
         """The method with the Zero-net, with as many training runs as an agent."""
@@ -180,30 +213,36 @@ class Runner:
             repeats: repeats of each solve; as in the configuration if 0.
         """
         for source in sources:
-            for method in methods:
+            for method in filter(None, (method.on(source) for method in methods)):
                 for seed in method.numbers:
                     for repeat in range(repeats or self.config.real.repeats):
                         if self.store.solve(source.name, method.label(seed), repeat) is None:
                             try:
                                 self._solve(source, method, seed, repeat, limit)
-                            except ProblemError as error:
-                                self.report(f"{source.name}: left out: {error}")
+                            except (ProblemError, SolverNameError) as error:
+                                self.report(f"{source.name} by {method.name}: left out: {error}")
 
     def _solve(self, source: Source, method: Method, seed: int, repeat: int, limit: int) -> None:
-        policy, options = method.build(seed)
+        if method.peer:
+            require(method.peer)
+        built = None if method.peer else method.build(seed)
         if self._read is None or self._read[0] != source:
             self._read = source, source.read()
         problem = self._read[1]
         self.report(f"{source.name} by {method.label(seed)}")
-        steps: list[IterationRecord] = []
-        solution = solve(
-            problem,
-            policy,
-            replace(options, max_iterations=limit, compilation="full"),
-            callback=lambda step: steps.append(step),
-        )
-        known: Any = {"name": source.name, "family": source.family, "repeat": repeat, "solver": SolverName("ceres")}
-        self.store.add_solve(replace(record_of(solution, steps, **known), solver=method.label(seed)))
+        if method.peer:
+            record = run_solver(problem, source, method.peer, repeat, RunSettings(max_iterations=limit))
+        else:
+            assert built is not None
+            policy, options = built
+            if real_problems.lens_is_known(self.config.real, source):
+                options = replace(options, intrinsics="fixed")
+            steps: list[IterationRecord] = []
+            options = replace(options, max_iterations=limit, compilation="full")
+            solution = solve(problem, policy, options, callback=lambda step: steps.append(step))
+            known: Any = {"name": source.name, "family": source.family, "solver": SolverName("ceres")}
+            record = record_of(solution, steps, repeat=repeat, **known)
+        self.store.add_solve(replace(record, solver=method.label(seed)))
         self.done += 1
 
     # Rows

@@ -115,6 +115,8 @@ def _check_agent(sac: SacConfig) -> None:
     for name in ("width", "layers", "batch", "target_every"):
         if getattr(sac, name) < 1:
             raise ValueError(f"sac.{name} must be at least 1, not {getattr(sac, name)}")
+    if sac.policy_layers < 1:
+        raise ValueError(f"sac.actor_layers must be at least 1, not {sac.actor_layers}")
     for name in ("learning_rate", "initial_temperature", "reward_scale", "log_std_max"):
         if not getattr(sac, name) > 0:
             raise ValueError(f"sac.{name} must be positive, not {getattr(sac, name)}")
@@ -129,11 +131,11 @@ def _check_agent(sac: SacConfig) -> None:
 
 def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
     """Refuses networks that are too large for a policy file."""
-    sizes = [observation_size(agent), *[sac.width] * sac.layers, 2 * agent.action_size]
+    sizes = [observation_size(agent), *[sac.width] * sac.policy_layers, 2 * agent.action_size]
     numbers = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     if 4 * numbers > LARGEST_FILE - METADATA_BYTES:
         raise ValueError(
-            f"sac.width {sac.width} with sac.layers {sac.layers} makes a policy of {4 * numbers} bytes, "
+            f"sac.width {sac.width} with sac.layers {sac.policy_layers} makes a policy of {4 * numbers} bytes, "
             f"more than the {LARGEST_FILE - METADATA_BYTES} of a policy file"
         )
 

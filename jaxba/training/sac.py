@@ -34,6 +34,9 @@ class SacConfig:
     layers: int = 2
     """Hidden layers of every network."""
 
+    actor_layers: int | None = None
+    """Hidden layers of the policy, if other ones than those of `layers`."""
+
     layer_norm: bool = True
     """Layer normalisation in critics and value network. Source: Ball et al. 2023, section 4.2."""
 
@@ -84,12 +87,14 @@ class SacConfig:
     def paper(cls) -> SacConfig:
         """The paper's agent; what the paper does not state is taken from its released code.
 
-        Three fully connected layers of 256, mean squared errors, target value network refreshed every 5 iterations.
+        Value network and critics of three fully connected layers, the last one linear, a policy of four, width 256;
+        mean squared errors; target value network refreshed every 5 iterations.
         """
         return cls(
             variant="value",
             width=256,
             layers=2,
+            actor_layers=3,
             layer_norm=False,
             learning_rate=3e-4,
             gamma=0.99,
@@ -100,6 +105,11 @@ class SacConfig:
             log_std_min=-20.0,
             privileged=False,
         )
+
+    @property
+    def policy_layers(self) -> int:
+        """Hidden layers of the policy."""
+        return self.layers if self.actor_layers is None else self.actor_layers
 
 
 class Learner(NamedTuple):
@@ -116,7 +126,7 @@ class Learner(NamedTuple):
 
 
 def _actor(config: SacConfig, actions: int) -> Any:  # flax types the outputs of its networks as anything or a pair
-    return networks.Actor(config.width, config.layers, actions, config.log_std_min, config.log_std_max)
+    return networks.Actor(config.width, config.policy_layers, actions, config.log_std_min, config.log_std_max)
 
 
 def _critic(config: SacConfig) -> Any:
@@ -176,7 +186,7 @@ def act(
         observation: of any floating point type; what the actor does not see may follow.
         key: of the sample; if None, the action is the hyperbolic tangent of the mean.
     """
-    network = _actor(config, networks.action_size(actor, config.layers))
+    network = _actor(config, networks.action_size(actor, config.policy_layers))
     seen = jnp.asarray(observation, jnp.float32)[..., : networks.input_size(actor)]
     mean, log_std = network.apply(actor, seen)
     return networks.squash(mean) if key is None else networks.sample_action(mean, log_std, key)[0]

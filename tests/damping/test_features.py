@@ -13,6 +13,7 @@ from support import step_info
 
 from jaxba.damping import features
 from jaxba.damping.agent_config import AgentConfig
+from jaxba.damping.clock import DURATIONS, duration
 from jaxba.damping.features import PAPER_LIMIT, observation_size
 
 awkward = st.sampled_from([0.0, 1.0, -1.0, 1e-300, 1e300, -1e300, np.nan, np.inf, -np.inf])
@@ -105,10 +106,13 @@ def test_the_paper_s_observation_is_the_last_errors_clipped():
     np.testing.assert_allclose(start, [PAPER_LIMIT, 0, 0])
 
 
-def test_the_duration_of_every_iteration_is_one():
+def test_the_times_of_the_last_iterations_are_those_of_the_clock_newest_first():
     config = AgentConfig(observation="duration", history=3)
-    memory = begin(config, info())
-    np.testing.assert_array_equal(observe(config, memory), np.zeros(3))
-    for accepted, seen in ((True, [-1, 0, 0]), (False, [-1, -1, 0]), (True, [-1, -1, -1]), (True, [-1, -1, -1])):
-        memory = record(config, memory, step_info(accepted))
-        np.testing.assert_array_equal(observe(config, memory), seen)
+    memory, seen = begin(config, info()), [0.0, 0.0, 0.0]
+    np.testing.assert_array_equal(observe(config, memory), seen)
+    for k in range(5):
+        step = step_info(k != 2, candidate_cost=50.0 - k)
+        memory, seen = record(config, memory, step), [-float(duration(step)), *seen[:2]]
+        np.testing.assert_allclose(observe(config, memory), seen, rtol=1e-6)
+    assert all(-time in np.float32(DURATIONS) for time in np.float32(seen))
+    assert np.mean(DURATIONS) == pytest.approx(1, abs=1e-3)

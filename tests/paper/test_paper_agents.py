@@ -24,6 +24,7 @@ CONFIG = config.load("fast")
         (agents.with_state_size(5), []),
         (agents.with_state_size(20), ["game.agent.history"]),
         (agents.REDUCTION, ["game.reward"]),
+        (agents.CLOCK, ["game.bonus", "game.reward", "game.scale"]),
         (agents.REVERSED, ["game.agent.observation", "game.reward"]),
         (agents.FEW, []),
     ],
@@ -43,6 +44,7 @@ def test_ours_is_the_papers_agent():
     found = agents.train_config(CONFIG, agents.OURS, 0)
     assert (found.game.agent.observation, found.game.agent.history, found.game.reward) == ("paper", 5, "duration")
     assert (found.game.bonus, found.loop.warmup_steps, found.sac.variant, found.sac.width) == (10.0, 500, "value", 256)
+    assert (found.sac.layers, found.sac.policy_layers) == (2, 3)  # and a linear one: three and four fully connected
     assert found.bank.classes == (SceneClass(10, 10, "paper"),)
     assert found.bank.intrinsics == "fixed"
     assert found.game.max_iterations == 100

@@ -11,13 +11,15 @@ import pytest
 
 from jaxba import BundleProblem, ProblemError
 from jaxba.bench.records import Record, TracePoint
+from jaxba.bench.sources import Source
 from jaxba.io.settings import SettingsError
-from jaxba.paper import claims, config, real_problems, rows
+from jaxba.paper import agents, claims, config, real_problems, rows
 from jaxba.paper.markdown import Line, disagreements, lines_table
 from jaxba.paper.rows import Outcome, Row
 from jaxba.paper.schedule import average_schedule
 from jaxba.paper.store import PLAYS, SOLVES, Play, Store
 from jaxba.paper.subproblem import SubProblem, neighbouring_cameras, sub_problem
+from jaxba.paper.tables_and_figures import profiles
 
 # Sub-problems
 
@@ -197,6 +199,7 @@ def of(
         (of(4, success=0.96), of(20), "reproduced"),
         (None, of(20), "not run"),
         (of(math.nan), of(20), "not run"),
+        (dataclasses.replace(of(4), solves=2), of(20), "not run"),  # not on all problems
     ],
 )
 def test_rule_for_ratios(ours, base, status):
@@ -236,6 +239,34 @@ def test_rule_for_orders_uses_the_ranges_over_the_seeds(better, worse, status):
 )
 def test_rule_for_fractions(ours, status):
     assert claims.fraction_claim("claim", 0.7, ours).status == status
+
+
+@pytest.mark.parametrize(
+    ("excess", "status"),
+    [([-1.0, 0.002], "reproduced"), ([0.002, 0.004], "partly"), ([0.002, 0.004, 0.01], "not"), ([], "not run")],
+)
+def test_rule_for_errors(excess, status):
+    assert claims.error_claim("claim", 0.003, excess).status == status
+
+
+@pytest.mark.parametrize(
+    ("ours", "faster", "status"),
+    [
+        ({"a": 1.0, "b": 1.0}, True, "reproduced"),
+        ({"a": 3.0, "b": 3.0}, True, "not"),
+        ({"a": 1.0}, True, "not"),  # faster, but not everywhere
+        ({"a": 3.0, "b": 3.0}, False, "reproduced"),
+        ({"a": 1.0}, False, "not"),
+    ],
+)
+def test_a_claim_about_speed_asks_for_the_same_success(ours, faster, status):
+    """Seconds to tau = 0.001 of two problems, where classic takes two."""
+    solve = lambda name, solver, seconds, end: dataclasses.replace(
+        record(name, [100.0, end], step_s=seconds, setup_s=0.0), solver=solver
+    )
+    records = [solve(name, "classic", 2.0, 1.0) for name in "ab"]
+    records += [solve(name, "learned-driver", ours.get(name, 1.0), 1.0 if name in ours else 50.0) for name in "ab"]
+    assert profiles._speed_claim(records, 0.001, "claim", faster).status == status
 
 
 def test_only_claims_that_failed_are_disagreements():
@@ -348,11 +379,34 @@ def test_files_and_their_sub_problems_are_found_and_missing_ones_are_reported(mo
     ]
     assert found.missing == ("$JAXBA_DATA/other.txt",)
     assert found.reason == ""
-    names = lambda whole, of: [s.name for s in of(config.RealConfig((dataclasses.replace(family, whole=whole),)))]
-    assert names(True, real_problems.bal) == ["problem-6-40-pre"]
-    assert names(True, real_problems.bal_and_sub_problems) == [source.name for source in found.all]
-    assert (
-        names(False, real_problems.bal)
-        == names(False, real_problems.bal_and_sub_problems)
-        == [source.name for source in found.sub_problems]
+    names = lambda whole: [
+        s.name for s in real_problems.bal(config.RealConfig((dataclasses.replace(family, whole=whole),)))
+    ]
+    assert names(True) == [source.name for source in found.all]
+    assert names(False) == [source.name for source in found.sub_problems]
+
+
+def test_an_agent_is_trained_on_other_problems_than_those_it_is_judged_on(monkeypatch, tmp_path):
+    monkeypatch.setenv("JAXBA_DATA", str(tmp_path))
+    for name in ("a-30", "a-40", "b-50", "drive-1", "drive-2"):
+        (tmp_path / f"{name}.txt").write_text("")
+    of = lambda name: config.FamilyConfig(name, (f"$JAXBA_DATA/{name}-*.txt",), (5,))
+    real = config.RealConfig((of("a"), of("b")), of("drive"))
+    path = lambda name: str(tmp_path / f"{name}.txt")
+    for source in real_problems.find(real.bal[0]).all:  # a whole family of BAL is one place
+        assert real_problems.training_files(real, source) == ("a", (path("b-50"),))
+        assert not real_problems.lens_is_known(real, source)
+    *_, whole, _, part = real_problems.find(real.kitti).all[-4:]
+    assert real_problems.training_files(real, part) == ("drive-2", (path("drive-1"),))
+    assert real_problems.lens_is_known(real, whole)
+    settings = dataclasses.replace(config.load("fast"), real=real)
+    judged_on_a, judged_on_b = (
+        agents.trained_elsewhere(settings, real_problems.find(family).all[0]) for family in real.bal
     )
+    assert judged_on_a
+    assert judged_on_b
+    assert judged_on_b.problems == (path("a-30"), path("a-40"))
+    assert judged_on_a.name != judged_on_b.name
+    found = agents.train_config(settings, judged_on_a, 0)
+    assert (found.bank.problems, found.bank.classes[0].family) == ((path("b-50"),), "windows")
+    assert agents.trained_elsewhere(settings, Source("x", "scene", "scene:tiny")) is None

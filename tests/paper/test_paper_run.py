@@ -90,6 +90,7 @@ def test_one_table_in_an_empty_folder(finished):
     assert str(finished.parent) not in text
     assert "BAL: not run: JAXBA_DATA is not set." in text
     assert "**BAL**: not run: JAXBA_DATA is not set." in text
+    assert re.search(r"\| Ladybug: DeepLM \+ ours over DeepLM, seconds .* \*\*not run\*\* \|", text)
     row = next(line for line in text.splitlines() if line.startswith("| classic | 20 |"))
     mean = sum(i if c else 100 for i, c in zip(plays[0]["iterations"], plays[0]["converged"], strict=True))
     assert row.split("|")[3].strip() == f"{mean / len(plays[0]['iterations']):.1f}".removesuffix(".0")

@@ -240,6 +240,9 @@ def _first_moment(state):
 def test_presets() -> None:
     paper = SacConfig.paper()
     assert (paper.variant, paper.width, paper.target_every, paper.tau) == ("value", 256, 5, 1.0)
+    layers = jax.eval_shape(lambda key: sac.init(paper, key, 5, 1), jax.random.key(0))
+    count = lambda params: sum("kernel" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(params))
+    assert (count(layers.actor), count(layers.critic), count(layers.value)) == (4, 3, 3)  # two critics, stacked
     assert not paper.learn_temperature
     assert (paper.log_std_min, paper.log_std_max) == (-20.0, 2.0)
     assert hash(paper) != hash(SacConfig())

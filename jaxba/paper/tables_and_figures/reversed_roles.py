@@ -41,9 +41,8 @@ def _section(runner: Runner) -> Section:
 
     found = common.claims_on_both_sets(runner, methods, make_claims)
     body = (
-        "Interpreted as: the state is minus the time of each of the last five iterations. The time of an iteration is "
-        "always 1 in our game, so that this agent observes only how many iterations it has made. The reward is minus "
-        "the logarithm of the error over the best known one, with the same bonus.",
+        "Interpreted as: the state is minus the time of each of the last five iterations, by the clock of the section "
+        "on rewards. The reward is minus the logarithm of the error over the best known one, with the same bonus.",
         *common.ablation_body(runner, methods),
         disagreements(found, common.AGENTS_DIFFER),
     )
