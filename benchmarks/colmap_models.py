@@ -118,6 +118,7 @@ def constraints(args: argparse.Namespace) -> Iterator[tuple[str, float, float]]:
     with tempfile.TemporaryDirectory() as folder:
         reconstruction("OPENCV", 2, args.frames, args.points, args.seed).write(folder)
         problem = jaxba.read_colmap(folder)
+        assert problem.labels is not None
         ids, points, lenses = (
             problem.labels.images.tolist(),
             problem.labels.points.tolist(),
@@ -153,6 +154,7 @@ def _with_priors(folder: str, problem: jaxba.BundleProblem, args: argparse.Names
 
     model = pycolmap.Reconstruction(folder)
     rng = np.random.default_rng(args.seed)
+    assert problem.labels is not None
     ids = problem.labels.images.tolist()
     places = np.array([model.image(i).projection_center() + PRIOR_SIGMA * rng.normal(size=3) for i in ids])
     spread = PRIOR_SIGMA**2 * np.eye(3)

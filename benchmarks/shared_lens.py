@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +50,7 @@ def make(folder: str, images: int, points: int, track: float) -> None:
     jaxba.write_colmap(with_lens(start, [780.0, 780.0, 640.0, 480.0, 0.0, 0.0, 0.0, 0.0], pixels), folder)
 
 
-def ours(folder: str, policy: str, solver: str) -> dict[str, float | str]:
+def ours(folder: str, policy: str, solver: Any) -> dict[str, float | str]:
     """Solves with jaxba."""
     import jaxba
 
@@ -80,7 +81,7 @@ def colmaps(folder: str) -> dict[str, float | str]:
     started = time.perf_counter()
     summary = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
     seconds = time.perf_counter() - started
-    ceres = getattr(summary, "ceres_summary", summary)
+    ceres: Any = getattr(summary, "ceres_summary", summary)
     return {
         "initial": ceres.initial_cost,
         "final": ceres.final_cost,
