@@ -45,6 +45,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_lens_priors, with_position_priors, with_rotation_priors
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
+from jaxba.problem.rigs import Rigs
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord
@@ -89,6 +90,7 @@ __all__ = [
     "ProblemWarning",
     "Refinement",
     "Retriangulation",
+    "Rigs",
     "SceneConfig",
     "Schedule",
     "Solution",

@@ -51,32 +51,37 @@ def preconditioner(
         name: which one.
     """
     if name == "jacobi":
-        return block_inverse(_with_shared_lenses(system, system.blocks))
+        return block_inverse(_with_shared(system, system.blocks))
     if blocks is None or layout.pairs is None:
         diagonal = diagonal_blocks(layout, linear, points, system)
     else:
         diagonal = take_rows(blocks, layout.pairs.diagonal)
-    fine = block_inverse(_with_shared_lenses(system, diagonal))
+    fine = block_inverse(_with_shared(system, diagonal))
     if name == "schur-jacobi":
         return fine
     coarse = coarse_preconditioner(layout, linear, points, system, anchor)
     return lambda r: fine(r) + coarse(r)
 
 
-def _with_shared_lenses(
+def _with_shared(
     system: CameraSystem, blocks: Float[Array, "cameras width width"]
 ) -> Float[Array, "cameras width width"]:
-    """The blocks, with the mean over its cameras in the place of a shared lens, which then couples with no pose."""
+    """The blocks, with means over cameras in the place of a shared lens or the pose of a frame, which do not couple."""
     unknowns = system.unknowns
     if unknowns is None:
         return blocks
-    pose, lens = blocks[:, :POSE_SIZE], blocks[:, POSE_SIZE:, POSE_SIZE:]
-    mean = unknowns.mean(lens.reshape(len(lens), -1)).reshape(lens.shape)
-    shares = jnp.any(jnp.asarray(unknowns.members), axis=1)[:, None, None]
-    zero = jnp.zeros_like(pose[:, :, POSE_SIZE:])
-    coupling = jnp.where(shares, zero, pose[:, :, POSE_SIZE:])
-    upper = jnp.concatenate([pose[:, :, :POSE_SIZE], coupling], axis=2)
-    return jnp.concatenate([upper, jnp.concatenate([coupling.mT, mean], axis=2)], axis=1)
+    pose, lens = blocks[:, :POSE_SIZE, :POSE_SIZE], blocks[:, POSE_SIZE:, POSE_SIZE:]
+    coupling = blocks[:, :POSE_SIZE, POSE_SIZE:]
+    flat = lambda part: part.reshape(len(part), -1)
+    if unknowns.members is not None:
+        shares = jnp.any(jnp.asarray(unknowns.members), axis=1)[:, None, None]
+        coupling = jnp.where(shares, jnp.zeros_like(coupling), coupling)
+        lens = unknowns.mean(flat(lens)).reshape(lens.shape)
+    if unknowns.frame is not None:
+        coupling = jnp.zeros_like(coupling)
+        pose = unknowns.frame_mean(flat(pose)).reshape(pose.shape)
+    upper = jnp.concatenate([pose, coupling], axis=2)
+    return jnp.concatenate([upper, jnp.concatenate([coupling.mT, lens], axis=2)], axis=1)
 
 
 def diagonal_blocks(

@@ -30,6 +30,7 @@ from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, couplin
 from jaxba.linear.two_level import Anchor
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.density import has_few_points
@@ -132,6 +133,8 @@ def _solve_bordered(
 ) -> tuple[Float[Array, "cameras width"], Int[Array, ""]]:
     """Solves `T^T S T y = T^T b` for shared lenses by a factorisation, and returns `T y`."""
     assert system.unknowns is not None
+    if system.unknowns.frame is not None:
+        return _solve_merged(layout, linear, points, system), _no_iterations()
     project = system.unknowns.project
     product = lambda x: apply_reduced(layout, linear, points, system, x)
     if not options.mixed_precision:
@@ -151,6 +154,36 @@ def _solve_bordered(
 
     system = system._replace(right=project(system.right))
     return _conjugate_gradients(lambda x: project(product(x)), precondition, system, options, CORRECTION_FORCING)
+
+
+def _solve_merged(
+    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
+) -> Float[Array, "cameras width"]:
+    """Solves `T^T S T y = T^T b` where frames and perhaps lenses are shared, as one dense matrix; returns `T y`."""
+    unknowns, shape = system.unknowns, system.right.shape
+    assert unknowns is not None
+    assert unknowns.frame is not None
+    if layout.grid is not None:
+        matrix = dense_system(layout.grid, linear, points, system)
+    else:
+        lower = dense_blocks(_pairs(layout), reduced_blocks(layout, linear, points, system))
+        matrix = jnp.tril(lower) + jnp.tril(lower, -1).T
+    number = jnp.arange(shape[1])
+    index = jnp.asarray(unknowns.frame)[:, None] * shape[1] + number
+    own = jnp.arange(shape[0])[:, None] * shape[1] + number
+    size = shape[0] * shape[1]
+    if unknowns.members is None:
+        index = jnp.where(number < POSE_SIZE, index, own)
+    else:
+        members = jnp.asarray(unknowns.members)
+        first = jnp.argmax(members, axis=0)[jnp.argmax(members, axis=1)]  # the first camera with the same lens
+        lens = jnp.where(jnp.any(members, axis=1), first, jnp.arange(shape[0]))[:, None] * shape[1] + number
+        index = jnp.where(number < POSE_SIZE, index, lens)
+    index = index.reshape(-1)
+    total = lambda rows: jax.ops.segment_sum(rows, index, num_segments=size)
+    unused = total(jnp.ones_like(index)) == 0
+    merged = total(total(matrix).T) + jnp.diag(unused.astype(matrix.dtype))
+    return factor_and_solve(merged, total(system.right.reshape(-1)))[index].reshape(shape)
 
 
 def _factored_without_shared(

@@ -93,7 +93,7 @@ class CameraSystem(NamedTuple):
     damping: Float[Array, "cameras width"]  # D_c, diagonal in the options' coordinates
     # [J_c, r, r - Q h], two rows an observation, sorted by camera (structure/layout.py)
     rows: Float[Array, "chunks terms columns"] | None = None
-    unknowns: Unknowns | None = None  # with shared lenses: each camera holds an equal part of their damping
+    unknowns: Unknowns | None = None  # if something is shared: each camera holds an equal part of its damping
 
 
 def eliminate_points(
@@ -169,10 +169,13 @@ def camera_system(
     factor = options.coordinates.camera_damping * damping
     extra = damping_diagonal(diagonal, factor, options)
     unknowns = layout.unknowns if layout.unknowns is not None and layout.unknowns.shared else None
-    if unknowns is not None:
+    if unknowns is not None and unknowns.members is not None:
         whole = damping_diagonal(unknowns.total(diagonal[:, POSE_SIZE:]), factor, options)
         count = unknowns.total(jnp.ones_like(diagonal[:, POSE_SIZE:]))
         extra = extra.at[:, POSE_SIZE:].set(unknowns.spread(whole / count, extra[:, POSE_SIZE:]))
+    if unknowns is not None and unknowns.frame is not None:
+        whole = damping_diagonal(unknowns.frame_total(diagonal[:, :POSE_SIZE]), factor, options)
+        extra = extra.at[:, :POSE_SIZE].set(whole / unknowns.frame_total(jnp.ones_like(whole)))
     # a camera without observations gets a unit block, and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     on_manifold = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
@@ -248,11 +251,14 @@ def jacobian_product(
 
 def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates) -> Float[Array, ""]:
     """Largest absolute entry of the gradient, in the options' coordinates."""
-    rotation = jnp.einsum("cji,cj->ci", coordinates.forward, system.gradient[:, :3])
-    lens = system.gradient[:, POSE_SIZE:]
-    if system.unknowns is not None:
-        lens = system.unknowns.spread(system.unknowns.total(lens), lens)
-    parts = rotation, system.gradient[:, 3:6], lens, jnp.stack(points.gradient)
+    gradient, unknowns = system.gradient, system.unknowns
+    if unknowns is not None and unknowns.frame is not None:
+        gradient = gradient.at[:, :POSE_SIZE].set(unknowns.frame_total(gradient[:, :POSE_SIZE]))
+    rotation = jnp.einsum("cji,cj->ci", coordinates.forward, gradient[:, :3])
+    lens = gradient[:, POSE_SIZE:]
+    if unknowns is not None and unknowns.members is not None:
+        lens = unknowns.spread(unknowns.total(lens), lens)
+    parts = rotation, gradient[:, 3:6], lens, jnp.stack(points.gradient)
     return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts if part.size])
 
 

@@ -165,6 +165,10 @@ def take_step(
 def _check_lenses(layout: Layout, options: StepOptions) -> None:
     """Raises a ValueError for what a method does not support."""
     unknowns = layout.unknowns
+    if unknowns is not None and unknowns.frame is not None:
+        apart = options.refinement.camera_rounds or options.refinement.pattern_moves
+        if options.coordinates.rotation != "manifold" or apart:
+            raise ValueError("rigs need rotation='manifold', and no camera rounds and pattern moves")
     if options.method is None or unknowns is None:
         return
     if unknowns.shared or unknowns.priors is not None:

@@ -173,18 +173,25 @@ def is_weightless(linear: Linearization, cost: Float[Array, ""], loss: Loss) -> 
 
 
 def only_free(layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False) -> Linearization:
-    """Sets the Jacobian columns of what is constant to zero. Its gradient, and so its step, is then zero, too.
+    """The linear model in the unknowns: pose columns of cameras that move together are those of their frame, and
+    columns of what is constant are zero. Its gradient, and so its step, is then zero, too.
 
     Args:
         layout: knows what is constant.
         linear: with all derivatives.
         intrinsics: `fixed`: all intrinsics are constant.
-        alone: whether cameras are optimised one by one, so that shared intrinsics must be constant.
+        alone: whether cameras are optimised one by one, so that what they share must be constant.
     """
     unknowns = layout.unknowns
     zero = jnp.zeros_like(linear.residual[0])
     by_camera, by_point = linear.camera_jacobian, linear.point_jacobian
-    if intrinsics == "fixed" or (alone and unknowns is not None and unknowns.shared):
+    if unknowns is not None and unknowns.from_rig is not None:
+        from_rig = take(jnp.moveaxis(jnp.asarray(unknowns.from_rig), 0, -1).reshape(9, -1), layout.slot_camera)
+        turn = lambda row: [sum(row[i] * from_rig[3 * i + k] for i in range(3)) for k in range(3)]
+        by_camera = [[*turn(row[:3]), *turn(row[3:6]), *row[6:]] for row in by_camera]
+        if alone:
+            by_camera = [[*[zero] * POSE_SIZE, *row[POSE_SIZE:]] for row in by_camera]
+    if intrinsics == "fixed" or (alone and unknowns is not None and unknowns.members is not None):
         by_camera = [[*row[:POSE_SIZE], *[zero] * (len(row) - POSE_SIZE)] for row in by_camera]
     if unknowns is not None and unknowns.free is not None:
         free = take(jnp.asarray(unknowns.free), layout.slot_camera)

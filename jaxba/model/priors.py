@@ -47,7 +47,7 @@ def prior_terms(
     """
 
     def at(step: Float[Array, "width cameras"]) -> tuple[Array, Array]:
-        full = unknowns.expanded(step)
+        full = unknowns.of_cameras(step)
         moved = (cameras + full).at[:3].set(camera.compose_left(full[:3], cameras[:3]))
         return _residuals(priors, moved)
 
@@ -55,8 +55,10 @@ def prior_terms(
     residual = at(zero)
     columns = [jax.jvp(at, (zero,), (zero.at[k].set(1),))[1] for k in range(unknowns.width)]
     free = jnp.ones(zero.shape, bool) if unknowns.free is None else jnp.asarray(unknowns.free)
-    if alone and unknowns.shared:
+    if alone and unknowns.members is not None:
         free = free.at[POSE_SIZE:].set(False)
+    if alone and unknowns.frame is not None:
+        free = free.at[:POSE_SIZE].set(False)
     weight = jnp.ones_like(zero[0])
     if not priors.position_loss.trivial:
         weight = priors.position_loss(jnp.sum(residual[0] * residual[0], axis=0))[1]

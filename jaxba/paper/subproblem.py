@@ -51,6 +51,7 @@ def sub_problem(
         whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
         lenses=None if problem.lenses is None else problem.lenses.of(kept),
         constants=None if problem.constants is None else problem.constants.of(kept, used),
+        rigs=None if problem.rigs is None else problem.rigs.of(kept),
         priors=None,
         labels=None,
     )

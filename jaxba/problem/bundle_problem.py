@@ -16,6 +16,7 @@ from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
 from jaxba.problem.priors import Priors
+from jaxba.problem.rigs import Rigs, checked_rigs
 from jaxba.typing import AnyArray, register_pytree
 
 CAMERA_SIZE = 9
@@ -75,6 +76,9 @@ class BundleProblem:
     constants: Constants | None = None
     """Constant poses and points; None: all are optimised."""
 
+    rigs: Rigs | None = None
+    """Cameras that move together; None: every camera has a pose of its own."""
+
     priors: Priors | None = None
     """What is known of cameras besides the pixels; None: nothing."""
 
@@ -94,6 +98,7 @@ class BundleProblem:
         weight: Any = None,
         lenses: Lenses | None = None,
         constants: Constants | None = None,
+        rigs: Rigs | None = None,
     ) -> BundleProblem:
         """Checks the arrays and returns a problem of float64 and int32 NumPy arrays.
 
@@ -109,6 +114,7 @@ class BundleProblem:
                 residual, like the covariance `I / weight`. Excludes `covariance`.
             lenses: optional; which cameras share intrinsics, of which models these are, and which are optimised.
             constants: optional; poses and points that are not optimised.
+            rigs: optional; cameras that move together.
 
         Raises:
             ProblemError: shapes differ, an index is out of range, a number is not finite, there
@@ -136,9 +142,11 @@ class BundleProblem:
                 lenses = checked_lenses(lenses, np.asarray(problem.cameras))
             if constants is not None:
                 constants = checked_constants(constants, problem.num_cameras, problem.num_points)
+            if rigs is not None:
+                rigs = checked_rigs(rigs, np.asarray(problem.cameras))
         except ValueError as error:
             raise ProblemError(str(error)) from None
-        return replace(problem, whitening=whitening, lenses=lenses, constants=constants)
+        return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs)
 
     @property
     def num_cameras(self) -> int:

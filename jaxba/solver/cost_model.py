@@ -280,6 +280,8 @@ def _check_method(problem: BundleProblem, options: StepOptions) -> None:
     """Raises a `ProblemError` if a method does not support a problem."""
     assert options.method is not None
     lenses, name = problem.lenses, options.method.name
+    if problem.rigs is not None:
+        raise ProblemError(f"rigs need plain LM, not {name}")
     if lenses is not None and lenses.shared and options.intrinsics == "free":
         raise ProblemError(f"shared lenses need plain LM, not {name}")
     if problem.priors is not None:

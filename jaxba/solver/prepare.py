@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -147,6 +147,12 @@ def set_up(
         policy, options = resolve_policy(policy, options)
     _check_policy(policy)
     step = options.step_options(policy)
+    if problem.rigs is not None:  # cameras of a frame stay together
+        step = replace(
+            step,
+            coordinates=replace(step.coordinates, rotation="manifold"),
+            refinement=replace(step.refinement, camera_rounds=0, pattern_moves=0),
+        )
     capacity, asked = None, options.linear_solver
     observations = ObservationOrder.of(problem)
     if _pads(problem, options):

@@ -196,6 +196,7 @@ def build_layout(
             cameras,
             empty_index,
             factor=factor,
+            banded=unknowns is None or unknowns.frame is None,
             capacity=capacity,
         )
     drawn_partitions = None

@@ -95,6 +95,7 @@ def capacity_of(problem: BundleProblem, observations: ObservationOrder | None = 
         `MAX_CAMERAS` or `MAX_PAIRS`, or with more observations or points than `MAX_OBSERVATIONS`.
     """
     general = problem.lenses is not None or problem.constants is not None or problem.priors is not None
+    general = general or problem.rigs is not None
     if general or problem.num_cameras > MAX_CAMERAS:
         return None
     observations = observations or ObservationOrder.of(problem)

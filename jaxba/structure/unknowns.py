@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -54,6 +55,12 @@ class Unknowns:
     """Whether an observed camera has this lens, for each lens that several observed cameras have; None if there is
     none."""
 
+    frame: Int[AnyArray, " cameras"] | None
+    """Frame of each camera; None if no observed cameras move together."""
+
+    from_rig: Float[AnyArray, "cameras 3 3"] | None
+    """Rotation M of each camera in its rig (problem/rigs.py): pose unknowns are those of frames. None without rigs."""
+
     free: Bool[AnyArray, "width cameras"] | None
     """Which unknowns of each camera's block are optimised; None: all."""
 
@@ -80,8 +87,8 @@ class Unknowns:
 
     @property
     def shared(self) -> bool:
-        """Whether several cameras have a lens in common of which something is optimised."""
-        return self.members is not None
+        """Whether several cameras have a number in common: of a lens, or the pose of a frame."""
+        return self.members is not None or self.frame is not None
 
     @property
     def width(self) -> int:
@@ -110,9 +117,26 @@ class Unknowns:
         """The orthogonal projection P on the range of T, without what is constant."""
         if self.free is not None:
             x = jnp.where(jnp.asarray(self.free).T, x, jnp.zeros_like(x))
-        if self.members is None:
-            return x
-        return jnp.concatenate([x[:, :POSE_SIZE], self.mean(x[:, POSE_SIZE:])], axis=1)
+        pose, lens = x[:, :POSE_SIZE], x[:, POSE_SIZE:]
+        pose = pose if self.frame is None else self.frame_mean(pose)
+        return jnp.concatenate([pose, lens if self.members is None else self.mean(lens)], axis=1)
+
+    def frame_total(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "cameras numbers"]:
+        """Sums over the cameras of each frame, for each of its cameras."""
+        assert self.frame is not None
+        return jax.ops.segment_sum(values, self.frame, num_segments=len(values))[jnp.asarray(self.frame)]
+
+    def frame_mean(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "cameras numbers"]:
+        """The mean over the cameras of each frame."""
+        return self.frame_total(values) / self.frame_total(jnp.ones_like(values[:, :1]))
+
+    def of_cameras(self, step: Float[Array, "width cameras"]) -> Float[Array, "parameters cameras"]:
+        """A step of all numbers of cameras for one of the unknowns: that of a frame turned into each of its cameras."""
+        full = self.expanded(step)
+        if self.from_rig is None:
+            return full
+        turn = lambda rows: jnp.einsum("cij,jc->ic", self.from_rig, rows, precision="highest")
+        return jnp.concatenate([turn(full[:3]), turn(full[3:6]), full[6:]])
 
     def restricted(self, changes: Float[Array, "*steps parameters cameras"]) -> Float[Array, "*steps width cameras"]:
         """The unknowns of changes of all numbers of cameras."""
@@ -143,7 +167,8 @@ def unknowns_of(
         None if all numbers of all cameras and points are optimised, as in BAL.
     """
     lenses, constants = problem.lenses, problem.constants
-    if lenses is None and constants is None and problem.priors is None and not fixed:
+    plain = lenses is None and constants is None and problem.priors is None and problem.rigs is None
+    if plain and not fixed:
         return None
     size, count = lens_size(lenses), problem.num_cameras
     index = np.arange(count) if lenses is None else np.asarray(lenses.index)
@@ -156,13 +181,16 @@ def unknowns_of(
         pose_free = ~np.asarray(constants.poses)
         if np.asarray(constants.points).any():
             free_points = np.append(~np.asarray(constants.points), True)[np.minimum(order, problem.num_points)]
-    free = np.hstack([pose_free, lens_free[:, columns]])
-    members = model = None
+    members = model = frame = from_rig = None
+    if problem.rigs is not None:
+        frame, pose_free = _frames(problem, seen[:count], pose_free)
+        from_rig = None if frame is None else np.asarray(problem.rigs.rotation)
     shared, times = np.unique(index[seen[:count]], return_counts=True)
     shared = shared[times > 1]
     if lenses is not None and columns and len(shared):
         members = (index[:, None] == shared) & seen[:count, None]
     all_shared = bool((times > 1).all())
+    free = np.hstack([pose_free, lens_free[:, columns]])
     models = None if lenses is None or lenses.all_bal else lenses.models
     if models is not None and len(models) > 1:
         assert lenses is not None
@@ -170,7 +198,25 @@ def unknowns_of(
         model = np.asarray(lenses.model)[index]
     priors = None if problem.priors is None else _camera_priors(problem, index, seen)
     free_numbers = None if free.all() else free.T
-    return Unknowns(members, free_numbers, free_points, model, priors, models, all_shared, columns, size)
+    return Unknowns(
+        members, frame, from_rig, free_numbers, free_points, model, priors, models, all_shared, columns, size
+    )
+
+
+def _frames(
+    problem: BundleProblem, seen: np.ndarray, pose_free: Bool[np.ndarray, "cameras 6"]
+) -> tuple[Int[np.ndarray, " cameras"] | None, Bool[np.ndarray, "cameras 6"]]:
+    """The frame of each camera, cameras that nothing sees by themselves, and which pose numbers of frames are free:
+    constant numbers of one camera are constant in its frame. No frames if all have one observed camera."""
+    assert problem.rigs is not None
+    frame = np.asarray(problem.rigs.frame).astype(np.int64)
+    frame = np.where(seen, frame, frame.max(initial=0) + 1 + np.arange(len(frame)))
+    _, frame, times = np.unique(frame, return_inverse=True, return_counts=True)
+    if not (times > 1).any():
+        return None, pose_free
+    constant = np.zeros(pose_free.shape, bool)
+    np.logical_or.at(constant, frame, ~pose_free)
+    return frame.astype(np.int32), ~constant[frame]
 
 
 def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> CameraPriors:

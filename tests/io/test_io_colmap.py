@@ -97,11 +97,15 @@ def colmap_cost(folder: Path | str) -> float:
     return total
 
 
-def adjusted_by_colmap(folder: Path | str, target: Path, lenses: bool) -> float:
+def adjusted_by_colmap(folder: Path | str, target: Path, lenses: bool, **free: bool) -> float:
     """Cost after COLMAP's own bundle adjustment, squared loss, principal points constant."""
     model = pycolmap.Reconstruction(str(folder))
     options = pycolmap.BundleAdjustmentOptions(
-        print_summary=False, refine_focal_length=lenses, refine_extra_params=lenses, refine_principal_point=False
+        print_summary=False,
+        refine_focal_length=lenses,
+        refine_extra_params=lenses,
+        refine_principal_point=False,
+        **free,
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
     options.ceres.solver_options.max_num_iterations = 300
@@ -384,27 +388,39 @@ def test_a_text_model_beside_a_binary_one_is_written_as_that(tmp_path):
     np.testing.assert_allclose(read_problem(binary).points, moved.points, rtol=1e-15)
 
 
-def test_a_rig_of_two_cameras_is_refused(tmp_path):
-    model = model_of(["RADIAL"])
-    second = pycolmap.Camera(camera_id=50, model="RADIAL", width=SIZE[0], height=SIZE[1], params=LENSES["RADIAL"])
-    model.add_camera(second)
-    rig = pycolmap.Rig(rig_id=50)
-    rig.add_ref_sensor(model.camera(9).sensor_id)
-    rig.add_sensor(second.sensor_id, pycolmap.Rigid3d())
-    model.add_rig(rig)
-    frame = pycolmap.Frame(frame_id=500, rig_id=50)
-    images = []
-    for identity, camera in ((500, 9), (501, 50)):
-        images.append(
-            pycolmap.Image(name=f"{identity}", keypoints=np.ones((1, 2)), camera_id=camera, image_id=identity)
-        )
-        images[-1].frame_id = 500
-        frame.add_data_id(images[-1].data_id)
-    frame.rig_from_world = pycolmap.Rigid3d()
-    model.add_frame(frame)
-    for image in images:
-        model.add_image(image)
-    assert "image 500 is of a rig of several cameras" in refusal(write(model, tmp_path / "model"))
+def rigs_of(cameras: int):
+    """Two rigs of cameras that see 60 points in five frames each, with noise."""
+    pycolmap.set_random_seed(0)
+    options, noise = pycolmap.SyntheticDatasetOptions(), pycolmap.SyntheticNoiseOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, cameras, 5
+    options.num_points3D, options.num_points2D_without_point3D = 60, 0
+    model = pycolmap.synthesize_dataset(options)
+    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_rotation_stddev = 0.5, 0.02, 0.3
+    pycolmap.synthesize_noise(noise, model)
+    return model
+
+
+@pytest.mark.parametrize("linear_solver", ["explicit", "implicit"])
+def test_rigs_end_where_colmap_has_them_and_are_written_as_rigs(tmp_path, linear_solver):
+    folder = write(rigs_of(3), tmp_path / "model")
+    problem = read_problem(folder)
+    np.testing.assert_allclose(geometry.cost(problem), colmap_cost(folder), rtol=1e-9)
+    solution = solve(problem, "ceres", SolveOptions(linear_solver=linear_solver, max_iterations=100))
+    truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=True, refine_sensor_from_rig=False)
+    np.testing.assert_allclose(solution.final_cost, truth, rtol=1e-5)
+    write_colmap(solution.problem, tmp_path / "out", like=folder)
+    np.testing.assert_allclose(colmap_cost(tmp_path / "out"), solution.final_cost, rtol=1e-9)
+    np.testing.assert_allclose(geometry.cost(read_problem(tmp_path / "out")), solution.final_cost, rtol=1e-9)
+
+
+def test_a_rig_that_does_not_say_where_a_camera_is_is_refused(tmp_path):
+    folder = write(rigs_of(2), tmp_path / "model", text=True)
+    lines = (folder / "rigs.txt").read_text().splitlines()
+    at = next(n for n, line in enumerate(lines) if not line.startswith("#"))
+    words = lines[at].split()  # id, 2, CAMERA, reference, CAMERA, other, 1 and seven numbers
+    lines[at] = " ".join([*words[:6], "0"])
+    (folder / "rigs.txt").write_text("\n".join(lines) + "\n")
+    assert f"it is not known where camera {words[5]} is in it" in refusal(folder)
 
 
 def test_a_lens_without_a_focal_length_has_colmaps_cost_and_is_constant(tmp_path):

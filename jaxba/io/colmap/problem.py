@@ -13,12 +13,24 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.io.colmap import lenses
-from jaxba.io.colmap.records import CAMERA_MODELS, CAMERA_SENSOR, XYZW, Frame, Image, Model, Pose, quaternions
+from jaxba.io.colmap.records import (
+    CAMERA_MODELS,
+    CAMERA_SENSOR,
+    WXYZ,
+    XYZW,
+    Frame,
+    Image,
+    Model,
+    Pose,
+    pose_of,
+    quaternions,
+)
 from jaxba.io.colmap.views import Ordered, Views, find_views, ordered
 from jaxba.io.colmap.wording import note
 from jaxba.io.files import display_name
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations
+from jaxba.problem.rigs import Rigs
 
 _EDGE = 0.01
 """A principal point is at the edge of an image within this fraction of its size."""
@@ -52,7 +64,7 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
         refine_principal_point: whether principal points are optimised.
 
     Raises:
-        ProblemError: a rig of several cameras, a lens that cannot be used, or nothing is observed.
+        ProblemError: it is not known where a camera is in its rig, a lens cannot be used, or nothing is observed.
     """
     images, notes = _registered(model)
     table = ordered(model, images)
@@ -93,7 +105,8 @@ def hints(model: Model) -> list[str]:
 
     notes = note(model.file("cameras"), np.arange(len(odd)), "principal point", "at the edge of the image", place)
     frames = _frames(model)
-    other = [one for one in model.images.values() if one.id in frames and _differ(one.pose, frames[one.id].pose)]
+    posed = lambda one: composed(place_in_rig(model, frames[one.id], one.camera), frames[one.id].pose)
+    other = [one for one in model.images.values() if one.id in frames and _differ(one.pose, posed(one))]
     where = f"with another pose than in {model.file('frames')}, which counts"
     return notes + note(model.file("images"), np.arange(len(other)), "image", where, lambda at: str(other[at]))
 
@@ -116,17 +129,10 @@ def _registered(model: Model) -> tuple[list[Image], list[str]]:
     """Registered images by id, with the poses of their frames, and notes on the others.
 
     Raises:
-        ProblemError: a frame has several cameras, or one that is not the reference of its rig.
+        ProblemError: it is not known where a camera is in its rig.
     """
     images = [model.images[identity] for identity in sorted(model.images)]
     frames = _frames(model)
-    for image in images:
-        frame = frames.get(image.id)
-        if frame is not None and model.rigs is not None:
-            first = model.rigs[frame.rig].sensors[0]
-            if len(frame.images) > 1 or (first.type, first.id) != (CAMERA_SENSOR, image.camera):
-                name = display_name(model.folder)
-                raise ProblemError(f"{name}: image {image.id} is of a rig of several cameras, whose poses depend on it")
     if model.frames is None:
         return images, []
     away = np.flatnonzero([image.id not in frames for image in images])
@@ -134,8 +140,61 @@ def _registered(model: Model) -> tuple[list[Image], list[str]]:
     notes = note(model.file("images"), away, "image", "left out, without a frame", lambda at: str(images[at]))
     name = lambda at: f"frame {lost[at].id}"
     notes += note(model.file("frames"), np.arange(len(lost)), "frame", "left out, without an image", name)
-    posed = [replace(image, pose=frames[image.id].pose) for image in images if image.id in frames]
-    return posed, notes
+    posed = [image for image in images if image.id in frames]
+    return [
+        replace(image, pose=composed(place_in_rig(model, frames[image.id], image.camera), frames[image.id].pose))
+        for image in posed
+    ], notes
+
+
+def place_in_rig(model: Model, frame: Frame, camera: int) -> Pose | None:
+    """Where a camera is in the rig of a frame; None for the reference sensor.
+
+    Raises:
+        ProblemError: it is not known.
+    """
+    assert model.rigs is not None
+    sensors = model.rigs[frame.rig].sensors
+    at = next(at for at, one in enumerate(sensors) if (one.type, one.id) == (CAMERA_SENSOR, camera))
+    if at and sensors[at].from_rig is None:
+        raise ProblemError(f"{model.file('rigs')}: rig {frame.rig}: it is not known where camera {camera} is in it")
+    return sensors[at].from_rig if at else None
+
+
+def composed(outer: Pose | None, inner: Pose) -> Pose:
+    """The transform `outer` after `inner`; exactly the inner one for None."""
+    if outer is None:
+        return inner
+    from scipy.spatial.transform import Rotation
+
+    first, second = (Rotation.from_quat(quaternions([pose])[0, XYZW]) for pose in (inner, outer))
+    translation = second.apply(inner.tvec) + np.array(outer.tvec)
+    return pose_of([*(second * first).as_quat()[WXYZ], *translation])
+
+
+def inverse(pose: Pose) -> Pose:
+    """The inverse transform."""
+    from scipy.spatial.transform import Rotation
+
+    back = Rotation.from_quat(quaternions([pose])[0, XYZW]).inv()
+    return pose_of([*back.as_quat()[WXYZ], *(-back.apply(pose.tvec))])
+
+
+def _rigs_of(model: Model, images: list[Image]) -> Rigs | None:
+    """The rigs of a problem of these images; None if no two of them are of one frame."""
+    frames = _frames(model)
+    ids = [frames[image.id].id if image.id in frames else -1 for image in images]
+    if model.frames is None or len(set(ids)) == len(ids):
+        return None
+    from scipy.spatial.transform import Rotation
+
+    places = [place_in_rig(model, frames[image.id], image.camera) for image in images]
+    same = pose_of([1, 0, 0, 0, 0, 0, 0])
+    poses = [same if place is None else place for place in places]
+    flip = np.diag(COLMAP_FLIP)
+    rotations = flip @ Rotation.from_quat(quaternions(poses)[:, XYZW]).as_matrix()
+    translations = np.array([pose.tvec for pose in poses]) * COLMAP_FLIP
+    return Rigs(np.unique(ids, return_inverse=True)[1].astype(np.int32), rotations, translations)
 
 
 def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
@@ -181,4 +240,4 @@ def _problem(
         )
     except ProblemError as error:
         raise ProblemError(f"{display_name(model.folder)}: {error}") from error
-    return problem, cameras
+    return problem.replace(rigs=_rigs_of(model, images)), cameras

@@ -19,6 +19,7 @@ def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point
     Cameras are the registered images, by id, and points are sorted by id. Lenses keep their camera models and numbers;
     as in COLMAP, focal lengths and distortion are optimised, shared by the images of a camera. If all are
     SIMPLE_PINHOLE, SIMPLE_RADIAL or RADIAL and principal points stay, they become BAL's lenses, which are faster.
+    Images of one frame of a rig move together; where cameras are in their rigs is constant.
 
     What is wrong with one view, point or image only is left out, and a `ProblemWarning` says what and how many.
 
@@ -28,8 +29,8 @@ def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point
         refine_principal_point: whether principal points are optimised, too. COLMAP's default is no.
 
     Raises:
-        ProblemError: no model, one whose structure is damaged, rigs of several cameras, nothing is observed, or a part
-            would be left out and `strict`; one line that names the file, and the record by its own id.
+        ProblemError: no model, one whose structure is damaged, a rig that does not say where a camera is, nothing is
+            observed, or a part would be left out and `strict`; one line that names the file, and the record by its id.
     """
     model = read_model(folder)
     assembled = assemble(model, refine_principal_point=refine_principal_point)

@@ -14,7 +14,7 @@ from jaxba.io.colmap import lenses
 from jaxba.io.colmap.create import create_model, mean_errors
 from jaxba.io.colmap.encode import encode
 from jaxba.io.colmap.folder import is_binary, read_model
-from jaxba.io.colmap.problem import Assembled, assemble
+from jaxba.io.colmap.problem import Assembled, assemble, composed, inverse, place_in_rig
 from jaxba.io.colmap.records import (
     CAMERA_MODELS,
     CAMERA_SENSOR,
@@ -98,13 +98,20 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
     }
     frames = model.frames
     if frames is not None:
-        moved = {
-            frame.id: replace(frame, pose=new_images[image].pose)
-            for frame in frames.values()
-            for _, image in frame.images
-            if image in new_images
-        }
-        frames = {**frames, **moved}
+        changed = {image.id for image, kept in zip(assembled.images, same, strict=True) if not kept}
+        for frame in model.frames.values() if model.frames is not None else ():
+            seen = [(camera, image) for camera, image in frame.images if image in changed]
+            if not seen:
+                continue
+            camera, image = seen[0]
+            place = place_in_rig(model, frame, camera)
+            pose = new_images[image].pose
+            moved = pose if place is None else composed(inverse(place), pose)
+            frames = {**frames, frame.id: replace(frame, pose=moved)}
+            for camera, image in frame.images:  # also of images that see nothing
+                if image in model.images:
+                    at = composed(place_in_rig(model, frame, camera), moved)
+                    new_images[image] = replace(new_images.get(image, model.images[image]), pose=at)
     heads = model.points.heads.copy()
     heads["xyz"][assembled.points] = points
     with np.errstate(over="ignore", invalid="ignore"):
