@@ -50,6 +50,7 @@ from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, sce
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.covariance import Covariance, covariance
+from jaxba.solver.implicit import SolveInputs, differentiable_solve, inputs_of
 from jaxba.solver.loop import Carry, History, solve_loop
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Prepared, prepare
@@ -94,6 +95,7 @@ __all__ = [
     "SceneConfig",
     "Schedule",
     "Solution",
+    "SolveInputs",
     "SolveOptions",
     "StepInfo",
     "StepOptions",
@@ -101,9 +103,11 @@ __all__ = [
     "Tolerances",
     "build_layout",
     "covariance",
+    "differentiable_solve",
     "drop_invalid",
     "hold",
     "initial_state",
+    "inputs_of",
     "lm_step",
     "load_policy",
     "make_method",

@@ -208,6 +208,14 @@ def apply_reduced(
     return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(rows, layout.camera_levels)
 
 
+def lift_to_cameras(layout: Layout, linear: Linearization, points: PointSystem) -> Float[Array, "cameras width"]:
+    """`E (C + D_p)^-1 g_p = sum Y h` of every camera, for the solved gradients h of the points."""
+    solved = take(jnp.stack(points.solved), layout.slot_point)
+    over, under = (sum(points.projected[k][i] * solved[i] for i in range(3)) for k in range(2))
+    rows = as_rows([a * over + b * under for a, b in zip(*linear.camera_jacobian, strict=True)])
+    return tree_sum(rows, layout.camera_levels)
+
+
 def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "sorted three_width"]:
     """`Y^T` [3, width] of every observation, flattened, sorted by camera (structure/layout.py)."""
     assert system.rows is not None

@@ -1,0 +1,262 @@
+"""Derivatives of what a solve finds, by the implicit function theorem.
+
+At a minimum the gradient g of the cost by the unknowns y vanishes, g(y, theta) = 0, where theta are observations,
+priors and what is constant. So
+
+    dy/dtheta = -H^-1 dg/dtheta,    H = dg/dy,
+
+with the exact Hessian H, not its Gauss-Newton approximation. Reverse mode takes one solve with H: conjugate gradients
+with products by forward over reverse mode, preconditioned by the Schur complement of the Gauss-Newton system, that is,
+by the linear solver of the solve itself. Nothing is differentiated through iterations.
+
+Source: Griewank and Walther 2008, "Evaluating Derivatives", chapter 15; Blondel et al. 2022, "Efficient and Modular
+Implicit Differentiation".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.scipy.sparse.linalg import cg
+from jaxtyping import Float
+
+from jaxba.damping import DampingPolicy
+from jaxba.linear.reduced_system import solve_reduced
+from jaxba.linear.schur import (
+    PointSystem,
+    RotationCoordinates,
+    back_substitute,
+    camera_system,
+    eliminate_points,
+    lift_to_cameras,
+)
+from jaxba.linear.two_level import Anchor
+from jaxba.lm.step import initial_state
+from jaxba.model import camera
+from jaxba.model.linearize import cost, linearize, only_free
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
+from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.solver.options import SolveOptions, checked_options
+from jaxba.solver.prepare import DEFAULT_POLICY, numerics, set_up
+from jaxba.solver.solve import solve
+from jaxba.structure.layout import Layout
+from jaxba.typing import AnyArray
+
+DAMPING = 1e-10
+"""lambda of the Gauss-Newton system in the preconditioner: enough that a free gauge leaves it positive definite."""
+
+TOLERANCE = 1e-12
+"""Relative residual at which conjugate gradients with the exact Hessian stop."""
+
+MAX_PRODUCTS = 300
+"""Most products with the exact Hessian. Where residuals are small the Gauss-Newton system is nearly it, and ten do."""
+
+
+class SolveInputs(NamedTuple):
+    """What a solution depends on."""
+
+    observations: Float[AnyArray, "observations 2"]
+    """Measured pixels."""
+
+    cameras: Float[AnyArray, "cameras parameters"]
+    """Cameras at the start; the solution depends on what of them is constant."""
+
+    points: Float[AnyArray, "points 3"]
+    """Points at the start; the solution depends on the constant ones."""
+
+    positions: Float[AnyArray, "cameras 3"] | None = None
+    """Measured positions, if the problem has priors."""
+
+
+def inputs_of(problem: BundleProblem) -> SolveInputs:
+    """The numbers of a problem that `differentiable_solve` takes."""
+    positions = None if problem.priors is None else problem.priors.positions
+    return SolveInputs(problem.observations, problem.cameras, problem.points, positions)
+
+
+def differentiable_solve(
+    problem: BundleProblem, policy: str | DampingPolicy = DEFAULT_POLICY, options: SolveOptions | None = None
+) -> Callable[[SolveInputs], tuple[Float[Array, "cameras parameters"], Float[Array, "points 3"]]]:
+    """A solve as a function with derivatives: from `SolveInputs` to the cameras and points at the minimum.
+
+    Reverse mode (`jax.grad`, `jax.vjp`) works, and not inside `jax.jit`, since the solve runs from Python. 64 bits must
+    be enabled in JAX. The start is that of the inputs, and the minimum that it leads to counts as a function of them.
+
+    Args:
+        problem: says everything that the inputs do not: who sees what, lenses, constants, priors, rigs.
+        policy: as for `solve`.
+        options: as for `solve`. Tolerances should be tight: the theorem holds at a minimum.
+
+    Returns:
+        A function; its derivatives raise a ProblemError if conjugate gradients do not solve with the Hessian, as where
+        the solution is not determined. With a free gauge only what does not depend on the gauge has derivatives.
+    """
+    options = checked_options(options)
+
+    @jax.custom_vjp
+    def find(inputs: SolveInputs) -> tuple[Array, Array]:
+        return forward(inputs)[0]
+
+    def forward(inputs: SolveInputs) -> tuple[tuple[Array, Array], tuple[SolveInputs, BundleProblem]]:
+        solved = solve(_with_inputs(problem, inputs), policy, options).problem
+        return (jnp.asarray(solved.cameras), jnp.asarray(solved.points)), (inputs, solved)
+
+    def backward(saved: tuple[SolveInputs, BundleProblem], cotangents: tuple[Array, Array]) -> tuple[SolveInputs]:
+        inputs, solved = saved
+        return (_transposed(solved, policy, options, inputs, cotangents),)
+
+    find.defvjp(forward, backward)
+    return find
+
+
+def _with_inputs(problem: BundleProblem, inputs: SolveInputs) -> BundleProblem:
+    host = lambda x: np.asarray(x, np.float64)
+    priors = problem.priors
+    if priors is not None and inputs.positions is not None:
+        priors = replace(priors, positions=host(inputs.positions))
+    return problem.replace(
+        cameras=host(inputs.cameras),
+        points=host(inputs.points),
+        observations=host(inputs.observations),
+        priors=priors,
+    )
+
+
+def _transposed(
+    solved: BundleProblem,
+    policy: str | DampingPolicy,
+    options: SolveOptions,
+    inputs: SolveInputs,
+    cotangents: tuple[Array, Array],
+) -> SolveInputs:
+    """Cotangents of the inputs for those of the solution."""
+    setup = set_up(solved, policy, replace(options, pad=False, dtype="float64"))
+    step = replace(
+        setup.options,
+        coordinates=replace(setup.options.coordinates, rotation="manifold"),
+        conjugate_gradients=ConjugateGradients(forcing=0.0, tolerance=1e-10),
+    )
+    if setup.offset is not None:
+        raise ProblemError("derivatives need a scene near the origin: shift it first (its extent is much smaller)")
+    numbered = np.stack([np.arange(solved.num_observations, dtype=float)] * 2, axis=1)
+    with numerics(np.dtype("float64")):
+        slots = set_up(solved.replace(observations=numbered), policy, replace(options, pad=False)).layout.pixels[0]
+        order = np.concatenate([np.asarray(members) for members in setup.layout.bucket_points])
+        arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), solved, inputs, cotangents)
+        found, residual = jax.jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
+    if not float(residual) < 1e-4:
+        raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
+    return found
+
+
+def _solve_transposed(
+    layout: Layout,
+    order: Array,
+    slots: Array,
+    solved: BundleProblem,
+    inputs: SolveInputs,
+    cotangents: tuple[Array, Array],
+    *,
+    options: StepOptions,
+) -> tuple[SolveInputs, Array]:
+    state = initial_state(layout, solved, options, jnp.float64)
+    unknowns = layout.unknowns
+    width = POSE_SIZE + LENS_SIZE if unknowns is None else unknowns.width
+    count = state.cameras.shape[1]
+    seen = jnp.asarray(layout.camera_seen)[:, None]
+    real = (order < solved.num_points) & jnp.ones(order.shape, bool)
+    if unknowns is not None and unknowns.free_points is not None:
+        real = real & jnp.asarray(unknowns.free_points)
+
+    def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
+        cameras = jnp.where(seen, y[0], 0)
+        return cameras if unknowns is None else unknowns.project(cameras), jnp.where(real, y[1], 0)
+
+    def moved(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
+        """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
+        cameras = state.cameras + _start_of_constants(layout, solved, theta.cameras)
+        points = state.points + _start_of_points(layout, solved, theta.points, order)
+        rows = y[0].T if unknowns is None else unknowns.of_cameras(y[0].T)
+        turned = camera.compose_left(rows[:3], cameras[:3])
+        return jnp.concatenate([turned, cameras[3:] + rows[3:]]), points + y[1]
+
+    def objective(y: tuple[Array, Array], theta: SolveInputs) -> Array:
+        pixels = jnp.where(layout.slot_mask, theta.observations.T[:, slots], 0)
+        here = replace(layout, pixels=pixels)
+        if unknowns is not None and unknowns.priors is not None and theta.positions is not None:
+            priors = replace(unknowns.priors, positions=theta.positions)
+            here = replace(here, unknowns=replace(unknowns, priors=priors))
+        return cost(here, *moved(y, theta), options.loss)
+
+    gradient = jax.grad(objective)
+    zero = jnp.zeros((count, width)), jnp.zeros_like(state.points)
+    # the cotangents in the unknowns
+    _, pull = jax.vjp(lambda y: moved(y, inputs), zero)
+    of_points = jnp.where(order < solved.num_points, 1.0, 0.0)
+    by_points = of_points * cotangents[1].T[:, jnp.minimum(order, solved.num_points - 1)]
+    right = project(pull((cotangents[0].T, by_points))[0])
+    product = lambda y: project(jax.jvp(lambda z: gradient(z, inputs), (zero,), (project(y),))[1])
+    inverse = _gauss_newton(layout, state.cameras, state.points, options)
+    found, _ = cg(product, right, tol=TOLERANCE, maxiter=MAX_PRODUCTS, M=lambda y: project(inverse(project(y))))
+    left = jax.tree.map(lambda a, b: a - b, product(found), right)
+    size = lambda y: jnp.sqrt(sum(jnp.sum(part * part) for part in y))
+    # dL/dtheta = -w . dg/dtheta, and what of the solution is constant passes directly
+    _, transpose = jax.vjp(lambda theta: gradient(zero, theta), inputs)
+    direct = jax.vjp(lambda theta: moved(zero, theta), inputs)[1]((cotangents[0].T, by_points))[0]
+    through = transpose(found)[0]
+    total = jax.tree.map(lambda a, b: b - a, through, direct)
+    return total, size(left) / jnp.maximum(size(right), jnp.finfo(right[0].dtype).tiny)
+
+
+def _start_of_constants(layout: Layout, solved: BundleProblem, cameras: Array) -> Array:
+    """Zero, with the derivative of the solution's constant numbers by those of the start."""
+    unknowns = layout.unknowns
+    constant = jnp.zeros(cameras.shape, bool)
+    if unknowns is not None and unknowns.free is not None:
+        every = jnp.ones((unknowns.width, cameras.shape[0]), cameras.dtype)
+        free = unknowns.expanded(jnp.where(jnp.asarray(unknowns.free), every, 0))
+        constant = free.T == 0
+    elif unknowns is not None:
+        constant = unknowns.expanded(jnp.ones((unknowns.width, cameras.shape[0]))).T == 0
+    kept = jnp.where(constant, cameras, 0)
+    return (kept - jax.lax.stop_gradient(kept)).T
+
+
+def _start_of_points(layout: Layout, solved: BundleProblem, points: Array, order: Array) -> Array:
+    """The same for points, in layout order."""
+    unknowns = layout.unknowns
+    if unknowns is None or unknowns.free_points is None:
+        return jnp.zeros((3, len(order)))
+    own = points.T[:, jnp.minimum(order, solved.num_points - 1)]
+    kept = jnp.where(jnp.asarray(unknowns.free_points), 0, own)
+    return kept - jax.lax.stop_gradient(kept)
+
+
+def _gauss_newton(
+    layout: Layout, cameras: Array, points: Array, options: StepOptions
+) -> Callable[[tuple[Array, Array]], tuple[Array, Array]]:
+    """`(J^T J + D)^-1` by the Schur complement, as a function of a right-hand side of cameras and points."""
+    linear = only_free(layout, linearize(layout, cameras, points, options.loss), options.intrinsics)
+    damping = jnp.asarray(DAMPING, cameras.dtype)
+    coordinates = RotationCoordinates.of(cameras, options)
+    eliminated = eliminate_points(layout, linear, damping, options)
+    system = camera_system(layout, linear, eliminated, coordinates, damping, options)
+    frames = camera.frames(cameras)
+    anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
+
+    def inverse(right: tuple[Array, Array]) -> tuple[Array, Array]:
+        by_points: PointSystem = eliminated._replace(solved=[-x for x in eliminated.factor.forward(list(right[1]))])
+        lifted = lift_to_cameras(layout, linear, by_points)
+        solved, _ = solve_reduced(
+            layout, linear, by_points, system._replace(right=right[0] + lifted), anchor, options, 0.0
+        )
+        return solved, jnp.stack(back_substitute(layout, linear, by_points, solved))
+
+    return inverse
