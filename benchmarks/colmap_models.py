@@ -2,7 +2,7 @@
 
     python -m benchmarks.colmap_models [--models OPENCV,FOV] [--seed 0] [--frames 12] [--points 80]
 
-Needs the extra `colmap`. For every model, free numbers (focal length; and distortion; and principal point) and sharing
+Needs the extra `ceres`. For every model, free numbers (focal length; and distortion; and principal point) and sharing
 (a lens each, one for all, two) the initial and the final cost over COLMAP's, less one. Then constants, both gauges and
 position priors. Nothing is written.
 """

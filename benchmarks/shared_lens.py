@@ -2,7 +2,7 @@
 
     python -m benchmarks.shared_lens [--images 3000] [--points 30000] [--track 5] [--policy guarded]
 
-Needs the extra `colmap`. Each side is a process of its own; memory is its largest resident set. Both read the same
+Needs the extra `ceres`. Each side is a process of its own; memory is its largest resident set. Both read the same
 COLMAP model, have a squared loss and stop at a relative decrease of 1e-6; ours are compiled, and COLMAP uses all cores.
 """
 

@@ -181,14 +181,14 @@ def _solve_transposed(
 
     def moved(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
         """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
-        cameras = state.cameras + _start_of_constants(layout, solved, theta.cameras)
-        points = state.points + _start_of_points(layout, solved, theta.points, order)
+        cameras = state.cameras + _start_of_constants(layout, solved, jnp.asarray(theta.cameras))
+        points = state.points + _start_of_points(layout, solved, jnp.asarray(theta.points), order)
         rows = y[0].T if unknowns is None else unknowns.of_cameras(y[0].T)
         turned = camera.compose_left(rows[:3], cameras[:3])
         return jnp.concatenate([turned, cameras[3:] + rows[3:]]), points + y[1]
 
     def objective(y: tuple[Array, Array], theta: SolveInputs) -> Array:
-        pixels = jnp.where(layout.slot_mask, theta.observations.T[:, slots], 0)
+        pixels = jnp.where(layout.slot_mask, jnp.asarray(theta.observations).T[:, slots], 0)
         here = replace(layout, pixels=pixels)
         if unknowns is not None and unknowns.priors is not None and theta.positions is not None:
             priors = replace(unknowns.priors, positions=theta.positions)

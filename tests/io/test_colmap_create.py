@@ -77,7 +77,7 @@ def test_the_principal_point_is_the_centre_of_the_smallest_even_image_with_all_p
 
 @pytest.mark.extra
 def test_colmap_reads_the_model_with_the_same_cost_and_our_names(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
+    pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
     problem = support.tiny()
     write_colmap(problem, tmp_path / "new")
     model = pycolmap.Reconstruction(str(tmp_path / "new"))

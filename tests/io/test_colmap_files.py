@@ -16,7 +16,7 @@ from jaxba.io.colmap.folder import read_model
 from jaxba.io.colmap.lenses import principal_point
 from jaxba.io.colmap.records import CAMERA_MODELS, NO_POINT, SENSORS, Camera, Model
 
-pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
+pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
 pytestmark = pytest.mark.extra
 

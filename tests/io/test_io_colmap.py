@@ -34,7 +34,7 @@ from jaxba.io.colmap.lenses import AS_BAL
 from jaxba.problem import geometry
 from jaxba.problem.camera_models import CAMERA_MODELS
 
-pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[colmap]")
+pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
 pytestmark = pytest.mark.extra
 
