@@ -230,20 +230,21 @@ def test_other_methods_refuse_shared_lenses(method):
         solve(shared(), "ceres", method=method)
 
 
-@pytest.mark.parametrize("solver", ["sparse", "implicit", "cg"])
-@pytest.mark.parametrize("preconditioner", ["two-level", "schur-jacobi", "jacobi"])
+@pytest.mark.parametrize(
+    ("solver", "preconditioner"),
+    [("sparse", "two-level"), ("implicit", "two-level"), ("implicit", "schur-jacobi"), ("cg", "jacobi")],
+)
 def test_conjugate_gradients_find_the_step_of_the_dense_problem_with_shared_lenses(solver, preconditioner):
     rule = ConjugateGradients(preconditioner, forcing=0.0, tolerance=1e-13, budget=200)
-    for problem in (shared(), unseen()):
-        options = StepOptions(linear_solver=solver, conjugate_gradients=rule)
-        layout, before = support.start(problem, options)
-        after, info = support.step(layout, before, 1e-2, options, min_gain=-np.inf)
-        assert info.cg_iterations > 0
-        found = support.difference(problem, support.back(problem, before, after), options)
-        wanted = dense_step(problem, options, 1e-2)
-        seen = np.ones(len(wanted), bool)
-        seen[: problem.cameras.size] = np.repeat(np.isin(np.arange(problem.num_cameras), problem.camera_index), 9)
-        np.testing.assert_allclose(found[seen], wanted[seen], rtol=0, atol=1e-7 * np.abs(wanted).max())
+    problem, options = unseen(), StepOptions(linear_solver=solver, conjugate_gradients=rule)
+    layout, before = support.start(problem, options)
+    after, info = support.step(layout, before, 1e-2, options, min_gain=-np.inf)
+    assert info.cg_iterations > 0
+    found = support.difference(problem, support.back(problem, before, after), options)
+    wanted = dense_step(problem, options, 1e-2)
+    seen = np.ones(len(wanted), bool)
+    seen[: problem.cameras.size] = np.repeat(np.isin(np.arange(problem.num_cameras), problem.camera_index), 9)
+    np.testing.assert_allclose(found[seen], wanted[seen], rtol=0, atol=1e-7 * np.abs(wanted).max())
 
 
 def test_clusters_are_split_by_shared_lenses_whose_columns_they_have_in_common():
