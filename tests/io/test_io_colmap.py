@@ -21,6 +21,8 @@ from jaxba import (
     ProblemError,
     Refinement,
     SolveOptions,
+    covariance,
+    hold,
     read_colmap,
     read_problem,
     solve,
@@ -498,3 +500,31 @@ def test_a_start_far_from_the_end_is_solved_with_a_shared_lens(tmp_path):
     near = solve(problem, "learned").final_cost
     options = SolveOptions(refinement=Refinement(points=3))
     np.testing.assert_allclose(solve(far, "ceres", options).final_cost, near, rtol=1e-4)
+
+
+def test_covariances_are_colmaps(tmp_path):
+    folder = write(rigs_of(1), tmp_path / "model")
+    problem = solve(read_problem(folder), "ceres", SolveOptions(max_iterations=100)).problem
+    write_colmap(problem, tmp_path / "solved", like=folder)
+    points = [0, 20, 40]
+    found = covariance(hold(problem, points=points))
+    model = pycolmap.Reconstruction(str(tmp_path / "solved"))
+    options, config = pycolmap.BundleAdjustmentOptions(print_summary=False), pycolmap.BundleAdjustmentConfig()
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.TRIVIAL
+    for identity in model.reg_image_ids():
+        config.add_image(identity)
+    for point in points:
+        config.add_constant_point(int(problem.labels.points[point]))
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    settings = pycolmap.BACovarianceOptions()
+    settings.params = pycolmap.BACovarianceOptionsParams.ALL
+    truth = pycolmap.estimate_ba_covariance(settings, model, adjuster)
+    # COLMAP's tangents of rotations are half angles, and its axes are turned
+    axes = np.kron(np.diag([0.5, 1.0]), np.diag(geometry.COLMAP_FLIP))
+    for camera in (0, 3):
+        theirs = truth.get_cam_cov_from_world(int(problem.labels.images[camera]))
+        ours = axes @ found.poses[camera] @ axes.T
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-7 * np.abs(theirs).max())
+    for point in (1, 33):
+        theirs = truth.get_point_cov(int(problem.labels.points[point]))  # of given cameras
+        np.testing.assert_allclose(found.points_given_cameras[point], theirs, rtol=1e-6)
