@@ -37,10 +37,11 @@ class ColmapProblem:
         """Copies the parameters; `problem` is not changed.
 
         Raises:
-            ProblemError: the problem has covariances, or shared or partly fixed lenses.
+            ProblemError: the problem has covariances, lenses, constants, priors or rigs.
         """
-        if problem.whitening is not None or problem.lenses is not None:
-            raise ProblemError("Ceres as a peer takes no covariances or weights, and no shared or partly fixed lenses")
+        parts = problem.whitening, problem.lenses, problem.constants, problem.priors, problem.rigs
+        if any(part is not None for part in parts):
+            raise ProblemError("Ceres as a peer takes BAL's cameras, and no weights, lenses, constants, priors or rigs")
         self.start = problem
         self.poses, self.lenses, self.points = _parameters(problem)
         self.pixels = np.asarray(problem.observations, np.float64) * FLIP[:2]

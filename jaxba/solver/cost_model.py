@@ -282,7 +282,8 @@ def _check_method(problem: BundleProblem, options: StepOptions) -> None:
     lenses, name = problem.lenses, options.method.name
     if problem.rigs is not None:
         raise ProblemError(f"rigs need plain LM, not {name}")
-    if lenses is not None and lenses.shared and options.intrinsics == "free":
+    shared = lenses is not None and lenses.shared and np.asarray(lenses.free).any()
+    if shared and options.intrinsics == "free":
         raise ProblemError(f"shared lenses need plain LM, not {name}")
     if problem.priors is not None:
         raise ProblemError(f"priors need plain LM, not {name}")

@@ -88,6 +88,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Every point starts from the midpoint of the rays of its pixels and at several distances from the first camera that
     sees it (`START_DISTANCES`), and takes `POINT_ITERATIONS` Gauss-Newton steps from each start. It moves to the best
     result, if the cost falls enough (`MIN_RELATIVE_GAIN`, `MIN_GAIN`) and it is behind no more cameras than before.
+    Constant points stay.
 
     Args:
         problem: best at the end of a solve: at a bad start points would be fitted to wrong cameras.
@@ -143,6 +144,9 @@ def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 poin
 
     starts = [origin + factor * (start - origin) for factor in START_DISTANCES] + [midpoints(layout, frames)]
     (points, costs), _ = lax.scan(try_start, (start, own), jnp.stack(starts))
+    unknowns = layout.unknowns
+    if unknowns is not None and unknowns.free_points is not None:
+        costs = jnp.where(unknowns.free_points, costs, own)
     moved = own - costs > jnp.maximum(MIN_RELATIVE_GAIN * own, MIN_GAIN * jnp.mean(costs))
     before = jnp.sum(own)
     # XLA may sum the same numbers in two orders: where nothing moves the cost stays to the last digit

@@ -17,6 +17,7 @@ from jaxba import (
     covariance,
     hold,
     release,
+    retriangulate,
     solve,
     with_gauge,
     with_lens_priors,
@@ -226,3 +227,13 @@ def test_the_covariance_of_a_relative_pose_does_not_depend_on_the_gauge():
 def test_prepare_takes_what_is_constant_and_known():
     assert prepare(known()).layout.unknowns.priors is not None
     assert prepare(held()).layout.unknowns.free is not None
+
+
+def test_constant_points_stay_when_points_are_looked_for_anew():
+    problem = support.strayed(3.0)
+    free = retriangulate(problem)
+    assert free.moved > 0
+    where = np.flatnonzero((free.problem.points != problem.points).any(axis=1))[:1]
+    found = retriangulate(hold(problem, points=where))
+    assert (found.problem.points[where] == problem.points[where]).all()
+    assert found.moved == free.moved - 1
