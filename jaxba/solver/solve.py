@@ -114,7 +114,7 @@ def solve(
     Raises:
         ValueError: unknown names, or options that exclude each other, or that contradict the name of the policy.
         ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
-            the linear solver or method does not support shared or partly fixed intrinsics.
+            the method does not support what the problem has (shared lenses, priors, rigs).
     """
     options = checked_options(options)
     setup = set_up(problem, policy, options)

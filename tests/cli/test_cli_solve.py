@@ -408,7 +408,7 @@ BAD = {
     "solver of a method": (lambda tiny: [str(tiny), "--method", "poba", "--linear-solver", "sparse"], "has its own"),
     "fixed intrinsics of a method": (
         lambda tiny: [str(tiny), "--intrinsics", "fixed", "--method", "ddlm"],
-        "--intrinsics 'fixed' need the explicit solver, not ddlm",
+        "ddlm optimises all numbers of BAL cameras, and nothing else",
     ),
     "negative refinement": (lambda tiny: [str(tiny), "--refine-points", "-1"], "--refine-points must be at least 0"),
     "learned in another unit": (lambda tiny: [str(tiny), "--scaling", "identity"], "not with scaling 'identity'"),

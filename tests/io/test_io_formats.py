@@ -69,7 +69,7 @@ def test_what_readers_remark_is_printed_as_notes(tmp_path, capsys):
     assert run([str(path), "--max-iterations", "1", "--output", str(tmp_path / "a.txt")]) == 0
     printed = capsys.readouterr()
     assert printed.out.startswith(f"note: {path}: the principal point of intrinsic 0 lies at the edge")
-    assert "note: that file cannot store: which images share a lens, which numbers of a lens stay" in printed.out
+    assert "note: that file cannot store: which images share a lens, which numbers of a lens are" in printed.out
     assert printed.err == ""
 
 
