@@ -33,8 +33,13 @@ def game():
     return make_game(replace(RULES, agent=CONFIG, reward="price", max_iterations=25), [KIND], [bank], [4])
 
 
-def test_the_base_policy_pays_what_it_pays_in_an_evaluation(game):
-    (alone,) = look_ahead(game, POLICY, ACTIONS, looks=False)
+@pytest.fixture(scope="module")
+def alone(game):
+    """The base policy's own episodes."""
+    return look_ahead(game, POLICY, ACTIONS, looks=False)[0]
+
+
+def test_the_base_policy_pays_what_it_pays_in_an_evaluation(game, alone):
     (bank,), rules = game.banks, game.config
     run = play(KIND, bank, POLICY, CONFIG.step_options(StepOptions()), rules.max_iterations, ftol=0.0)
     reached = reach(run.costs[:, 1:], np.asarray(bank.best_cost), rules.tolerance) + 1
@@ -42,15 +47,15 @@ def test_the_base_policy_pays_what_it_pays_in_an_evaluation(game):
     np.testing.assert_array_equal(alone.success, np.isfinite(reached))
 
 
-def test_it_pays_no_more_than_its_base_and_less_somewhere(game):
-    (alone,), (ahead,) = (look_ahead(game, POLICY, ACTIONS, looks) for looks in (False, True))
+def test_it_pays_no_more_than_its_base_and_less_somewhere(game, alone):
+    (ahead,) = look_ahead(game, POLICY, ACTIONS, looks=True)
     assert (ahead.paid <= alone.paid * (1 + 1e-9)).all()
     assert (ahead.paid < 0.95 * alone.paid).any()
 
 
-def test_its_first_prices_are_those_of_the_whole_episodes(game):
+def test_its_first_prices_are_those_of_the_whole_episodes(game, alone):
     """The base policy's own action leads to what it pays alone."""
-    (alone,), (bank,) = look_ahead(game, POLICY, ACTIONS, looks=False), game.banks
+    (bank,) = game.banks
     prices = jax.jit(
         lambda scene: play_on(game, KIND, bank, POLICY, jnp.asarray([POLICY.action]), game.start(bank, scene))
     )
