@@ -7,21 +7,14 @@ COLMAP 3.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from jaxba.cli.common import UsageError
 
 PREFIXES = ("--BundleAdjustment.", "--BundleAdjustmentCeres.")
 
 
-class Option(NamedTuple):
-    """An option of COLMAP."""
-
-    here: str
-    """What it is here, for the documents."""
-
-    arguments: Callable[[str], list[str]]
-    """Arguments of `jaxba-solve` for a value."""
+Option = Callable[[str], list[str]]
+"""From the value of an option of COLMAP to arguments of `jaxba-solve`."""
 
 
 def _flag(name: str, if_true: list[str], if_false: list[str]) -> Option:
@@ -32,12 +25,11 @@ def _flag(name: str, if_true: list[str], if_false: list[str]) -> Option:
             raise UsageError(f"{name} must be 0 or 1, not {value!r}")
         return words[value.lower()]
 
-    shown = (" ".join(side) or "the default" for side in (if_true, if_false))
-    return Option("1: `{}`; 0: `{}`".format(*shown).replace("`the default`", "the default"), arguments)
+    return arguments
 
 
 def _same(option: str) -> Option:
-    return Option(f"`{option}`", lambda value: [option, value])
+    return lambda value: [option, value]
 
 
 def _sensor_from_rig(value: str) -> list[str]:
@@ -63,14 +55,14 @@ OPTIONS: dict[str, Option] = {
     "refine_extra_params": _flag("refine_extra_params", [], _constant("distortion")),
     "refine_points3D": _flag("refine_points3D", [], _constant("points")),
     "refine_rig_from_world": _flag("refine_rig_from_world", [], _constant("poses")),
-    "refine_sensor_from_rig": Option("0: what is done", _sensor_from_rig),
+    "refine_sensor_from_rig": _sensor_from_rig,
     "refine_extrinsics": _flag("refine_extrinsics", [], _constant("poses")),
     "constant_rig_from_world_rotation": _flag("constant_rig_from_world_rotation", _constant("rotations"), []),
     "max_num_iterations": _same("--max-iterations"),
     "function_tolerance": _same("--ftol"),
     "gradient_tolerance": _same("--gtol"),
     "parameter_tolerance": _same("--xtol"),
-    "loss_function_type": Option("`--loss`", _loss),
+    "loss_function_type": _loss,
     "loss_function_scale": _same("--loss-scale"),
 }
 """Options of COLMAP's bundle adjustment by name."""
@@ -88,6 +80,10 @@ def translated(argv: Sequence[str]) -> list[str]:
     found, paths, constants, words = [], [], [], list(argv)
     while words:
         word = words.pop(0)
+        if word == "--constant":  # gathered with those of COLMAP's options
+            while words and not words[0].startswith("--"):
+                constants.append(words.pop(0))
+            continue
         name, equals, value = word.partition("=")
         if name not in PATHS and not name.startswith(PREFIXES):
             found.append(word)
@@ -104,7 +100,7 @@ def translated(argv: Sequence[str]) -> list[str]:
         own = name.rpartition(".")[2]
         if own not in OPTIONS:
             raise UsageError(f"{name} is not an option here; of COLMAP's are {', '.join(OPTIONS)}")
-        arguments = OPTIONS[own].arguments(value)
+        arguments = OPTIONS[own](value)
         if arguments[:1] == ["--constant"]:
             constants += arguments[1:]
         else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -39,19 +39,29 @@ def constrained(
         ProblemError: as the functions of `jaxba` that do it.
     """
     settings = {} if file is None else _read(file)
+    first = [key for key in settings if key == "position_priors"]  # the scene is aligned before anything is constant
+    for key in first:
+        problem = _applied(problem, file, key, settings.pop(key))
     try:
         numbers = [one.replace("-", "_") for one in constant if one not in PARTS]
         parts: dict[str, Any] = {part: "all" for part in PARTS if part in constant}
         problem = hold(problem, numbers=numbers, **parts)
     except ValueError as error:
         raise UsageError(f"--constant: {error}") from None
+    in_file = settings.pop("gauge", "free")
+    if in_file not in get_args(Gauge):
+        raise UsageError(f"--constraints {file}: gauge: must be one of {', '.join(get_args(Gauge))}, not {in_file!r}")
     for key, value in settings.items():
-        try:
-            problem = _apply(problem, key, value)
-        except (ValueError, TypeError, AttributeError) as error:
-            raise UsageError(f"--constraints {file}: {key}: {error}") from None
-    wanted = gauge or settings.get("gauge", "free")
-    return with_gauge(problem, wanted)
+        problem = _applied(problem, file, key, value)
+    return with_gauge(problem, gauge or in_file)
+
+
+def _applied(problem: BundleProblem, file: str | None, key: str, value: Any) -> BundleProblem:
+    try:
+        return _apply(problem, key, value)
+    except (ValueError, TypeError, AttributeError, LookupError, OverflowError) as error:
+        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise UsageError(f"--constraints {file}: {key}: {what}") from None
 
 
 def _read(file: str) -> dict[str, Any]:
@@ -67,21 +77,24 @@ def _read(file: str) -> dict[str, Any]:
 
 def _apply(problem: BundleProblem, key: str, value: Any) -> BundleProblem:
     labels = problem.labels
-    images = lambda wanted: np.array(wanted, np.int64) if labels is None else labels.images_at(wanted)
+    images = lambda wanted: wanted if labels is None else labels.images_at(wanted)
     if key == "constant_poses":
         return hold(problem, poses=images(value))
     if key == "constant_rotations":
         return hold(problem, rotations=images(value))
     if key == "constant_points":
-        return hold(problem, points=np.array(value, np.int64) if labels is None else labels.points_at(value))
+        return hold(problem, points=value if labels is None else labels.points_at(value))
     if key == "constant_cameras":
-        return hold(problem, lenses=np.array(value, np.int64) if labels is None else labels.lenses_at(value))
+        return hold(problem, lenses=value if labels is None else labels.lenses_at(value))
     if key == "constant_numbers":
         return hold(problem, numbers=value)
     if key == "position_priors":
+        unknown = [one for one in value if one not in ("positions", "stddev", "loss", "loss_scale")]
+        if unknown:
+            raise ValueError(f"unknown key {unknown[0]!r}; there are positions, stddev, loss and loss_scale")
         positions = value["positions"]
         spread = np.broadcast_to(np.asarray(value.get("stddev", 1.0), np.float64), 3)
         loss = Loss(value.get("loss", "squared"), float(value.get("loss_scale", 1.0)))
-        at = images(list(positions)).tolist()
+        at = np.asarray(images(list(positions))).tolist()
         return with_position_priors(problem, list(positions.values()), np.diag(spread**2), images=at, loss=loss)
-    return problem  # the gauge comes last
+    raise ValueError("unknown key")

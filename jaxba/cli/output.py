@@ -30,7 +30,7 @@ def _is_like_source(output: str, source: str | None) -> bool:
     return source is not None and is_colmap(source) and is_model(output, source)
 
 
-def check_outputs(output: str | None, log: str | None, source: str | None) -> None:
+def check_outputs(output: str | None, log: str | None, source: str | None, name: str = "--log") -> None:
     """Checks that the output files can be written and differ from each other and from the problem.
 
     Raises:
@@ -43,11 +43,11 @@ def check_outputs(output: str | None, log: str | None, source: str | None) -> No
     else:
         common.check_writable("--output", output)
         check_output(output or "")
-    common.check_writable("--log", log)
+    common.check_writable(name, log)
     if log and output and Path(log).resolve() == Path(output).resolve():
         raise common.UsageError(f"--output and --log name the same file, {output}")
     if log and source and Path(log).resolve() == Path(source).resolve():
-        raise common.UsageError(f"--log names the problem's file, {log}")
+        raise common.UsageError(f"{name} names the problem's file, {log}")
 
 
 def check_storable(output: str | None, problem: BundleProblem, source: str | None) -> None:

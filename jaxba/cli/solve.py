@@ -24,7 +24,7 @@ from jaxba.io.files import open_output, stream_number
 from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.constraints import Gauge
+from jaxba.problem.constraints import Gauge, hold
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import (
     ConjugateGradients,
@@ -253,11 +253,13 @@ def _solve(args: Arguments) -> int:
     policy, options = solve_options(args)
     path = None if args.problem is None else resolve(args.problem)
     check_outputs(args.output, args.log, path)
+    check_outputs(None, args.covariance, path, "--covariance")
+    if args.covariance and args.covariance in (args.output, args.log):
+        raise common.UsageError(f"--covariance names the same file as another output, {args.covariance}")
     with common.notes_printed():
         problem = _default_scene() if path is None else _read(args, path)
         problem = constrained(problem, args.constant, args.gauge, args.constraints)
     check_storable(args.output, problem, path)
-    common.check_writable("--covariance", args.covariance)
     if args.covariance and problem.constants is None and problem.priors is None:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
     common.prepare_process(untraced=True)
@@ -270,7 +272,10 @@ def _solve(args: Arguments) -> int:
     if args.output:
         write_solution(args.output, solution.problem, path)
     if args.covariance:
-        _write_covariance(args.covariance, solution.problem, options.loss)
+        solved = solution.problem
+        if args.intrinsics == "fixed":
+            solved = hold(solved, lenses="all")
+        _write_covariance(args.covariance, solved, options.loss)
     if args.log:
         from jaxba.bench.records import record_to_json
         from jaxba.bench.run import record_of

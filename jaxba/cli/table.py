@@ -168,6 +168,8 @@ def lost_in_new_model(problem: BundleProblem) -> str:
     lost = [
         (lenses is not None and not np.asarray(lenses.free).all(), "which numbers of a lens are constant"),
         (problem.constants is not None, "which poses and points are constant"),
+        (problem.rigs is not None, "rigs"),
+        (problem.priors is not None, "priors"),
         (problem.whitening is not None, "weights of observations"),
     ]
     return ", ".join(what for is_lost, what in lost if is_lost)
@@ -179,8 +181,8 @@ def padding(problem: BundleProblem, solution: Solution) -> str:
         return f"padded to {solution.capacity}"
     if problem.lenses is not None:
         why = "the problem has shared or partly constant lenses"
-    elif problem.constants is not None:
-        why = "part of the problem is constant"
+    elif problem.constants is not None or problem.priors is not None or problem.rigs is not None:
+        why = "the problem has constants, priors or rigs"
     elif capacity_of(problem) is None:
         why = "the problem is too large"
     else:

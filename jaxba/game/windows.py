@@ -61,14 +61,16 @@ def read_all(paths: Sequence[str]) -> list[BundleProblem]:
     """The problems.
 
     Raises:
-        ProblemError: a problem cannot be read, has whitened observations or too few cameras; or none is large enough
-            for windows in two places. One line.
+        ProblemError: a problem cannot be read, has whitened observations, other lenses than BAL's or too few cameras;
+            or none is large enough for windows in two places. One line.
     """
     problems = []
     for path in paths:
         problem = read_problem(path)
         if problem.whitening is not None:
             raise ProblemError(f"{path}: windows of observations with covariances are not made")
+        if problem.lenses is not None and not problem.lenses.all_bal:
+            raise ProblemError(f"{path}: windows are made of cameras whose lenses are BAL's")
         if problem.num_cameras < FEWEST_CAMERAS:
             raise ProblemError(f"{path}: {problem.num_cameras} cameras; a window has {FEWEST_CAMERAS} at least")
         problems.append(problem)

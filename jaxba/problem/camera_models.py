@@ -11,6 +11,7 @@ Source: COLMAP 4.2, src/colmap/sensor/models.h, whose names, numbers and order o
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -37,6 +38,10 @@ class CameraModel:
     project: Callable[[Sequence[Any], Any, Any, Any], Pixel]
     """From the numbers of lenses, and x, y and z of points in the camera's frame, to pixels."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By name, so that a problem may be pickled: of a model that is registered where it is unpickled."""
+        return _registered, (self.name,)
+
     def __len__(self) -> int:
         """Number of parameters."""
         return len(self.parameters)
@@ -62,6 +67,10 @@ class CameraModel:
 
 CAMERA_MODELS: dict[str, CameraModel] = {}
 """All camera models by name."""
+
+
+def _registered(name: str) -> CameraModel:
+    return CAMERA_MODELS[name]
 
 
 def register_camera_model(name: str, parameters: str, project: Callable[..., Pixel]) -> CameraModel:
@@ -193,23 +202,30 @@ def _enhanced_unified(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
 
 
 def _equirectangular(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
+    """Pixels jump by the width where x = 0 behind the camera: an error there is not taken around the seam."""
     width, height = lens
     xp = x.__array_namespace__()
     pi = 3.141592653589793
     return width * (xp.atan2(x, z) / (2 * pi) + 0.5), height * (xp.atan2(y, xp.sqrt(x * x + z * z)) / pi + 0.5)
 
 
-def _distorted(
-    to_plane: Callable[[Any, Any, Any], Pixel], distort: Callable[..., Pixel], focals: int
-) -> Callable[[Sequence[Any], Any, Any, Any], Pixel]:
+def _distorted(to_plane: Callable[..., Pixel], distort: Callable[..., Pixel], focals: int) -> Callable[..., Pixel]:
     """A model that projects to the plane, distorts there, and scales to pixels."""
+    return functools.partial(_project_distorted, to_plane, distort, focals)
 
-    def project(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
-        cx, cy, *coefficients = lens[focals:]
-        u, v = distort(*to_plane(x, y, z), *coefficients)
-        return lens[0] * u + cx, lens[focals - 1] * v + cy
 
-    return project
+def _project_distorted(
+    to_plane: Callable[..., Pixel],
+    distort: Callable[..., Pixel],
+    focals: int,
+    lens: Sequence[Any],
+    x: Any,
+    y: Any,
+    z: Any,
+) -> Pixel:
+    cx, cy, *coefficients = lens[focals:]
+    u, v = distort(*to_plane(x, y, z), *coefficients)
+    return lens[0] * u + cx, lens[focals - 1] * v + cy
 
 
 _ONE, _TWO = "f cx cy", "fx fy cx cy"

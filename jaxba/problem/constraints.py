@@ -9,15 +9,16 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Literal, get_args
 
+import jax
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constants import ROTATION, Constants, constants_of
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
 
-Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray
+Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
 """Positions, names of images, a mask, or all of them."""
 
 Gauge = Literal["free", "two-cameras", "three-points"]
@@ -75,9 +76,11 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
 
     A cost of pixels alone does not change when the whole scene is moved, turned and scaled. `two-cameras`: the pose of
     the observed camera that is nearest to the middle of all, and one number of the translation of the one that is
-    farthest from it, are constant: the seven degrees of freedom of a similarity, and nothing else. `three-points`:
-    three points that many images see and that are far apart are constant. `free`: nothing is. Source: COLMAP,
-    `BundleAdjustmentGauge`.
+    farthest from it, are constant: the seven degrees of freedom of a similarity, and nothing else; where rigs give the
+    scene its scale, the first pose alone. `three-points`: three points that many images see and that are far apart are
+    constant. `free`: no more than is. Source: COLMAP, `BundleAdjustmentGauge`.
+
+    In a scene far from the origin (`preprocess.FAR`) the number of a translation is that of the scene shifted to it.
 
     Raises:
         ValueError: no such gauge.
@@ -88,11 +91,31 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     if gauge == "free":
         return problem
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
-    if gauge == "two-cameras":
+    if problem.rigs is not None and _has_baseline(problem):
+        if gauge == "three-points":
+            raise ProblemError("the rigs give the scene its scale: use the gauge of two cameras, which then holds one")
+        constants.poses[_middle_camera(problem)] = True
+    elif gauge == "two-cameras":
         _fix_two_cameras(problem, constants)
     else:
         _fix_three_points(problem, constants)
     return _with_constants(problem, constants)
+
+
+def _has_baseline(problem: BundleProblem) -> bool:
+    """Whether two observed cameras of a frame are in different places, which fixes the scale."""
+    assert problem.rigs is not None
+    seen = np.unique(problem.camera_index)
+    centers = geometry.camera_centers(problem.cameras)[seen]
+    _, first, group = np.unique(np.asarray(problem.rigs.frame)[seen], return_index=True, return_inverse=True)
+    return bool((np.linalg.norm(centers - centers[first[group]], axis=1) > 1e-9 * np.ptp(centers)).any())
+
+
+def _middle_camera(problem: BundleProblem) -> int:
+    """The observed camera that is nearest to the middle of all."""
+    seen = np.unique(problem.camera_index)
+    centers = geometry.camera_centers(problem.cameras)[seen]
+    return int(seen[np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))])
 
 
 def _fix_two_cameras(problem: BundleProblem, constants: Constants) -> None:
@@ -100,7 +123,7 @@ def _fix_two_cameras(problem: BundleProblem, constants: Constants) -> None:
     if len(seen) < 2:
         raise ProblemError("a gauge of two cameras needs two that see points")
     centers = geometry.camera_centers(problem.cameras)[seen]
-    first = int(np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
+    first = int(np.searchsorted(seen, _middle_camera(problem)))
     second = int(np.argmax(np.linalg.norm(centers - centers[first], axis=1)))
     constants.poses[seen[first]] = True
     # its distance from the first camera along the axis of its own on which that is largest
@@ -144,22 +167,33 @@ def _mask(problem: BundleProblem, which: Which, count: int, what: str) -> Bool[n
         if which != "all":
             raise ValueError(f"which {what} must be 'all' or a list, not {which!r}")
         return np.ones(count, bool)
-    chosen = which if isinstance(which, np.ndarray) else list(which)
     mask = np.zeros(count, bool)
-    if len(chosen) and isinstance(chosen[0], str):
-        if problem.labels is None or what != "image":
-            raise ValueError(f"this problem has no names of {what} parts: give positions")
-        chosen = problem.labels.images_at(chosen)
-    if isinstance(chosen, np.ndarray) and chosen.dtype == bool:
+    chosen = np.asarray(which if isinstance(which, np.ndarray | jax.Array) else list(which))
+    if chosen.dtype == bool:
         if chosen.shape != mask.shape:
-            raise ValueError(f"a mask of {what} parts has shape {chosen.shape}, not {mask.shape}")
+            raise ValueError(f"a mask for every {what} has shape {mask.shape}, not {chosen.shape}")
         return chosen
-    at = np.asarray(chosen, np.int64)
+    at = positions_of(problem, chosen, what)
     bad = at[(at < 0) | (at >= count)]
     if len(bad):
         raise ValueError(f"there is no {what} {bad[0]}: there are {count}")
     mask[at] = True
     return mask
+
+
+def positions_of(problem: BundleProblem, chosen: np.ndarray, what: str) -> Int[np.ndarray, " n"]:
+    """Positions, of images perhaps from names.
+
+    Raises:
+        ValueError: neither positions nor names; one line.
+    """
+    if chosen.dtype.kind in "US":
+        if problem.labels is None or what != "image":
+            raise ValueError(f"this problem has no names for a {what}: give positions")
+        return problem.labels.images_at(chosen.tolist())
+    if chosen.size and chosen.dtype.kind not in "iu":
+        raise ValueError(f"each {what} is given by its position, not by {chosen.ravel()[0].item()!r}")
+    return chosen.astype(np.int64)
 
 
 def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "lenses numbers"]:
@@ -170,7 +204,7 @@ def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "
     """
     free = np.asarray(lenses.free)
     meant = np.zeros(free.shape, bool)
-    for name in numbers:
+    for name in (numbers,) if isinstance(numbers, str) else numbers:
         of_models = [
             getattr(model, name)
             if name in GROUPS

@@ -38,13 +38,16 @@ class Labels:
 
     def lenses_at(self, wanted: Iterable[int]) -> Int[np.ndarray, " wanted"]:
         """Positions of lenses by id. Raises as `images_at`."""
-        by_id = {int(number): at for at, number in enumerate(self.lenses)}
-        return _positions(list(wanted), [by_id.get(one, -1) for one in wanted], "camera")
+        return _positions(list(wanted), _found(self.lenses, wanted), "camera")
 
     def points_at(self, wanted: Iterable[int]) -> Int[np.ndarray, " wanted"]:
         """Positions of points by id. Raises as `images_at`."""
-        by_id = {int(number): at for at, number in enumerate(self.points)}
-        return _positions(list(wanted), [by_id.get(one, -1) for one in wanted], "point")
+        return _positions(list(wanted), _found(self.points, wanted), "point")
+
+
+def _found(ids: Integer[np.ndarray, " n"], wanted: Iterable[int]) -> list[int]:
+    by_id = {int(number): at for at, number in enumerate(ids)}
+    return [-1 if isinstance(one, bool) else by_id.get(one, -1) for one in wanted]
 
 
 def _positions(wanted: list, found: list[int], what: str) -> np.ndarray:

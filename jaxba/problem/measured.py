@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.constraints import every_lens, number_columns
+from jaxba.problem.constraints import every_lens, number_columns, positions_of
 from jaxba.problem.losses import Loss
 from jaxba.problem.priors import Priors
 
@@ -44,7 +44,8 @@ def with_position_priors(
 
     Raises:
         ValueError: shapes, or no such image; one line.
-        ProblemError: a covariance is not positive definite, or too few positions for an alignment.
+        ProblemError: a covariance is not positive definite; or an alignment has too few positions, or would move what
+            is constant or has priors.
     """
     at = np.arange(problem.num_cameras) if images is None else _images_at(problem, images)
     measured = np.asarray(positions, np.float64)
@@ -52,6 +53,8 @@ def with_position_priors(
         raise ValueError(f"positions must be finite, of shape ({len(at)}, 3), not {measured.shape}")
     whitening = _inverse_roots("position", covariance, len(at))
     if align:
+        if problem.constants is not None or problem.priors is not None:
+            raise ProblemError("an alignment would move what is constant or measured: align first, or align=False")
         problem = aligned(problem, measured, at)
     priors = priors_of(problem)
     places, weights = np.array(priors.positions), np.array(priors.position_whitening)
@@ -148,7 +151,9 @@ def aligned(problem: BundleProblem, positions: Float[np.ndarray, "n 3"], images:
     matrices = geometry.rotation_matrices(cameras[:, :3]) @ rotation.T
     cameras[:, :3] = geometry.angle_axis(matrices)
     cameras[:, 3:6] = scale * cameras[:, 3:6] - np.einsum("nij,j->ni", matrices, shift)
-    return problem.replace(cameras=cameras, points=scale * np.asarray(problem.points) @ rotation.T + shift)
+    rigs = None if problem.rigs is None else problem.rigs.scaled(scale)
+    points = scale * np.asarray(problem.points) @ rotation.T + shift
+    return problem.replace(cameras=cameras, points=points, rigs=rigs)
 
 
 def similarity(
@@ -165,12 +170,7 @@ def similarity(
 
 
 def _images_at(problem: BundleProblem, images: Iterable[int] | Iterable[str]) -> np.ndarray:
-    chosen = list(images)
-    if chosen and isinstance(chosen[0], str):
-        if problem.labels is None:
-            raise ValueError("this problem has no names of images: give positions")
-        return problem.labels.images_at(chosen)
-    at = np.asarray(chosen, np.int64)
+    at = positions_of(problem, np.asarray(list(images)), "image")
     bad = at[(at < 0) | (at >= problem.num_cameras)]
     if len(bad):
         raise ValueError(f"there is no image {bad[0]}: there are {problem.num_cameras}")

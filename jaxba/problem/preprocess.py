@@ -57,7 +57,19 @@ def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
     cameras = np.array(problem.cameras, dtype=np.float64)
     # c' = s (c - m) with t = -R c gives t' = s (t + R m).
     cameras[:, 3:6] = scale * (cameras[:, 3:6] + rotation_matrices(cameras[:, :3]) @ middle)
-    return problem.replace(cameras=cameras, points=scale * (points - middle))
+    rigs, priors = problem.rigs, problem.priors
+    if priors is not None:
+        priors = dataclasses.replace(
+            priors,
+            positions=scale * (np.asarray(priors.positions) - middle),
+            position_whitening=np.asarray(priors.position_whitening) / scale,
+        )
+    return problem.replace(
+        cameras=cameras,
+        points=scale * (points - middle),
+        rigs=None if rigs is None else rigs.scaled(scale),
+        priors=priors,
+    )
 
 
 def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"] | None:

@@ -38,6 +38,10 @@ class Rigs:
     translation: Float[AnyArray, "cameras 3"]
     """m, scene units."""
 
+    def scaled(self, scale: float) -> Rigs:
+        """The same for a scene that is `scale` times as large."""
+        return Rigs(self.frame, self.rotation, scale * np.asarray(self.translation))
+
     def of(self, cameras: Int[np.ndarray, " kept"]) -> Rigs:
         """The same for a subset of the cameras; the numbering of frames is unchanged."""
         return Rigs(*(np.asarray(part)[cameras] for part in (self.frame, self.rotation, self.translation)))
@@ -71,3 +75,24 @@ def checked_rigs(rigs: Rigs, cameras: np.ndarray) -> Rigs:
     if bad.size:
         raise ValueError(f"cameras {first[group[bad[0]]]} and {bad[0]} of one frame are not where their rig has them")
     return Rigs(np.ascontiguousarray(frame, np.int32), rotation, translation)
+
+
+def with_unseen_of_frames(
+    rigs: Rigs, cameras: Float[np.ndarray, "cameras parameters"], seen: Int[np.ndarray, " seen"]
+) -> Float[np.ndarray, "cameras parameters"]:
+    """Cameras, of which those that nothing sees are where their rig has them from the first seen one of their frame."""
+    from scipy.spatial.transform import Rotation
+
+    frame = np.asarray(rigs.frame)
+    unseen = np.setdiff1d(np.arange(len(cameras)), seen)
+    known, first = np.unique(frame[seen], return_index=True)
+    unseen = unseen[np.isin(frame[unseen], known)]
+    if not len(unseen):
+        return cameras
+    of = seen[first[np.searchsorted(known, frame[unseen])]]
+    rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
+    found = np.array(cameras)
+    back = np.einsum("nij,nkj->nik", rotation[unseen], rotation[of])  # M_unseen M_seen^T
+    found[unseen, :3] = Rotation.from_matrix(back @ Rotation.from_rotvec(cameras[of, :3]).as_matrix()).as_rotvec()
+    found[unseen, 3:6] = np.einsum("nij,nj->ni", back, cameras[of, 3:6] - translation[of]) + translation[unseen]
+    return found

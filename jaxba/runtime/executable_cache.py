@@ -18,6 +18,7 @@ import os
 import platform
 import threading
 import time
+import types
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -234,6 +235,14 @@ def _describe(value: Any) -> str:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
         return f"{_name(type(value))}{_describe(dict(fields))}"
+    if isinstance(value, functools.partial):
+        return _describe((value.func, *value.args))
+    if (
+        isinstance(value, types.FunctionType)
+        and "<" not in value.__qualname__
+        and value.__module__.startswith("jaxba.")
+    ):
+        return _name(value)  # its source is part of the key
     raise _UnknownSource(repr(value))
 
 

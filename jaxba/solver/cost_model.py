@@ -145,13 +145,15 @@ def work(
     solvers = {"implicit": every._replace(coarse=observed, implicit=products * observed)}
     if blocks <= MAX_BYTES:
         solvers["sparse"] = every._replace(coarse=observed, block=products * counts.blocks, pair=counts.pairs)
-    explicit, needed = _factoring(order, counts, blocks, _width(problem))
+    explicit, needed = _factoring(order, counts, blocks, _width(problem), problem.rigs is not None)
     if needed <= MAX_BYTES:
         solvers["explicit"] = explicit._replace(step=1.0, observation=observed)
     return solvers
 
 
-def _factoring(observations: ObservationOrder, counts: PairCounts, blocks: float, width: int) -> tuple[Work, float]:
+def _factoring(
+    observations: ObservationOrder, counts: PairCounts, blocks: float, width: int, rigs: bool
+) -> tuple[Work, float]:
     """Work of forming and factoring the system, and the memory that it needs, bytes.
 
     Args:
@@ -159,6 +161,7 @@ def _factoring(observations: ObservationOrder, counts: PairCounts, blocks: float
         counts: pairs and blocks.
         blocks: memory of the blocks, bytes.
         width: unknowns of a camera.
+        rigs: whether cameras move together, so that the system is dense.
     """
     unknowns, band = float(width * observations.num_cameras), float(width * counts.bandwidth)
     points = observations.num_observed_points
@@ -170,7 +173,7 @@ def _factoring(observations: ObservationOrder, counts: PairCounts, blocks: float
         forming = Work(dense_product=side**2 * inner, square=side**2, cube=side**3)
         return forming, 3 * 8 * side * inner
     forming = Work(pair=counts.pairs)
-    if is_banded(observations.num_cameras, counts.bandwidth):
+    if not rigs and is_banded(observations.num_cameras, counts.bandwidth):
         return forming._replace(band=unknowns * band**2), blocks + 3 * 8 * unknowns * band
     return forming._replace(square=unknowns**2, cube=unknowns**3), blocks + DENSE_MATRICES * 8 * unknowns**2
 
@@ -304,7 +307,7 @@ def _check_memory(problem: BundleProblem, observations: ObservationOrder | None)
     needed += _bytes_of_blocks(PairCounts(most, min(most, problem.num_cameras**2), 0), width)
     if needed > available:  # an upper bound: count blocks and look for a band
         counts = count_pairs(problem, observations)
-        needed = _factoring(observations, counts, _bytes_of_blocks(counts, width), width)[1]
+        needed = _factoring(observations, counts, _bytes_of_blocks(counts, width), width, problem.rigs is not None)[1]
     if needed > available:
         raise ProblemError(
             f"{problem.num_cameras} cameras take some {needed / 1e9:.0f} GB to "

@@ -25,7 +25,8 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
 from jaxba.problem.losses import Loss
-from jaxba.problem.options import StepOptions
+from jaxba.problem.options import Coordinates, StepOptions
+from jaxba.problem.preprocess import far_middle, shift
 from jaxba.solver.prepare import numerics
 from jaxba.structure.layout import Layout, layout_for
 
@@ -59,6 +60,9 @@ class Covariance:
     cameras: Float[np.ndarray, "unknowns unknowns"]
     """Of all unknown numbers of cameras together."""
 
+    changes: Float[np.ndarray, "cameras 6 6"]
+    """From the unknowns of a camera's pose to its pose: of a frame through the rig, of a shifted scene to this one."""
+
     rotations: Float[np.ndarray, "cameras 3 3"]
     """Rotation matrices of the cameras."""
 
@@ -68,7 +72,9 @@ class Covariance:
     def between(self, first: int, second: int) -> Float[np.ndarray, "12 12"]:
         """Joint covariance of the poses of two cameras."""
         rows = np.concatenate([self.unknowns[at, :POSE_SIZE] for at in (first, second)])
-        return _submatrix(self.cameras, rows)
+        change = np.zeros((12, 12))
+        change[:6, :6], change[6:, 6:] = self.changes[first], self.changes[second]
+        return change @ _submatrix(self.cameras, rows) @ change.T
 
     def relative_pose(self, first: int, second: int) -> Float[np.ndarray, "6 6"]:
         """Covariance of a camera's pose in the frame of another, `P_2 = R P_1 + t`: left perturbation of R, and t.
@@ -98,7 +104,9 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
         ProblemError: the position, orientation and scale of the scene are free (`with_gauge`, constants or priors fix
             them), or something that is not constant is not determined by what is observed.
     """
-    options = StepOptions(linear_solver="implicit", loss=loss or Loss())
+    options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
+    offset = far_middle(problem)
+    given, problem = problem, problem if offset is None else shift(problem, -offset)
     with numerics(np.dtype("float64")):
         layout = layout_for(problem, options)
         linear = jax.device_get(jax.jit(_linear, static_argnames="options")(layout, problem, options))
@@ -115,17 +123,33 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     seen_points = np.bincount(point, minlength=problem.num_points) > 0
     system, inverse, coupling, rows = _reduced(index, count, camera, point, by_camera, by_point, free_points, linear)
     of_cameras = _inverse(system)
-    given = np.where(free_points[:, None, None], inverse, 0.0)
-    marginal = given + _of_cameras(of_cameras, given, coupling, rows, point)
-    for matrices in (given, marginal):
+    of_points = np.where(free_points[:, None, None], inverse, 0.0)
+    marginal = of_points + _of_cameras(of_cameras, of_points, coupling, rows, point)
+    for matrices in (of_points, marginal):
         matrices[~seen_points & free_points] = np.nan
     seen = np.asarray(layout.camera_seen)
-    poses = np.array([_submatrix(of_cameras, row[:POSE_SIZE]) for row in index])
-    poses[~seen] = np.nan
-    cameras = np.asarray(problem.cameras)
+    cameras = np.asarray(given.cameras)
     rotations = geometry.rotation_matrices(cameras[:, :3])
+    changes = _changes(problem, rotations, offset)
+    poses = np.array([_submatrix(of_cameras, row[:POSE_SIZE]) for row in index])
+    poses = changes @ poses @ changes.transpose(0, 2, 1)
+    poses[~seen] = np.nan
     lenses = _of_lenses(problem, layout, index, of_cameras)
-    return Covariance(poses, lenses, marginal, given, index, of_cameras, rotations, cameras[:, 3:6])
+    return Covariance(poses, lenses, marginal, of_points, index, of_cameras, changes, rotations, cameras[:, 3:6])
+
+
+def _changes(
+    problem: BundleProblem, rotations: Float[np.ndarray, "cameras 3 3"], offset: np.ndarray | None
+) -> Float[np.ndarray, "cameras 6 6"]:
+    """`Covariance.changes`: the turn M of each camera in its rig, and `t = t' - R o` for a scene shifted by -o."""
+    changes = np.tile(np.eye(6), (len(rotations), 1, 1))
+    if problem.rigs is not None:
+        changes[:, :3, :3] = changes[:, 3:, 3:] = np.asarray(problem.rigs.rotation)
+    if offset is not None:
+        back = np.tile(np.eye(6), (len(rotations), 1, 1))
+        back[:, 3:, :3] = [_cross(moved) for moved in rotations @ offset]  # -(w x R o) = [R o]x w
+        changes = back @ changes
+    return changes
 
 
 def _linear(layout: Layout, problem: BundleProblem, options: StepOptions) -> Linearization:
@@ -145,6 +169,9 @@ def _unknown_index(problem: BundleProblem, layout: Layout) -> tuple[np.ndarray, 
             members = np.asarray(unknowns.members)
             first = np.where(members.any(axis=1), members.argmax(axis=0)[members.argmax(axis=1)], np.arange(cameras))
             index[:, POSE_SIZE:] = index[first, POSE_SIZE:]
+        if unknowns.frame is not None:
+            _, first, group = np.unique(unknowns.frame, return_index=True, return_inverse=True)
+            index[:, :POSE_SIZE] = index[first[group], :POSE_SIZE]
         if unknowns.free is not None:
             free &= np.asarray(unknowns.free).T
     used, place = np.unique(index[free], return_inverse=True)
@@ -221,6 +248,8 @@ def _of_cameras(
     from scipy.sparse import csr_matrix
 
     count = len(given)
+    if not len(of_cameras):
+        return np.zeros((count, 3, 3))
     place = (3 * point[:, None, None] + np.arange(3)[None, None] + np.zeros_like(rows)[:, :, None]).ravel()
     of_row = np.repeat(rows[:, :, None], 3, axis=2).ravel()
     used = of_row >= 0

@@ -1,7 +1,7 @@
 """Derivatives of what a solve finds, by the implicit function theorem.
 
 At a minimum the gradient g of the cost by the unknowns y vanishes, g(y, theta) = 0, where theta are observations,
-priors and what is constant. So
+measured positions and what is constant. So
 
     dy/dtheta = -H^-1 dg/dtheta,    H = dg/dy,
 
@@ -181,7 +181,7 @@ def _solve_transposed(
 
     def moved(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
         """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
-        cameras = state.cameras + _start_of_constants(layout, solved, jnp.asarray(theta.cameras))
+        cameras = state.cameras + _start_of_constants(layout, jnp.asarray(theta.cameras))
         points = state.points + _start_of_points(layout, solved, jnp.asarray(theta.points), order)
         rows = y[0].T if unknowns is None else unknowns.of_cameras(y[0].T)
         turned = camera.compose_left(rows[:3], cameras[:3])
@@ -215,7 +215,7 @@ def _solve_transposed(
     return total, size(left) / jnp.maximum(size(right), jnp.finfo(right[0].dtype).tiny)
 
 
-def _start_of_constants(layout: Layout, solved: BundleProblem, cameras: Array) -> Array:
+def _start_of_constants(layout: Layout, cameras: Array) -> Array:
     """Zero, with the derivative of the solution's constant numbers by those of the start."""
     unknowns = layout.unknowns
     constant = jnp.zeros(cameras.shape, bool)

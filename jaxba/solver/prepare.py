@@ -20,6 +20,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import far_middle, shift
+from jaxba.problem.rigs import with_unseen_of_frames
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver, prices
@@ -223,6 +224,8 @@ def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: 
         follows = np.isin(lens, used)
         cameras[follows, 6:] = cameras[seen[first[np.searchsorted(used, lens[follows])]], 6:]
         cameras[:, 6:] = np.where(np.asarray(problem.lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
+    if problem.rigs is not None:
+        cameras = with_unseen_of_frames(problem.rigs, cameras, seen)
     order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = order < problem.num_points
     points[order[real]] = items_first(np.asarray(state.points, np.float64))[real]

@@ -25,7 +25,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CameraModel
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
 from jaxba.problem.losses import Loss
@@ -214,6 +214,11 @@ def _frames(
     _, frame, times = np.unique(frame, return_inverse=True, return_counts=True)
     if not (times > 1).any():
         return None, pose_free
+    diagonal = np.abs(np.asarray(problem.rigs.rotation)) > 1 - 1e-12  # of a camera whose axes are those of its rig
+    part = ~pose_free[:, 3:].all(axis=1) & pose_free[:, 3:].any(axis=1)
+    bad = np.flatnonzero(part & ~(np.diagonal(diagonal, axis1=1, axis2=2).all(axis=1)))
+    if bad.size:
+        raise ProblemError(f"part of the translation of camera {bad[0]} is constant, which is turned in its rig")
     constant = np.zeros(pose_free.shape, bool)
     np.logical_or.at(constant, frame, ~pose_free)
     return frame.astype(np.int32), ~constant[frame]

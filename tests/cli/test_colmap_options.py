@@ -27,6 +27,32 @@ def test_colmaps_options_are_those_of_the_command():
     assert translated(words.split()) == wanted.split()
 
 
+def test_constants_of_both_ways_are_gathered():
+    words = "s --constant poses k1 --BundleAdjustment.refine_focal_length 0 --dtype mixed"
+    assert translated(words.split()) == ["s", "--dtype", "mixed", "--constant", "poses", "k1", "focal"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("gauge: two_cameras", "gauge: must be one of free, two-cameras, three-points, not 'two_cameras'"),
+        ("gauge: [free]", "gauge: must be one of"),
+        ("position_priors: {stddev: 0.1}", "position_priors: 'positions' is missing"),
+        ("position_priors: {std: 0.1, positions: {}}", "position_priors: unknown key 'std'"),
+        ("constant_points: [true]", "constant_points: "),
+        ("constant_numbers: k9", "constant_numbers: no lens has a number 'k9'"),
+        ("constant_poses: [absent.jpg]", "constant_poses: there is no image 'absent.jpg'"),
+        ("constant_points: [99999999999999999999]", "constant_points: there is no point"),
+    ],
+)
+def test_mistakes_in_a_file_of_constraints_are_one_line(model, tmp_path, capsys, text, message):
+    (tmp_path / "c.yaml").write_text(text + "\n")
+    assert run([str(model), "--constraints", str(tmp_path / "c.yaml")]) == 2
+    error = capsys.readouterr().err
+    assert f"c.yaml: {message}" in error
+    assert error.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -35,6 +61,8 @@ def test_colmaps_options_are_those_of_the_command():
         ("--BundleAdjustment.use_gpu 1", "--BundleAdjustment.use_gpu is not an option here; of COLMAP's are refine_"),
         ("--constant k9", "--constant: no lens has a number 'k9'; there are focal, principal_point"),
         ("--covariance c.npz", "--covariance needs --gauge, constants or priors"),
+        ("--covariance p.txt --gauge two-cameras", "--covariance names the problem's file"),
+        ("--covariance a.txt --output a.txt", "--covariance names the same file as another output"),
         ("--refine-principal-point", "--refine-principal-point is for COLMAP models"),
         ("--constraints none.yaml", "--constraints none.yaml: No such file"),
     ],

@@ -200,6 +200,7 @@ def test_an_iteration_is_paid_by_the_point_iterations_that_the_action_chose():
     assert game.demonstrate(state, jax.random.key(1)).shape == (6, 3)
 
 
+@pytest.mark.slow
 def test_work_is_paid_at_the_prices_of_the_scene():
     """In the game, and in an evaluation: a lambda that reaches no goal, with no, one and three point iterations."""
     agent = replace(PAID, guard="off", trials=1, camera_rounds=0, pattern_moves=0)

@@ -42,6 +42,7 @@ def test_one_dense_product_and_chosen_pairs_make_the_same_step():
     np.testing.assert_allclose(one.cost, other.cost, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_mixed_step_is_the_full_one_up_to_its_forcing_term():
     problem = support.tiny()
     layout = jax.tree.map(jnp.asarray, build_layout(problem))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from jaxba import CAMERA_MODELS, BundleProblem, Lenses, Loss, SolveOptions, Step
 from jaxba.linear.schur import jacobian_product
 from jaxba.model.linearize import linearize
 from jaxba.problem import geometry
+from jaxba.runtime.executable_cache import _describe
 
 START = {"omega": 0.8, "alpha": 0.6, "beta": 1.1, "width": 640.0, "height": 320.0, "cx": 320.0, "cy": 240.0}
 MIXED = ("OPENCV", "SIMPLE_RADIAL_FISHEYE", "BAL")
@@ -102,6 +105,13 @@ def test_mixed_models_end_at_one_cost_with_every_linear_solver_and_embedded_iter
     options = lambda solver: SolveOptions(linear_solver=solver, max_iterations=60)
     costs = [solve(problem, policy, options(solver)).final_cost for policy, solver in ways]
     np.testing.assert_allclose(costs, costs[0], rtol=1e-5)
+
+
+def test_a_problem_of_any_model_can_be_pickled_and_its_programs_are_named():
+    for name in CAMERA_MODELS:
+        problem = pickle.loads(pickle.dumps(scene(name)))
+        assert problem.lenses.models == (CAMERA_MODELS[name],)
+        assert name in _describe(problem.lenses.models)
 
 
 def test_lenses_with_impossible_models_are_refused():

@@ -104,6 +104,11 @@ def test_names_of_groups_and_numbers_say_what_of_lenses_is_constant():
         hold(problem, numbers=["k9"])
     with pytest.raises(ValueError, match="there is no image 6: there are 6"):
         hold(problem, poses=[6])
+    with pytest.raises(ValueError, match=r"each point is given by its position, not by 1.7"):
+        hold(problem, points=np.array([1.7]))
+    mask = [False, False, True, False, False, False]
+    assert hold(support.tiny(), poses=mask).constants.poses.all(axis=1).tolist() == mask
+    assert hold(support.tiny(), numbers="focal").lenses.free[0].tolist() == [False, True, True]
 
 
 def test_methods_refuse_what_they_do_not_support():
@@ -179,6 +184,8 @@ def test_a_scene_is_aligned_with_measured_positions_of_which_some_are_wrong():
     aligned = with_position_priors(problem, wrong, np.eye(3))
     np.testing.assert_allclose(np.delete(geometry.camera_centers(aligned.cameras), 1, 0), np.delete(measured, 1, 0))
     np.testing.assert_allclose(geometry.cost(aligned), geometry.cost(problem), rtol=1e-9)
+    with pytest.raises(ProblemError, match="an alignment would move what is constant or measured"):
+        with_position_priors(hold(problem, poses=[0]), measured, np.eye(3))
     with pytest.raises(ProblemError, match="at least three images"):
         with_position_priors(problem, measured[:2], np.eye(3), images=[0, 1])
     with pytest.raises(ProblemError, match="covariance of position 0 is not symmetric positive definite"):
@@ -209,6 +216,20 @@ def test_covariances_are_those_of_the_dense_inverse():
         np.testing.assert_allclose(found.points_given_cameras[point], wanted, rtol=1e-7, atol=1e-14)
     pair = np.r_[9:15, 36:42]
     np.testing.assert_allclose(found.between(1, 4), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-14)
+
+
+def test_covariances_far_from_the_origin_are_those_near_it():
+    near = solve(support.tiny(), "ceres", SolveOptions(max_iterations=300)).problem
+    near = hold(near, poses=[0, 3])
+    cameras = np.array(near.cameras)
+    cameras[:, 3:6] -= geometry.rotation_matrices(cameras[:, :3]) @ np.full(3, 1e5)
+    far = near.replace(cameras=cameras, points=near.points + 1e5)
+    here, there = covariance(near), covariance(far)
+    np.testing.assert_allclose(there.points, here.points, rtol=1e-3)
+    np.testing.assert_allclose(there.poses[1, :3, :3], here.poses[1, :3, :3], rtol=1e-3)
+    np.testing.assert_allclose(there.relative_pose(1, 4), here.relative_pose(1, 4), rtol=1e-2, atol=1e-6)
+    fixed = covariance(hold(near, poses="all", lenses="all"))
+    assert (fixed.points == fixed.points_given_cameras).all()
 
 
 def test_the_covariance_of_a_relative_pose_does_not_depend_on_the_gauge():

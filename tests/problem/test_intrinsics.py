@@ -135,7 +135,7 @@ def test_the_promised_decrease_and_the_gradient_are_those_of_the_problem_with_sh
     np.testing.assert_allclose(info.gradient_max, gradient, rtol=1e-10)
 
 
-@pytest.mark.parametrize("policy", ["ceres", "learned"])
+@pytest.mark.parametrize("policy", ["ceres", pytest.param("learned", marks=pytest.mark.slow)])
 def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
     problem = shared()
     copies = copy_matrix(problem)
@@ -153,7 +153,7 @@ def test_a_solve_ends_in_the_minimum_that_scipy_finds(policy):
     np.testing.assert_allclose(solution.final_cost, geometry.cost(solution.problem), rtol=1e-10)
 
 
-@pytest.mark.parametrize("policy", ["ceres", "learned"])
+@pytest.mark.parametrize("policy", ["ceres", pytest.param("learned", marks=pytest.mark.slow)])
 def test_cameras_of_one_lens_end_with_equal_numbers_and_what_stays_stays_bit_by_bit(policy):
     problem = unseen()
     after = solve(problem, policy).problem

@@ -8,7 +8,22 @@ import pytest
 import support
 from scipy.spatial.transform import Rotation
 
-from jaxba import BundleProblem, Lenses, ProblemError, Rigs, SolveOptions, StepOptions, hold, lm_step, solve
+from jaxba import (
+    BundleProblem,
+    Constants,
+    Lenses,
+    ProblemError,
+    Rigs,
+    SolveOptions,
+    StepOptions,
+    covariance,
+    hold,
+    lm_step,
+    normalize,
+    solve,
+    with_gauge,
+    with_position_priors,
+)
 from jaxba.methods.registry import make_method
 from jaxba.problem import geometry
 from jaxba.problem.options import ConjugateGradients, Coordinates
@@ -60,8 +75,9 @@ def copy_matrix(problem: BundleProblem) -> np.ndarray:
     return np.array(columns).T
 
 
-@pytest.mark.parametrize("solver", ["explicit", "sparse", "implicit"])
-@pytest.mark.parametrize("shared", [True, False], ids=["shared-lenses", "own-lenses"])
+@pytest.mark.parametrize(
+    ("solver", "shared"), [("explicit", True), ("explicit", False), ("sparse", False), ("implicit", True)]
+)
 def test_a_step_is_that_of_the_dense_problem_of_frames(solver, shared):
     problem = rigged(shared)
     options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT, coordinates=MANIFOLD)
@@ -88,6 +104,41 @@ def test_cameras_of_a_frame_stay_where_their_rig_has_them(policy):
     np.testing.assert_allclose(after.cameras[[1, 4], :6], problem.cameras[[1, 4], :6], rtol=0, atol=0)
 
 
+def test_covariances_are_those_of_the_dense_inverse_seen_by_each_camera():
+    problem = with_gauge(solve(rigged(), "ceres").problem, "two-cameras")
+    assert problem.constants.poses.all(axis=1).sum() == 1  # the rigs give the scene its scale
+    found = covariance(problem)
+    _, jacobian = support.linear(problem, StepOptions(coordinates=MANIFOLD))
+    copies = copy_matrix(problem)
+    held = np.repeat(problem.constants.poses.any(axis=1), 9)
+    held = np.concatenate([held & np.tile(np.arange(9) < 6, 6), np.zeros(3 * problem.num_points, bool)])
+    of_held = np.abs(copies[held]).any(axis=0)
+    small = copies[:, ~of_held]
+    whole = small @ np.linalg.inv(small.T @ jacobian.T @ jacobian @ small) @ small.T
+    for camera in range(6):
+        at = slice(9 * camera, 9 * camera + 6)
+        np.testing.assert_allclose(found.poses[camera], whole[at, at], rtol=1e-5, atol=1e-12)
+    pair = np.r_[0:6, 18:24]
+    np.testing.assert_allclose(found.between(0, 2), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-12)
+
+
+def test_a_camera_that_nothing_sees_moves_with_its_frame():
+    problem = rigged()
+    seen = problem.camera_index != 2
+    parts = (problem.observations[seen], problem.camera_index[seen], problem.point_index[seen])
+    blind = BundleProblem.create(problem.cameras, problem.points, *parts, lenses=problem.lenses, rigs=problem.rigs)
+    after = solve(blind, "ceres").problem
+    assert (after.cameras[2, :6] != problem.cameras[2, :6]).any()
+    BundleProblem.create(after.cameras, *support.arrays(after)[1:], rigs=after.rigs)
+
+
+def test_rigs_grow_with_their_scene():
+    problem = rigged()
+    centers = geometry.camera_centers(problem.cameras)
+    for larger in (with_position_priors(problem, 3 * centers + 1, np.eye(3)), normalize(problem)):
+        BundleProblem.create(larger.cameras, *support.arrays(larger)[1:], rigs=larger.rigs)
+
+
 def test_what_rigs_do_not_support_is_one_line():
     problem = rigged()
     with pytest.raises(ProblemError, match="rigs need plain LM, not poba"):
@@ -96,6 +147,11 @@ def test_what_rigs_do_not_support_is_one_line():
     with pytest.raises(ValueError, match="rigs need rotation='manifold'"):
         lm_step(layout, state, jnp.asarray(1e-3), StepOptions())
     rigs = problem.rigs
+    part = np.zeros((6, 6), bool)
+    part[2, 4] = True
+    constants = Constants(part, np.zeros(problem.num_points, bool))
+    with pytest.raises(ProblemError, match="part of the translation of camera 2 is constant, which is turned"):
+        solve(problem.replace(constants=constants), "ceres")
     wrong = np.array(rigs.translation)
     wrong[2] += 1.0
     with pytest.raises(ProblemError, match="cameras 0 and 2 of one frame are not where their rig has them"):

@@ -303,6 +303,7 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
     assert trusted >= 5
 
 
+@pytest.mark.slow
 def test_a_further_round_is_made_only_where_it_may_lead_to_acceptance(monkeypatch):
     """What one round and two leave shows who is to have the next; limits in the middle of these, so that some are."""
     scenes = wide()

@@ -96,6 +96,7 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
         image.id: replace(model.images[image.id], pose=pose)
         for image, pose in zip(assembled.images, poses, strict=True)
     }
+    model = _with_places(model, assembled, problem)
     frames = model.frames
     if frames is not None:
         changed = {image.id for image, kept in zip(assembled.images, same, strict=True) if not kept}
@@ -124,6 +125,31 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
         points=Points(heads, model.points.tracks),
         frames=frames,
     )
+
+
+def _with_places(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
+    """The model with its cameras where the problem's rigs have them: a scene that was scaled has larger rigs."""
+    old, new = assembled.problem.rigs, problem.rigs
+    if old is None or new is None or model.rigs is None or (old.translation == new.translation).all():
+        return model
+    rig_of = {image: frame.rig for frame in (model.frames or {}).values() for _, image in frame.images}
+    moved = {
+        (rig_of[image.id], image.camera): translation
+        for image, translation in zip(
+            assembled.images, (np.asarray(new.translation) * COLMAP_FLIP).tolist(), strict=True
+        )
+    }
+
+    def placed(rig: Rig) -> Rig:
+        sensors = (
+            replace(sensor, from_rig=replace(sensor.from_rig, tvec=tuple(moved[rig.id, sensor.id])))
+            if sensor.from_rig is not None and sensor.type == CAMERA_SENSOR and (rig.id, sensor.id) in moved
+            else sensor
+            for sensor in rig.sensors
+        )
+        return replace(rig, sensors=tuple(sensors))
+
+    return replace(model, rigs={identity: placed(rig) for identity, rig in model.rigs.items()})
 
 
 def _check_lens(camera: Camera, target: str) -> None:
