@@ -61,6 +61,7 @@ def test_derivatives_by_observations_priors_and_constants_are_those_of_differenc
     assert float(found.points[5, 1]) == 0
 
 
+@pytest.mark.slow
 def test_a_value_that_depends_on_a_free_gauge_has_no_derivative():
     problem = scene()
     find = differentiable_solve(problem, "ceres", TIGHT)
