@@ -41,7 +41,7 @@ class ColmapProblem:
         """
         parts = problem.whitening, problem.lenses, problem.constants, problem.priors, problem.rigs
         if any(part is not None for part in parts):
-            raise ProblemError("Ceres as a peer takes BAL's cameras, and no covariances, lenses, constants, priors or rigs")
+            raise ProblemError("Ceres as a peer takes no covariances, lenses, constants, priors or rigs")
         self.start = problem
         self.poses, self.lenses, self.points = _parameters(problem)
         self.pixels = np.asarray(problem.observations, np.float64) * FLIP[:2]

@@ -265,7 +265,7 @@ def test_a_benchmark_takes_models_and_skips_what_a_solver_refuses(tmp_path, caps
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 2
     assert errors[0].startswith("error: garden-sparse-0, stba+ceres: shared lenses need plain LM")
-    assert errors[1].startswith("error: garden-sparse-0, pyceres:dense: Ceres as a peer takes BAL's cameras")
+    assert errors[1].startswith("error: garden-sparse-0, pyceres:dense: Ceres as a peer takes no covariances")
     assert [record.solver for record in read_records(out / "results.jsonl")] == ["ceres"]
     assert (out / "report.html").is_file()
 
