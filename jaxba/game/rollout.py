@@ -54,7 +54,7 @@ def step_groups(function: Callable[..., T], *arguments: Any, shared: Any = None)
     @grouped.def_vmap
     def more_groups(size: int, batched: Any, shared: Any, arguments: Any) -> tuple[T, Any]:
         if any(jax.tree.leaves(batched[0])):
-            raise NotImplementedError("what scenes share has no axis")
+            raise ValueError("arrays that all scenes share must not be batched")
         whole = lambda x, own: x if own else jnp.broadcast_to(x, (size, *x.shape))
         flat = jax.tree.map(lambda x, own: whole(x, own).reshape(-1, *x.shape[1 + own :]), arguments, batched[1])
         found = _grouped(function, shared, flat)

@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from jaxba.model import camera
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.structure.unknowns import CameraPriors, Unknowns
+from jaxba.problem.priors import Priors
+from jaxba.structure.unknowns import Unknowns
 
 
 class PriorTerms(NamedTuple):
@@ -26,7 +27,7 @@ class PriorTerms(NamedTuple):
     gradient: Float[Array, "cameras width"]
 
 
-def prior_costs(priors: CameraPriors, cameras: Float[Array, "parameters cameras"]) -> Float[Array, " cameras"]:
+def prior_costs(priors: Priors, cameras: Float[Array, "parameters cameras"]) -> Float[Array, " cameras"]:
     """The cost of the priors of each camera, pixels^2 by the weights."""
     position, others = _residuals(priors, cameras)
     squared = jnp.sum(position * position, axis=0)
@@ -35,12 +36,12 @@ def prior_costs(priors: CameraPriors, cameras: Float[Array, "parameters cameras"
 
 
 def prior_terms(
-    priors: CameraPriors, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], *, alone: bool = False
+    priors: Priors, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], *, alone: bool = False
 ) -> PriorTerms:
     """Hessian `J^T J` and gradient `J^T r` of the priors of each camera, weighted by the robust loss.
 
     Args:
-        priors: priors of the cameras.
+        priors: with a row for each camera (`Unknowns.priors`).
         unknowns: which numbers are part of a camera's block, and which are constant.
         cameras: current cameras.
         alone: whether cameras are optimised one by one, so that shared lenses are constant.
@@ -70,7 +71,7 @@ def prior_terms(
     return PriorTerms(jnp.asarray(blocks), jnp.asarray(gradient))
 
 
-def _residuals(priors: CameraPriors, cameras: Float[Array, "parameters cameras"]) -> tuple[Array, Array]:
+def _residuals(priors: Priors, cameras: Float[Array, "parameters cameras"]) -> tuple[Array, Array]:
     """Whitened residuals of the position, [3, cameras], and of rotation and lens, [3 + numbers, cameras]."""
     rotation = camera.rotation_matrix(cameras[:3])
     center = -jnp.einsum("jic,jc->ic", rotation, cameras[3:6], precision="highest")

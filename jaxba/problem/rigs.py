@@ -27,7 +27,11 @@ LARGEST_DISAGREEMENT = 1e-6
 @register_pytree
 @dataclass(frozen=True)
 class Rigs:
-    """The frame of each camera of a problem, and its place in the rig."""
+    """The frame of each camera of a problem, and its place in the rig.
+
+    A solve then adds rotations on the manifold, and makes no camera rounds and pattern moves, which would take cameras
+    of a frame apart.
+    """
 
     frame: Int[AnyArray, " cameras"]
     """Frame of each camera, int32. A camera alone in its frame has M = I and m = 0, whatever is said of it."""

@@ -17,7 +17,7 @@ the orthogonal projector P, which averages over the cameras of a lens,
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 import jax.numpy as jnp
@@ -28,22 +28,8 @@ from jaxtyping import Bool, Float, Int
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CameraModel
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
-from jaxba.problem.losses import Loss
+from jaxba.problem.priors import Priors
 from jaxba.typing import AnyArray, register_pytree
-
-
-@register_pytree
-@dataclass(frozen=True)
-class CameraPriors:
-    """Priors of a problem (problem/priors.py), one row for each camera; of a shared lens in that of one camera."""
-
-    positions: Float[AnyArray, "cameras 3"]
-    position_whitening: Float[AnyArray, "cameras 3 3"]
-    rotations: Float[AnyArray, "cameras 3"]
-    rotation_whitening: Float[AnyArray, "cameras 3 3"]
-    lenses: Float[AnyArray, "cameras numbers"]
-    lens_weight: Float[AnyArray, "cameras numbers"]
-    position_loss: Loss = field(metadata={"static": True})
 
 
 @register_pytree
@@ -70,8 +56,9 @@ class Unknowns:
     model: Int[AnyArray, " cameras"] | None
     """Camera model of each camera, a position in `models`; None if there is only one."""
 
-    priors: CameraPriors | None
-    """Priors of the cameras; None if there are none."""
+    priors: Priors | None
+    """Priors, with a row for each camera also of what is known of lenses: a shared lens has its weight in one of them;
+    None if there are none."""
 
     models: tuple[CameraModel, ...] | None = field(metadata={"static": True})
     """Camera models; None if all are BAL's."""
@@ -224,20 +211,18 @@ def _frames(
     return frame.astype(np.int32), ~constant[frame]
 
 
-def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> CameraPriors:
+def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> Priors:
     """Cameras that nothing sees have no priors: they are not optimised."""
     priors = problem.priors
     assert priors is not None
     observed = np.flatnonzero(seen[: len(index)])
     first = np.zeros(len(index), bool)
     first[observed[np.unique(index[observed], return_index=True)[1]]] = True
-    seen = seen[: len(index)]
-    return CameraPriors(
-        np.asarray(priors.positions),
-        np.asarray(priors.position_whitening) * seen[:, None, None],
-        np.asarray(priors.rotations),
-        np.asarray(priors.rotation_whitening) * seen[:, None, None],
-        np.asarray(priors.lenses)[index],
-        np.asarray(priors.lens_weight)[index] * first[:, None],
-        priors.position_loss,
+    seen = seen[: len(index), None, None]
+    return replace(
+        priors,
+        position_whitening=np.asarray(priors.position_whitening) * seen,
+        rotation_whitening=np.asarray(priors.rotation_whitening) * seen,
+        lenses=np.asarray(priors.lenses)[index],
+        lens_weight=np.asarray(priors.lens_weight)[index] * first[:, None],
     )
