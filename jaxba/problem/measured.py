@@ -17,6 +17,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constraints import every_lens, number_columns, positions_of
 from jaxba.problem.losses import Loss
 from jaxba.problem.priors import Priors
+from jaxba.problem.similarity import umeyama
 
 ROUNDS, KEPT = 10, 0.5
 """Rounds of a robust alignment, and the share of the images that each keeps: it stands half of the positions wrong."""
@@ -125,48 +126,33 @@ def priors_of(problem: BundleProblem) -> Priors:
 def aligned(problem: BundleProblem, positions: Float[np.ndarray, "n 3"], images: np.ndarray) -> BundleProblem:
     """The problem moved, turned and scaled so that the centres of images are near the given positions.
 
-    Source: Umeyama 1991, "Least-squares estimation of transformation parameters between two point patterns", in rounds
-    that each keep the nearer half of the images (least trimmed squares; Rousseeuw 1984).
+    Source: `umeyama` in rounds that each keep the nearer half of the images (least trimmed squares; Rousseeuw 1984).
 
     Raises:
-        ProblemError: fewer than three images, or their centres or positions are in one place.
+        ProblemError: fewer than three images, or their centres or positions lie on a line.
     """
     centers = geometry.camera_centers(problem.cameras)[images]
-    if len(images) < 3 or not (np.ptp(centers, axis=0).any() and np.ptp(positions, axis=0).any()):
-        raise ProblemError("an alignment needs at least three images, and not all in one place")
-    best, error = None, np.inf
+    best, error = umeyama(centers, positions), np.inf
     rng = np.random.default_rng(0)
     for start in range(ROUNDS):
         kept = np.arange(len(images)) if start == 0 else rng.choice(len(images), 3, replace=False)
-        for _ in range(ROUNDS):
-            scale, rotation, shift = similarity(centers[kept], positions[kept])
-            distance = np.linalg.norm(scale * centers @ rotation.T + shift - positions, axis=1)
-            kept = np.argsort(distance)[: max(3, int(np.ceil(KEPT * len(images))))]
+        try:
+            for _ in range(ROUNDS):
+                fit = umeyama(centers[kept], positions[kept])
+                distance = np.linalg.norm(fit.points(centers) - positions, axis=1)
+                kept = np.argsort(distance)[: max(3, int(np.ceil(KEPT * len(images))))]
+        except ProblemError:  # these few lie on a line
+            continue
         found = float(np.sum(distance[kept] ** 2))
         if found < error:
-            best, error = (scale, rotation, shift), found
-    assert best is not None
+            best, error = fit, found
     scale, rotation, shift = best
     cameras = np.array(problem.cameras, np.float64)
     matrices = geometry.rotation_matrices(cameras[:, :3]) @ rotation.T
     cameras[:, :3] = geometry.angle_axis(matrices)
     cameras[:, 3:6] = scale * cameras[:, 3:6] - np.einsum("nij,j->ni", matrices, shift)
     rigs = None if problem.rigs is None else problem.rigs.scaled(scale)
-    points = scale * np.asarray(problem.points) @ rotation.T + shift
-    return problem.replace(cameras=cameras, points=points, rigs=rigs)
-
-
-def similarity(
-    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]
-) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, " 3"]]:
-    """Scale s, rotation R and shift b that minimise `sum |s R x + b - y|^2`. Source: Umeyama 1991."""
-    mean, goal = source.mean(axis=0), target.mean(axis=0)
-    left, values, right = np.linalg.svd((target - goal).T @ (source - mean))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    rotation = left @ np.diag(sign) @ right
-    spread = np.sum((source - mean) ** 2)
-    scale = float(np.sum(values * sign) / max(spread, np.finfo(float).tiny))
-    return scale, rotation, goal - scale * rotation @ mean
+    return problem.replace(cameras=cameras, points=best.points(np.asarray(problem.points)), rigs=rigs)
 
 
 def _images_at(problem: BundleProblem, images: Iterable[int] | Iterable[str]) -> np.ndarray:

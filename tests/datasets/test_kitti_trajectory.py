@@ -8,8 +8,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from jaxba.datasets.kitti import trajectory
-from jaxba.datasets.kitti.trajectory import absolute_errors, align, relative_errors, segment_errors, umeyama
+from jaxba.datasets.kitti.trajectory import absolute_errors, align, relative_errors, segment_errors
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.similarity import umeyama
 
 
 def wander(count: int, seed: int, step: float = 1.0) -> np.ndarray:

@@ -186,7 +186,7 @@ def test_a_scene_is_aligned_with_measured_positions_of_which_some_are_wrong():
     np.testing.assert_allclose(geometry.cost(aligned), geometry.cost(problem), rtol=1e-9)
     with pytest.raises(ProblemError, match="an alignment would move what is constant or measured"):
         with_position_priors(hold(problem, poses=[0]), measured, np.eye(3))
-    with pytest.raises(ProblemError, match="at least three images"):
+    with pytest.raises(ProblemError, match="an alignment needs 3 poses, not 2"):
         with_position_priors(problem, measured[:2], np.eye(3), images=[0, 1])
     with pytest.raises(ProblemError, match="covariance of position 0 is not symmetric positive definite"):
         with_position_priors(problem, measured, -np.eye(3))

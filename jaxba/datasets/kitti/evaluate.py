@@ -20,6 +20,7 @@ from jaxba.io.encoding import decode
 from jaxba.io.files import StrPath, display_name, open_output, reason, strip_compression
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.similarity import Similarity, umeyama
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def score(
     lengths: tuple[float, ...] = trajectory.DEVKIT_LENGTHS,
 ) -> Scores:
     """All errors of a trajectory after its alignment. Raises ProblemError where it cannot be aligned."""
-    similarity = trajectory.umeyama(poses[:, :, 3], truth[:, :, 3])
+    similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
     aligned = similarity.poses(poses)
     return Scores(
         similarity.scale,
@@ -126,10 +127,10 @@ def evaluate(
         poses, points = poses_of_cameras(np.asarray(problem.cameras)), np.asarray(problem.points)
         scores = None
         if truth is not None:
-            similarity = trajectory.umeyama(poses[:, :, 3], truth[:, :, 3])
+            similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
             scores = score(poses, truth, lengths)
         else:
-            similarity = trajectory.Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
+            similarity = Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
         rms = float(np.sqrt(2 * geometry.cost(problem) / problem.num_observations))
         if not np.isfinite([rms, *(() if scores is None else _numbers(scores))]).all():
             raise ProblemError(f"{display_name(path)}: an error is not finite: a camera or point lies where it cannot")
