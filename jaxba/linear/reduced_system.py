@@ -30,7 +30,6 @@ from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, couplin
 from jaxba.linear.two_level import Anchor
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.model.linearize import Linearization
-from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.density import has_few_points
@@ -162,24 +161,12 @@ def _solve_merged(
     """Solves `T^T S T y = T^T b` where frames and perhaps lenses are shared, as one dense matrix; returns `T y`."""
     unknowns, shape = system.unknowns, system.right.shape
     assert unknowns is not None
-    assert unknowns.frame is not None
     if layout.grid is not None:
         matrix = dense_system(layout.grid, linear, points, system)
     else:
         lower = dense_blocks(_pairs(layout), reduced_blocks(layout, linear, points, system))
         matrix = jnp.tril(lower) + jnp.tril(lower, -1).T
-    number = jnp.arange(shape[1])
-    index = jnp.asarray(unknowns.frame)[:, None] * shape[1] + number
-    own = jnp.arange(shape[0])[:, None] * shape[1] + number
-    size = shape[0] * shape[1]
-    if unknowns.members is None:
-        index = jnp.where(number < POSE_SIZE, index, own)
-    else:
-        members = jnp.asarray(unknowns.members)
-        first = jnp.argmax(members, axis=0)[jnp.argmax(members, axis=1)]  # the first camera with the same lens
-        lens = jnp.where(jnp.any(members, axis=1), first, jnp.arange(shape[0]))[:, None] * shape[1] + number
-        index = jnp.where(number < POSE_SIZE, index, lens)
-    index = index.reshape(-1)
+    index, size = unknowns.index(shape[0]).reshape(-1), shape[0] * shape[1]
     total = lambda rows: jax.ops.segment_sum(rows, index, num_segments=size)
     unused = total(jnp.ones_like(index)) == 0
     merged = total(total(matrix).T) + jnp.diag(unused.astype(matrix.dtype))

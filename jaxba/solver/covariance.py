@@ -165,13 +165,7 @@ def _unknown_index(problem: BundleProblem, layout: Layout) -> tuple[np.ndarray, 
     index = np.arange(cameras * width).reshape(cameras, width)
     free = np.tile(np.asarray(layout.camera_seen)[:, None], (1, width))
     if unknowns is not None:
-        if unknowns.members is not None:
-            members = np.asarray(unknowns.members)
-            first = np.where(members.any(axis=1), members.argmax(axis=0)[members.argmax(axis=1)], np.arange(cameras))
-            index[:, POSE_SIZE:] = index[first, POSE_SIZE:]
-        if unknowns.frame is not None:
-            _, first, group = np.unique(unknowns.frame, return_index=True, return_inverse=True)
-            index[:, :POSE_SIZE] = index[first[group], :POSE_SIZE]
+        index = np.asarray(unknowns.index(cameras))
         if unknowns.free is not None:
             free &= np.asarray(unknowns.free).T
     used, place = np.unique(index[free], return_inverse=True)

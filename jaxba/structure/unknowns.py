@@ -82,6 +82,17 @@ class Unknowns:
         """Number of unknowns in a camera's block."""
         return POSE_SIZE + len(self.columns)
 
+    def index(self, cameras: int) -> Int[Array, "cameras width"]:
+        """A number for each unknown of each camera's block, the same for those that are one, below cameras x width."""
+        number, every = jnp.arange(self.width), jnp.arange(cameras)
+        frame = every if self.frame is None else jnp.asarray(self.frame)
+        lens = every
+        if self.members is not None:
+            members = jnp.asarray(self.members)
+            first = jnp.argmax(members, axis=0)[jnp.argmax(members, axis=1)]  # the first camera with the same lens
+            lens = jnp.where(jnp.any(members, axis=1), first, every)
+        return jnp.where(number < POSE_SIZE, frame[:, None], lens[:, None]) * self.width + number
+
     def total(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "lenses numbers"]:
         """Sums over the cameras of each shared lens: the product with `T^T`."""
         assert self.members is not None
