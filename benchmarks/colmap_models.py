@@ -3,8 +3,8 @@
     python -m benchmarks.colmap_models [--models OPENCV,FOV] [--seed 0] [--frames 12] [--points 80]
 
 Needs the extra `ceres`. For every model, free numbers (focal length; and distortion; and principal point) and sharing
-(a lens each, one for all, two) the initial and the final cost over COLMAP's, less one. Then constants, both gauges and
-position priors. Nothing is written.
+(a lens each, one for all, two) the initial and the final cost over COLMAP's, less one. Then constants, both gauges,
+position priors, and rigs of three cameras with free and constant extrinsics. Nothing is written.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PRIOR_SIGMA = 0.05
 START = {"omega": 0.5, "alpha": 0.5, "beta": 1.0, "f": 500.0, "fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0}
 
 
-def reconstruction(kind: str, cameras: int, frames: int, points: int, seed: int) -> Any:
+def reconstruction(kind: str, cameras: int, frames: int, points: int, seed: int, in_rig: int = 1) -> Any:
     """A reconstruction that COLMAP makes up, with noise of half a pixel and a start that is a little off."""
     import pycolmap
 
@@ -43,7 +43,7 @@ def reconstruction(kind: str, cameras: int, frames: int, points: int, seed: int)
     rng = np.random.default_rng(seed)
     params = [START[name] if name in START else rng.uniform(-0.01, 0.01) for name in CAMERA_MODELS[kind].parameters]
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = cameras, 1, frames // cameras
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = cameras, in_rig, frames // cameras
     options.num_points3D, options.num_points2D_without_point3D = points, 0
     options.camera_width, options.camera_height = SIZE
     options.camera_model_id = getattr(pycolmap.CameraModelId, kind)
@@ -149,6 +149,19 @@ def constraints(args: argparse.Namespace) -> Iterator[tuple[str, float, float]]:
         yield "position priors", 0.0, _with_priors(folder, problem, args)
 
 
+def rigs(args: argparse.Namespace) -> Iterator[tuple[str, float, float]]:
+    """Two rigs of three cameras each, OPENCV."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = reconstruction("OPENCV", 2, args.frames, args.points, args.seed, in_rig=3)
+        made.write(folder)
+        problem = jaxba.read_colmap(folder)
+        start = geometry.cost(problem) / cost_of(made) - 1
+        for name, extrinsics in (("free extrinsics", ()), ("constant extrinsics", "all")):
+            solution = jaxba.solve(jaxba.hold(problem, extrinsics=extrinsics), args.policy, TIGHT)
+            end = cost_of(by_colmap(folder, refine_sensor_from_rig=not extrinsics))
+            yield name, start, solution.final_cost / end - 1
+
+
 def _with_priors(folder: str, problem: jaxba.BundleProblem, args: argparse.Namespace) -> float:
     import pycolmap
 
@@ -199,6 +212,8 @@ def main() -> None:
             print(f"{kind:28s}{sharing:10s}{free:24s}{initial:10.1e}{final:10.1e}", flush=True)
     for name, initial, final in constraints(args):
         print(f"{'OPENCV':28s}{'two':10s}{name:24s}{initial:10.1e}{final:10.1e}", flush=True)
+    for name, initial, final in rigs(args):
+        print(f"{'OPENCV':28s}{'rigs':10s}{name:24s}{initial:10.1e}{final:10.1e}", flush=True)
 
 
 if __name__ == "__main__":

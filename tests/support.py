@@ -33,6 +33,7 @@ from jaxba import (
 )
 from jaxba.lm.records import StepInfo
 from jaxba.problem import geometry
+from jaxba.problem.rigs import in_frames
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.segment_sums import point_sum, point_sums, tree_sum
 
@@ -167,7 +168,7 @@ def start(problem: BundleProblem, options: StepOptions | None = None, dtype: str
     """Layout and state of a problem."""
     options = options or StepOptions()
     layout = layout_for(problem, options)
-    return layout, _initial(layout, problem, options, dtype)
+    return layout, _initial(layout, in_frames(problem), options, dtype)
 
 
 @functools.partial(jax.jit, static_argnames=("options", "dtype"))

@@ -32,12 +32,6 @@ def _same(option: str) -> Option:
     return lambda value: [option, value]
 
 
-def _sensor_from_rig(value: str) -> list[str]:
-    if value not in ("0", "false"):
-        raise UsageError("refine_sensor_from_rig must be 0: where a camera is in its rig is constant here")
-    return []
-
-
 def _loss(value: str) -> list[str]:
     known = {"TRIVIAL": "squared", "SOFT_L1": "soft_l1", "CAUCHY": "cauchy", "HUBER": "huber"}
     if value.upper() not in known:
@@ -55,7 +49,7 @@ OPTIONS: dict[str, Option] = {
     "refine_extra_params": _flag("refine_extra_params", [], _constant("distortion")),
     "refine_points3D": _flag("refine_points3D", [], _constant("points")),
     "refine_rig_from_world": _flag("refine_rig_from_world", [], _constant("poses")),
-    "refine_sensor_from_rig": _sensor_from_rig,
+    "refine_sensor_from_rig": _flag("refine_sensor_from_rig", [], _constant("extrinsics")),
     "refine_extrinsics": _flag("refine_extrinsics", [], _constant("poses")),
     "constant_rig_from_world_rotation": _flag("constant_rig_from_world_rotation", _constant("rotations"), []),
     "max_num_iterations": _same("--max-iterations"),

@@ -14,7 +14,7 @@ from jaxba.problem.constraints import Gauge, hold, with_gauge
 from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_position_priors
 
-PARTS = ("poses", "rotations", "points")
+PARTS = ("poses", "rotations", "points", "extrinsics")
 """What `--constant` names besides numbers of lenses."""
 
 KEYS = {
@@ -22,6 +22,7 @@ KEYS = {
     "constant_rotations": "names or ids of images",
     "constant_points": "ids of points",
     "constant_cameras": "ids of cameras, which images share",
+    "constant_extrinsics": "ids of cameras, whose places in their rigs do not move",
     "constant_numbers": "focal, principal_point, distortion or names such as k2",
     "position_priors": "positions: {name or id: [x, y, z]}, stddev, loss and loss_scale",
     "gauge": "free, two-cameras or three-points",
@@ -86,6 +87,8 @@ def _apply(problem: BundleProblem, key: str, value: Any) -> BundleProblem:
         return hold(problem, points=value if labels is None else labels.points_at(value))
     if key == "constant_cameras":
         return hold(problem, lenses=value if labels is None else labels.lenses_at(value))
+    if key == "constant_extrinsics":
+        return hold(problem, extrinsics=value if labels is None else labels.lenses_at(value))
     if key == "constant_numbers":
         return hold(problem, numbers=value)
     if key == "position_priors":

@@ -67,10 +67,6 @@ def camera_modes(layout: Layout, anchor: Anchor, width: int) -> Float[Array, "ca
     translation = jnp.concatenate(
         [zeros(3, 3), minus_rotation, anchor.translation.T[:, :, None], zeros(3, numbers)], axis=2
     )
-    from_rig = None if layout.unknowns is None else layout.unknowns.from_rig
-    if from_rig is not None:  # pose unknowns are those of frames
-        turn = lambda rows: jnp.einsum("cji,cjm->cim", from_rig, rows, precision="highest")
-        rotation, translation = turn(rotation), turn(translation)
     lens = jnp.eye(numbers, SIMILARITY + numbers, SIMILARITY, dtype=minus_rotation.dtype)
     lens = jnp.broadcast_to(lens, (count, *lens.shape))
     modes = jnp.concatenate([rotation, translation, lens], axis=1)

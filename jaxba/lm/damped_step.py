@@ -99,7 +99,7 @@ def solve_step(
         damped = slope - sum(jnp.sum(m * m) for m in jacobian_product(layout, linear, manifold_step, point_step))
     step = components_first(camera_step)
     return Step(
-        step if layout.unknowns is None else layout.unknowns.of_cameras(step),
+        step if layout.unknowns is None else layout.unknowns.expanded(step),
         point_step,
         slope,
         damped,

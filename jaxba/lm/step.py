@@ -28,6 +28,7 @@ from jaxba.lm.method import Round, RoundMethod
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.model.linearize import Reference, cost, is_weightless, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
 from jaxba.refinement.acceptance import Candidate
@@ -55,6 +56,9 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
         options: the loss, and the number of previous steps to keep.
         dtype: floating point type of the solve; that of the problem's arrays if None.
     """
+    unknowns = layout.unknowns
+    if unknowns is not None and unknowns.in_rigs and problem.cameras.shape[1] != POSE_SIZE + unknowns.size:
+        raise ValueError("a problem with rigs must be in_frames (jaxba.problem.rigs); jaxba.prepare does it")
     cameras = components_first(jnp.asarray(problem.cameras, dtype))
     order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
     # padding points have an index out of range and are placed at the origin

@@ -49,6 +49,7 @@ class Frames(NamedTuple):
     lens: Float[Array, "numbers ..."] | list[Array]  # f (pixels), k1, k2 of BAL
     model: Int[Array, "..."] | None = None  # position in the models; None: the only one
     models: Models | None = None  # None: all cameras are BAL's
+    place: Float[Array, "12 ..."] | None = None  # M by rows, and m: from the frame of a rig to the camera
 
     def at(self, index: Int[AnyArray, " n"]) -> Frames:
         """The frames of the cameras in `index`.
@@ -57,11 +58,14 @@ class Frames(NamedTuple):
         for every index.
         """
         rotation = jnp.asarray(self.rotation).reshape(9, -1)
-        table = fusion_barrier(jnp.stack([*rotation, *self.translation, *self.lens]))
+        place = [] if self.place is None else self.place
+        table = fusion_barrier(jnp.stack([*rotation, *self.translation, *self.lens, *place]))
         # not fused with its uses, in which a gather keeps the compiler from vectorising
         table = compute_unfused(take, table, jnp.asarray(index), index=index)
         model = None if self.model is None else take(self.model, jnp.asarray(index))
-        return Frames(table[:9].reshape(3, 3, -1), table[9:12], table[12:], model, self.models)
+        end = len(table) - len(place)
+        found = Frames(table[:9].reshape(3, 3, -1), table[9:12], table[12:end], model, self.models)
+        return found if self.place is None else found._replace(place=table[end:])
 
 
 class Projection(NamedTuple):
@@ -73,13 +77,14 @@ class Projection(NamedTuple):
     radius: Float[Array, "..."]  # |p|^2
     distortion: Float[Array, "..."]  # d = 1 + k1 |p|^2 + k2 |p|^4 of BAL, else 1
     rotated: Float[Array, "3 ..."] | list[Array]  # R X
-    local: Float[Array, "3 ..."] | list[Array]  # P; (0, 0, -1) where masked
+    local: Float[Array, "3 ..."] | list[Array]  # P; (0, 0, -1) where masked and not BAL's
+    placed: Float[Array, "3 ..."] | list[Array] | None  # P - m of a camera in a rig
     mask: Bool[AnyArray, "..."] | None  # as given
 
     def stacked(self) -> Projection:
         """The same with arrays in place of lists."""
-        lists = {name: jnp.stack(list(getattr(self, name))) for name in ("pixel", "direction", "rotated", "local")}
-        return self._replace(**lists)
+        names = ["pixel", "direction", "rotated", "local", *([] if self.placed is None else ["placed"])]
+        return self._replace(**{name: jnp.stack(list(getattr(self, name))) for name in names})
 
 
 def _coefficients(squared: Array) -> tuple[Array, Array, Array]:
@@ -165,11 +170,37 @@ def frames(cameras: Float[Array, "parameters cameras"], unknowns: Unknowns | Non
         cameras: pose and lens of each camera.
         unknowns: knows their camera models; None: all are BAL's.
     """
-    pose_and_lens = rotation_matrix(cameras[:3]), cameras[3:6], cameras[6:]
+    found = Frames(rotation_matrix(cameras[:3]), cameras[3:6], cameras[6:])
+    if unknowns is not None and unknowns.in_rigs:
+        rotation, translation = rotation_matrix(cameras[-6:-3]), cameras[-3:]
+        place = jnp.concatenate([rotation.reshape(9, -1), translation])
+        found = found._replace(lens=cameras[6:-6], place=place)
     if unknowns is None or unknowns.models is None:
-        return Frames(*pose_and_lens)
+        return found
     model = None if unknowns.model is None else jnp.asarray(unknowns.model)
-    return Frames(*pose_and_lens, model, Models(unknowns.models))
+    return found._replace(model=model, models=Models(unknowns.models))
+
+
+def moved(
+    cameras: Float[Array, "parameters cameras"],
+    step: Float[Array, "parameters cameras"],
+    unknowns: Unknowns | None = None,
+) -> Float[Array, "parameters cameras"]:
+    """Cameras after a step, `R <- exp(w) R` for rotations."""
+    found = (cameras + step).at[:3].set(compose_left(step[:3], cameras[:3]))
+    if unknowns is None or not unknowns.in_rigs:
+        return found
+    return found.at[-6:-3].set(compose_left(step[-6:-3], cameras[-6:-3]))
+
+
+def poses(
+    cameras: Float[Array, "parameters cameras"], unknowns: Unknowns | None = None
+) -> tuple[Float[Array, "3 cameras"], Float[Array, "3 cameras"]]:
+    """Angle-axis and translation of each camera, also of one in a rig: `M R_r` and `M t_r + m` (problem/rigs.py)."""
+    if unknowns is None or not unknowns.in_rigs:
+        return cameras[:3], cameras[3:6]
+    turned = jnp.einsum("ijc,jc->ic", rotation_matrix(cameras[-6:-3]), cameras[3:6], precision="highest")
+    return compose_left(cameras[-6:-3], cameras[:3]), turned + cameras[-3:]
 
 
 def project(
@@ -188,7 +219,13 @@ def project(
     """
     rotation = frame.rotation
     rotated = [row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in rotation]
-    local = x, y, z = [rotated[k] + frame.translation[k] for k in range(3)]
+    local = [rotated[k] + frame.translation[k] for k in range(3)]
+    placed = None
+    if frame.place is not None:
+        turn, m = frame.place[:9], frame.place[9:]
+        placed = [sum(turn[3 * i + k] * local[k] for k in range(3)) for i in range(3)]
+        local = [placed[k] + m[k] for k in range(3)]
+    x, y, z = local
     if frame.models is not None and mask is not None:
         local = x, y, z = [jnp.where(mask, row, value) for row, value in zip(local, (0.0, 0.0, -1.0), strict=True)]
     # masked twice: the derivative of the quotient, too, must not see the depth of an empty slot
@@ -200,11 +237,11 @@ def project(
     if frame.models is not None:
         pixel = list(model_pixel(frame, list(frame.lens), x, y, z))
         pixel = pixel if mask is None else [jnp.where(mask, row, jnp.zeros_like(row)) for row in pixel]
-        return Projection(pixel, [u, v], inverse, radius, jnp.ones_like(radius), rotated, local, mask)
+        return Projection(pixel, [u, v], inverse, radius, jnp.ones_like(radius), rotated, local, placed, mask)
     focal, k1, k2 = frame.lens
     distortion = 1 + radius * (k1 + k2 * radius)
     scale = focal * distortion
-    return Projection([scale * u, scale * v], [u, v], inverse, radius, distortion, rotated, local, mask)
+    return Projection([scale * u, scale * v], [u, v], inverse, radius, distortion, rotated, local, placed, mask)
 
 
 def model_pixel(frame: Frames, lens: list[Array], x: Array, y: Array, z: Array) -> tuple[Array, Array]:
@@ -246,6 +283,9 @@ def derivatives(frame: Frames, projection: Projection, columns: tuple[int, ...] 
         dz/dw = -dz/dP [R X]x            dz/dX = dz/dP R             dz/d(f, k1, k2) = (d, f |p|^2, f |p|^4) p
     """
     by_camera_point, by_lens = (_bal_derivatives if frame.models is None else _model_derivatives)(frame, projection)
+    if frame.place is not None:
+        by_camera_point, by_extrinsics = _through_rig(frame, projection, by_camera_point)
+        by_lens = [[*own, *more] for own, more in zip(by_lens, by_extrinsics, strict=True)]
     columns = tuple(range(len(by_lens[0]))) if columns is None else columns
     qx, qy, qz = projection.rotated
     rotation = frame.rotation
@@ -260,6 +300,25 @@ def derivatives(frame: Frames, projection: Projection, columns: tuple[int, ...] 
 
 Rows = tuple[list[list[Array]], list[list[Callable[[], Array]]]]
 """`dz/dP`, [2][3], and `dz/d numbers of the lens`, [2][numbers], each computed when it is asked for."""
+
+
+def _through_rig(frame: Frames, projection: Projection, rows: list[list[Array]]) -> Rows:
+    """From `dz/dP` of a camera in a rig, the derivative by the point in its frame, and by its extrinsics: left
+    perturbation of M, and m."""
+    assert frame.place is not None
+    assert projection.placed is not None
+    turn, (x, y, z) = frame.place[:9], projection.placed
+    by_frame = [[sum(row[i] * turn[3 * i + k] for i in range(3)) for k in range(3)] for row in rows]
+    by_extrinsics: list[list[Callable[[], Array]]] = [
+        [
+            lambda b=b, c=c: y * c - z * b,
+            lambda a=a, c=c: z * a - x * c,
+            lambda a=a, b=b: x * b - y * a,
+            *(lambda one=one: one for one in (a, b, c)),
+        ]
+        for a, b, c in rows
+    ]
+    return by_frame, by_extrinsics
 
 
 def _bal_derivatives(frame: Frames, projection: Projection) -> Rows:

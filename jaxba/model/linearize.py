@@ -99,8 +99,7 @@ def with_prior_costs(
     if not _has_priors(layout):
         return terms
     assert layout.unknowns is not None
-    assert layout.unknowns.priors is not None
-    return jnp.concatenate([terms, prior_costs(layout.unknowns.priors, cameras)])
+    return jnp.concatenate([terms, prior_costs(layout.unknowns, cameras)])
 
 
 def _has_priors(layout: Layout) -> bool:
@@ -159,8 +158,7 @@ def linearize(
     unknowns = layout.unknowns
     if unknowns is None or unknowns.priors is None:
         return found
-    priors = unknowns.priors
-    return found._replace(priors=prior_terms(priors, unknowns, cameras), prior_costs=prior_costs(priors, cameras))
+    return found._replace(priors=prior_terms(unknowns, cameras), prior_costs=prior_costs(unknowns, cameras))
 
 
 def is_weightless(linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:
@@ -173,8 +171,8 @@ def is_weightless(linear: Linearization, cost: Float[Array, ""], loss: Loss) -> 
 
 
 def only_free(layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False) -> Linearization:
-    """The linear model in the unknowns: pose columns of cameras that move together are those of their frame, and
-    columns of what is constant are zero. Its gradient, and so its step, is then zero, too.
+    """The linear model in the unknowns: columns of what is constant are zero. Its gradient, and so its step, is then
+    zero, too.
 
     Args:
         layout: knows what is constant.
@@ -185,13 +183,11 @@ def only_free(layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, 
     unknowns = layout.unknowns
     zero = jnp.zeros_like(linear.residual[0])
     by_camera, by_point = linear.camera_jacobian, linear.point_jacobian
-    if unknowns is not None and unknowns.from_rig is not None:
-        from_rig = take(jnp.moveaxis(jnp.asarray(unknowns.from_rig), 0, -1).reshape(9, -1), layout.slot_camera)
-        turn = lambda row: [sum(row[i] * from_rig[3 * i + k] for i in range(3)) for k in range(3)]
-        by_camera = [[*turn(row[:3]), *turn(row[3:6]), *row[6:]] for row in by_camera]
-        if alone:
-            by_camera = [[*[zero] * POSE_SIZE, *row[POSE_SIZE:]] for row in by_camera]
-    if intrinsics == "fixed" or (alone and unknowns is not None and unknowns.members is not None):
+    if alone and unknowns is not None and unknowns.frame is not None:
+        by_camera = [[*[zero] * POSE_SIZE, *row[POSE_SIZE:]] for row in by_camera]
+    if (intrinsics == "fixed" and unknowns is None) or (
+        alone and unknowns is not None and unknowns.members is not None
+    ):
         by_camera = [[*row[:POSE_SIZE], *[zero] * (len(row) - POSE_SIZE)] for row in by_camera]
     if unknowns is not None and unknowns.free is not None:
         free = take(jnp.asarray(unknowns.free), layout.slot_camera)

@@ -16,7 +16,6 @@ from jaxtyping import Float
 
 from jaxba.model import camera
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.problem.priors import Priors
 from jaxba.structure.unknowns import Unknowns
 
 
@@ -27,30 +26,30 @@ class PriorTerms(NamedTuple):
     gradient: Float[Array, "cameras width"]
 
 
-def prior_costs(priors: Priors, cameras: Float[Array, "parameters cameras"]) -> Float[Array, " cameras"]:
+def prior_costs(unknowns: Unknowns, cameras: Float[Array, "parameters cameras"]) -> Float[Array, " cameras"]:
     """The cost of the priors of each camera, pixels^2 by the weights."""
-    position, others = _residuals(priors, cameras)
+    priors = unknowns.priors
+    assert priors is not None
+    position, others = _residuals(unknowns, cameras)
     squared = jnp.sum(position * position, axis=0)
     loss = priors.position_loss
     return 0.5 * ((squared if loss.trivial else loss(squared)[0]) + jnp.sum(others * others, axis=0))
 
 
-def prior_terms(
-    priors: Priors, unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], *, alone: bool = False
-) -> PriorTerms:
+def prior_terms(unknowns: Unknowns, cameras: Float[Array, "parameters cameras"], *, alone: bool = False) -> PriorTerms:
     """Hessian `J^T J` and gradient `J^T r` of the priors of each camera, weighted by the robust loss.
 
     Args:
-        priors: with a row for each camera (`Unknowns.priors`).
-        unknowns: which numbers are part of a camera's block, and which are constant.
+        unknowns: the priors, which numbers are part of a camera's block, and which are constant.
         cameras: current cameras.
         alone: whether cameras are optimised one by one, so that shared lenses are constant.
     """
 
+    priors = unknowns.priors
+    assert priors is not None
+
     def at(step: Float[Array, "width cameras"]) -> tuple[Array, Array]:
-        full = unknowns.of_cameras(step)
-        moved = (cameras + full).at[:3].set(camera.compose_left(full[:3], cameras[:3]))
-        return _residuals(priors, moved)
+        return _residuals(unknowns, camera.moved(cameras, unknowns.expanded(step), unknowns))
 
     zero = jnp.zeros((unknowns.width, cameras.shape[1]), cameras.dtype)
     residual = at(zero)
@@ -71,12 +70,15 @@ def prior_terms(
     return PriorTerms(jnp.asarray(blocks), jnp.asarray(gradient))
 
 
-def _residuals(priors: Priors, cameras: Float[Array, "parameters cameras"]) -> tuple[Array, Array]:
+def _residuals(unknowns: Unknowns, cameras: Float[Array, "parameters cameras"]) -> tuple[Array, Array]:
     """Whitened residuals of the position, [3, cameras], and of rotation and lens, [3 + numbers, cameras]."""
-    rotation = camera.rotation_matrix(cameras[:3])
-    center = -jnp.einsum("jic,jc->ic", rotation, cameras[3:6], precision="highest")
+    priors = unknowns.priors
+    assert priors is not None
+    angle_axis, translation = camera.poses(cameras, unknowns)
+    rotation = camera.rotation_matrix(angle_axis)
+    center = -jnp.einsum("jic,jc->ic", rotation, translation, precision="highest")
     position = jnp.einsum("cij,jc->ic", priors.position_whitening, center - priors.positions.T, precision="highest")
-    turned = camera.compose_left(cameras[:3], -jnp.asarray(priors.rotations.T))
+    turned = camera.compose_left(angle_axis, -jnp.asarray(priors.rotations.T))
     turned = jnp.einsum("cij,jc->ic", priors.rotation_whitening, turned, precision="highest")
-    lens = priors.lens_weight.T * (cameras[POSE_SIZE:] - priors.lenses.T)
-    return position, jnp.concatenate([turned, lens])
+    lens = cameras[POSE_SIZE : POSE_SIZE + priors.lenses.shape[1]]
+    return position, jnp.concatenate([turned, priors.lens_weight.T * (lens - priors.lenses.T)])

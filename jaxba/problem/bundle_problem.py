@@ -143,7 +143,7 @@ class BundleProblem:
             if constants is not None:
                 constants = checked_constants(constants, problem.num_cameras, problem.num_points)
             if rigs is not None:
-                rigs = checked_rigs(rigs, np.asarray(problem.cameras))
+                rigs = checked_rigs(rigs, np.asarray(problem.cameras), lenses)
         except ValueError as error:
             raise ProblemError(str(error)) from None
         return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs)

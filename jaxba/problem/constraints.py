@@ -35,6 +35,7 @@ def hold(
     points: Which = (),
     lenses: Which = (),
     numbers: Iterable[str] = (),
+    extrinsics: Which = (),
 ) -> BundleProblem:
     """The problem with more of it constant.
 
@@ -46,6 +47,7 @@ def hold(
         lenses: constant lenses: positions in `problem.lenses`, or of cameras where every camera has its own.
         numbers: what is constant in every lens: `focal`, `principal_point`, `distortion`, or the name of a number of a
             camera model such as `k2`.
+        extrinsics: lenses whose place in their rig is constant; of no effect without rigs.
 
     Raises:
         ValueError: no such image, lens, point or number; one line.
@@ -59,6 +61,10 @@ def hold(
     free = np.array(own.free)
     free[_mask(problem, lenses, len(free), "lens")] = False
     free &= ~number_columns(own, numbers)
+    placed = _mask(problem, extrinsics, len(free), "lens")
+    if problem.rigs is not None and problem.rigs.free is not None:
+        moves = np.asarray(problem.rigs.free) & ~placed[np.asarray(own.index)]
+        changed = changed.replace(rigs=replace(problem.rigs, free=moves if moves.any() else None))
     return changed if (free == own.free).all() else changed.replace(lenses=replace(own, free=free))
 
 
@@ -103,27 +109,39 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
 
 
 def _has_baseline(problem: BundleProblem) -> bool:
-    """Whether two observed cameras of a frame are in different places, which fixes the scale."""
+    """Whether two observed cameras of a frame are in different places that are constant, which fixes the scale."""
     assert problem.rigs is not None
-    seen = np.unique(problem.camera_index)
+    seen = _placed(problem)
+    if not len(seen):
+        return False
     centers = geometry.camera_centers(problem.cameras)[seen]
     _, first, group = np.unique(np.asarray(problem.rigs.frame)[seen], return_index=True, return_inverse=True)
     return bool((np.linalg.norm(centers - centers[first[group]], axis=1) > 1e-9 * np.ptp(centers)).any())
 
 
+def _placed(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
+    """The observed cameras, without those whose place in their rig is optimised."""
+    seen = np.unique(problem.camera_index)
+    if problem.rigs is None or problem.rigs.free is None:
+        return seen
+    return seen[~np.asarray(problem.rigs.free)[seen]]
+
+
 def _middle_camera(problem: BundleProblem) -> int:
     """The observed camera that is nearest to the middle of all."""
-    seen = np.unique(problem.camera_index)
+    seen = _placed(problem)
     centers = geometry.camera_centers(problem.cameras)[seen]
     return int(seen[np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))])
 
 
 def _fix_two_cameras(problem: BundleProblem, constants: Constants) -> None:
-    seen = np.unique(problem.camera_index)
+    seen = _placed(problem)
+    if problem.rigs is not None:  # of one frame only one, and with the axes of the frame if there are such
+        seen = seen[np.unique(np.asarray(problem.rigs.frame)[seen], return_index=True)[1]]
     if len(seen) < 2:
         raise ProblemError("a gauge of two cameras needs two that see points")
     centers = geometry.camera_centers(problem.cameras)[seen]
-    first = int(np.searchsorted(seen, _middle_camera(problem)))
+    first = int(np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
     second = int(np.argmax(np.linalg.norm(centers - centers[first], axis=1)))
     constants.poses[seen[first]] = True
     # its distance from the first camera along the axis of its own on which that is largest

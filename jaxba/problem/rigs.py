@@ -4,21 +4,29 @@ A *frame* is what the cameras of a rig took at one moment. The pose of its camer
 
     R_c = M R_r,    t_c = M t_r + m,
 
-with the rotation M and the translation m of the camera in the rig, which are constant in a solve. A left perturbation w
-of R_r and a change d of t_r are the perturbations M w and M d of the camera: the pose step of all cameras of a frame is
-one unknown, seen through M.
+with the rotation M and the translation m of the camera in the rig: its extrinsics. A solve works on frames
+(`in_frames`): a camera is `[pose of its frame, lens, angle-axis of M, m]`. Cameras of a frame share its pose, and
+extrinsics are shared and free or constant as the numbers of a lens are.
 
 Source: COLMAP 3.12 and later, `Rig` and `Frame`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxba.problem.intrinsics import POSE_SIZE, Lenses
 from jaxba.typing import AnyArray, register_pytree
+
+if TYPE_CHECKING:
+    from jaxba.problem.bundle_problem import BundleProblem
+
+EXTRINSICS_SIZE = 6
+"""Numbers of the extrinsics of a camera: angle-axis (radians) of M and m (scene units)."""
 
 LARGEST_DISAGREEMENT = 1e-6
 """Of the rotations (radians) and relative translations of a frame's cameras, beyond which they are no rig."""
@@ -42,24 +50,37 @@ class Rigs:
     translation: Float[AnyArray, "cameras 3"]
     """m, scene units."""
 
+    free: Bool[AnyArray, " cameras"] | None = None
+    """Whether M and m are optimised; None: of no camera. Cameras with the same lens then have the same, as those of a
+    sensor in COLMAP. One camera of each rig should be constant: it says where the frame is."""
+
     def scaled(self, scale: float) -> Rigs:
         """The same for a scene that is `scale` times as large."""
-        return Rigs(self.frame, self.rotation, scale * np.asarray(self.translation))
+        return replace(self, translation=scale * np.asarray(self.translation))
 
     def of(self, cameras: Int[np.ndarray, " kept"]) -> Rigs:
         """The same for a subset of the cameras; the numbering of frames is unchanged."""
-        return Rigs(*(np.asarray(part)[cameras] for part in (self.frame, self.rotation, self.translation)))
+        free = None if self.free is None else np.asarray(self.free)[cameras]
+        return Rigs(*(np.asarray(part)[cameras] for part in (self.frame, self.rotation, self.translation)), free)
+
+    @property
+    def turned(self) -> Bool[np.ndarray, " cameras"]:
+        """Whether the axes of a camera are not those of its frame, but for their signs."""
+        diagonal = np.abs(np.diagonal(np.asarray(self.rotation), axis1=1, axis2=2)) > 1 - 1e-12
+        return ~diagonal.all(axis=1)
 
 
-def checked_rigs(rigs: Rigs, cameras: np.ndarray) -> Rigs:
+def checked_rigs(rigs: Rigs, cameras: np.ndarray, lenses: Lenses | None) -> Rigs:
     """Checks rigs and returns them as NumPy arrays.
 
     Args:
         rigs: of a problem.
         cameras: its cameras.
+        lenses: its checked lenses.
 
     Raises:
-        ValueError: shapes differ, or cameras of a frame are not where their rig has them; one line.
+        ValueError: shapes differ, cameras of a frame are not where their rig has them, or cameras of a lens with free
+            extrinsics are in different places; one line.
     """
     from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
 
@@ -78,7 +99,71 @@ def checked_rigs(rigs: Rigs, cameras: np.ndarray) -> Rigs:
     bad = np.flatnonzero(np.maximum(turned, moved) > LARGEST_DISAGREEMENT)
     if bad.size:
         raise ValueError(f"cameras {first[group[bad[0]]]} and {bad[0]} of one frame are not where their rig has them")
-    return Rigs(np.ascontiguousarray(frame, np.int32), rotation, translation)
+    free = _checked_free(rigs, rotation, translation, lenses)
+    return Rigs(np.ascontiguousarray(frame, np.int32), rotation, translation, free)
+
+
+def _checked_free(
+    rigs: Rigs, rotation: np.ndarray, translation: np.ndarray, lenses: Lenses | None
+) -> Bool[np.ndarray, " cameras"] | None:
+    if rigs.free is None or not np.asarray(rigs.free).any():
+        return None
+    free = np.asarray(rigs.free)
+    if free.dtype != bool or free.shape != (len(rotation),):
+        raise ValueError(f"rigs must say of each of {len(rotation)} cameras whether its extrinsics are free")
+    if lenses is None:
+        raise ValueError("free extrinsics of rigs need lenses, which say what images are of one camera")
+    _, first, group = np.unique(np.asarray(lenses.index), return_index=True, return_inverse=True)
+    of_lens = np.hstack([rotation.reshape(-1, 9), translation, free[:, None]])
+    bad = np.flatnonzero((free | free[first][group]) & (of_lens != of_lens[first][group]).any(axis=1))
+    if bad.size:
+        pair = f"{first[group[bad[0]]]} and {bad[0]}"
+        raise ValueError(f"cameras {pair} share a lens, but are in different places of their rigs, which are free")
+    return free
+
+
+def in_frames(problem: BundleProblem) -> BundleProblem:
+    """The problem with the poses of frames, and the extrinsics of each camera after its lens.
+
+    Without rigs, or where no two observed cameras are of one frame, it is the problem itself, without rigs.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rigs = problem.rigs
+    if rigs is None:
+        return problem
+    frame, cameras = np.asarray(rigs.frame), np.asarray(problem.cameras)
+    seen = np.unique(problem.camera_index)
+    if len(np.unique(frame[seen])) == len(seen):
+        return problem.replace(rigs=None)
+    rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
+    moved = cameras[:, 3:6] - translation
+    of_frame = rotation.transpose(0, 2, 1) @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
+    poses = np.hstack([Rotation.from_matrix(of_frame).as_rotvec(), np.einsum("nji,nj->ni", rotation, moved)])
+    known, first = np.unique(frame[seen], return_index=True)
+    at, leader = np.isin(frame, known), np.arange(len(frame))
+    leader[at] = seen[first[np.searchsorted(known, frame[at])]]
+    poses = poses[leader]  # bit for bit the same in a frame
+    extrinsics = np.hstack([Rotation.from_matrix(rotation).as_rotvec(), translation])
+    return problem.replace(cameras=np.hstack([poses, cameras[:, POSE_SIZE:], extrinsics]))
+
+
+def out_of_frames(
+    problem: BundleProblem, cameras: Float[np.ndarray, "cameras more"]
+) -> tuple[Float[np.ndarray, "cameras parameters"], Rigs]:
+    """Cameras and rigs for cameras of a problem as `in_frames` has them. Constant extrinsics are copied exactly."""
+    from scipy.spatial.transform import Rotation
+
+    assert problem.rigs is not None
+    rigs, extrinsics = problem.rigs, cameras[:, -EXTRINSICS_SIZE:]
+    free = np.zeros(len(cameras), bool) if rigs.free is None else np.asarray(rigs.free)
+    rotation = np.where(free[:, None, None], Rotation.from_rotvec(extrinsics[:, :3]).as_matrix(), rigs.rotation)
+    translation = np.where(free[:, None], extrinsics[:, 3:], rigs.translation)
+    turned = rotation @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
+    moved = np.einsum("nij,nj->ni", rotation, cameras[:, 3:6]) + translation
+    own = cameras[:, POSE_SIZE:-EXTRINSICS_SIZE]
+    cameras = np.hstack([Rotation.from_matrix(turned).as_rotvec(), moved, own])
+    return cameras, replace(rigs, rotation=rotation, translation=translation)
 
 
 def with_unseen_of_frames(

@@ -45,15 +45,15 @@ def refine_cameras(
     products = tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
     blocks, gradient = products[:, :, :width], products[:, :, width]
     unknowns = layout.unknowns
-    priors = None if unknowns is None else unknowns.priors
-    if unknowns is not None and priors is not None:
-        terms = prior_terms(priors, unknowns, cameras, alone=True)
+    has_priors = unknowns is not None and unknowns.priors is not None
+    if has_priors:
+        terms = prior_terms(unknowns, cameras, alone=True)
         blocks, gradient = blocks + terms.blocks, gradient + terms.gradient
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
     own_cost = lambda costs: compute_unfused(each_sum, costs, index=layout.slot_camera)
-    of_priors = lambda cameras: 0.0 if priors is None else prior_costs(priors, cameras)
+    of_priors = lambda cameras: prior_costs(unknowns, cameras) if has_priors else 0.0
     before = own_cost(linear.costs) + of_priors(cameras)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
@@ -62,7 +62,7 @@ def refine_cameras(
         step = -components_first(solve_positive(damped, gradient))
         step = step if layout.unknowns is None else layout.unknowns.expanded(step)
         # the Jacobian, and so the step, is in manifold coordinates
-        trial = (cameras + step).at[:3].set(camera.compose_left(step[:3], cameras[:3]))
+        trial = camera.moved(cameras, step)
         costs = observation_costs(layout, trial, points, options.loss)
         better = (own_cost(costs) + of_priors(trial) < before) & ~done & keep_focal_signs(cameras, trial)
         return jnp.where(better, trial, best), done | better, attempt_number + 1

@@ -58,7 +58,12 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
     inverse_norm = 1 / jnp.sqrt(undistorted[0] * undistorted[0] + undistorted[1] * undistorted[1] + 1)
     camera_ray = [undistorted[0] * inverse_norm, undistorted[1] * inverse_norm, -inverse_norm]
     to_world = lambda vector: [sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)]
-    ray, center = to_world(camera_ray), [-x for x in to_world(frame.translation)]
+    offset = list(frame.translation)
+    if frame.place is not None:  # first from the camera to its frame
+        turn, m = frame.place[:9], frame.place[9:]
+        back = lambda vector: [sum(turn[3 * j + i] * vector[j] for j in range(3)) for i in range(3)]
+        camera_ray, offset = back(camera_ray), [t + b for t, b in zip(offset, back(m), strict=True)]
+    ray, center = to_world(camera_ray), [-x for x in to_world(offset)]
     along = sum(ray[i] * center[i] for i in range(3))
     matrix = [(1.0 if i == j else 0.0) - ray[i] * ray[j] for i in range(3) for j in range(i + 1)]
     right = [center[i] - ray[i] * along for i in range(3)]

@@ -40,10 +40,9 @@ def move_cameras(
         step: camera step in the coordinates of the options.
         options: `Coordinates.rotation` and `lens_step`, and `intrinsics`.
     """
-    moved = cameras + step
-    if options.coordinates.rotation == "manifold":
-        moved = moved.at[:3].set(camera.compose_left(step[:3], cameras[:3]))
     unknowns = layout.unknowns
+    on_manifold = options.coordinates.rotation == "manifold"
+    moved = camera.moved(cameras, step, unknowns) if on_manifold else cameras + step
     plain = options.coordinates.lens_step == "file" or options.intrinsics == "fixed"
     if plain or (unknowns is not None and unknowns.models is not None):
         return moved

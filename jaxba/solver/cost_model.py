@@ -16,6 +16,7 @@ from jaxba.lm.records import Prices
 from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemError
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import LinearSolver, LinearSolverChoice, StepOptions
+from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.camera_ordering import camera_order, is_banded
 from jaxba.structure.density import has_dense_shape, has_small_capacitance
 from jaxba.structure.observation_order import ObservationOrder
@@ -322,5 +323,7 @@ def _bytes_of_blocks(counts: PairCounts, width: int) -> float:
 
 def _width(problem: BundleProblem) -> int:
     """Unknowns of a camera's block."""
-    lenses = problem.lenses
-    return CAMERA_SIZE if lenses is None else POSE_SIZE + int(np.asarray(lenses.free).any(axis=0).sum())
+    lenses, rigs = problem.lenses, problem.rigs
+    extrinsics = 0 if rigs is None or rigs.free is None else EXTRINSICS_SIZE
+    own = CAMERA_SIZE if lenses is None else POSE_SIZE + int(np.asarray(lenses.free).any(axis=0).sum())
+    return own + extrinsics

@@ -23,10 +23,11 @@ from jaxba.lm.step import initial_state
 from jaxba.model.linearize import Linearization, linearize, only_free
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
+from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, lens_size
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Coordinates, StepOptions
 from jaxba.problem.preprocess import far_middle, shift
+from jaxba.problem.rigs import EXTRINSICS_SIZE, in_frames
 from jaxba.solver.prepare import numerics
 from jaxba.structure.layout import Layout, layout_for
 
@@ -60,8 +61,9 @@ class Covariance:
     cameras: Float[np.ndarray, "unknowns unknowns"]
     """Of all unknown numbers of cameras together."""
 
-    changes: Float[np.ndarray, "cameras 6 6"]
-    """From the unknowns of a camera's pose to its pose: of a frame through the rig, of a shifted scene to this one."""
+    changes: Float[np.ndarray, "cameras 6 width"]
+    """From the unknowns of a camera to its pose: of frame and extrinsics through the rig, of a shifted scene to this
+    one."""
 
     rotations: Float[np.ndarray, "cameras 3 3"]
     """Rotation matrices of the cameras."""
@@ -71,9 +73,10 @@ class Covariance:
 
     def between(self, first: int, second: int) -> Float[np.ndarray, "12 12"]:
         """Joint covariance of the poses of two cameras."""
-        rows = np.concatenate([self.unknowns[at, :POSE_SIZE] for at in (first, second)])
-        change = np.zeros((12, 12))
-        change[:6, :6], change[6:, 6:] = self.changes[first], self.changes[second]
+        rows = np.concatenate([self.unknowns[at] for at in (first, second)])
+        width = len(rows) // 2
+        change = np.zeros((12, 2 * width))
+        change[:6, :width], change[6:, width:] = self.changes[first], self.changes[second]
         return change @ _submatrix(self.cameras, rows) @ change.T
 
     def relative_pose(self, first: int, second: int) -> Float[np.ndarray, "6 6"]:
@@ -106,7 +109,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     """
     options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
     offset = far_middle(problem)
-    given, problem = problem, problem if offset is None else shift(problem, -offset)
+    given, problem = problem, in_frames(problem if offset is None else shift(problem, -offset))
     with numerics(np.dtype("float64")):
         layout = layout_for(problem, options)
         linear = jax.device_get(jax.jit(_linear, static_argnames="options")(layout, problem, options))
@@ -130,8 +133,8 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     seen = np.asarray(layout.camera_seen)
     cameras = np.asarray(given.cameras)
     rotations = geometry.rotation_matrices(cameras[:, :3])
-    changes = _changes(problem, rotations, offset)
-    poses = np.array([_submatrix(of_cameras, row[:POSE_SIZE]) for row in index])
+    changes = _changes(problem, layout, rotations, offset)
+    poses = np.array([_submatrix(of_cameras, row) for row in index])
     poses = changes @ poses @ changes.transpose(0, 2, 1)
     poses[~seen] = np.nan
     lenses = _of_lenses(problem, layout, index, of_cameras)
@@ -139,12 +142,24 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
 
 
 def _changes(
-    problem: BundleProblem, rotations: Float[np.ndarray, "cameras 3 3"], offset: np.ndarray | None
-) -> Float[np.ndarray, "cameras 6 6"]:
-    """`Covariance.changes`: the turn M of each camera in its rig, and `t = t' - R o` for a scene shifted by -o."""
-    changes = np.tile(np.eye(6), (len(rotations), 1, 1))
-    if problem.rigs is not None:
-        changes[:, :3, :3] = changes[:, 3:, 3:] = np.asarray(problem.rigs.rotation)
+    problem: BundleProblem, layout: Layout, rotations: Float[np.ndarray, "cameras 3 3"], offset: np.ndarray | None
+) -> Float[np.ndarray, "cameras 6 width"]:
+    """`Covariance.changes`. With a step w, d of its frame and v, e of its extrinsics, a camera in a rig turns by
+    `M w + v` and moves by `M d + v x M t_r + e`; of a scene shifted by -o, `t = t' - R o`."""
+    unknowns = layout.unknowns
+    width = POSE_SIZE + LENS_SIZE if unknowns is None else unknowns.width
+    changes = np.tile(np.eye(POSE_SIZE, width), (len(rotations), 1, 1))
+    if unknowns is not None and unknowns.in_rigs:
+        assert problem.rigs is not None
+        turn = np.asarray(problem.rigs.rotation)
+        changes[:, :3, :3] = changes[:, 3:6, 3:6] = turn
+        moved = np.einsum("nij,nj->ni", turn, np.asarray(problem.cameras)[:, 3:6])
+        by_extrinsics = np.tile(np.eye(EXTRINSICS_SIZE), (len(rotations), 1, 1))
+        by_extrinsics[:, 3:, :3] = [-_cross(one) for one in moved]
+        start = unknowns.size - EXTRINSICS_SIZE
+        for place, column in enumerate(unknowns.columns):
+            if column >= start:
+                changes[:, :, POSE_SIZE + place] = by_extrinsics[:, :, column - start]
     if offset is not None:
         back = np.tile(np.eye(6), (len(rotations), 1, 1))
         back[:, 3:, :3] = [_cross(moved) for moved in rotations @ offset]  # -(w x R o) = [R o]x w
@@ -264,14 +279,16 @@ def _of_lenses(
 ) -> Float[np.ndarray, "lenses numbers numbers"]:
     unknowns = layout.unknowns
     lenses = problem.lenses
-    size = LENS_SIZE if unknowns is None else unknowns.size
-    columns = tuple(range(size)) if unknowns is None else unknowns.columns
+    size = lens_size(lenses)
+    columns = range(size) if unknowns is None else unknowns.columns
+    place = [(k, column) for k, column in enumerate(columns) if column < size]
     of_camera = np.arange(problem.num_cameras) if lenses is None else np.asarray(lenses.index)
     count = problem.num_cameras if lenses is None else len(lenses.free)
     found = np.full((count, size, size), np.nan)
     for camera in np.flatnonzero(layout.camera_seen):
         rows = np.full(size, -1)
-        rows[list(columns)] = index[camera, POSE_SIZE:]
+        for k, column in place:
+            rows[column] = index[camera, POSE_SIZE + k]
         found[of_camera[camera]] = _submatrix(of_cameras, rows)
     return found
 

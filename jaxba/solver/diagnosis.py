@@ -14,6 +14,7 @@ from jaxba.model.observations import Views, view_terms
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
+from jaxba.problem.rigs import in_frames
 from jaxba.refinement.acceptance import COST_ROUNDING
 from jaxba.runtime.compilation import compile_and_run, program
 from jaxba.structure.layout import Layout, build_layout
@@ -31,6 +32,7 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
     """
     dtype = np.dtype(dtype)
     loss = loss or Loss()
+    problem = in_frames(problem)
     layout = build_layout(problem, pairs=False, grid=False)
     with jax.enable_x64(dtype != np.float32):
         found = compile_and_run(program(_start_terms, "loss", "dtype", level="quick"), layout, problem, loss, dtype)

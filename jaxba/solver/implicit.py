@@ -43,6 +43,7 @@ from jaxba.model.linearize import cost, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.problem.rigs import EXTRINSICS_SIZE, in_frames
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, numerics, set_up
 from jaxba.solver.solve import solve
@@ -149,7 +150,8 @@ def _transposed(
     with numerics(np.dtype("float64")):
         slots = set_up(solved.replace(observations=numbered), policy, replace(options, pad=False)).layout.pixels[0]
         order = np.concatenate([np.asarray(members) for members in setup.layout.bucket_points])
-        arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), solved, inputs, cotangents)
+        here = in_frames(solved)
+        arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, inputs, cotangents)
         found, residual = jax.jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
     if not float(residual) < 1e-4:
         raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
@@ -181,11 +183,27 @@ def _solve_transposed(
 
     def moved(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
         """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
-        cameras = state.cameras + _start_of_constants(layout, jnp.asarray(theta.cameras))
+        cameras = state.cameras + _start_of_constants(layout, of_frames(theta.cameras))
         points = state.points + _start_of_points(layout, solved, jnp.asarray(theta.points), order)
-        rows = y[0].T if unknowns is None else unknowns.of_cameras(y[0].T)
-        turned = camera.compose_left(rows[:3], cameras[:3])
-        return jnp.concatenate([turned, cameras[3:] + rows[3:]]), points + y[1]
+        rows = y[0].T if unknowns is None else unknowns.expanded(y[0].T)
+        return camera.moved(cameras, rows, unknowns), points + y[1]
+
+    def of_frames(cameras: Array) -> Array:
+        """Cameras as the inputs have them, as those of the state."""
+        if unknowns is None or not unknowns.in_rigs:
+            return jnp.asarray(cameras)
+        place = state.cameras[-EXTRINSICS_SIZE:]
+        turn, rows = camera.rotation_matrix(place[:3]), jnp.asarray(cameras).T
+        moved = jnp.einsum("jic,jc->ic", turn, rows[3:6] - place[3:], precision="highest")
+        return jnp.concatenate([camera.compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place]).T
+
+    def found(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
+        """Parameters as the solution has them."""
+        cameras, points = moved(y, theta)
+        if unknowns is None or not unknowns.in_rigs:
+            return cameras, points
+        own = cameras[POSE_SIZE:-EXTRINSICS_SIZE]
+        return jnp.concatenate([*camera.poses(cameras, unknowns), own]), points
 
     def objective(y: tuple[Array, Array], theta: SolveInputs) -> Array:
         pixels = jnp.where(layout.slot_mask, jnp.asarray(theta.observations).T[:, slots], 0)
@@ -198,19 +216,19 @@ def _solve_transposed(
     gradient = jax.grad(objective)
     zero = jnp.zeros((count, width)), jnp.zeros_like(state.points)
     # the cotangents in the unknowns
-    _, pull = jax.vjp(lambda y: moved(y, inputs), zero)
+    _, pull = jax.vjp(lambda y: found(y, inputs), zero)
     of_points = jnp.where(order < solved.num_points, 1.0, 0.0)
     by_points = of_points * cotangents[1].T[:, jnp.minimum(order, solved.num_points - 1)]
     right = project(pull((cotangents[0].T, by_points))[0])
     product = lambda y: project(jax.jvp(lambda z: gradient(z, inputs), (zero,), (project(y),))[1])
     inverse = _gauss_newton(layout, state.cameras, state.points, options)
-    found, _ = cg(product, right, tol=TOLERANCE, maxiter=MAX_PRODUCTS, M=lambda y: project(inverse(project(y))))
-    left = jax.tree.map(lambda a, b: a - b, product(found), right)
+    adjoint, _ = cg(product, right, tol=TOLERANCE, maxiter=MAX_PRODUCTS, M=lambda y: project(inverse(project(y))))
+    left = jax.tree.map(lambda a, b: a - b, product(adjoint), right)
     size = lambda y: jnp.sqrt(sum(jnp.sum(part * part) for part in y))
     # dL/dtheta = -w . dg/dtheta, and what of the solution is constant passes directly
     _, transpose = jax.vjp(lambda theta: gradient(zero, theta), inputs)
-    direct = jax.vjp(lambda theta: moved(zero, theta), inputs)[1]((cotangents[0].T, by_points))[0]
-    through = transpose(found)[0]
+    direct = jax.vjp(lambda theta: found(zero, theta), inputs)[1]((cotangents[0].T, by_points))[0]
+    through = transpose(adjoint)[0]
     total = jax.tree.map(lambda a, b: b - a, through, direct)
     return total, size(left) / jnp.maximum(size(right), jnp.finfo(right[0].dtype).tiny)
 

@@ -20,7 +20,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import far_middle, shift
-from jaxba.problem.rigs import with_unseen_of_frames
+from jaxba.problem.rigs import in_frames, out_of_frames, with_unseen_of_frames
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver, prices
@@ -163,7 +163,7 @@ def set_up(
     with numerics(dtype):
         started = time.perf_counter()
         offset = far_middle(problem)
-        here = problem if offset is None else shift(problem, -offset)
+        here = in_frames(problem if offset is None else shift(problem, -offset))
         layout = jax.device_put(layout_for(here, step, capacity, observations))
         start = here if capacity is None else padded_parameters(here, capacity)
         known = prices(problem, step, observations) if observes_prices(policy) else Prices()
@@ -213,19 +213,25 @@ def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: 
         state: optimised parameters in layout order.
         options: whether intrinsics were fixed.
     """
-    cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
+    points = np.array(problem.points, np.float64)
     seen = np.flatnonzero(layout.camera_seen)  # padding cameras are not seen
+    in_rigs = layout.unknowns is not None and layout.unknowns.in_rigs
+    cameras = np.array(in_frames(problem).cameras if in_rigs else problem.cameras, np.float64)
     cameras[seen] = items_first(np.asarray(state.cameras, np.float64))[seen]
-    if options.intrinsics == "fixed":
-        cameras[:, 6:] = problem.cameras[:, 6:]
-    elif problem.lenses is not None:  # unobserved cameras follow the others with their lens
+    if problem.lenses is not None:  # unobserved cameras follow the others with their lens
         lens = np.asarray(problem.lenses.index)
         used, first = np.unique(lens[seen], return_index=True)
         follows = np.isin(lens, used)
         cameras[follows, 6:] = cameras[seen[first[np.searchsorted(used, lens[follows])]], 6:]
+    rigs = problem.rigs
+    if in_rigs:
+        cameras, rigs = out_of_frames(problem, cameras)
+    if options.intrinsics == "fixed":
+        cameras[:, 6:] = problem.cameras[:, 6:]
+    elif problem.lenses is not None:
         cameras[:, 6:] = np.where(np.asarray(problem.lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
-    if problem.rigs is not None:
-        cameras = with_unseen_of_frames(problem.rigs, cameras, seen)
+    if rigs is not None:
+        cameras = with_unseen_of_frames(rigs, cameras, seen)
     order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = order < problem.num_points
     points[order[real]] = items_first(np.asarray(state.points, np.float64))[real]
@@ -233,4 +239,4 @@ def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: 
         constant = np.asarray(problem.constants.poses)
         cameras[:, :POSE_SIZE] = np.where(constant, problem.cameras[:, :POSE_SIZE], cameras[:, :POSE_SIZE])
         points = np.where(np.asarray(problem.constants.points)[:, None], problem.points, points)
-    return problem.replace(cameras=cameras, points=points)
+    return problem.replace(cameras=cameras, points=points, rigs=rigs)

@@ -27,6 +27,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
+from jaxba.problem.rigs import in_frames
 from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
@@ -101,7 +102,8 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         ProblemError: the cost is not finite.
     """
     with jax.enable_x64(True), process.single_blas_thread():
-        layout = build_layout(problem, pairs=False, grid=False)
+        here = in_frames(problem)
+        layout = build_layout(here, pairs=False, grid=False)
         order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
         real = order < problem.num_points  # without padding points
         first = np.zeros(problem.num_points, np.int64)
@@ -110,7 +112,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         origin[:, real] = components_first(geometry.camera_centers(problem.cameras)[first[order[real]]])
         level = level_after(EQUIVALENT_STEPS, stages("acceptance", problem.num_observations))
         search = program(_search, "loss", level=level)
-        given = (jax.device_put(layout), problem, jnp.asarray(origin), loss or Loss())
+        given = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
         found = jax.device_get(compile_and_run(search, *given))
         process.release_programs()  # see `release_programs`: too many programs end a process
     if not np.isfinite(found.cost_before):

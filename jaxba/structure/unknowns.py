@@ -29,6 +29,7 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CameraModel
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
 from jaxba.problem.priors import Priors
+from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.typing import AnyArray, register_pytree
 
 
@@ -43,9 +44,6 @@ class Unknowns:
 
     frame: Int[AnyArray, " cameras"] | None
     """Frame of each camera; None if no observed cameras move together."""
-
-    from_rig: Float[AnyArray, "cameras 3 3"] | None
-    """Rotation M of each camera in its rig (problem/rigs.py): pose unknowns are those of frames. None without rigs."""
 
     free: Bool[AnyArray, "width cameras"] | None
     """Which unknowns of each camera's block are optimised; None: all."""
@@ -70,7 +68,10 @@ class Unknowns:
     """Numbers of a lens that are part of a camera's block, ascending."""
 
     size: int = field(metadata={"static": True})
-    """Number of all intrinsics of a camera."""
+    """Number of all intrinsics of a camera, and of its extrinsics if it is in a rig."""
+
+    in_rigs: bool = field(default=False, metadata={"static": True})
+    """Whether poses are those of frames, and the last numbers of a camera its extrinsics (problem/rigs.py)."""
 
     @property
     def shared(self) -> bool:
@@ -128,14 +129,6 @@ class Unknowns:
         """The mean over the cameras of each frame."""
         return self.frame_total(values) / self.frame_total(jnp.ones_like(values[:, :1]))
 
-    def of_cameras(self, step: Float[Array, "width cameras"]) -> Float[Array, "parameters cameras"]:
-        """A step of all numbers of cameras for one of the unknowns: that of a frame turned into each of its cameras."""
-        full = self.expanded(step)
-        if self.from_rig is None:
-            return full
-        turn = lambda rows: jnp.einsum("cij,jc->ic", self.from_rig, rows, precision="highest")
-        return jnp.concatenate([turn(full[:3]), turn(full[3:6]), full[6:]])
-
     def restricted(self, changes: Float[Array, "*steps parameters cameras"]) -> Float[Array, "*steps width cameras"]:
         """The unknowns of changes of all numbers of cameras."""
         rows = [*range(POSE_SIZE), *(POSE_SIZE + column for column in self.columns)]
@@ -156,7 +149,7 @@ def unknowns_of(
     """The unknowns of a problem, for its layout.
 
     Args:
-        problem: a checked problem.
+        problem: a checked problem, `in_frames` if it has rigs.
         seen: whether each camera has an observation; padding cameras have none.
         order: point of the problem at each position in layout order; out of range for padding.
         fixed: whether all intrinsics are constant.
@@ -168,10 +161,12 @@ def unknowns_of(
     plain = lenses is None and constants is None and problem.priors is None and problem.rigs is None
     if plain and not fixed:
         return None
-    size, count = lens_size(lenses), problem.num_cameras
+    count, in_rigs = problem.num_cameras, problem.rigs is not None
     index = np.arange(count) if lenses is None else np.asarray(lenses.index)
-    lens_free = np.ones((count, size), bool) if lenses is None else np.asarray(lenses.free)[index]
+    lens_free = np.ones((count, lens_size(lenses)), bool) if lenses is None else np.asarray(lenses.free)[index]
     lens_free = lens_free & (not fixed)
+    if in_rigs:
+        lens_free = np.hstack([lens_free, _free_extrinsics(problem, index)])
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
     pose_free = np.ones((count, POSE_SIZE), bool)
     free_points = None
@@ -179,10 +174,9 @@ def unknowns_of(
         pose_free = ~np.asarray(constants.poses)
         if np.asarray(constants.points).any():
             free_points = np.append(~np.asarray(constants.points), True)[np.minimum(order, problem.num_points)]
-    members = model = frame = from_rig = None
-    if problem.rigs is not None:
+    members = model = frame = None
+    if in_rigs:
         frame, pose_free = _frames(problem, seen[:count], pose_free)
-        from_rig = None if frame is None else np.asarray(problem.rigs.rotation)
     shared, times = np.unique(index[seen[:count]], return_counts=True)
     shared = shared[times > 1]
     if lenses is not None and columns and len(shared):
@@ -196,25 +190,37 @@ def unknowns_of(
         model = np.asarray(lenses.model)[index]
     priors = None if problem.priors is None else _camera_priors(problem, index, seen)
     free_numbers = None if free.all() else free.T
+    size = lens_free.shape[1]
     return Unknowns(
-        members, frame, from_rig, free_numbers, free_points, model, priors, models, all_shared, columns, size
+        members, frame, free_numbers, free_points, model, priors, models, all_shared, columns, size, in_rigs
     )
+
+
+def _free_extrinsics(problem: BundleProblem, index: Int[np.ndarray, " cameras"]) -> Bool[np.ndarray, "cameras 6"]:
+    """Which extrinsics of each camera are optimised: of a lens, those that no camera of it with a constant pose has."""
+    assert problem.rigs is not None
+    free = np.zeros((problem.num_cameras, EXTRINSICS_SIZE), bool)
+    if problem.rigs.free is None:
+        return free
+    free |= np.asarray(problem.rigs.free)[:, None]
+    if problem.constants is not None:
+        constant = np.zeros((index.max() + 1, EXTRINSICS_SIZE), bool)
+        np.logical_or.at(constant, index, np.asarray(problem.constants.poses))
+        free &= ~constant[index]
+    return free
 
 
 def _frames(
     problem: BundleProblem, seen: np.ndarray, pose_free: Bool[np.ndarray, "cameras 6"]
-) -> tuple[Int[np.ndarray, " cameras"] | None, Bool[np.ndarray, "cameras 6"]]:
+) -> tuple[Int[np.ndarray, " cameras"], Bool[np.ndarray, "cameras 6"]]:
     """The frame of each camera, cameras that nothing sees by themselves, and which pose numbers of frames are free:
-    constant numbers of one camera are constant in its frame. No frames if all have one observed camera."""
+    constant numbers of one camera are constant in its frame."""
     assert problem.rigs is not None
     frame = np.asarray(problem.rigs.frame).astype(np.int64)
     frame = np.where(seen, frame, frame.max(initial=0) + 1 + np.arange(len(frame)))
-    _, frame, times = np.unique(frame, return_inverse=True, return_counts=True)
-    if not (times > 1).any():
-        return None, pose_free
-    diagonal = np.abs(np.asarray(problem.rigs.rotation)) > 1 - 1e-12  # of a camera whose axes are those of its rig
+    _, frame = np.unique(frame, return_inverse=True)
     part = ~pose_free[:, 3:].all(axis=1) & pose_free[:, 3:].any(axis=1)
-    bad = np.flatnonzero(part & ~(np.diagonal(diagonal, axis1=1, axis2=2).all(axis=1)))
+    bad = np.flatnonzero(part & problem.rigs.turned)
     if bad.size:
         raise ProblemError(f"part of the translation of camera {bad[0]} is constant, which is turned in its rig")
     constant = np.zeros(pose_free.shape, bool)

@@ -403,12 +403,15 @@ def rigs_of(cameras: int):
 
 
 @pytest.mark.parametrize("linear_solver", ["explicit", "implicit"])
-def test_rigs_end_where_colmap_has_them_and_are_written_as_rigs(tmp_path, linear_solver):
+@pytest.mark.parametrize("places", ["constant", "free"])
+def test_rigs_end_where_colmap_has_them_and_are_written_as_rigs(tmp_path, linear_solver, places):
     folder = write(rigs_of(3), tmp_path / "model")
     problem = read_problem(folder)
+    assert problem.rigs.free.sum() == 20  # two of three cameras in ten frames
+    problem = hold(problem, extrinsics="all" if places == "constant" else ())
     np.testing.assert_allclose(geometry.cost(problem), colmap_cost(folder), rtol=1e-9)
     solution = solve(problem, "ceres", SolveOptions(linear_solver=linear_solver, max_iterations=100))
-    truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=True, refine_sensor_from_rig=False)
+    truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=True, refine_sensor_from_rig=places == "free")
     np.testing.assert_allclose(solution.final_cost, truth, rtol=1e-5)
     write_colmap(solution.problem, tmp_path / "out", like=folder)
     np.testing.assert_allclose(colmap_cost(tmp_path / "out"), solution.final_cost, rtol=1e-9)

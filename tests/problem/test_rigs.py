@@ -52,9 +52,34 @@ def rigged(shared: bool = True) -> BundleProblem:
     return problem.replace(observations=pixels)
 
 
-def copy_matrix(problem: BundleProblem) -> np.ndarray:
-    """T: the steps of all parameters (rotations on the manifold) for unit steps of the unknowns."""
+def stereo() -> BundleProblem:
+    """Six cameras in four frames, two of them of two cameras: the second has a lens of its own, and is not quite where
+    its rig says it is."""
+    plain, rng = support.tiny(), np.random.default_rng(1)
+    cameras, rotation, translation = np.array(plain.cameras), np.tile(np.eye(3), (6, 1, 1)), np.zeros((6, 3))
+    index = np.array([0, 0, 1, 0, 1, 0])
+    cameras[:, 6:] = cameras[index, 6:]
+    matrices = geometry.rotation_matrices(cameras[:, :3])
+
+    def place(turn, moved):
+        rotation[[2, 4]], translation[[2, 4]] = Rotation.from_rotvec(turn).as_matrix(), moved
+        for second, first in ((2, 0), (4, 1)):
+            cameras[second, :3] = Rotation.from_matrix(rotation[2] @ matrices[first]).as_rotvec()
+            cameras[second, 3:6] = rotation[2] @ cameras[first, 3:6] + translation[2]
+
+    place([0.1, 0.05, -0.1], [0.3, -0.2, 0.1])
+    pixels = geometry.project(plain.replace(cameras=cameras)) + 0.3 * rng.normal(size=plain.observations.shape)
+    place([0.11, 0.04, -0.1], [0.35, -0.2, 0.15])
+    rigs = Rigs(FRAME, rotation, translation, index == 1)
+    parts = (plain.points, pixels, plain.camera_index, plain.point_index)
+    return BundleProblem.create(cameras, *parts, lenses=Lenses(index, np.ones((2, 3), bool)), rigs=rigs)
+
+
+def copies_of(problem: BundleProblem) -> tuple[dict, np.ndarray]:
+    """The unknowns, and T: the steps of all parameters (rotations on the manifold) for unit steps of them."""
     size, names, columns = 9 * 6 + 3 * problem.num_points, {}, []
+    rigs = problem.rigs
+    free = np.zeros(6, bool) if rigs.free is None else rigs.free
 
     def column(name) -> np.ndarray:
         if name not in names:
@@ -70,27 +95,84 @@ def copy_matrix(problem: BundleProblem) -> np.ndarray:
         for k in range(6, 9):
             lens = camera if problem.lenses is None else int(problem.lenses.index[camera])
             column(("lens", lens, k))[9 * camera + k] = 1
+        for k in range(3 if free[camera] else 0):
+            start, axis = 9 * camera, np.eye(3)[k]
+            column(("place", int(problem.lenses.index[camera]), k))[start + k] = 1
+            turned = np.cross(axis, problem.cameras[camera, 3:6] - rigs.translation[camera])
+            column(("place", int(problem.lenses.index[camera]), k))[start + 3 : start + 6] = turned
+            column(("place", int(problem.lenses.index[camera]), 3 + k))[start + 3 + k] = 1
     for k in range(54, size):
-        column(k)[k] = 1
-    return np.array(columns).T
+        column(("point", k - 54))[k] = 1
+    return names, np.array(columns).T
 
 
-@pytest.mark.parametrize(
-    ("solver", "shared"), [("explicit", True), ("explicit", False), ("sparse", False), ("implicit", True)]
-)
-def test_a_step_is_that_of_the_dense_problem_of_frames(solver, shared):
-    problem = rigged(shared)
+def unknown_step(problem: BundleProblem, names: dict, before, after) -> np.ndarray:
+    """The step of each unknown between two states."""
+    old, new = np.array(before.cameras).T, np.array(after.cameras).T
+    change = new - old
+    for at in (0, 9):
+        turned = (
+            Rotation.from_rotvec(new[:, at : at + 3].copy()) * Rotation.from_rotvec(old[:, at : at + 3].copy()).inv()
+        )
+        change[:, at : at + 3] = turned.as_rotvec()
+    points = (support.back(problem, before, after).points - problem.points).ravel()
+    at = {"frame": (FRAME, 0), "place": (problem.lenses.index if problem.lenses is not None else np.arange(6), 9)}
+    at["lens"] = (at["place"][0], 0)
+    found = []
+    for kind, *number in names:
+        if kind == "point":
+            found.append(points[number[0]])
+            continue
+        of_camera, first = at[kind]
+        same = change[of_camera == number[0], first + number[1]]
+        np.testing.assert_array_equal(same, same[0])  # what is one unknown stays one, bit for bit
+        found.append(same[0])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("solver", ["explicit", "sparse", "implicit"])
+@pytest.mark.parametrize("make", [rigged, lambda: rigged(shared=False), stereo], ids=["shared", "own", "free"])
+def test_a_step_is_that_of_the_dense_problem_of_frames(solver, make):
+    problem = make()
     options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT, coordinates=MANIFOLD)
     layout, before = support.start(problem, options)
     after, _ = support.step(layout, before, 1e-2, options, min_gain=-np.inf)
-    found = support.difference(problem, support.back(problem, before, after), options)
     residual, jacobian = support.linear(problem, options)
-    copies = copy_matrix(problem)
+    names, copies = copies_of(problem)
+    found = unknown_step(problem, names, before, after)
     small = jacobian @ copies
     stacked = np.vstack([small, np.diag(np.sqrt(1e-2 * np.clip(np.sum(small**2, axis=0), 1e-6, 1e32)))])
     right = np.concatenate([-residual, np.zeros(small.shape[1])])
-    wanted = copies @ np.linalg.lstsq(stacked, right, rcond=None)[0]
+    wanted = np.linalg.lstsq(stacked, right, rcond=None)[0]
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-7 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("policy", ["ceres", "guarded"])
+def test_where_a_camera_is_in_its_rig_is_found(policy):
+    problem = stereo()
+    found = solve(problem, policy).problem
+    parts = (found.cameras, *support.arrays(found)[1:])
+    BundleProblem.create(*parts, lenses=found.lenses, rigs=found.rigs)  # refuses cameras that are elsewhere
+    assert geometry.cost(found) < 0.9 * geometry.cost(solve(problem.replace(rigs=held(problem)), policy).problem)
+    assert support.same_bits(found.rigs.rotation[[0, 1, 3, 5]], problem.rigs.rotation[[0, 1, 3, 5]])
+    # the truth, but for the scale of the scene and noise
+    turn = Rotation.from_matrix(found.rigs.rotation[2]).as_rotvec()
+    np.testing.assert_allclose(turn, [0.1, 0.05, -0.1], rtol=0, atol=2e-3)
+    # constant poses and constant places come back bit for bit
+    kept = solve(hold(problem, poses=[2], extrinsics="all"), policy).problem
+    assert support.same_bits(kept.cameras[2, :6], problem.cameras[2, :6])
+    assert support.same_bits((kept.rigs.rotation, kept.rigs.translation), problem_places(problem))
+    held_pose = solve(hold(problem, poses=[2]), policy).problem
+    assert support.same_bits(held_pose.cameras[2, :6], problem.cameras[2, :6])
+    BundleProblem.create(held_pose.cameras, *support.arrays(held_pose)[1:], rigs=held(held_pose))
+
+
+def held(problem: BundleProblem) -> Rigs:
+    return Rigs(problem.rigs.frame, problem.rigs.rotation, problem.rigs.translation)
+
+
+def problem_places(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
+    return problem.rigs.rotation, problem.rigs.translation
 
 
 @pytest.mark.parametrize("policy", ["ceres", "guarded"])
@@ -104,14 +186,16 @@ def test_cameras_of_a_frame_stay_where_their_rig_has_them(policy):
     np.testing.assert_allclose(after.cameras[[1, 4], :6], problem.cameras[[1, 4], :6], rtol=0, atol=0)
 
 
-def test_covariances_are_those_of_the_dense_inverse_seen_by_each_camera():
-    problem = with_gauge(solve(rigged(), "ceres").problem, "two-cameras")
-    assert problem.constants.poses.all(axis=1).sum() == 1  # the rigs give the scene its scale
+@pytest.mark.parametrize("make", [rigged, stereo])
+def test_covariances_are_those_of_the_dense_inverse_seen_by_each_camera(make):
+    problem = with_gauge(solve(make(), "ceres").problem, "two-cameras")
+    # constant places in rigs give the scene its scale
+    assert problem.constants.poses.any(axis=1).sum() == (1 if problem.rigs.free is None else 2)
     found = covariance(problem)
     _, jacobian = support.linear(problem, StepOptions(coordinates=MANIFOLD))
-    copies = copy_matrix(problem)
-    held = np.repeat(problem.constants.poses.any(axis=1), 9)
-    held = np.concatenate([held & np.tile(np.arange(9) < 6, 6), np.zeros(3 * problem.num_points, bool)])
+    _, copies = copies_of(problem)
+    held = np.hstack([problem.constants.poses, np.zeros((6, 3), bool)]).ravel()
+    held = np.concatenate([held, np.zeros(3 * problem.num_points, bool)])
     of_held = np.abs(copies[held]).any(axis=0)
     small = copies[:, ~of_held]
     whole = small @ np.linalg.inv(small.T @ jacobian.T @ jacobian @ small) @ small.T
@@ -156,3 +240,8 @@ def test_what_rigs_do_not_support_is_one_line():
     wrong[2] += 1.0
     with pytest.raises(ProblemError, match="cameras 0 and 2 of one frame are not where their rig has them"):
         BundleProblem.create(*support.arrays(problem), rigs=Rigs(rigs.frame, rigs.rotation, wrong))
+    free = Rigs(*[getattr(rigs, name) for name in ("frame", "rotation", "translation")], np.ones(6, bool))
+    with pytest.raises(ProblemError, match="free extrinsics of rigs need lenses"):
+        BundleProblem.create(*support.arrays(problem), rigs=free)
+    with pytest.raises(ProblemError, match="cameras 1 and 2 share a lens, but are in different places"):
+        BundleProblem.create(*support.arrays(problem), lenses=problem.lenses, rigs=free)

@@ -194,7 +194,14 @@ def _rigs_of(model: Model, images: list[Image]) -> Rigs | None:
     flip = np.diag(COLMAP_FLIP)
     rotations = flip @ Rotation.from_quat(quaternions(poses)[:, XYZW]).as_matrix()
     translations = np.array([pose.tvec for pose in poses]) * COLMAP_FLIP
-    return Rigs(np.unique(ids, return_inverse=True)[1].astype(np.int32), rotations, translations)
+    # a rig whose reference sensor sees nothing has its frames where the first of its other cameras says
+    rig, known = [frames[image.id].rig for image in images], {}
+    for of_rig, place, image in sorted(zip(rig, places, images, strict=True), key=lambda one: one[2].camera):
+        if place is None or of_rig not in known:
+            known[of_rig] = None if place is None else image.camera
+    free = np.array([p is not None and known[r] != i.camera for r, p, i in zip(rig, places, images, strict=True)])
+    frame = np.unique(ids, return_inverse=True)[1].astype(np.int32)
+    return Rigs(frame, rotations, translations, free if free.any() else None)
 
 
 def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:

@@ -30,7 +30,7 @@ from jaxba.io.colmap.records import (
 from jaxba.io.files import StrPath, display_name, reason
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import COLMAP_FLIP, colmap_quaternions
+from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, colmap_quaternions
 
 
 def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None = None) -> None:
@@ -128,28 +128,34 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
 
 
 def _with_places(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
-    """The model with its cameras where the problem's rigs have them: a scene that was scaled has larger rigs."""
+    """The model with its cameras where the problem's rigs have them."""
     old, new = assembled.problem.rigs, problem.rigs
-    if old is None or new is None or model.rigs is None or (old.translation == new.translation).all():
+    if old is None or new is None or model.rigs is None:
         return model
+    turned = (old.rotation != new.rotation).any(axis=(1, 2))
+    if not turned.any() and (old.translation == new.translation).all():
+        return model
+    quaternions = colmap_quaternions(angle_axis(new.rotation))[:, WXYZ]
+    translations = np.asarray(new.translation) * COLMAP_FLIP
     rig_of = {image: frame.rig for frame in (model.frames or {}).values() for _, image in frame.images}
     moved = {
-        (rig_of[image.id], image.camera): translation
-        for image, translation in zip(
-            assembled.images, (np.asarray(new.translation) * COLMAP_FLIP).tolist(), strict=True
+        (rig_of[image.id], image.camera): (pose_of([*quaternion, *translation]), turn)
+        for image, quaternion, translation, turn in zip(
+            assembled.images, quaternions, translations, turned, strict=True
         )
     }
 
-    def placed(rig: Rig) -> Rig:
-        sensors = (
-            replace(sensor, from_rig=replace(sensor.from_rig, tvec=tuple(moved[rig.id, sensor.id])))
-            if sensor.from_rig is not None and sensor.type == CAMERA_SENSOR and (rig.id, sensor.id) in moved
-            else sensor
-            for sensor in rig.sensors
-        )
-        return replace(rig, sensors=tuple(sensors))
+    def placed(rig: Rig, sensor: Sensor) -> Sensor:
+        if sensor.from_rig is None or sensor.type != CAMERA_SENSOR or (rig.id, sensor.id) not in moved:
+            return sensor
+        pose, turn = moved[rig.id, sensor.id]
+        return replace(sensor, from_rig=pose if turn else replace(sensor.from_rig, tvec=pose.tvec))
 
-    return replace(model, rigs={identity: placed(rig) for identity, rig in model.rigs.items()})
+    rigs = {
+        identity: replace(rig, sensors=tuple(placed(rig, sensor) for sensor in rig.sensors))
+        for identity, rig in model.rigs.items()
+    }
+    return replace(model, rigs=rigs)
 
 
 def _check_lens(camera: Camera, target: str) -> None:
