@@ -1,0 +1,212 @@
+"""The solve loop on several devices, as one program.
+
+Points are divided among the devices of a mesh with their observations (structure/shards.py); cameras, the state of the
+policy and all decisions are on every device. The step is the same as on one device: what is summed over points or
+observations is summed over devices, too (structure/devices.py).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Float, Int
+
+from jaxba.damping import DampingPolicy, effort_of
+from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.lm.step import lm_step
+from jaxba.lm.termination import Termination, Tolerances
+from jaxba.model.linearize import cost
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.options import StepOptions
+from jaxba.runtime import distributed
+from jaxba.solver.loop import Carry, History, advance, begin, history_of, problem_info
+from jaxba.structure.devices import AXIS
+from jaxba.structure.layout import Layout
+from jaxba.structure.shards import deal_points, shard_of, sharded_layout
+
+_DIVIDED, _EVERYWHERE = PartitionSpec(AXIS), PartitionSpec()
+_CARRY = Carry(LMState(_EVERYWHERE, _DIVIDED, _EVERYWHERE), _EVERYWHERE, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE)
+"""Where the parts of a carry are: points are divided, all else is on every device."""
+
+
+class Shards:
+    """A problem divided among devices, and the programs of its loop."""
+
+    layout: Layout
+    """Layouts of all shards, of equal shapes, along a leading axis that is divided among the devices."""
+
+    first: Layout
+    """The layout of this process's first shard, on the host."""
+
+    order: Int[np.ndarray, "shards points"]
+    """The point of the problem at each position in layout order; the number of points for padding."""
+
+    def __init__(
+        self, problem: BundleProblem, options: StepOptions, devices: Sequence[jax.Device], dtype: np.dtype[Any]
+    ) -> None:
+        """Deals the points, builds the layouts of this process, and places them on its devices.
+
+        Args:
+            problem: `in_frames` if it has rigs.
+            options: of the step.
+            devices: of all processes.
+            dtype: of the parameters.
+
+        Raises:
+            ProblemError: the method of the options works on one device only, or there are too few points.
+        """
+        if options.method is not None:
+            raise ProblemError(f"several devices are for plain LM, not for {options.solver_name}")
+        self._options, self._devices = options, devices
+        self._mesh = Mesh(np.array(devices), (AXIS,))
+        tracks = np.bincount(problem.point_index, minlength=problem.num_points)
+        dealt = deal_points(tracks, len(devices))
+        if not len(dealt[-1]):
+            raise ProblemError(f"{len(devices)} devices are more than there are observed points")
+        own = [shard_of(problem, points) for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
+        layouts = sharded_layout(own, options, distributed.gather)
+        self.layout, self.first = self._placed(layouts), layouts[0]
+        here = [points for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
+        orders = [_order(layout, points, problem) for layout, points in zip(layouts, here, strict=True)]
+        self.order = distributed.to_host(self._placed(orders))
+        known = np.append(np.asarray(problem.points, dtype), np.zeros((1, 3), dtype), axis=0)
+        self._points = self._placed([np.ascontiguousarray(known[order].T) for order in orders])
+        cameras = np.ascontiguousarray(np.asarray(problem.cameras, dtype).T)
+        self._cameras = jax.device_put(cameras, NamedSharding(self._mesh, _EVERYWHERE))
+
+    def _placed(self, trees: list[Any]) -> Any:
+        """Pytrees of this process's shards as arrays with a leading axis, each entry on its device."""
+        here = [device for device in self._devices if _is_here(device)]
+        sharding = NamedSharding(self._mesh, _DIVIDED)
+
+        def placed(*leaves: Any) -> Array:
+            parts = [jax.device_put(np.asarray(leaf)[None], device) for leaf, device in zip(leaves, here, strict=True)]
+            shape = (len(self._devices), *np.shape(leaves[0]))
+            return jax.make_array_from_single_device_arrays(shape, sharding, parts)
+
+        return jax.tree.map(placed, *trees)
+
+    def begin(self, policy: DampingPolicy, limit: Int[np.ndarray, ""], prices: Prices) -> Carry:
+        """The carry before the first iteration."""
+        given = self.layout, self._cameras, self._points, policy, limit, prices
+        return _begin(*given, mesh=self._mesh, options=self._options)
+
+    def run(
+        self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""], length: int
+    ) -> tuple[Carry, History]:
+        """The whole loop; histories have the given length."""
+        given = self.layout, carry, policy, tolerances, limit
+        return _run(*given, mesh=self._mesh, options=self._options, length=length)
+
+    def iterate(
+        self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""]
+    ) -> tuple[Carry, StepInfo]:
+        """One iteration."""
+        return _iterate(self.layout, carry, policy, tolerances, limit, mesh=self._mesh, options=self._options)
+
+
+def _is_here(device: jax.Device) -> bool:
+    return device.process_index == jax.process_index()
+
+
+def _order(layout: Layout, points: Int[np.ndarray, " own"], problem: BundleProblem) -> Int[np.ndarray, " points"]:
+    """The point of the problem at each position of a shard."""
+    members = np.concatenate([np.asarray(one) for one in layout.bucket_points])
+    return np.append(points, problem.num_points)[np.minimum(members, len(points))]
+
+
+def _own(layout: Layout) -> Layout:
+    """The layout of this device, inside of a program."""
+    return jax.tree.map(lambda leaf: leaf[0], layout)
+
+
+def _divided(carry: Carry, points: Callable[[Array], Array]) -> Carry:
+    return carry._replace(state=carry.state._replace(points=points(carry.state.points)))
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "options"))
+def _begin(
+    layout: Layout,
+    cameras: Float[Array, "parameters cameras"],
+    points: Float[Array, "shards 3 points"],
+    policy: DampingPolicy,
+    limit: Int[Array, ""],
+    prices: Prices,
+    *,
+    mesh: Mesh,
+    options: StepOptions,
+) -> Carry:
+    def start(layout: Layout, cameras: Array, points: Array, policy: Any, limit: Array, prices: Prices) -> Carry:
+        layout, points = _own(layout), points[0]
+        state = LMState(cameras, points, cost(layout, cameras, points, options.loss))
+        carry = begin(problem_info(layout, state, options, limit, prices), policy, state)
+        return _divided(carry, lambda x: x[None])
+
+    places = _DIVIDED, _EVERYWHERE, _DIVIDED, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
+    on_all = jax.shard_map(start, mesh=mesh, in_specs=places, out_specs=_CARRY, check_vma=False)
+    return on_all(layout, cameras, points, policy, limit, prices)
+
+
+def _step(layout: Layout, carry: Carry, policy: DampingPolicy, options: StepOptions) -> tuple[LMState, StepInfo]:
+    effort = effort_of(policy, carry.policy)
+    return lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration, effort)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "options"))
+def _iterate(
+    layout: Layout,
+    carry: Carry,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    limit: Int[Array, ""],
+    *,
+    mesh: Mesh,
+    options: StepOptions,
+) -> tuple[Carry, StepInfo]:
+    def iterate(layout: Layout, carry: Carry, policy: Any, tolerances: Tolerances, limit: Array) -> Any:
+        layout, carry = _own(layout), _divided(carry, lambda x: x[0])
+        state, step = _step(layout, carry, policy, options)
+        return _divided(advance(carry, state, step, policy, tolerances, limit, 1), lambda x: x[None]), step
+
+    places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
+    on_all = jax.shard_map(iterate, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
+    return on_all(layout, carry, policy, tolerances, limit)
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "options", "length"))
+def _run(
+    layout: Layout,
+    carry: Carry,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    limit: Int[Array, ""],
+    *,
+    mesh: Mesh,
+    options: StepOptions,
+    length: int,
+) -> tuple[Carry, History]:
+    def run(layout: Layout, carry: Carry, policy: Any, tolerances: Tolerances, limit: Array) -> Any:
+        layout, carry = _own(layout), _divided(carry, lambda x: x[0])
+        shapes = jax.eval_shape(lambda c: history_of(_step(layout, c, policy, options)[1]), carry)
+        empty = jax.tree.map(lambda s: jnp.zeros((length, *s.shape), s.dtype), shapes)
+
+        def body(loop: tuple[Carry, History]) -> tuple[Carry, History]:
+            carry, history = loop
+            state, step = _step(layout, carry, policy, options)
+            history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, history_of(step))
+            return advance(carry, state, step, policy, tolerances, limit, 1), history
+
+        more = lambda loop: loop[0].termination == Termination.RUNNING
+        carry, history = lax.while_loop(more, body, (carry, empty))
+        return _divided(carry, lambda x: x[None]), history
+
+    places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
+    on_all = jax.shard_map(run, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
+    return on_all(layout, carry, policy, tolerances, limit)

@@ -1,0 +1,40 @@
+"""Sums over devices: the only place where devices of a sharded solve talk to each other.
+
+Points are divided among devices, each with its observations and a `Layout` of its own; cameras are on all of them. Sums
+over observations or points, into cameras or scalars, end in one of these functions. Without a mesh they do nothing.
+
+Source: the same division as in PBA (Wu et al. 2011) and DeepLM (Huang et al. 2021); `jax.shard_map`.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array, lax
+
+from jaxba.structure.layout import Layout
+
+AXIS = "devices"
+"""Name of the axis of the mesh over which points are divided."""
+
+T = TypeVar("T")
+
+
+def sum_over_devices(layout: Layout, values: T) -> T:
+    """The sum of an array, or of each of a pytree, over all devices."""
+    return values if layout.axis is None else lax.psum(values, layout.axis)
+
+
+def max_over_devices(layout: Layout, value: Array) -> Array:
+    """The largest value of any device."""
+    return value if layout.axis is None else lax.pmax(value, layout.axis)
+
+
+def on_one_device(layout: Layout, values: T) -> T:
+    """The values on the first device and zeros on the others: a term that is no sum over points, before a sum."""
+    if layout.axis is None:
+        return values
+    first = lax.axis_index(layout.axis) == 0
+    return jax.tree.map(lambda x: jnp.where(first, x, jnp.zeros_like(x)), values)
