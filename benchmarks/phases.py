@@ -106,9 +106,7 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     yield phase("camera sums", by_camera, linear, points, rotation)
     system = done["camera sums"]
     if layout.grid is not None:
-        yield phase(
-            "form", lambda la, li, po, sy: reduced_system.dense_system(la.grid, li, po, sy), linear, points, system
-        )
+        yield phase("form", lambda la, li, po, sy: reduced_system.dense_system(la, li, po, sy), linear, points, system)
         factor = lambda _, m, x: factor_and_solve(m, x.reshape(-1))
         yield phase("factor", factor, done["form"], system.right)
     elif plain.forms_reduced_system:

@@ -24,6 +24,7 @@ from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import Preconditioner
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.fusion import fusion_barrier
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
@@ -103,7 +104,7 @@ def diagonal_blocks(
     columns = [f00 * a + f10 * b for a, b in zip(first, second, strict=True)] + [f11 * b for b in second]
     level, *levels = layout.camera_levels
     gathered = take_rows(as_rows(columns), level).reshape(level.shape[0], -1, len(first))
-    return system.own + tree_sum(outer_sum(gathered, gathered), tuple(levels))
+    return system.own + sum_over_devices(layout, tree_sum(outer_sum(gathered, gathered), tuple(levels)))
 
 
 def block_inverse(blocks: Float[Array, "cameras width width"]) -> Callable[[Array], Array]:

@@ -33,6 +33,7 @@ from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.density import has_few_points
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout, PairLayout
 from jaxba.structure.segment_sums import take_rows, tree_sum
 from jaxba.typing import AnyArray
@@ -74,8 +75,8 @@ def solve_reduced(
     if explicit and system.unknowns is not None:
         return _solve_bordered(layout, linear, points, system, options)
     # the system of a scene with few points is small: float32 would save nothing
-    if explicit and grid is not None and (not options.mixed_precision or has_few_points(*grid.shape)):
-        return solve_dense(grid, linear, points, system), _no_iterations()
+    if explicit and grid is not None and (not options.mixed_precision or _by_woodbury(layout)):
+        return solve_dense(layout, linear, points, system), _no_iterations()
     if not options.mixed_precision:
         if explicit:
             return factor_blocks(layout, reduced_blocks(layout, linear, points, system), system.right), _no_iterations()
@@ -85,7 +86,7 @@ def solve_reduced(
         if grid is None:
             solve = factored(layout, reduced_blocks(layout, linear32, points32, system32))
         else:
-            solve = factored_dense(dense_system(grid, linear32, points32, system32))
+            solve = factored_dense(dense_system(layout, linear32, points32, system32))
         precondition = lambda r: solve(r.astype(jnp.float32)).astype(r.dtype)
         return _conjugate_gradients(product, precondition, system, options, CORRECTION_FORCING)
     step, iterations = _solve_iteratively(layout, linear32, points32, system32, anchor32, options, forcing)
@@ -162,7 +163,7 @@ def _solve_merged(
     unknowns, shape = system.unknowns, system.right.shape
     assert unknowns is not None
     if layout.grid is not None:
-        matrix = dense_system(layout.grid, linear, points, system)
+        matrix = dense_system(layout, linear, points, system)
     else:
         lower = dense_blocks(_pairs(layout), reduced_blocks(layout, linear, points, system))
         matrix = jnp.tril(lower) + jnp.tril(lower, -1).T
@@ -179,7 +180,7 @@ def _factored_without_shared(
     """`A^-1` of several columns, where A is S without shared lenses; `shifted` for a float32 preconditioner."""
     unknowns, cameras = border.unknowns, layout.num_cameras
     if layout.grid is not None:
-        matrix = dense_system(layout.grid, linear, points, system)
+        matrix = dense_system(layout, linear, points, system)
         every = jnp.arange(cameras)
         blocks = matrix.reshape(cameras, -1, cameras, matrix.shape[0] // cameras).transpose(0, 2, 1, 3)
         blocks = blocks.reshape(-1, *blocks.shape[2:])
@@ -213,7 +214,7 @@ def reduced_blocks(
     """The blocks of the lower triangle of S, in the order of `PairLayout`; the last one is zero."""
     pairs = _pairs(layout)
     width = system.blocks.shape[-1]
-    products = pair_products(pairs, coupling_by_camera(layout, points, system), width)
+    products = sum_over_devices(layout, pair_products(pairs, coupling_by_camera(layout, points, system), width))
 
     def subtracted(own: Array, products: Array) -> Array:
         own = jnp.concatenate([own.reshape(-1, width**2), jnp.zeros((1, width**2), own.dtype)])
@@ -223,13 +224,23 @@ def reduced_blocks(
 
 
 def solve_dense(
-    grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
+    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "cameras width"]:
     """Solves `S x = b` where most cameras see most points: by S itself, or by Woodbury's identity for few points."""
-    if has_few_points(*grid.shape):
-        return capacitance_solve(dense_coupling(grid, linear, points), system)
-    matrix = dense_system(grid, linear, points, system)
+    if _by_woodbury(layout):
+        return capacitance_solve(dense_coupling(_grid(layout), linear, points), system)
+    matrix = dense_system(layout, linear, points, system)
     return factor_and_solve(matrix, system.right.reshape(-1)).reshape(system.right.shape)
+
+
+def _by_woodbury(layout: Layout) -> bool:
+    return layout.axis is None and has_few_points(*_grid(layout).shape)
+
+
+def _grid(layout: Layout) -> Int[AnyArray, "points cameras"]:
+    if layout.grid is None:
+        raise ValueError("this layout has no grid of slots: its system is formed from pairs")
+    return layout.grid
 
 
 def dense_coupling(
@@ -242,12 +253,12 @@ def dense_coupling(
 
 
 def dense_system(
-    grid: Int[AnyArray, "points cameras"], linear: Linearization, points: PointSystem, system: CameraSystem
+    layout: Layout, linear: Linearization, points: PointSystem, system: CameraSystem
 ) -> Float[Array, "unknowns unknowns"]:
     """`S = B + D_c - W W^T` as one dense matrix product."""
-    cameras = grid.shape[1]
-    wide = dense_coupling(grid, linear, points)
-    product = jnp.matmul(wide, wide.T, precision="highest")
+    cameras = layout.num_cameras
+    wide = dense_coupling(_grid(layout), linear, points)
+    product = sum_over_devices(layout, jnp.matmul(wide, wide.T, precision="highest"))
     own = system.blocks[:, :, None, :] * jnp.eye(cameras, dtype=product.dtype)[:, None, :, None]
     return own.reshape(product.shape) - product
 

@@ -39,6 +39,7 @@ from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.conventions import components_first
+from jaxba.structure.devices import max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import (
     as_rows,
@@ -157,7 +158,7 @@ def camera_system(
     level, *levels = layout.camera_levels
     width = len(linear.camera_jacobian[0])
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 2)
-    products = tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
+    products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient, right = products[:, :, :width], products[:, :, width], -products[:, :, width + 1]
     priors = linear.priors
     if priors is not None:
@@ -205,7 +206,8 @@ def apply_reduced(
         return [a * over + b * under for a, b in zip(first, second, strict=True)]
 
     rows = as_rows(compute_in_one_loop(lifted, at_slot, points.projected, *linear.camera_jacobian))
-    return jnp.einsum("cab,cb->ca", system.blocks, x) - tree_sum(rows, layout.camera_levels)
+    eliminated = sum_over_devices(layout, tree_sum(rows, layout.camera_levels))
+    return jnp.einsum("cab,cb->ca", system.blocks, x) - eliminated
 
 
 def lift_to_cameras(layout: Layout, linear: Linearization, points: PointSystem) -> Float[Array, "cameras width"]:
@@ -213,7 +215,7 @@ def lift_to_cameras(layout: Layout, linear: Linearization, points: PointSystem) 
     solved = take(jnp.stack(points.solved), layout.slot_point)
     over, under = (sum(points.projected[k][i] * solved[i] for i in range(3)) for k in range(2))
     rows = as_rows([a * over + b * under for a, b in zip(*linear.camera_jacobian, strict=True)])
-    return tree_sum(rows, layout.camera_levels)
+    return sum_over_devices(layout, tree_sum(rows, layout.camera_levels))
 
 
 def coupling_by_camera(layout: Layout, points: PointSystem, system: CameraSystem) -> Float[Array, "sorted three_width"]:
@@ -257,7 +259,9 @@ def jacobian_product(
     return [dot(c, by_camera) + dot(p, by_point) for c, p in rows]
 
 
-def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates) -> Float[Array, ""]:
+def largest_gradient(
+    layout: Layout, points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates
+) -> Float[Array, ""]:
     """Largest absolute entry of the gradient, in the options' coordinates."""
     gradient, unknowns = system.gradient, system.unknowns
     if unknowns is not None and unknowns.frame is not None:
@@ -267,7 +271,8 @@ def largest_gradient(points: PointSystem, system: CameraSystem, coordinates: Rot
     if unknowns is not None and unknowns.members is not None:
         lens = unknowns.spread(unknowns.total(lens), lens)
     parts = rotation, gradient[:, 3:6], lens, jnp.stack(points.gradient)
-    return functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts if part.size])
+    largest = functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts if part.size])
+    return max_over_devices(layout, largest)
 
 
 def damping_diagonal(diagonal: Array, damping: Float[Array, "..."], options: StepOptions) -> Array:

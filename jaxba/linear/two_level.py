@@ -30,6 +30,7 @@ from jaxba.model.linearize import Linearization
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.camera_clusters import ClusterLayout
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
 
@@ -144,7 +145,8 @@ def coarse_system(
 ) -> Float[Array, "unknowns unknowns"]:
     """The lower triangle of `P^T S P = P^T (B + D_c) P - sum (P^T Y) (P^T Y)^T`, in blocks of clusters."""
     clusters, count = _clusters(layout), modes.shape[-1]
-    shared = pair_products(clusters.pairs, _shared_rows(layout, linear, points, anchor.points), count)
+    products = pair_products(clusters.pairs, _shared_rows(layout, linear, points, anchor.points), count)
+    shared = sum_over_devices(layout, products)
     own = jnp.einsum("cam,cab,cbn->cmn", modes, system.blocks, modes).reshape(-1, count**2)
     own = cluster_sum(clusters, own)
     own = jnp.concatenate([own, jnp.zeros((1, count**2), own.dtype)])

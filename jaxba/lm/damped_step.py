@@ -44,6 +44,7 @@ from jaxba.model import camera
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
 from jaxba.structure.conventions import components_first
+from jaxba.structure.devices import max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 
@@ -93,24 +94,30 @@ def solve_step(
     if point_step is None:
         point_step = jnp.stack(back_substitute(layout, linear, eliminated, manifold_step))
     camera_step = coordinates.from_manifold(manifold_step)
-    slope, damped = _slope_and_damping(eliminated, reduced, manifold_step, camera_step, point_step)
+    slope, damped = _slope_and_damping(layout, eliminated, reduced, manifold_step, camera_step, point_step)
     if not solution.residual_orthogonal:
         # d.e is not zero: `-g.d - d.H d` takes the place of d.D d, with d.H d = |J d|^2
-        damped = slope - sum(jnp.sum(m * m) for m in jacobian_product(layout, linear, manifold_step, point_step))
+        change = jacobian_product(layout, linear, manifold_step, point_step)
+        damped = slope - sum_over_devices(layout, sum(jnp.sum(m * m) for m in change))
     step = components_first(camera_step)
     return Step(
         step if layout.unknowns is None else layout.unknowns.expanded(step),
         point_step,
         slope,
         damped,
-        largest_gradient(eliminated, reduced, coordinates),
+        largest_gradient(layout, eliminated, reduced, coordinates),
         solution.iterations,
         jnp.asarray(0.0 if truncated is None else forcing, cameras.dtype),
     )
 
 
 def _slope_and_damping(
-    points: PointSystem, system: CameraSystem, manifold_step: Array, camera_step: Array, point_step: Array
+    layout: Layout,
+    points: PointSystem,
+    system: CameraSystem,
+    manifold_step: Array,
+    camera_step: Array,
+    point_step: Array,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`-g.d` and `d.D d`, whose sum gives the decrease of the linear model without cancellation.
 
@@ -121,14 +128,15 @@ def _slope_and_damping(
     `d.e` is zero for a factorisation, for conjugate gradients started at zero, and for the best step of a subspace. The
     two terms that are left are positive.
     """
-    slope = jnp.sum(system.gradient * manifold_step) + jnp.sum(jnp.stack(points.gradient) * point_step)
-    damped = jnp.sum(system.damping * camera_step**2) + jnp.sum(jnp.stack(points.damping) * point_step**2)
-    return -slope, damped
+    of_points = jnp.sum(jnp.stack(points.gradient) * point_step), jnp.sum(jnp.stack(points.damping) * point_step**2)
+    slope, damped = sum_over_devices(layout, of_points)
+    slope = jnp.sum(system.gradient * manifold_step) + slope
+    return -slope, jnp.sum(system.damping * camera_step**2) + damped
 
 
 def largest_diagonal(layout: Layout, linear: Linearization) -> Float[Array, ""]:
     """Largest diagonal entry of the undamped `H = J^T J`. Source: the unit of g2o's initial lambda."""
     square = lambda rows: [a * a + b * b for a, b in zip(*rows, strict=True)]
-    by_camera = tree_sum(as_rows(square(linear.camera_jacobian)), layout.camera_levels)
+    by_camera = sum_over_devices(layout, tree_sum(as_rows(square(linear.camera_jacobian)), layout.camera_levels))
     by_point = jnp.stack(point_sums(layout, square(linear.point_jacobian)))
-    return jnp.maximum(jnp.max(by_camera), jnp.max(by_point))
+    return max_over_devices(layout, jnp.maximum(jnp.max(by_camera), jnp.max(by_point)))

@@ -35,8 +35,8 @@ from jaxba.refinement.acceptance import Candidate
 from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.subproblems import Whole
 from jaxba.structure.conventions import components_first
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
-from jaxba.typing import AnyArray
 
 
 class Proposal(NamedTuple):
@@ -127,7 +127,7 @@ def propose(
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = only_free(layout, linear, options.intrinsics)
     step = solve_step(layout, linear, state.cameras, state.points, damping, options, iteration, state.previous_steps)
-    return Proposal(step, linear.reference, is_weightless(linear, state.cost, options.loss))
+    return Proposal(step, linear.reference, is_weightless(layout, linear, state.cost, options.loss))
 
 
 def try_step(
@@ -151,11 +151,11 @@ def take_step(
     step = proposal.step
     tried_step = [candidate.step_fraction * step.cameras, candidate.points - state.points]
     return _advance(
+        layout,
         state,
         candidate,
         tried_step,
         jnp.asarray(damping, state.cost.dtype),
-        layout.camera_seen,
         gradient_max=step.gradient_max,
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
@@ -195,11 +195,11 @@ def _round(
     method = cast(RoundMethod, options.method)
     result = method.round(layout, *state[:3], damping, iteration, options, min_gain)
     return _advance(
+        layout,
         state,
         result,
         [result.cameras - state.cameras, result.points - state.points],
         damping,
-        layout.camera_seen,
         gradient_max=result.gradient_max,
         cg_iterations=jnp.zeros((), jnp.int32),
         forcing=jnp.zeros_like(state.cost),
@@ -211,21 +211,21 @@ def _round(
 
 
 def _advance(
+    layout: Layout,
     state: LMState,
     candidate: Candidate | Round,
     tried_step: list[Array],
     damping: Float[Array, ""],
-    camera_seen: Bool[AnyArray, " cameras"],
     **fields: Array,
 ) -> tuple[LMState, StepInfo]:
     """The state after the accept decision, and the record of the iteration.
 
     Args:
+        layout: the problem's observations; only cameras with observations count in the parameter norm.
         state: before the iteration.
         candidate: proposed parameters, with the decision.
         tried_step: change of cameras and points that was evaluated, for its norm.
         damping: lambda.
-        camera_seen: cameras with observations; only these count in the parameter norm.
         fields: the fields of `StepInfo` that are not set here.
     """
     choose = lambda new, old: jnp.where(candidate.accepted, new, old)
@@ -235,6 +235,7 @@ def _advance(
         previous = choose(jnp.concatenate([latest[None], previous[:-1]]), previous)
     cameras, points, new_cost = (choose(*pair) for pair in zip(candidate[:3], state[:3], strict=True))
     after = LMState(cameras, points, new_cost, previous)
+    moved, size = sum_over_devices(layout, (jnp.sum(tried_step[1] ** 2), jnp.sum(state.points**2)))
     return after, StepInfo(
         cost=after.cost,
         previous_cost=state.cost,
@@ -243,7 +244,7 @@ def _advance(
         gain_ratio=candidate.gain,
         accepted=candidate.accepted,
         damping=damping,
-        step_norm=safe_sqrt(jnp.sum(tried_step[0] ** 2) + jnp.sum(tried_step[1] ** 2)),
-        parameter_norm=safe_sqrt(jnp.sum(jnp.where(camera_seen, state.cameras, 0) ** 2) + jnp.sum(state.points**2)),
+        step_norm=safe_sqrt(jnp.sum(tried_step[0] ** 2) + moved),
+        parameter_norm=safe_sqrt(jnp.sum(jnp.where(layout.camera_seen, state.cameras, 0) ** 2) + size),
         **fields,
     )

@@ -180,7 +180,7 @@ def _cluster_steps(
     slopes = parts.sums(-(linear.residual[0] * product[0] + linear.residual[1] * product[1]))
     slopes = jnp.where(solved, slopes, jnp.nan)
     curvatures = parts.sums(product[0] * product[0] + product[1] * product[1])
-    gradient_max = largest_gradient(eliminated, system, coordinates)
+    gradient_max = largest_gradient(layout, eliminated, system, coordinates)
     none = jnp.zeros((), jnp.int32), jnp.zeros_like(gradient_max)
     return Step(
         components_first(coordinates.from_manifold(camera_step)),

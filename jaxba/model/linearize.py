@@ -23,6 +23,7 @@ from jaxba.problem.options import Intrinsics
 from jaxba.problem.safe_math import safe_sqrt
 from jaxba.runtime.compilation import traced_once
 from jaxba.runtime.fusion import compute_unfused
+from jaxba.structure.devices import on_one_device, sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import take, total
 
@@ -89,7 +90,8 @@ def cost(
     """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2, and that of the priors."""
     # not fused with the sum: XLA would compile both to a slow library call
     of_pixels = compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
-    return with_prior_costs(layout, cameras, of_pixels[None]).sum() if _has_priors(layout) else of_pixels
+    whole = with_prior_costs(layout, cameras, of_pixels[None]).sum() if _has_priors(layout) else of_pixels
+    return sum_over_devices(layout, whole)
 
 
 def with_prior_costs(
@@ -99,7 +101,7 @@ def with_prior_costs(
     if not _has_priors(layout):
         return terms
     assert layout.unknowns is not None
-    return jnp.concatenate([terms, prior_costs(layout.unknowns, cameras)])
+    return jnp.concatenate([terms, on_one_device(layout, prior_costs(layout.unknowns, cameras))])
 
 
 def _has_priors(layout: Layout) -> bool:
@@ -158,16 +160,17 @@ def linearize(
     unknowns = layout.unknowns
     if unknowns is None or unknowns.priors is None:
         return found
-    return found._replace(priors=prior_terms(unknowns, cameras), prior_costs=prior_costs(unknowns, cameras))
+    costs_of_priors = on_one_device(layout, prior_costs(unknowns, cameras))
+    return found._replace(priors=prior_terms(unknowns, cameras), prior_costs=costs_of_priors)
 
 
-def is_weightless(linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:
+def is_weightless(layout: Layout, linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:
     """Whether the loss gives weight to no observation though there is a cost: gradient and Hessian are zero, and
     nothing says where to go."""
     if loss.trivial:
         return jnp.zeros((), bool)
     first, second = linear.residual
-    return (total(first * first + second * second) == 0) & (cost > 0)
+    return (sum_over_devices(layout, total(first * first + second * second)) == 0) & (cost > 0)
 
 
 def only_free(layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, alone: bool = False) -> Linearization:

@@ -28,7 +28,7 @@ from jaxba.peers.model import half_rotation
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import ConjugateGradients, StepOptions
-from jaxba.solver.prepare import write_back
+from jaxba.solver.prepare import layout_order, write_back
 from jaxba.structure.layout import Layout, layout_for
 
 FORCED_DECREASE = 1e200
@@ -132,7 +132,7 @@ class StepAcceptance:
 
     def bundle(self) -> BundleProblem:
         """The problem at the current state."""
-        return write_back(self.run.colmap.start, self.layout, self.state, self.options)
+        return write_back(self.run.colmap.start, self.layout, layout_order(self.layout), self.state, self.options)
 
 
 @functools.partial(jax.jit, static_argnames="options")

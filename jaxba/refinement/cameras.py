@@ -15,6 +15,7 @@ from jaxba.refinement.retraction import keep_focal_signs
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.conventions import components_first
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
 
@@ -42,7 +43,7 @@ def refine_cameras(
     level, *levels = layout.camera_levels
     width = len(linear.camera_jacobian[0])
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 1)
-    products = tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels))
+    products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient = products[:, :, :width], products[:, :, width]
     unknowns = layout.unknowns
     has_priors = unknowns is not None and unknowns.priors is not None
@@ -52,7 +53,7 @@ def refine_cameras(
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
-    own_cost = lambda costs: compute_unfused(each_sum, costs, index=layout.slot_camera)
+    own_cost = lambda costs: sum_over_devices(layout, compute_unfused(each_sum, costs, index=layout.slot_camera))
     of_priors = lambda cameras: prior_costs(unknowns, cameras) if has_priors else 0.0
     before = own_cost(linear.costs) + of_priors(cameras)
 

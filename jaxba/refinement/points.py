@@ -32,6 +32,7 @@ from jaxba.model.observations import Views, point_passes
 from jaxba.problem.losses import Loss
 from jaxba.runtime import loops
 from jaxba.runtime.fusion import compute_in_one_loop
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sums
 
@@ -83,6 +84,7 @@ class _Carry(NamedTuple):
     inverse_depth_sum: Float[Array, " points"]  # at the start
     delayed: Bool[Array, " points"]  # whether the point was reset, and so is a pass behind the others
     passes: Int[Array, ""]
+    late: Bool[Array, ""]  # whether any point is delayed
     converged: Bool[Array, ""]  # whether the last pass lowered the cost too little for another one
 
 
@@ -147,7 +149,10 @@ def refine_points(
         accepted = (costs < carry.costs) & ~has_receded(inverse_depth_sum, start) & active
         grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
         damping = jnp.where(accepted, carry.damping / DAMPING_FACTOR, grown)
-        least, lowered = jnp.where(accepted, costs, carry.costs), jnp.sum(jnp.where(accepted, carry.costs - costs, 0))
+        least = jnp.where(accepted, costs, carry.costs)
+        lowered = jnp.sum(jnp.where(accepted, carry.costs - costs, 0))
+        counts = lowered, jnp.sum(least), jnp.any(delayed).astype(jnp.int32)
+        lowered, left, late = sum_over_devices(layout, counts)
         best = _Carry(
             points=jnp.where(accepted, carry.trial, carry.points),
             costs=least,
@@ -157,7 +162,8 @@ def refine_points(
             inverse_depth_sum=start,
             delayed=delayed,
             passes=carry.passes + 1,
-            converged=lowered <= jnp.minimum(min_decrease, SMALL_DECREASE * jnp.sum(least)),
+            late=late > 0,
+            converged=lowered <= jnp.minimum(min_decrease, SMALL_DECREASE * left),
         )
         best = best._replace(trial=propose(best))
         if previous is None:
@@ -170,12 +176,10 @@ def refine_points(
     # start and end are passes like the others, with infinite initial costs: the program contains a pass only once
     infinite = jnp.full_like(points[0], jnp.inf)
     damping = jnp.full_like(infinite, DAMPING_FACTOR * INITIAL_DAMPING)
-    not_delayed, zero = jnp.zeros(infinite.shape, bool), jnp.zeros_like(infinite)
+    not_delayed, zero, no = jnp.zeros(infinite.shape, bool), jnp.zeros_like(infinite), jnp.zeros((), bool)
     system = jnp.zeros((9, *infinite.shape), points.dtype)
-    carry = _Carry(
-        points, infinite, system, damping, points, zero, not_delayed, jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    )
-    more = lambda c: (c.passes <= iterations + jnp.any(c.delayed)) & ~c.converged
+    carry = _Carry(points, infinite, system, damping, points, zero, not_delayed, jnp.zeros((), jnp.int32), no, no)
+    more = lambda c: (c.passes <= iterations + c.late) & ~c.converged
     carry = loops.while_loop(more, body, carry)
     return carry.points, carry.costs
 

@@ -16,6 +16,7 @@ from jaxba.model.linearize import Reference, observation_costs, slot_frames, wit
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import refine_from_starts
 from jaxba.refinement.points import PreviousPoints, refine_points
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.random_partitions import Partition
 from jaxba.structure.segment_sums import point_sum, take, total, tree_sum
@@ -97,7 +98,7 @@ class Whole(NamedTuple):
 
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
         """See `Subproblems`."""
-        return total(terms)
+        return sum_over_devices(self.layout, total(terms))
 
     def all_cameras(self, holds: Bool[Array, " cameras"]) -> Bool[Array, ""]:
         """See `Subproblems`."""

@@ -150,6 +150,18 @@ def _broadcast(content: bytes) -> bytes:
     return np.asarray(multihost_utils.broadcast_one_to_all(padded)).tobytes() if size else b""
 
 
+def gather(values: list[T]) -> list[T]:
+    """The values of all processes, in the order of the processes."""
+    if jax.process_count() == 1:
+        return values
+    content = np.frombuffer(pickle.dumps(values), np.uint8)
+    sizes = np.asarray(multihost_utils.process_allgather(np.asarray(len(content), np.int32)))
+    padded = np.zeros(int(sizes.max()), np.uint8)
+    padded[: len(content)] = content
+    parts = np.asarray(multihost_utils.process_allgather(padded)).reshape(len(sizes), -1)
+    return [one for part, size in zip(parts, sizes, strict=True) for one in pickle.loads(part[:size].tobytes())]
+
+
 def to_host(x: Any) -> np.ndarray:
     """The whole of an array that lies on devices of several processes, in each of them."""
     if x.is_fully_addressable or x.is_fully_replicated:

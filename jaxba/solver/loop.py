@@ -21,6 +21,7 @@ from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, only_free
 from jaxba.problem.options import StepOptions
+from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout, num_partitions
 from jaxba.structure.segment_sums import point_sum
 from jaxba.typing import AnyArray
@@ -82,11 +83,13 @@ def problem_info(
         linear = linearize(layout, state.cameras, state.points, options.loss)
         unit = largest_diagonal(layout, only_free(layout, linear, "free"))
     count = lambda n: jnp.asarray(n, jnp.int32)
+    tracks = point_sum(layout, jnp.asarray(layout.slot_mask, state.cost.dtype)[None])
+    observations, points = sum_over_devices(layout, (jnp.sum(layout.slot_mask), jnp.sum(tracks > 0)))
     info = ProblemInfo(
         cost=state.cost,
-        observations=count(jnp.sum(layout.slot_mask)),
+        observations=count(observations),
         cameras=count(jnp.sum(layout.camera_seen)),
-        points=count(jnp.sum(point_sum(layout, jnp.asarray(layout.slot_mask, state.cost.dtype)[None]) > 0)),
+        points=count(points),
         unit=unit,
         focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
         max_iterations=count(max_iterations),

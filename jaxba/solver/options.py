@@ -98,6 +98,10 @@ class SolveOptions:
     in half of the time and are nearly as fast, and replaces them by optimised ones when that pays. Results differ by
     rounding. On a GPU all are `full`."""
 
+    devices: int | None = None
+    """Number of devices, in each process, among which points are divided; None: one, or with several processes all. A
+    CPU can be several before anything is computed with JAX. For plain LM; nothing is padded, compilation is `full`."""
+
     def __post_init__(self) -> None:
         for name, kind in _GROUPS.items():
             value = getattr(self, name)
@@ -111,6 +115,8 @@ class SolveOptions:
             if getattr(self, name) not in get_args(known):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
         check_count("max_iterations", self.max_iterations, 1)
+        if self.devices is not None:
+            check_count("devices", self.devices, 1)
         for name, value in self.tolerances._asdict().items():
             if not value >= 0:
                 raise ValueError(f"{name} must not be negative, is {value}")

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.damping.policy import observes_prices
@@ -21,12 +22,13 @@ from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.problem.rigs import in_frames, out_of_frames, with_unseen_of_frames
-from jaxba.runtime import process
+from jaxba.runtime import distributed, process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver, prices
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
+from jaxba.solver.sharded import Shards
 from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.observation_order import ObservationOrder
@@ -77,6 +79,9 @@ class Setup:
     setup_s: float
     """Seconds for the layout and the transfer to the device."""
 
+    shards: Shards | None
+    """The problem divided among devices; None for one device, then `layout` is the first shard's."""
+
     def initial(self, call: Callable[..., Any]) -> LMState:
         """The initial state. `call` runs its program, or compiles it (`ParallelCompilation`)."""
         initial = program(initial_state, "options", "dtype", level="quick")
@@ -90,9 +95,14 @@ class Setup:
 
     def problem_at(self, state: LMState) -> BundleProblem:
         """The problem with the parameters of a state, as NumPy float64; what is not optimised is copied exactly."""
+        order = layout_order(self.layout) if self.shards is None else self.shards.order.reshape(-1)
+        points = np.asarray(distributed.to_host(state.points), np.float64)
+        points = points if self.shards is None else np.moveaxis(points, 0, 1).reshape(3, -1)
+        state = state._replace(points=points)
         if self.offset is None:
-            return write_back(self.problem, self.layout, state, self.options)
-        found = shift(write_back(shift(self.problem, -self.offset), self.layout, state, self.options), self.offset)
+            return write_back(self.problem, self.layout, order, state, self.options)
+        moved = shift(self.problem, -self.offset)
+        found = shift(write_back(moved, self.layout, order, state, self.options), self.offset)
         return found.replace(priors=self.problem.priors, **_exact(self.problem, found))
 
 
@@ -154,9 +164,10 @@ def set_up(
             coordinates=replace(step.coordinates, rotation="manifold"),
             refinement=replace(step.refinement, camera_rounds=0, pattern_moves=0),
         )
+    devices = distributed.use_devices(options.devices)
     capacity, asked = None, options.linear_solver
     observations = ObservationOrder.of(problem)
-    if _pads(problem, options):
+    if len(devices) == 1 and _pads(problem, options):
         capacity, asked = with_padded_solver(capacity_of(problem, observations), step, asked)
     step = choose_linear_solver(problem, step, asked, observations)
     dtype = np.dtype("float32" if options.dtype == "float32" else "float64")
@@ -164,12 +175,13 @@ def set_up(
         started = time.perf_counter()
         offset = far_middle(problem)
         here = in_frames(problem if offset is None else shift(problem, -offset))
-        layout = jax.device_put(layout_for(here, step, capacity, observations))
+        shards = None if len(devices) == 1 else Shards(here, step, devices, dtype)
+        layout = jax.device_put(layout_for(here, step, capacity, observations)) if shards is None else shards.first
         start = here if capacity is None else padded_parameters(here, capacity)
         known = prices(problem, step, observations) if observes_prices(policy) else Prices()
         known = jax.tree.map(lambda x: np.asarray(x, dtype), known)
         setup_s = time.perf_counter() - started
-    return Setup(problem, layout, step, policy, capacity, offset, start, dtype, known, setup_s)
+    return Setup(problem, layout, step, policy, capacity, offset, start, dtype, known, setup_s, shards)
 
 
 def _pads(problem: BundleProblem, options: SolveOptions) -> bool:
@@ -204,12 +216,20 @@ def _exact(problem: BundleProblem, found: BundleProblem) -> dict[str, np.ndarray
     return {"cameras": cameras, "points": points}
 
 
-def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:
+def layout_order(layout: Layout) -> Int[np.ndarray, " points"]:
+    """The point of the problem at each position in layout order; out of range for padding."""
+    return np.concatenate([np.asarray(members) for members in layout.bucket_points])
+
+
+def write_back(
+    problem: BundleProblem, layout: Layout, order: Int[np.ndarray, " points"], state: LMState, options: StepOptions
+) -> BundleProblem:
     """The problem with optimised parameters, in its own order; what was not optimised is copied exactly.
 
     Args:
         problem: the problem at the start.
         layout: its layout.
+        order: the point of the problem at each position of `state.points`.
         state: optimised parameters in layout order.
         options: whether intrinsics were fixed.
     """
@@ -232,7 +252,6 @@ def write_back(problem: BundleProblem, layout: Layout, state: LMState, options: 
         cameras[:, 6:] = np.where(np.asarray(problem.lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
     if rigs is not None:
         cameras = with_unseen_of_frames(rigs, cameras, seen)
-    order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
     real = order < problem.num_points
     points[order[real]] = items_first(np.asarray(state.points, np.float64))[real]
     if problem.constants is not None:

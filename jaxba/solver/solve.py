@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
@@ -23,7 +24,7 @@ from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, Stage, compile_and_run, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord, Run, parts_of, run_stepwise
 from jaxba.solver.diagnosis import cost_of_rounding
-from jaxba.solver.loop import History, solve_loop
+from jaxba.solver.loop import History, history_of, solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, numerics, set_up
 from jaxba.structure.padding import Capacity
@@ -123,6 +124,8 @@ def solve(
         run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts)
         if callback is None and not any(stages_of_parts.values()):
             run = _run_compiled
+        if setup.shards is not None:
+            run = functools.partial(_run_sharded, callback=callback)
         carry, history, initial_cost, quick_iterations, compile_s, total_s = run(
             setup, options.tolerances, options.max_iterations
         )
@@ -160,6 +163,40 @@ def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> d
     if compilation == "quick":
         return dict.fromkeys(parts, (Stage("quick", sys.maxsize),))
     return {name: stages(part, problem.num_observations) for name, part in parts.items()}
+
+
+def _run_sharded(
+    setup: Setup,
+    tolerances: Tolerances,
+    max_iterations: int,
+    *,
+    callback: Callable[[IterationRecord], bool | None] | None,
+) -> Run:
+    """Runs the loop on several devices: as one program, or an iteration at a time for a callback."""
+    assert setup.shards is not None
+    started = time.perf_counter()
+    limit = np.asarray(max_iterations, np.int32)
+    history: Any = None
+    with CompileClock() as clock:
+        carry = jax.block_until_ready(setup.shards.begin(setup.policy, limit, setup.prices))
+        initial_cost = float(carry.state.cost)
+        setup.check_cost(carry.state)
+        if callback is None:
+            length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
+            found = setup.shards.run(carry, setup.policy, tolerances, limit, length)
+            carry, history = jax.block_until_ready(found)
+        else:
+            records = []
+            while int(carry.termination) == Termination.RUNNING:
+                carry, step = jax.device_get(setup.shards.iterate(carry, setup.policy, tolerances, limit))
+                records.append(history_of(step))
+                time_s = time.perf_counter() - started - clock.seconds
+                record = IterationRecord(len(records), time_s, jax.tree.map(lambda x: x.item(), step))
+                if callback(record) and int(carry.termination) == Termination.RUNNING:
+                    carry = carry._replace(termination=np.asarray(Termination.STOPPED, np.int32))
+            history = jax.tree.map(lambda *rows: np.stack(rows), *records)
+    total_s = time.perf_counter() - started - clock.seconds
+    return Run(carry, history, initial_cost, 0, clock.seconds, total_s)
 
 
 def _run_compiled(setup: Setup, tolerances: Tolerances, max_iterations: int) -> Run:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Int
 
+from jaxba.structure.agreement import Agreement, size_of
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
 from jaxba.typing import AnyArray, register_pytree
@@ -59,6 +60,7 @@ def cluster_layout(
     slot_point: Int[np.ndarray, " slots"],
     empty: int,
     shared_lens: Bool[np.ndarray, "cameras lenses"] | None = None,
+    agreement: Agreement | None = None,
 ) -> ClusterLayout:
     """Clusters the cameras and lists the pairs of clusters with common points.
 
@@ -73,11 +75,14 @@ def cluster_layout(
         slot_point: point of each slot, in layout order.
         empty: an empty slot.
         shared_lens: which cameras have which lens of those that several have.
+        agreement: with the other shards of a problem, which have the same clusters.
     """
     from jaxba.structure.agglomeration import agglomerate, shared_points  # SciPy: its import takes 0.2 s
 
     num_clusters = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
-    label = agglomerate(shared_points(camera, point, cameras, points)[0], cameras, num_clusters)
+    shared = shared_points(camera, point, cameras, points)[0]
+    shared = shared if agreement is None else agreement.total("shared points", shared)
+    label = agglomerate(shared, cameras, num_clusters)
     tied = None
     if shared_lens is not None:
         tied = np.hstack([shared_lens, ~shared_lens.any(axis=1, keepdims=True)])
@@ -92,13 +97,18 @@ def cluster_layout(
     keys, counts = keys[first], np.diff(first, append=len(keys))
     seen_by = np.bincount(keys // clusters, minlength=points)
     start = np.cumsum(seen_by) - seen_by
-    coarse = np.arange(len(keys))
+    coarse, count = np.arange(len(keys)), size_of(agreement, "coarse", len(keys))
+    part = lambda name: None if agreement is None else agreement.within(name)
+    width = size_of(agreement, "width", fitting_width(counts))
+    counts = np.append(counts, np.zeros(count + 1 - len(keys), counts.dtype))
+    slots = np.append(slot[order][first], np.full(count + 1 - len(keys), empty))
+    keyed = (keys % clusters, coarse, seen_by, start, clusters, count)
     return ClusterLayout(
         label=label.astype(np.int32),
         members=cluster_members(label, clusters, int(np.bincount(label).max())),
-        levels=sum_tree(slot[order], np.append(counts, 0), empty, fitting_width(counts)),
-        point=slot_point[np.append(slot[order][first], empty)],
-        pairs=pair_layout(keys % clusters, coarse, seen_by, start, clusters, len(keys), factor=True, banded=False),
+        levels=sum_tree(slot[order], counts, empty, width, agreement=part("slots")),
+        point=slot_point[slots],
+        pairs=pair_layout(*keyed, factor=True, banded=False, agreement=part("pairs")),
         tied=tied,
     )
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int
 
+from jaxba.structure.agreement import Agreement, size_of
 from jaxba.structure.camera_ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.structure.padding import Capacity, room_for
 from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, prefix_levels, sorted_by, sum_tree
@@ -88,6 +89,7 @@ def pair_layout(
     factor: bool,
     banded: bool = True,
     capacity: Capacity | None = None,
+    agreement: Agreement | None = None,
 ) -> PairLayout:
     """Lists all pairs of observations of one point, sorted by the block that they add to.
 
@@ -102,6 +104,7 @@ def pair_layout(
         banded: whether it may be factored as a band, where that is cheaper.
         capacity: fixed sizes from which all shapes follow: every block of the lower triangle is listed, and no band is
             used.
+        agreement: with the other shards of a problem, which have the same blocks.
     """
     camera, row_index = camera.astype(np.int32), row_index.astype(np.int32)
     left, right = _pairs_of_tracks(tracks, start)
@@ -113,9 +116,13 @@ def pair_layout(
         left, right = np.concatenate([left, right[twice]]), np.concatenate([right, left[twice]])
         rows, columns = np.concatenate([rows, columns[twice]]), np.concatenate([columns, rows[twice]])
     rank, reach = np.arange(cameras), cameras
+    everywhere = rows, columns  # the blocks of all shards
+    if agreement is not None:
+        own = np.unique(rows.astype(np.int64) * cameras + columns)
+        everywhere = np.divmod(agreement.union("blocks", own), cameras)
     if capacity is None and factor and banded and cameras >= MIN_BAND_CAMERAS:
         covisible = np.zeros((cameras, cameras), bool)
-        covisible[rows, columns] = True
+        covisible[everywhere] = True
         row, column = np.nonzero(covisible)
         rank, reach = camera_order(row, column, cameras)
     banded = banded and is_banded(cameras, reach)
@@ -130,17 +137,24 @@ def pair_layout(
     blocks = _BlockList.of(rows, columns, cameras)
     if capacity is not None:
         blocks = blocks.with_all(cameras)
+    if agreement is not None:
+        first, second = rank[everywhere[0]], rank[everywhere[1]]
+        blocks = blocks.with_these(np.maximum(first, second) * np.int64(cameras) + np.minimum(first, second))
     keys, counts, order = blocks
     diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
     room = None if capacity is None else room_for(counts, capacity.pairs, capacity.points)
-    number_of = lambda w: int((-(-counts // w)).sum()) if room is None else chunks_at_most(room.items, len(keys), w)
+
+    def number_of(width: int) -> int:
+        chunks = int((-(-counts // width)).sum()) if room is None else chunks_at_most(room.items, len(keys), width)
+        return size_of(agreement, f"chunks of {width}", chunks)
+
     width = min(PAIR_CHUNKS, key=lambda w: number_of(w) * (w + PAIR_ITEM_COST))
-    width = max(1, min(width, int(counts.max()) if room is None else room.most))
+    width = max(1, min(width, size_of(agreement, "pairs", int(counts.max())) if room is None else room.most))
     chunks = -(-counts // width)
     # position of each pair in the chunks: pairs of one block are contiguous, and a block starts a new chunk
     shift = width * (np.cumsum(chunks) - chunks) - (np.cumsum(counts) - counts)
     position = np.repeat(shift.astype(np.int32), counts) + np.arange(len(left), dtype=np.int32)
-    most = int(chunks.sum()) if room is None else number_of(width)  # largest number of chunks
+    most = number_of(width)  # largest number of chunks
     largest = PAIR_BATCH if room is None else -(-PAIR_BATCH // 2)  # smaller ones, of which the last is rarely full
     batches = max(1, -(-most // (largest - 1)))
     batch = max(1, -(-most // batches))  # chunks of a batch, without the one that is padding
@@ -151,7 +165,8 @@ def pair_layout(
         array = np.full(batches * (batch + 1) * width, empty, np.int32)
         array[position] = row_index[side[order]]
         padded.append(array.reshape(batches, batch + 1, width))
-    sums, levels, by_sums = _batch_sums(chunks, batches, batch, None if room is None else -(-room.most // width))
+    most_of_block = None if room is None else -(-room.most // width)
+    sums, levels, by_sums = _batch_sums(chunks, batches, batch, most_of_block, agreement)
     keys = keys[by_sums]
     table = None
     if factor and not banded:
@@ -205,7 +220,11 @@ def _pairs_of_tracks(
 
 
 def _batch_sums(
-    chunks: Int[np.ndarray, " blocks"], batches: int, batch: int, most: int | None
+    chunks: Int[np.ndarray, " blocks"],
+    batches: int,
+    batch: int,
+    most: int | None,
+    agreement: Agreement | None = None,
 ) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...], Int[np.ndarray, " blocks"]]:
     """Partial sums within each batch, how these are summed to the blocks and one more that is empty, and their order.
 
@@ -214,6 +233,7 @@ def _batch_sums(
         batches: number of batches.
         batch: number of chunks of a batch.
         most: largest number of chunks of a block, if all shapes shall follow from that and from the numbers above.
+        agreement: with the other shards of a problem.
     """
     block = np.repeat(np.arange(len(chunks)), chunks)
     own_batch, position = np.divmod(np.arange(len(block)), batch)
@@ -222,7 +242,7 @@ def _batch_sums(
     starts_sum = within % TREE_WIDTH == 0
     sum_batch, target = own_batch[starts_sum], block[starts_sum]  # batch and block of each partial sum
     counts = np.bincount(sum_batch, minlength=batches)
-    partial = int(counts.max())
+    partial = size_of(agreement, "partial", int(counts.max()))
     if most is not None:  # nearly always a batch has sums of few blocks; at worst it has as many sums as chunks
         bound = chunks_at_most(batch, len(chunks), TREE_WIDTH)
         usual = min(bound, batch // TREE_WIDTH + 5 * len(chunks) // (2 * batches) + 1)
@@ -233,7 +253,8 @@ def _batch_sums(
     items, empty = sum_batch * (partial + 1) + number, batches * (partial + 1) - 1
     counts = np.bincount(target, minlength=len(chunks) + 1)
     if most is None:
-        return sums, sum_tree(items, counts, empty, TREE_WIDTH), np.arange(len(chunks))
+        part = None if agreement is None else agreement.within("sums")
+        return sums, sum_tree(items, counts, empty, TREE_WIDTH, agreement=part), np.arange(len(chunks))
     touched = min(batches, (most - 1) // batch + 2)  # most batches over which the chunks of one block are spread
     room = Room(batches * partial, chunks_at_most(most, touched, TREE_WIDTH))
     order = np.argsort(-counts, kind="stable")

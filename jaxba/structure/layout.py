@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
+from jaxba.structure.agreement import Agreement, size_of
 from jaxba.structure.camera_clusters import ClusterLayout, cluster_layout
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.density import is_dense
@@ -97,6 +98,9 @@ class Layout:
     buckets: tuple[Bucket, ...] = field(metadata={"static": True})
     """Shape of each bucket; empty for a layout with fixed capacity."""
 
+    axis: str | None = field(default=None, metadata={"static": True})
+    """Axis of the mesh over which points are divided (structure/devices.py); None: all are here."""
+
     @property
     def num_slots(self) -> int:
         """Number of slots, including empty ones."""
@@ -124,6 +128,7 @@ def build_layout(
     capacity: Capacity | None = None,
     fixed_intrinsics: bool = False,
     observations: ObservationOrder | None = None,
+    agreement: Agreement | None = None,
 ) -> Layout:
     """Assigns a problem's observations to slots and builds the index arrays of their sums.
 
@@ -139,6 +144,7 @@ def build_layout(
         capacity: fixed sizes to pad to. Only for a factored system, which is then dense even if it is a band.
         fixed_intrinsics: whether all intrinsics are constant.
         observations: the sorted observations of the problem, if they are known already.
+        agreement: with the layouts of the other shards of a problem (structure/shards.py).
 
     Returns:
         A pytree of NumPy arrays. Without a capacity, its shapes follow from the sizes and track lengths of the problem.
@@ -158,8 +164,10 @@ def build_layout(
     camera, point, tracks = observations.camera, observations.point, observations.tracks
     order, start = observations.order, observations.start
     seen = np.bincount(camera, minlength=cameras)
+    part = lambda name: None if agreement is None else agreement.within(name)
+    is_seen = seen > 0 if agreement is None else agreement.total("seen", seen) > 0
 
-    assignment = bucket_slots(tracks) if capacity is None else padded_slots(tracks, capacity)
+    assignment = bucket_slots(tracks, part("buckets")) if capacity is None else padded_slots(tracks, capacity)
     slot, slot_point, empty = assignment.slot, assignment.point, assignment.empty
     slots = len(slot_point)
     mask = np.zeros(slots, bool)
@@ -174,15 +182,16 @@ def build_layout(
         whitening[:, :, slot] = np.moveaxis(np.asarray(problem.whitening)[order], 0, -1)
     room = None if capacity is None else room_for(seen, capacity.usual_observations(len(camera)), capacity.points)
     by_camera = sorted_by(camera, cameras)
-    camera_levels = with_spare_row(sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room), empty)
+    levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, part("cameras"))
+    camera_levels = with_spare_row(levels, empty)
     slot_grid = None
     columns = sum(map(len, assignment.members))
-    if pairs and factor and grid and is_dense(camera, point, tracks, cameras, columns):
+    if pairs and factor and grid and _is_dense(camera, point, tracks, cameras, columns, agreement):
         slot_grid = np.full((columns, cameras), empty, np.int32)
         slot_grid[slot_point[slot], camera] = slot
     pair_lists = None
     members = np.concatenate([np.asarray(points) for points in assignment.members])
-    unknowns = unknowns_of(problem, seen > 0, members, fixed=fixed_intrinsics)
+    unknowns = unknowns_of(problem, is_seen, members, fixed=fixed_intrinsics)
     if pairs and slot_grid is None:
         slots_by_camera = camera_levels[0].ravel()
         sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot
@@ -198,6 +207,7 @@ def build_layout(
             factor=factor,
             banded=unknowns is None or unknowns.frame is None,
             capacity=capacity,
+            agreement=part("pairs"),
         )
     drawn_partitions = None
     if partitions is not None:
@@ -209,7 +219,8 @@ def build_layout(
     camera_clusters = None
     if clusters:
         shared = None if unknowns is None or unknowns.members is None else np.asarray(unknowns.members)
-        camera_clusters = cluster_layout(camera, point, slot, cameras, len(tracks), slot_point, empty, shared)
+        sorted_observations = camera, point, slot, cameras, len(tracks), slot_point, empty
+        camera_clusters = cluster_layout(*sorted_observations, shared, part("clusters"))
     return Layout(
         slot_camera=slot_camera,
         slot_point=slot_point,
@@ -219,7 +230,7 @@ def build_layout(
         bucket_points=assignment.members,
         point_levels=assignment.levels,
         camera_levels=camera_levels,
-        camera_seen=seen > 0,
+        camera_seen=is_seen,
         pairs=pair_lists,
         grid=slot_grid,
         clusters=camera_clusters,
@@ -234,6 +245,7 @@ def layout_for(
     options: StepOptions,
     capacity: Capacity | None = None,
     observations: ObservationOrder | None = None,
+    agreement: Agreement | None = None,
 ) -> Layout:
     """The layout with exactly the parts that a step with these options needs. Arguments as for `build_layout`."""
     return build_layout(
@@ -245,7 +257,21 @@ def layout_for(
         capacity=capacity,
         fixed_intrinsics=options.intrinsics == "fixed",
         observations=observations,
+        agreement=agreement,
     )
+
+
+def _is_dense(
+    camera: np.ndarray,
+    point: np.ndarray,
+    tracks: np.ndarray,
+    cameras: int,
+    columns: int,
+    agreement: Agreement | None,
+) -> bool:
+    """`is_dense`, of all shards or none."""
+    own = is_dense(camera, point, tracks, cameras, columns)
+    return size_of(agreement, "listed pairs", int(not own)) == 0
 
 
 def num_partitions(layout: Layout) -> int:

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from jaxba.structure.agreement import Agreement, size_of
+
 TREE_WIDTH = 8
 """Width of the chunks on all levels but the first."""
 
@@ -26,7 +28,12 @@ class Room(NamedTuple):
 
 
 def sum_tree(
-    items: np.ndarray, counts: np.ndarray, empty: int, width: int, room: Room | None = None
+    items: np.ndarray,
+    counts: np.ndarray,
+    empty: int,
+    width: int,
+    room: Room | None = None,
+    agreement: Agreement | None = None,
 ) -> tuple[np.ndarray, ...]:
     """The summation tree of `items`, with chunks of `width` on the first level and of `TREE_WIDTH` on the others.
 
@@ -37,6 +44,7 @@ def sum_tree(
         width: chunk width on the first level.
         room: bounds from which the shapes follow, together with the number of targets and the width; None: the shapes
             follow from the data.
+        agreement: with the trees of other shards, which have the same shapes.
 
     Returns:
         Index arrays [chunks, width], one per level; those of level l + 1 index the sums of level l. Every level but the
@@ -49,11 +57,13 @@ def sum_tree(
     space, most = room or Room(len(items), int(counts.max(initial=1)))
     if len(items) > space or counts.max(initial=0) > most:
         raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
+    most = size_of(agreement, "most", most)
     while True:
         width = max(1, min(width, most))
         chunks = -(-counts // width)
         used, last = int(chunks.sum()), most <= width
         space = used if room is None else chunks_at_most(space, len(counts), width)
+        space = size_of(agreement, f"level {len(levels)}", space)
         rows = np.arange(len(counts)) if last else np.cumsum(chunks) - chunks
         total = len(counts) if last else space + 1
         target = np.repeat(np.arange(len(counts)), counts)

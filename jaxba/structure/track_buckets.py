@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
+from jaxba.structure.agreement import Agreement, size_of
 from jaxba.structure.padding import POINT_CHUNK, Capacity, room_for
 from jaxba.structure.sum_trees import prefix_levels
 
@@ -60,13 +61,22 @@ class Slots(NamedTuple):
     """An empty slot."""
 
 
-def bucket_slots(tracks: Int[np.ndarray, " points"]) -> Slots:
+def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement | None = None) -> Slots:
     """Puts points of similar track length into buckets of shape `tiles x t x n`.
 
     Args:
         tracks: number of observations of each point; observations are sorted by point.
+        agreement: with the other shards of a problem, which have the same buckets.
     """
-    lengths = _bucket_lengths(tracks)
+    values, counts = np.unique(tracks[tracks > 0], return_counts=True)
+    if agreement is not None:
+        values = agreement.union("track lengths", values)
+        own = np.zeros(len(values), np.int64)
+        own[np.searchsorted(values, np.unique(tracks[tracks > 0]))] = counts
+        counts = np.array(
+            [agreement.size(f"points of {length}", int(n)) for length, n in zip(values, own, strict=True)]
+        )
+    lengths = _bucket_lengths(values, counts)
     which = np.searchsorted(lengths, tracks)
     column = np.zeros(len(tracks), np.int64)  # index of a point in its bucket
     bucket_points, slot_point, offsets, buckets = [], [], [], []
@@ -74,7 +84,8 @@ def bucket_slots(tracks: Int[np.ndarray, " points"]) -> Slots:
     for number, length in enumerate(lengths):
         members = np.flatnonzero((which == number) & (tracks > 0))
         column[members] = np.arange(len(members))
-        wanted = len(members) + (number == 0)  # one padding point, so that there always is an empty slot
+        wanted = size_of(agreement, f"bucket {number}", len(members))
+        wanted += number == 0  # one padding point, so that there always is an empty slot
         tile = TILE if wanted >= TILED_POINTS else wanted
         tiles = -(-wanted // tile)
         if number == 0:
@@ -142,14 +153,14 @@ def padded_slots(tracks: Int[np.ndarray, " points"], capacity: Capacity) -> Slot
     )
 
 
-def _bucket_lengths(tracks: np.ndarray) -> np.ndarray:
-    """Largest track length of each bucket, for few buckets with little padding.
+def _bucket_lengths(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Largest track length of each bucket, for few buckets with little padding; from track lengths, ascending, and the
+    number of points of each.
 
     Every bucket adds to the size of the compiled program, so that their number is penalised: dynamic programming over
     the distinct lengths minimises `slots + penalty * buckets`, for penalties that are lowered until the padding is
     within `_MAX_BUCKET_PADDING`.
     """
-    values, counts = np.unique(tracks[tracks > 0], return_counts=True)
     total = int(values @ counts)
     before = np.concatenate([[0], np.cumsum(counts)])
     # slots of a bucket, by its last and first length
