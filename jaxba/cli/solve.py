@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -12,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from jaxba.cli import common, table
+from jaxba.cli import common, processes, table
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import constrained
 from jaxba.cli.interrupt import Interrupt
@@ -23,7 +24,7 @@ from jaxba.io import is_colmap, read_colmap, read_problem
 from jaxba.io.files import open_output, stream_number
 from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
-from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constraints import Gauge, hold
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import (
@@ -169,6 +170,23 @@ class Arguments:
     log: str | None = None
     """Output file of a JSON record of the solve, compressed by its ending."""
 
+    devices: int | None = None
+    """Devices of each process, among which points are divided. On a CPU virtual ones, which gain nothing. Default: one;
+    with several processes all that there are."""
+
+    coordinator: str | None = None
+    """HOST:PORT of the first of several processes, which prints, reads and writes for all. Each is started with the
+    same options but --process."""
+
+    processes: int | None = None
+    """Number of processes."""
+
+    process: int | None = None
+    """Number of this process, from 0."""
+
+    distributed: bool = False
+    """Find the last three under Slurm, Open MPI or Kubernetes."""
+
 
 def main() -> None:
     """Entry point of `jaxba-solve`."""
@@ -224,6 +242,7 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
             max_iterations=args.max_iterations,
             pad={"auto": None, "yes": True, "no": False}[args.pad],
             compilation=args.compilation,
+            devices=args.devices,
         )
         options.step_options(policy)  # raises an error for incompatible options
         return policy, options
@@ -241,6 +260,22 @@ def _about_option(message: str) -> str:
 
 
 def _run(args: Arguments) -> int:
+    several = processes.start(args.coordinator, args.processes, args.process, args.distributed, args.devices)
+    if not several:
+        return _run_main(args)
+    args = replace(args, compilation="full")
+    from jaxba.runtime.distributed import MainFailedError, is_main
+
+    if is_main():
+        return _run_main(args)
+    try:  # the others read, print and write nothing
+        with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+            return _solve(replace(args, output=None, log=None, covariance=None))
+    except (MainFailedError, ProblemError, common.UsageError):  # which the first one reports
+        return common.BAD_INPUT
+
+
+def _run_main(args: Arguments) -> int:
     if _STDOUT not in [stream_number(path or "") for path in (args.output, args.log)]:
         return _solve(args)
     with redirect_stdout(sys.stderr):  # stdout has only the output file
@@ -257,12 +292,11 @@ def _solve(args: Arguments) -> int:
     if args.covariance and args.covariance in (args.output, args.log):
         raise common.UsageError(f"--covariance names the same file as another output, {args.covariance}")
     with common.notes_printed():
-        problem = _default_scene() if path is None else _read(args, path)
-        problem = constrained(problem, args.constant, args.gauge, args.constraints)
+        problem = _in_all_processes(args, path) if _is_divided(args) else _problem(args, path)
     check_storable(args.output, problem, path)
     if args.covariance and problem.constants is None and problem.priors is None:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
-    common.prepare_process(untraced=True)
+    common.prepare_process(untraced=not _is_divided(args))
     name = args.problem or DEFAULT_SCENE
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     solution, steps = _iterate(args, problem, policy, options)
@@ -285,6 +319,22 @@ def _solve(args: Arguments) -> int:
             file.write(json.dumps(record_to_json(record), allow_nan=False).encode() + b"\n")
         common.print_line(f"wrote {args.log}")
     return 0
+
+
+def _is_divided(args: Arguments) -> bool:
+    """Whether the solve may have several devices or processes."""
+    return args.devices is not None or args.processes is not None or args.distributed
+
+
+def _in_all_processes(args: Arguments, path: str | None) -> BundleProblem:
+    from jaxba.runtime.distributed import together
+
+    return together(lambda: _problem(args, path))
+
+
+def _problem(args: Arguments, path: str | None) -> BundleProblem:
+    problem = _default_scene() if path is None else _read(args, path)
+    return constrained(problem, args.constant, args.gauge, args.constraints)
 
 
 def _read(args: Arguments, path: str) -> BundleProblem:
@@ -314,7 +364,8 @@ def _iterate(
 ) -> tuple[Solution, list[IterationRecord]]:
     """Solves, and prints every iteration. The first Ctrl-C stops after the current iteration."""
     steps: list[IterationRecord] = []
-    with Interrupt("iteration", graceful=True) as interrupt:
+    alone = args.processes is None and not args.distributed  # processes must do the same
+    with Interrupt("iteration", graceful=alone) as interrupt:
 
         def show(record: IterationRecord) -> bool:
             if not steps:

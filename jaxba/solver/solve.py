@@ -188,7 +188,8 @@ def _run_sharded(
         else:
             records = []
             while int(carry.termination) == Termination.RUNNING:
-                carry, step = jax.device_get(setup.shards.iterate(carry, setup.policy, tolerances, limit))
+                carry, step = setup.shards.iterate(carry, setup.policy, tolerances, limit)
+                step = jax.device_get(step)
                 records.append(history_of(step))
                 time_s = time.perf_counter() - started - clock.seconds
                 record = IterationRecord(len(records), time_s, jax.tree.map(lambda x: x.item(), step))

@@ -191,7 +191,7 @@ def build_layout(
         slot_grid[slot_point[slot], camera] = slot
     pair_lists = None
     members = np.concatenate([np.asarray(points) for points in assignment.members])
-    unknowns = unknowns_of(problem, is_seen, members, fixed=fixed_intrinsics)
+    unknowns = unknowns_of(problem, is_seen, members, fixed=fixed_intrinsics, agreement=agreement)
     if pairs and slot_grid is None:
         slots_by_camera = camera_levels[0].ravel()
         sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot

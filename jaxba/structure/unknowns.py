@@ -30,6 +30,7 @@ from jaxba.problem.camera_models import CameraModel
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
 from jaxba.problem.priors import Priors
 from jaxba.problem.rigs import EXTRINSICS_SIZE
+from jaxba.structure.agreement import Agreement, size_of
 from jaxba.typing import AnyArray, register_pytree
 
 
@@ -144,7 +145,12 @@ class Unknowns:
 
 
 def unknowns_of(
-    problem: BundleProblem, seen: Bool[np.ndarray, " cameras"], order: Int[np.ndarray, " points"], *, fixed: bool
+    problem: BundleProblem,
+    seen: Bool[np.ndarray, " cameras"],
+    order: Int[np.ndarray, " points"],
+    *,
+    fixed: bool,
+    agreement: Agreement | None = None,
 ) -> Unknowns | None:
     """The unknowns of a problem, for its layout.
 
@@ -153,6 +159,7 @@ def unknowns_of(
         seen: whether each camera has an observation; padding cameras have none.
         order: point of the problem at each position in layout order; out of range for padding.
         fixed: whether all intrinsics are constant.
+        agreement: with the other shards of the problem, some of whose points may be constant.
 
     Returns:
         None if all numbers of all cameras and points are optimised, as in BAL.
@@ -172,7 +179,7 @@ def unknowns_of(
     free_points = None
     if constants is not None:
         pose_free = ~np.asarray(constants.poses)
-        if np.asarray(constants.points).any():
+        if size_of(agreement, "constant points", int(np.asarray(constants.points).any())):
             free_points = np.append(~np.asarray(constants.points), True)[np.minimum(order, problem.num_points)]
     members = model = frame = None
     if in_rigs:

@@ -1,0 +1,179 @@
+"""A solve on several devices is that on one: every observation is on one device, and costs agree to rounding."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections import Counter
+
+import jax
+import numpy as np
+import pytest
+import support
+
+import jaxba
+from jaxba import (
+    BundleProblem,
+    Lenses,
+    ProblemError,
+    SolveOptions,
+    hold,
+    random_scene,
+    solve,
+    with_position_priors,
+)
+from jaxba.lm.termination import Tolerances
+from jaxba.problem import geometry
+from jaxba.problem.options import StepOptions
+from jaxba.solver.prepare import set_up
+from jaxba.solver.sharded import _iterate
+from jaxba.structure.shards import deal_points, shard_of, sharded_layout
+
+DEVICES = 3
+"""Of the tests (conftest.py): a number that divides little."""
+
+
+def sequence() -> BundleProblem:
+    """Cameras in a row, of which neighbours see the same points."""
+    return random_scene(jaxba.SceneConfig(cameras=20, points=150), 0)
+
+
+def general() -> BundleProblem:
+    """Shared and partly constant lenses, constant poses and points, priors, covariances."""
+    problem = support.tiny()
+    cameras, lens = np.array(problem.cameras), np.array([0, 0, 1, 1, 2, 0], np.int32)
+    cameras[:, 6:] = cameras[lens, 6:]
+    free = np.array([[True, True, True], [True, False, True], [False, False, False]])
+    spread = np.tile(np.diag([0.5, 2.0]), (problem.num_observations, 1, 1))
+    parts = (cameras, *support.arrays(problem)[1:])
+    found = BundleProblem.create(*parts, covariance=spread, lenses=Lenses(lens, free))
+    found = with_position_priors(found, geometry.camera_centers(cameras) + 0.01, 0.01 * np.eye(3))
+    return hold(found, poses=[2], points=[3, 17])
+
+
+def compare(problem: BundleProblem, policy: str, rtol: float = 1e-10, **options) -> jaxba.Solution:
+    one, several = (
+        solve(problem, policy, SolveOptions(max_iterations=6, pad=False, devices=devices, **options))
+        for devices in (None, DEVICES)
+    )
+    shared = min(len(one.history.cost), len(several.history.cost))
+    assert shared >= 3
+    np.testing.assert_allclose(several.history.cost[:shared], one.history.cost[:shared], rtol=rtol)
+    if problem.priors is None:
+        np.testing.assert_allclose(geometry.cost(several.problem), several.final_cost, rtol=max(rtol, 1e-9))
+    return several
+
+
+@pytest.mark.parametrize(
+    ("linear_solver", "policy"),
+    [
+        pytest.param("explicit", "ceres+embedded", marks=pytest.mark.slow),
+        ("sparse", "ceres"),
+        ("implicit", "ceres+refine1"),
+        pytest.param("cg", "ceres", marks=pytest.mark.slow),
+    ],
+)
+def test_costs_of_every_iteration_are_those_of_one_device(linear_solver, policy):
+    compare(sequence(), policy, linear_solver=linear_solver)
+
+
+@pytest.mark.slow
+def test_a_dense_product_and_a_far_scene_with_odd_observations_are_divided_too():
+    problem = support.odd()
+    away = np.array([4000.0, 0.0, -3000.0])
+    cameras = np.array(problem.cameras)
+    cameras[:, 3:6] -= np.einsum("nij,j->ni", geometry.rotation_matrices(cameras[:, :3]), away)
+    found = compare(problem.replace(cameras=cameras, points=problem.points + away), "ceres")
+    # points that nobody sees stay, and so do cameras
+    np.testing.assert_array_equal(found.problem.points[[40, 42]], (problem.points + away)[[40, 42]])
+    np.testing.assert_array_equal(found.problem.cameras[6], cameras[6])
+    compare(support.tiny(), "learned", dtype="float32", rtol=1e-4)
+
+
+@pytest.mark.parametrize("linear_solver", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
+def test_lenses_constants_and_priors_are_divided_too(linear_solver):
+    problem = general()
+    found = compare(problem, "ceres+refine1", linear_solver=linear_solver).problem
+    assert support.same_bits(found.points[[3, 17]], problem.points[[3, 17]])
+    assert support.same_bits(found.cameras[2, :6], problem.cameras[2, :6])
+    assert support.same_bits(found.cameras[[0, 1, 5], 6:], np.tile(found.cameras[0, 6:], (3, 1)))
+
+
+def test_a_callback_sees_the_same_iterations_and_stops():
+    problem, records = sequence(), []
+    options = SolveOptions(linear_solver="implicit", devices=DEVICES, max_iterations=6)
+    found = solve(problem, "ceres", options, callback=lambda record: records.append(record) or len(records) == 3)
+    assert found.iterations == 3
+    assert found.termination.reason == "stopped by the caller"
+    one = solve(problem, "ceres", SolveOptions(linear_solver="implicit", max_iterations=3))
+    np.testing.assert_allclose([record.step.cost for record in records], one.history.cost, rtol=1e-10)
+
+
+def test_every_observation_is_on_one_device_and_each_has_its_share():
+    problem = support.odd()
+    tracks = np.bincount(problem.point_index, minlength=problem.num_points)
+    dealt = deal_points(tracks, DEVICES)
+    assert sorted(np.concatenate(dealt)) == np.flatnonzero(tracks).tolist()
+    shares = [int(tracks[points].sum()) for points in dealt]
+    assert max(shares) - min(shares) <= tracks.max()
+    options = StepOptions(linear_solver="sparse")
+    shards = [shard_of(problem, points) for points in dealt]
+    layouts = sharded_layout(shards, options)
+    shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(layout)] for layout in layouts]
+    assert shapes[0] == shapes[1] == shapes[2]
+    found = Counter()
+    for layout, points in zip(layouts, dealt, strict=True):
+        order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+        mask = np.asarray(layout.slot_mask)
+        own = points[order[np.asarray(layout.slot_point)[mask]]]
+        camera, pixels = np.asarray(layout.slot_camera)[mask], np.asarray(layout.pixels)[:, mask]
+        found.update(zip(camera.tolist(), own.tolist(), *pixels.tolist(), strict=True))
+    index = problem.camera_index.tolist(), problem.point_index.tolist()
+    assert found == Counter(zip(*index, *problem.observations.T.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("linear_solver", "policy", "stated"),
+    [("explicit", "ceres", 9), ("implicit", "ceres", 11), ("explicit", "guarded", 15)],
+)
+def test_an_iteration_has_the_stated_number_of_sums_over_devices(linear_solver, policy, stated):
+    setup = set_up(sequence(), policy, SolveOptions(linear_solver=linear_solver, devices=DEVICES))
+    limit = np.asarray(5, np.int32)
+    carry = jax.eval_shape(lambda: setup.shards.begin(setup.policy, limit, setup.prices))
+    given = setup.shards.layout, carry, setup.policy, Tolerances(), limit
+    text = _iterate.lower(*given, mesh=setup.shards._mesh, options=setup.options).as_text()
+    assert text.count("stablehlo.all_reduce") == stated
+
+
+def test_what_several_devices_cannot_do_is_one_line():
+    problem = support.single()
+    with pytest.raises(ProblemError, match="3 devices are more than there are observed points"):
+        solve(problem, "ceres", SolveOptions(devices=DEVICES))
+    with pytest.raises(ProblemError, match="several devices are for plain LM, not for poba"):
+        solve(support.tiny(), "ceres", SolveOptions(devices=DEVICES, method="poba"))
+    with pytest.raises(ValueError, match="devices must be"):
+        SolveOptions(devices=0)
+
+
+def test_two_processes_solve_as_one(tmp_path):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    file = tmp_path / "scene.txt"
+    jaxba.write_problem(sequence(), file)
+    command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", str(file), "--policy", "ceres"]
+    command += ["--linear-solver", "implicit", "--max-iterations", "4", "--compilation", "full"]
+    ends = ["--output", str(tmp_path / "out.txt"), "--coordinator", address, "--processes", "2", "--process"]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    started = [
+        subprocess.Popen([*command, *ends, str(k)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        for k in range(2)
+    ]
+    printed = [process.communicate(timeout=240)[0].decode() for process in started]
+    assert [process.returncode for process in started] == [0, 0], printed
+    assert "4 iterations" in printed[0]
+    assert all(line.startswith("[Gloo]") for line in printed[1].splitlines())  # which is C++'s
+    one = solve(sequence(), "ceres", SolveOptions(linear_solver="implicit", max_iterations=4)).final_cost
+    np.testing.assert_allclose(geometry.cost(jaxba.read_problem(tmp_path / "out.txt")), one, rtol=1e-9)
