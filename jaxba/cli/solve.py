@@ -170,6 +170,9 @@ class Arguments:
     log: str | None = None
     """Output file of a JSON record of the solve, compressed by its ending."""
 
+    device: Literal["auto", "cpu"] = "auto"
+    """cpu: the CPU, also where JAX has a GPU."""
+
     devices: int | None = None
     """Devices of each process, among which points are divided. On a CPU virtual ones, which gain nothing. Default: one;
     with several processes all that there are."""
@@ -260,6 +263,10 @@ def _about_option(message: str) -> str:
 
 
 def _run(args: Arguments) -> int:
+    if args.device == "cpu":
+        import jax
+
+        jax.config.update("jax_platforms", "cpu")
     several = processes.start(args.coordinator, args.processes, args.process, args.distributed, args.devices)
     if not several:
         return _run_main(args)

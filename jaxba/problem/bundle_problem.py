@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
-from jaxba.problem.priors import Priors
+from jaxba.problem.priors import Priors, checked_priors
 from jaxba.problem.rigs import Rigs, checked_rigs
 from jaxba.typing import AnyArray, register_pytree
 
@@ -99,6 +99,7 @@ class BundleProblem:
         lenses: Lenses | None = None,
         constants: Constants | None = None,
         rigs: Rigs | None = None,
+        priors: Priors | None = None,
     ) -> BundleProblem:
         """Checks the arrays and returns a problem of float64 and int32 NumPy arrays.
 
@@ -115,11 +116,12 @@ class BundleProblem:
             lenses: optional; which cameras share intrinsics, of which models these are, and which are optimised.
             constants: optional; poses and points that are not optimised.
             rigs: optional; cameras that move together.
+            priors: optional; what is known of cameras besides the pixels.
 
         Raises:
             ProblemError: shapes differ, an index is out of range, a number is not finite, there
-                are no observations, a covariance is not positive definite, or cameras of one lens differ in their
-                intrinsics.
+                are no observations, a covariance is not positive definite, cameras of one lens differ in their
+                intrinsics, or a part of the problem does not fit the others.
         """
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
@@ -144,9 +146,12 @@ class BundleProblem:
                 constants = checked_constants(constants, problem.num_cameras, problem.num_points)
             if rigs is not None:
                 rigs = checked_rigs(rigs, np.asarray(problem.cameras), lenses)
+            if priors is not None:
+                count = problem.num_cameras
+                priors = checked_priors(priors, count, count if lenses is None else len(lenses.free), lens_size(lenses))
         except ValueError as error:
             raise ProblemError(str(error)) from None
-        return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs)
+        return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
 
     @property
     def num_cameras(self) -> int:

@@ -11,8 +11,9 @@ Source: COLMAP, `CovarianceWeightedCostFunctor<AbsolutePosePositionPriorCostFunc
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import numpy as np
 from jaxtyping import Float
 
 from jaxba.problem.losses import Loss
@@ -44,3 +45,32 @@ class Priors:
 
     position_loss: Loss = field(default_factory=Loss, metadata={"static": True})
     """Robust loss of the squared whitened distance from a measured position."""
+
+
+def checked_priors(priors: Priors, cameras: int, lenses: int, numbers: int) -> Priors:
+    """Checks priors and returns them as float64 NumPy arrays.
+
+    Args:
+        priors: of a problem.
+        cameras: its number of cameras.
+        lenses: its number of lenses.
+        numbers: numbers of a lens.
+
+    Raises:
+        ValueError: a shape differs, or something is not finite; one line.
+    """
+    shapes = {
+        "positions": (cameras, 3),
+        "position_whitening": (cameras, 3, 3),
+        "rotations": (cameras, 3),
+        "rotation_whitening": (cameras, 3, 3),
+        "lenses": (lenses, numbers),
+        "lens_weight": (lenses, numbers),
+    }
+    arrays = {name: np.ascontiguousarray(getattr(priors, name), np.float64) for name in shapes}
+    for name, array in arrays.items():
+        if array.shape != shapes[name]:
+            raise ValueError(f"{name} of priors must have shape {shapes[name]}, not {array.shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{name} of priors are not finite")
+    return replace(priors, **arrays)

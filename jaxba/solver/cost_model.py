@@ -10,6 +10,7 @@ import os
 from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from jaxba.lm.records import Prices
@@ -254,6 +255,7 @@ def choose_linear_solver(
     options: StepOptions,
     asked: LinearSolverChoice,
     observations: ObservationOrder | None = None,
+    devices: int = 1,
 ) -> StepOptions:
     """The step options with the requested linear solver.
 
@@ -262,12 +264,14 @@ def choose_linear_solver(
         options: options of the step.
         asked: `auto` or a name. Methods have their own solver.
         observations: the sorted observations of the problem, if they are known already.
+        devices: among which observations are divided.
 
     Raises:
         ValueError: a linear solver is requested by name for a method.
-        ProblemError: a method is asked for that does not support the problem; or a factorisation needs more memory than
-            the machine has.
+        ProblemError: a method is asked for that does not support the problem; or a step needs more memory than the
+            device or the machine has.
     """
+    _check_device_memory(problem, devices)
     if options.method is not None and asked != "auto":
         raise ValueError(f"linear solver {asked!r} is for plain LM steps; {options.method.name} has its own")
     if options.method is not None:
@@ -293,6 +297,25 @@ def _check_method(problem: BundleProblem, options: StepOptions) -> None:
         raise ProblemError(f"priors need plain LM, not {name}")
     if not options.single_solve and not (lenses is None and problem.constants is None and options.intrinsics == "free"):
         raise ProblemError(f"{name} optimises all numbers of BAL cameras, and nothing else")
+
+
+def device_memory() -> float | None:
+    """Bytes of memory of the default device, if it has its own."""
+    device = jax.local_devices()[0]
+    stats = None if device.platform == "cpu" else device.memory_stats()
+    return None if not stats else float(stats.get("bytes_limit", 0)) or None
+
+
+def _check_device_memory(problem: BundleProblem, devices: int) -> None:
+    """Raises a `ProblemError` if the observations alone do not fit the memory of a GPU, whatever the linear solver."""
+    available = device_memory()
+    needed = 0.5 * BYTES_PER_OBSERVATION * problem.num_observations / devices  # in float32
+    if available is not None and needed > available:
+        raise ProblemError(
+            f"{problem.num_observations} observations take {2 * needed / 1e9:.1f} GB of a device in float64 and "
+            f"{needed / 1e9:.1f} in float32, more than its {available / 1e9:.1f} GB: "
+            "divide them among more (--devices) or take the CPU (--device cpu)"
+        )
 
 
 def _check_memory(problem: BundleProblem, observations: ObservationOrder | None) -> None:

@@ -243,6 +243,8 @@ def _start_of_constants(layout: Layout, cameras: Array) -> Array:
         constant = free.T == 0
     elif unknowns is not None:
         constant = unknowns.expanded(jnp.ones((unknowns.width, cameras.shape[0]))).T == 0
+    if unknowns is None or unknowns.members is None:  # else its lens may be that of a camera that is seen
+        constant = constant | ~jnp.asarray(layout.camera_seen)[:, None]
     kept = jnp.where(constant, cameras, 0)
     return (kept - jax.lax.stop_gradient(kept)).T
 

@@ -169,7 +169,7 @@ def set_up(
     observations = ObservationOrder.of(problem)
     if len(devices) == 1 and _pads(problem, options):
         capacity, asked = with_padded_solver(capacity_of(problem, observations), step, asked)
-    step = choose_linear_solver(problem, step, asked, observations)
+    step = choose_linear_solver(problem, step, asked, observations, len(devices))
     dtype = np.dtype("float32" if options.dtype == "float32" else "float64")
     with numerics(dtype):
         started = time.perf_counter()

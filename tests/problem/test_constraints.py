@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import support
@@ -155,6 +157,16 @@ def prior_residuals(problem: BundleProblem) -> np.ndarray:
 
 def whole_residuals(problem: BundleProblem) -> np.ndarray:
     return np.concatenate([geometry.residuals(problem).ravel(), prior_residuals(problem)])
+
+
+def test_priors_that_do_not_fit_are_refused_in_one_line():
+    problem = known()
+    parts, priors = support.arrays(problem), problem.priors
+    assert support.same_bits(BundleProblem.create(*parts, priors=priors).priors, priors)
+    with pytest.raises(ProblemError, match=r"positions of priors must have shape \(6, 3\), not \(5, 3\)"):
+        BundleProblem.create(*parts, priors=replace(priors, positions=priors.positions[:5]))
+    with pytest.raises(ProblemError, match="lens_weight of priors are not finite"):
+        BundleProblem.create(*parts, priors=replace(priors, lens_weight=priors.lens_weight * np.nan))
 
 
 @pytest.mark.parametrize(("policy", "solver"), [("ceres", "explicit"), ("guarded", "implicit")])

@@ -23,10 +23,12 @@ from jaxba import (
     solve,
     with_gauge,
     with_position_priors,
+    with_rotation_priors,
 )
 from jaxba.methods.registry import make_method
 from jaxba.problem import geometry
 from jaxba.problem.options import ConjugateGradients, Coordinates
+from jaxba.problem.rigs import in_frames, out_of_frames
 
 FRAME = np.array([0, 1, 0, 2, 1, 3], np.int32)
 MANIFOLD = Coordinates(rotation="manifold")
@@ -204,6 +206,33 @@ def test_covariances_are_those_of_the_dense_inverse_seen_by_each_camera(make):
         np.testing.assert_allclose(found.poses[camera], whole[at, at], rtol=1e-5, atol=1e-12)
     pair = np.r_[0:6, 18:24]
     np.testing.assert_allclose(found.between(0, 2), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-12)
+
+
+def test_priors_are_of_cameras_and_not_of_their_frames():
+    problem, rng = stereo(), np.random.default_rng(2)
+    centers = geometry.camera_centers(problem.cameras) + 0.2 * rng.normal(size=(6, 3))
+    known = with_position_priors(problem, centers, np.diag([0.01, 0.02, 0.03]), align=False)
+    turned = problem.cameras[:, :3] + 0.05 * rng.normal(size=(6, 3))
+    known = with_rotation_priors(known, turned, 0.02 * np.eye(3))
+
+    def cost(at: BundleProblem) -> float:
+        away = geometry.camera_centers(at.cameras) - centers
+        angles = Rotation.from_rotvec(at.cameras[:, :3].copy()) * Rotation.from_rotvec(turned).inv()
+        weighed = np.sum(away**2 / [0.01, 0.02, 0.03]), np.sum(angles.as_rotvec() ** 2) / 0.02
+        return geometry.cost(at) + 0.5 * sum(weighed)
+
+    found = solve(known, "ceres", SolveOptions(max_iterations=100))
+    np.testing.assert_allclose(found.initial_cost, cost(problem), rtol=1e-9)
+    np.testing.assert_allclose(found.final_cost, cost(found.problem), rtol=1e-9)
+    # a minimum: small moves of the frames and places raise the cost
+    here = in_frames(found.problem)
+    for _ in range(20):
+        moved = np.array(here.cameras)
+        by_frame, by_lens = 1e-4 * rng.normal(size=(4, 6)), 1e-4 * rng.normal(size=(2, 6)) * [[0], [1]]
+        moved[:, :6] += by_frame[FRAME]
+        moved[:, -6:] += by_lens[problem.lenses.index]
+        cameras, rigs = out_of_frames(found.problem, moved)
+        assert cost(found.problem.replace(cameras=cameras, rigs=rigs)) > found.final_cost
 
 
 def test_a_camera_that_nothing_sees_moves_with_its_frame():
