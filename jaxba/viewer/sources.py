@@ -1,0 +1,141 @@
+"""What the viewer shows, from files: problems, recordings, COLMAP's colours, images, KITTI's true paths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxba.datasets.bal.paths import resolve
+from jaxba.datasets.kitti.evaluate import Sidecar, read_sidecar, sidecar_path, truth_of
+from jaxba.datasets.kitti.poses import read_poses
+from jaxba.io import is_colmap, read_problem
+from jaxba.io.colmap.look import Looks, read_colmap_with_looks
+from jaxba.io.files import StrPath, display_name
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.similarity import umeyama
+from jaxba.viewer import geometry
+from jaxba.viewer.recording import ENDING, Recording, read_recording, still
+
+LARGEST_SIDE = 320
+"""Pixels of the longer side of an image on the page."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A problem or a recorded solve, and what is known of its looks."""
+
+    name: str
+    recording: Recording
+    looks: Looks | None = None
+    """Colours of points and sizes of images; None if they are not known."""
+
+    truth: Float[np.ndarray, "cameras 3"] | None = None
+    """True positions of cameras, in the scene of the last iteration."""
+
+    names: tuple[str, ...] | None = None
+    """Names of images."""
+
+    images: Path | None = None
+    """Folder of the images."""
+
+    @property
+    def problem(self) -> BundleProblem:
+        """The problem at the start, of a recording thinned."""
+        return self.recording.problem
+
+    def name_of(self, camera: int) -> str:
+        """What an image is called."""
+        return f"image {camera}" if self.names is None else self.names[camera]
+
+    def image(self, camera: int) -> UInt8[np.ndarray, "height width 3"] | None:
+        """A small version of an image; None if it is not at hand."""
+        if self.images is None or self.names is None:
+            return None
+        from PIL import Image
+
+        try:
+            with Image.open(self.images / self.names[camera]) as image:
+                image.draft("RGB", (2 * LARGEST_SIDE, 2 * LARGEST_SIDE))  # of a JPEG no more than is needed
+                image.thumbnail((LARGEST_SIDE, LARGEST_SIDE))
+                return np.asarray(image.convert("RGB"))
+        except (OSError, ValueError):
+            return None
+
+
+def shown(what: BundleProblem | Recording, name: str) -> Shown:
+    """What is shown of a problem or a recording without a file."""
+    recording = what if isinstance(what, Recording) else still(what)
+    labels = recording.problem.labels
+    return Shown(name, recording, names=labels and labels.names)
+
+
+def open_all(paths: Sequence[str], images: str | None = None, poses: str | None = None) -> list[Shown]:
+    """Opens files.
+
+    Args:
+        paths: of problems in any format that is read, names of downloaded BAL problems, or recordings.
+        images: folder of the images.
+        poses: KITTI's file of the true poses of the whole sequence; None: that with which `jaxba-kitti` made the
+            problem, if it is there.
+
+    Raises:
+        ProblemError: a file cannot be read; one line.
+    """
+    found = [_open(path) for path in paths]
+    sides = [_sidecar(path, one) for path, one in zip(paths, found, strict=True)]
+    return [_with_frames(one, sides, poses, images) for one in found]
+
+
+def _open(path: str) -> Shown:
+    name = Path(path.rstrip("/")).name or path
+    if path.endswith(ENDING):
+        return shown(read_recording(path), name.removesuffix(ENDING))
+    path = resolve(path)
+    if is_colmap(path):
+        problem, looks = read_colmap_with_looks(path)
+        return replace(shown(problem, name), looks=looks)
+    return shown(read_problem(path), name)
+
+
+def _sidecar(path: str, one: Shown) -> Sidecar | None:
+    """The file of frames beside a problem of `jaxba-kitti`, or beside the one that was solved."""
+    for place in (path, one.recording.source):
+        if place and sidecar_path(place).is_file():
+            return read_sidecar(place)
+    return None
+
+
+def _with_frames(one: Shown, sides: Sequence[Sidecar | None], poses: str | None, images: StrPath | None) -> Shown:
+    """With names, images and the true path of a problem of `jaxba-kitti`; the files of one sequence share a sidecar."""
+    count = one.problem.num_cameras
+    side = next((side for side in sides if side is not None and len(side.frames) == count), None)
+    if side is not None and one.names is None:
+        one = replace(one, names=tuple(f"{frame:06d}.png" for frame in side.frames))
+    if images is not None:
+        if one.names is None:
+            raise ProblemError(f"--images: {display_name(one.name)} does not name its images")
+        one = replace(one, images=Path(images))
+    if poses is None and side is not None:
+        known = side.contents.get("options", {}).get("poses")
+        poses = known if known and Path(known).is_file() else None
+    if poses is None:
+        return one
+    table = read_poses(poses)
+    if side is not None:
+        path = truth_of(side, poses)[:, :, 3]
+    elif len(table.numbers) == count:
+        path = table.matrices[:, :, 3]
+    else:
+        has = f"{len(table.numbers)} poses for {count} cameras"
+        raise ProblemError(f"{display_name(poses)}: has {has}, and no .frames.json says which are meant")
+    return replace(one, truth=_aligned(path, one))
+
+
+def _aligned(path: Float[np.ndarray, "cameras 3"], one: Shown) -> Float[np.ndarray, "cameras 3"]:
+    """A true path in the scene of the last iteration, by the similarity that takes the path found to it."""
+    centers = geometry.poses_of(np.asarray(one.recording.at(one.recording.last).cameras))[:, :, 3]
+    return umeyama(path, centers).points(path)

@@ -1,0 +1,297 @@
+"""One problem or recorded solve drawn into a scene of viser: points, frusta, the start, the true path, an image chosen.
+
+Every stage has its own similarity to the page, so that solves from other starts stand side by side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.viewer import geometry
+from jaxba.viewer.extra import viser
+from jaxba.viewer.measures import Measures, colours, limits, measure
+from jaxba.viewer.recording import evenly
+from jaxba.viewer.sources import Shown
+
+SHOWN_POINTS = 200_000
+"""Most points on a page. Software rendering draws them at a few frames a second."""
+
+SHOWN_FRUSTA = 500
+"""Most cameras on a page."""
+
+POINT_SIZE = 0.006
+"""Of points; scenes have a size of about one."""
+
+ASIDE = 3.0
+"""Distance between the middles of neighbouring stages."""
+
+FILE, ERROR, TRACK = "colour of the file", "reprojection error", "track length"
+"""What colours of points may mean."""
+
+START, TRUTH, PATH, CHOSEN, RESIDUAL = (150, 150, 150), (31, 94, 234), (208, 0, 0), (255, 120, 0), (208, 0, 0)
+"""Colours."""
+
+_CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
+
+
+class Stage:
+    """What a page shows of one problem or solve."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        shown: Shown,
+        key: str = "scene",
+        place: int = 0,
+        points: int = SHOWN_POINTS,
+        on_click: Callable[[int], None] | None = None,
+    ) -> None:
+        """Draws the last iteration.
+
+        Args:
+            server: owner of the scene.
+            shown: what to draw.
+            key: name in the tree of the scene.
+            place: number among those side by side.
+            points: most points that are drawn.
+            on_click: called with the number of an image whose frustum was clicked.
+        """
+        self.shown, self.server, self._root, self._on_click = shown, server, f"/{key}", on_click
+        recording = shown.recording
+        self.iteration, self.colour, self.chosen = recording.last, self.colour_choices()[0], None
+        self.points = evenly(shown.problem.num_points, points)
+        self.frusta = evenly(shown.problem.num_cameras, SHOWN_FRUSTA)
+        last = recording.at(recording.last)
+        self._similarity = geometry.to_page(last)
+        self._nodes: dict[str, Any] = {}
+        self._measured: tuple[int, Measures] | None = None
+        measures = self.measures
+        self._error_limits, self._image_limits = limits(measures.of_point), limits(measures.of_image)
+        self._track_limits = limits(measures.tracks.astype(float))
+        self.image_planes = geometry.frusta_of(last, None if shown.looks is None else shown.looks.sizes)
+        self._size = self._size_of_frusta(last)
+        server.scene.add_frame(self._root, show_axes=False, position=(ASIDE * place, 0.0, 0.0))
+        self._handles: dict[int, Any] = {}
+        self._draw()
+
+    def colour_choices(self) -> list[str]:
+        """What colours of points may mean here; the first is shown at the beginning."""
+        return [*([FILE] if self.shown.looks is not None else []), ERROR, TRACK]
+
+    @property
+    def problem(self) -> BundleProblem:
+        """The problem at the iteration shown."""
+        return self.shown.recording.at(self.iteration)
+
+    @property
+    def measures(self) -> Measures:
+        """Those of the iteration shown."""
+        state = int(self.shown.recording.state[self.iteration])
+        if self._measured is None or self._measured[0] != state:
+            self._measured = state, measure(self.problem)
+        return self._measured[1]
+
+    def show(self, iteration: int | None = None, colour: str | None = None, shown: Shown | None = None) -> None:
+        """Shows another iteration, other colours, or a recording that has grown."""
+        self.shown = shown or self.shown
+        self.iteration = self.iteration if iteration is None else min(iteration, self.shown.recording.last)
+        self.colour = self.colour if colour is None or colour not in self.colour_choices() else colour
+        self._draw()
+
+    def choose(self, camera: int | None) -> None:
+        """Marks an image: its points, and its residuals as segments in its plane."""
+        self.chosen = camera
+        self._draw()
+
+    def layer(self, name: str, visible: bool) -> None:
+        """Shows or hides `start`, `truth` or `path`."""
+        for node in self._nodes:
+            if node.split()[0] == name:
+                self._nodes[node].visible = visible
+
+    def layers(self) -> set[str]:
+        """The layers that there are."""
+        return {node.split()[0] for node in self._nodes}
+
+    def size_points(self, size: float) -> None:
+        """Draws points in another size."""
+        self._nodes["points"].point_size = size
+
+    def load_images(self) -> int:
+        """Puts images into the frusta, and returns how many there were."""
+        found = 0
+        for camera, handle in list(self._handles.items()):
+            image = self.shown.image(camera)
+            if image is not None:
+                handle.image, found = image, found + 1
+        return found
+
+    def limits_text(self) -> str:
+        """What the colours of points mean."""
+        if self.colour == FILE:
+            return ""
+        low, high = self._error_limits if self.colour == ERROR else self._track_limits
+        unit = "px" if self.colour == ERROR else "views"
+        return f"violet: {low:.3g} {unit} or less; yellow: {high:.3g} or more"
+
+    def _draw(self) -> None:
+        problem, measures, similarity = self.problem, self.measures, self._similarity
+        points = similarity.points(np.asarray(problem.points))
+        poses = similarity.poses(geometry.poses_of(np.asarray(problem.cameras)))
+        with self.server.atomic():
+            self._cloud("points", points[self.points], self._colours(measures)[self.points])
+            shown = set(self.frusta.tolist()) | ({self.chosen} if self.chosen is not None else set())
+            of_image = colours(measures.of_image, *self._image_limits)
+            for camera in sorted(shown):
+                colour = CHOSEN if camera == self.chosen else tuple(of_image[camera].tolist())
+                self._frustum(camera, poses[camera], colour)
+            for camera in self._handles.keys() - shown:
+                self._handles.pop(camera).remove()
+            self._mark(problem, measures, points, poses)
+            if "start points" not in self._nodes and self.shown.recording.last > 0:
+                self._draw_start()
+            if self.shown.truth is not None:
+                if "truth" not in self._nodes:
+                    self._lines("truth", _polyline(similarity.points(self.shown.truth)), TRUTH, 3.0)
+                self._lines("path", _polyline(poses[:, :, 3]), PATH, 2.0)
+            self._label(points)
+
+    def _colours(self, measures: Measures) -> np.ndarray:
+        if self.colour == FILE and self.shown.looks is not None:
+            return self.shown.looks.colours
+        if self.colour == TRACK:
+            return colours(measures.tracks.astype(float), *self._track_limits)
+        return colours(measures.of_point, *self._error_limits)
+
+    def _size_of_frusta(self, problem: BundleProblem) -> float:
+        """Such that neighbours do not cover each other."""
+        centers = self._similarity.points(geometry.poses_of(np.asarray(problem.cameras))[self.frusta][:, :, 3])
+        if len(centers) < 2:
+            return 0.15
+        distance = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+        np.fill_diagonal(distance, np.inf)
+        return float(np.clip(0.5 * np.median(distance.min(axis=1)), 0.015, 0.15))
+
+    def _corners(self, poses: Float[np.ndarray, "n 3 4"], half: Float[np.ndarray, "n 2"]) -> np.ndarray:
+        """Corners of images on the page, shape (n, 4, 3)."""
+        return self._on_page(
+            poses[:, None], _CORNERS * half[:, None], geometry.depth_of_image(half, self._size)[:, None]
+        )
+
+    def _on_page(self, poses: np.ndarray, plane: np.ndarray, depth: Any) -> np.ndarray:
+        """Places on the page of places in the planes at distance 1 before cameras, at a depth."""
+        local = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) * np.asarray(depth)[..., None]
+        return np.einsum("...ij,...j->...i", poses[..., :3], local) + poses[..., 3]
+
+    def _frustum(self, camera: int, pose: Float[np.ndarray, "3 4"], colour: tuple[int, int, int]) -> None:
+        quaternion, half = _quaternion(pose[:, :3]), self.image_planes.half[camera]
+        handle = self._handles.get(camera)
+        if handle is not None:
+            handle.wxyz, handle.position = quaternion, pose[:, 3]
+            if handle.color != colour:
+                handle.color = colour
+            return
+        name = f"{self._root}/cameras/{camera}"
+        handle = self.server.scene.add_camera_frustum(
+            name,
+            fov=2 * float(np.arctan(half[1])),
+            aspect=float(half[0] / half[1]),
+            scale=self._size,
+            thickness=1.5,
+            thickness_units="screen",
+            color=colour,
+            wxyz=quaternion,
+            position=pose[:, 3],
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        self._handles[camera] = handle
+        if self._on_click is not None:
+            handle.on_click(lambda _, camera=camera: self._on_click and self._on_click(camera))
+
+    def _mark(self, problem: BundleProblem, measures: Measures, points: np.ndarray, poses: np.ndarray) -> None:
+        if self.chosen is None:
+            return
+        camera = self.chosen
+        own = np.asarray(problem.point_index)[np.asarray(problem.camera_index) == camera]
+        self._cloud("chosen points", points[own], CHOSEN, size=2.5 * POINT_SIZE)
+        segments, _ = geometry.residual_segments(problem, self.image_planes, measures.residuals, camera)
+        depth = geometry.depth_of_image(self.image_planes.half[camera : camera + 1], self._size)[0]
+        self._lines("chosen residuals", self._on_page(poses[camera], segments, depth), RESIDUAL, 2.0)
+
+    def _draw_start(self) -> None:
+        start = self.shown.problem
+        poses = self._similarity.poses(geometry.poses_of(np.asarray(start.cameras)))[self.frusta]
+        corners = self._corners(poses, self.image_planes.half[self.frusta])
+        apex = np.broadcast_to(poses[:, None, :, 3], corners.shape)
+        around = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
+        spokes = np.stack([apex, corners], axis=2)
+        points = self._similarity.points(np.asarray(start.points)[self.points])
+        self._cloud("start points", points, START, size=0.6 * POINT_SIZE)
+        self._lines("start cameras", np.concatenate([around, spokes], axis=1).reshape(-1, 2, 3), START, 1.0)
+
+    def _label(self, points: np.ndarray) -> None:
+        text = f"{self.shown.name}: {self.numbers()}"
+        if "label" in self._nodes:
+            self._nodes["label"].text = text
+            return
+        top = float(np.percentile(points[:, 2], 95)) + 0.3
+        self._nodes["label"] = self.server.scene.add_label(
+            f"{self._root}/label", text, position=(0.0, 0.0, top), anchor="bottom-center"
+        )
+
+    def numbers(self) -> str:
+        """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error."""
+        recording, k = self.shown.recording, self.iteration
+        error = f"RMSE {self.measures.rmse:.4g} px"
+        if recording.last == 0:
+            return error
+        if k == 0:
+            return f"start, cost {recording.cost[0]:.5g}, {error}"
+        how = "" if recording.accepted[k] else ", rejected"
+        return (
+            f"iteration {k} of {recording.last}{how}, cost {recording.cost[k]:.5g}, λ {recording.damping[k]:.2g}, "
+            f"gain {recording.gain_ratio[k]:.2g}, {recording.time_s[k]:.3g} s, {error}"
+        )
+
+    def _cloud(self, name: str, points: np.ndarray, of: Any, size: float = POINT_SIZE) -> None:
+        points = np.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+        node = self._nodes.get(name)
+        if node is not None and len(node.points) == len(points):
+            node.points, node.colors = points, np.asarray(of, np.uint8)
+            return
+        self._nodes[name] = self.server.scene.add_point_cloud(
+            f"{self._root}/{name}",
+            points,
+            np.asarray(of, np.uint8),
+            point_size=size,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+        )
+
+    def _lines(self, name: str, segments: np.ndarray, colour: tuple[int, int, int], width: float) -> None:
+        node = self._nodes.get(name)
+        if node is not None and len(node.points) == len(segments):
+            node.points = segments.astype(np.float32)
+            return
+        self._nodes[name] = self.server.scene.add_line_segments(
+            f"{self._root}/{name}", segments, colour, thickness=width, thickness_units="screen"
+        )
+
+
+def _polyline(points: np.ndarray) -> np.ndarray:
+    """Segments from each point to the next."""
+    return np.stack([points[:-1], points[1:]], axis=1)
+
+
+def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
+    """The quaternion wxyz of a rotation."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]]
