@@ -168,7 +168,8 @@ class Arguments:
     priors that fix position, orientation and scale."""
 
     record: str | None = None
-    """Output file (.npz) of the parameters after every step, for jaxba-view; of more than 20,000 points an even choice."""
+    """Output file (.npz) of the parameters after every step, for jaxba-view; of more than 20,000 points an even
+    choice."""
 
     view: bool = False
     """Watch the solve in the browser while it runs (extra view)."""

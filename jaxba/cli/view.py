@@ -33,8 +33,8 @@ class Arguments:
     """Folder of the images, for files that name them (COLMAP, jaxba-kitti)."""
 
     poses: str | None = None
-    """KITTI's file of the true poses of the whole sequence. Default: that with which jaxba-kitti made the problem, if it
-    is there."""
+    """KITTI's file of the true poses of the whole sequence. Default: that with which jaxba-kitti made the problem, if
+    it is there."""
 
     html: str | None = None
     """Output file: one page that opens without a server and plays the iterations. Nothing is served."""

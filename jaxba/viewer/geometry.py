@@ -85,8 +85,8 @@ def poses_of(cameras: Float[np.ndarray, "cameras parameters"]) -> Float[np.ndarr
 
 
 def to_page(problem: BundleProblem) -> Similarity:
-    """The similarity to a scene whose middle is the origin, of a size of about one, with the mean of the cameras' upward
-    directions along +z."""
+    """The similarity to a scene whose middle is the origin, of a size of about one, with the mean of the cameras'
+    upward directions along +z."""
     poses, points = poses_of(np.asarray(problem.cameras)), np.asarray(problem.points)
     places = np.concatenate([poses[:, :, 3], points])
     places = places[np.isfinite(places).all(axis=1)]

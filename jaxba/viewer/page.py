@@ -21,7 +21,7 @@ LISTED = 5
 
 
 def write_page(all_shown: Sequence[Shown], path: StrPath) -> None:
-    """Writes a page that plays the iterations of all solves, in step. Where there are none, the worst image is marked.
+    """Writes a page that plays the iterations of all solves, in step; the worst image at the end is marked.
 
     Raises:
         ProblemError: it cannot be written.
@@ -31,10 +31,8 @@ def write_page(all_shown: Sequence[Shown], path: StrPath) -> None:
         drawn = stages(server, all_shown, points=PAGE_POINTS)
         for stage in drawn:
             stage.load_images()
+            stage.choose(int(stage.measures.worst()[0]))
         last = max(stage.shown.recording.last for stage in drawn)
-        if last == 0:
-            for stage in drawn:
-                stage.choose(int(stage.measures.worst()[0]))
         summary = _summary(drawn)
         for stage in drawn:
             stage.show(0)

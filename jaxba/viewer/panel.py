@@ -113,7 +113,8 @@ class Viewer:
     def _show(self, iteration: int | None = None, colour: str | None = None) -> None:
         with self._lock:
             for stage in self.stages:
-                stage.show(iteration, colour)
+                if iteration != stage.iteration:  # a slider that is drawn calls more often than it changes
+                    stage.show(iteration, colour)
                 if stage.chosen is not None:
                     self._about.content = about_image(stage, stage.chosen)
             self._tell()

@@ -216,6 +216,9 @@ class Stage:
 
     def _mark(self, problem: BundleProblem, measures: Measures, points: np.ndarray, poses: np.ndarray) -> None:
         if self.chosen is None:
+            for name in ("chosen points", "chosen residuals"):
+                if name in self._nodes:
+                    self._nodes.pop(name).remove()
             return
         camera = self.chosen
         own = np.asarray(problem.point_index)[np.asarray(problem.camera_index) == camera]

@@ -1,7 +1,7 @@
-"""The viewer's page and the one in a file, in headless Chromium: pixels, not only status; no error, no request elsewhere.
+"""The viewer's page and the one in a file, in headless Chromium: pixels, no error, no request elsewhere.
 
-Colours are looked for: points of a problem without colours are viridis's, and so are frusta; what is chosen is orange and
-red. Software rendering gives them to within a few shades.
+Points and frusta of a problem without colours are viridis's, what is chosen is orange; software rendering gives them to
+within a few shades.
 """
 
 from __future__ import annotations
