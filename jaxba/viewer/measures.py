@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
@@ -70,7 +70,7 @@ def limits(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
     return float(low), float(max(high, 1.001 * low))
 
 
-def colours(values: Float[np.ndarray, " n"], low: float, high: float) -> Int[np.ndarray, "n 3"]:
+def colours(values: Float[np.ndarray, " n"], low: float, high: float) -> UInt8[np.ndarray, "n 3"]:
     """Colours of positive values on a logarithmic scale from `low` to `high`; the brightest where there is no value."""
     with np.errstate(divide="ignore", invalid="ignore"):
         place = np.log(values / low) / np.log(high / low)

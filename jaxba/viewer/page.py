@@ -28,7 +28,7 @@ def write_page(all_shown: Sequence[Shown], path: StrPath) -> None:
     """
     server = start_server()
     try:
-        drawn = stages(server, all_shown, points=PAGE_POINTS)
+        drawn = stages(server, all_shown, points=PAGE_POINTS, caption="numbers")
         for stage in drawn:
             stage.load_images()
             stage.choose(int(stage.measures.worst()[0]))

@@ -49,7 +49,7 @@ class Viewer:
         """
         self.server = start_server(port)
         self._lock = threading.RLock()
-        self.stages = stages(self.server, all_shown, self.choose)
+        self.stages = stages(self.server, all_shown, self.choose, caption="name" if len(all_shown) > 1 else "")
         self._panel()
 
     @property
@@ -138,6 +138,7 @@ def stages(
     all_shown: Sequence[Shown],
     on_click: Callable[[Stage, int], None] | None = None,
     points: int = SHOWN_POINTS,
+    caption: str = "",
 ) -> list[Stage]:
     """Draws problems and solves side by side, and turns the camera to them.
 
@@ -146,12 +147,13 @@ def stages(
         all_shown: what to draw.
         on_click: called with the stage and the number of an image that was clicked.
         points: most points, of all together.
+        caption: as of a `Stage`.
     """
     share = max(points // len(all_shown), 1)
     found: list[Stage] = []
     for place, one in enumerate(all_shown):
         click = None if on_click is None else lambda camera, place=place: on_click(found[place], camera)
-        found.append(Stage(server, one, f"{place + 1}", place, share, click))
+        found.append(Stage(server, one, f"{place + 1}", place, share, click, caption))
     middle = ASIDE * (len(all_shown) - 1) / 2
     server.initial_camera.position = (middle, -2.2 - 1.2 * middle, 1.6 + 0.5 * middle)
     server.initial_camera.look_at = (middle, 0.0, 0.0)

@@ -50,6 +50,7 @@ class Stage:
         place: int = 0,
         points: int = SHOWN_POINTS,
         on_click: Callable[[int], None] | None = None,
+        caption: str = "",
     ) -> None:
         """Draws the last iteration.
 
@@ -60,9 +61,10 @@ class Stage:
             place: number among those side by side.
             points: most points that are drawn.
             on_click: called with the number of an image whose frustum was clicked.
+            caption: text above the scene, `""`, `"name"`, or `"numbers"` with those of the iteration.
         """
         self.shown, self.server, self._root, self._on_click = shown, server, f"/{key}", on_click
-        recording = shown.recording
+        self._caption, recording = caption, shown.recording
         self.iteration, self.colour, self.chosen = recording.last, self.colour_choices()[0], None
         self.points = evenly(shown.problem.num_points, points)
         self.frusta = evenly(shown.problem.num_cameras, SHOWN_FRUSTA)
@@ -239,7 +241,9 @@ class Stage:
         self._lines("start cameras", np.concatenate([around, spokes], axis=1).reshape(-1, 2, 3), START, 1.0)
 
     def _label(self, points: np.ndarray) -> None:
-        text = f"{self.shown.name}: {self.numbers()}"
+        if not self._caption:
+            return
+        text = self.shown.name if self._caption == "name" else f"{self.shown.name}: {self.numbers()}"
         if "label" in self._nodes:
             self._nodes["label"].text = text
             return

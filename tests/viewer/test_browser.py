@@ -34,6 +34,7 @@ FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--window-size=900,700", "--disable-dev-shm-usage"),
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )
 
 READY_S = 60.0
@@ -66,7 +67,7 @@ def recording():
 
 
 @pytest.fixture
-def viewer(recording):
+def viewer(recording, browser):
     from jaxba.viewer.panel import Viewer
     from jaxba.viewer.sources import shown
 
@@ -74,7 +75,10 @@ def viewer(recording):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     found = Viewer([shown(recording, "run")], port)
+    for log in ("browser", "performance"):
+        browser.get_log(log)  # what went before
     yield found
+    browser.get("about:blank")
     found.close()
 
 
@@ -108,8 +112,8 @@ def wait_for(what, browser) -> None:
         time.sleep(0.3)
 
 
-def check_silent(browser, allowed: str) -> None:
-    """No error on the console, and no request but to one origin."""
+def check_silent(browser, *allowed: str) -> None:
+    """No error on the console, as of a name that does not resolve, and no request but to these origins."""
     errors = [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"]
     assert errors == []
     asked = []
@@ -121,7 +125,7 @@ def check_silent(browser, allowed: str) -> None:
             if message["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated") and url:
                 asked.append(url)
     assert asked
-    assert [url for url in asked if not url.startswith((allowed, "data:", "blob:"))] == []
+    assert [url for url in asked if not url.startswith((*allowed, "data:", "blob:"))] == []
 
 
 def test_the_page_shows_points_and_frusta_and_the_slider_changes_them(browser, viewer):
@@ -138,7 +142,7 @@ def test_the_page_shows_points_and_frusta_and_the_slider_changes_them(browser, v
     slider.send_keys("\ue012" * 10)  # arrow to the left
     wait_for(lambda: "start, cost" in browser.find_element(By.TAG_NAME, "body").text, browser)
     wait_for(lambda: (np.abs(scene(browser) - last).max(axis=2) > 60).sum() > 200, browser)
-    check_silent(browser, viewer.url.replace("http", "ws"))
+    check_silent(browser, viewer.url, viewer.url.replace("http", "ws"))
 
 
 def test_a_click_on_a_frustum_marks_its_points(browser, viewer):
@@ -174,7 +178,8 @@ def test_a_page_in_a_file_plays_without_a_server(browser, recording, tmp_path):
     path = tmp_path / "run.html"
     write_page([shown(recording, "run")], path)
     assert path.stat().st_size < 2e6
-    browser.get_log("performance")
+    for log in ("browser", "performance"):
+        browser.get_log(log)
     browser.get(f"file://{path}")
     wait_for(lambda: coloured(scene(browser)) > 500, browser)
     first = scene(browser)
