@@ -53,10 +53,13 @@ def frusta_of(problem: BundleProblem, sizes: Float[np.ndarray, "cameras 2"] | No
     count = len(numbers)
     focal, center, flipped = np.ones((count, 2)), np.zeros((count, 2)), np.zeros(count, bool)
     lenses = problem.lenses
-    lens = np.arange(count) if lenses is None else np.asarray(lenses.index)
-    models = [BAL] if lenses is None else [lenses.model_of(one) for one in range(len(lenses.free))]
-    for at, own in enumerate([slice(None)] if lenses is None else [lens == one for one in range(len(models))]):
-        model = models[at]
+    models, kind = (BAL,), np.zeros(count, int)
+    if lenses is not None:
+        models = lenses.models
+        if lenses.model is not None:
+            kind = np.asarray(lenses.model)[np.asarray(lenses.index)]
+    for at, model in enumerate(models):
+        own = np.flatnonzero(kind == at)
         flipped[own] = model is BAL
         if model.focal:
             focal[own] = numbers[own][:, [model.focal[0], model.focal[-1]]]
@@ -65,17 +68,26 @@ def frusta_of(problem: BundleProblem, sizes: Float[np.ndarray, "cameras 2"] | No
         if model.principal_point:
             center[own] = numbers[own][:, list(model.principal_point)]
     focal = np.where(np.abs(focal) > 0, np.abs(focal), 1.0)
-    reach = np.zeros((count, 2))
+    if sizes is not None and sizes.all():
+        reach = sizes / 2
+    else:
+        reach = _reach(problem, center)
+        reach = reach if sizes is None else np.where(sizes > 0, sizes / 2, reach)
+    return Frusta(focal, center, flipped, np.clip(reach / focal, 1e-3, WIDEST))
+
+
+def _reach(problem: BundleProblem, center: Float[np.ndarray, "cameras 2"]) -> Float[np.ndarray, "cameras 2"]:
+    """How far images reach from their principal points: to the corner of the pixels, or where pixels begin in the
+    middle, to the observations of their lens, or of the median image."""
+    reach = np.zeros(center.shape)
     index = np.asarray(problem.camera_index)
     np.maximum.at(reach, index, np.abs(np.asarray(problem.observations) - center[index]))
+    lenses = problem.lenses
     if lenses is not None:
-        of_lens = np.zeros((len(models), 2))
-        np.maximum.at(of_lens, lens, reach)
-        reach = of_lens[lens]
-    reach = np.maximum(reach, np.where(center.any(axis=1)[:, None], np.abs(center), np.median(reach, axis=0)))
-    if sizes is not None:
-        reach = np.where(sizes > 0, sizes / 2, reach)
-    return Frusta(focal, center, flipped, np.clip(reach / focal, 1e-3, WIDEST))
+        of_lens = np.zeros((len(lenses.free), 2))
+        np.maximum.at(of_lens, np.asarray(lenses.index), reach)
+        reach = of_lens[lenses.index]
+    return np.maximum(reach, np.where(center.any(axis=1, keepdims=True), np.abs(center), np.median(reach, axis=0)))
 
 
 def poses_of(cameras: Float[np.ndarray, "cameras parameters"]) -> Float[np.ndarray, "cameras 3 4"]:

@@ -104,11 +104,16 @@ class Viewer:
         self._slider.on_update(lambda _: self._show(iteration=int(self._slider.value)))
         colour.on_update(lambda _: self._show(colour=colour.value))
         picked.on_update(lambda _: self.choose(*worst.get(picked.value, (self.stages[0], None))))
-        size.on_update(lambda _: [stage.size_points(size.value) for stage in self.stages])
+        size.on_update(lambda _: self._each(lambda stage: stage.size_points(size.value)))
         for name, what in layers:
             box = gui.add_checkbox(name, True)
-            box.on_update(lambda _, box=box, what=what: [stage.layer(what, box.value) for stage in self.stages])
+            box.on_update(lambda _, box=box, what=what: self._each(lambda stage: stage.layer(what, box.value)))
         self._tell()
+
+    def _each(self, change: Callable[[Stage], None]) -> None:
+        with self._lock:
+            for stage in self.stages:
+                change(stage)
 
     def _show(self, iteration: int | None = None, colour: str | None = None) -> None:
         with self._lock:

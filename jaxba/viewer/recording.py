@@ -130,14 +130,15 @@ class Recorder:
         if step.accepted:
             found = now()
             self._states.append((np.asarray(found.cameras), np.asarray(found.points)[self._kept]))
-        numbers = (step.cost, step.damping, step.gain_ratio, record.time_s)
-        self._rows.append((len(self._states) - 1, *map(float, numbers)))
+        numbers = float(step.cost), float(step.damping), float(step.gain_ratio), record.time_s
+        self._rows.append((len(self._states) - 1, *numbers))
 
     def recording(self) -> Recording:
         """What was recorded so far."""
         cameras, points = zip(*self._states, strict=True)
-        state, *rows = map(np.array, zip(*self._rows, strict=True))
-        return Recording(self._problem, self._whole, np.stack(cameras), np.stack(points), state, *rows, self._source)
+        state, cost, damping, gain, seconds = map(np.array, zip(*self._rows, strict=True))
+        states = state, cost, damping, gain, seconds
+        return Recording(self._problem, self._whole, np.stack(cameras), np.stack(points), *states, self._source)
 
 
 _ARRAYS = ("observations", "camera_index", "point_index")
@@ -185,8 +186,8 @@ def read_recording(path: StrPath) -> Recording:
         if "names" in found:
             ids = np.arange(problem.num_cameras)
             problem = problem.replace(labels=Labels(tuple(map(str, found["names"])), ids, ids[:0], ids[:0]))
-        history = (found[key] for key in _HISTORY[1:])
-        return Recording(problem, int(found["whole"]), found["cameras"], points, *history, str(found["source"]))
+        history: dict[str, Any] = {key: found[key] for key in _HISTORY}
+        return Recording(problem, int(found["whole"]), points=points, source=str(found["source"]), **history)
     except OSError as error:
         raise ProblemError(f"cannot read {name}: {reason(error)}") from None
     except (ValueError, KeyError, IndexError, TypeError, EOFError, zipfile.BadZipFile):

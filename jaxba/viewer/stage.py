@@ -143,10 +143,10 @@ class Stage:
 
     def _draw(self) -> None:
         problem, measures, similarity = self.problem, self.measures, self._similarity
-        points = similarity.points(np.asarray(problem.points))
+        points = similarity.points(np.asarray(problem.points)[self.points])
         poses = similarity.poses(geometry.poses_of(np.asarray(problem.cameras)))
         with self.server.atomic():
-            self._cloud("points", points[self.points], self._colours(measures)[self.points])
+            self._cloud("points", points, self._colours(measures)[self.points])
             shown = set(self.frusta.tolist()) | ({self.chosen} if self.chosen is not None else set())
             of_image = colours(measures.of_image, *self._image_limits)
             for camera in sorted(shown):
@@ -154,7 +154,7 @@ class Stage:
                 self._frustum(camera, poses[camera], colour)
             for camera in self._handles.keys() - shown:
                 self._handles.pop(camera).remove()
-            self._mark(problem, measures, points, poses)
+            self._mark(problem, measures, poses)
             if "start points" not in self._nodes and self.shown.recording.last > 0:
                 self._draw_start()
             if self.shown.truth is not None:
@@ -216,7 +216,7 @@ class Stage:
         if self._on_click is not None:
             handle.on_click(lambda _, camera=camera: self._on_click and self._on_click(camera))
 
-    def _mark(self, problem: BundleProblem, measures: Measures, points: np.ndarray, poses: np.ndarray) -> None:
+    def _mark(self, problem: BundleProblem, measures: Measures, poses: np.ndarray) -> None:
         if self.chosen is None:
             for name in ("chosen points", "chosen residuals"):
                 if name in self._nodes:
@@ -224,7 +224,9 @@ class Stage:
             return
         camera = self.chosen
         own = np.asarray(problem.point_index)[np.asarray(problem.camera_index) == camera]
-        self._cloud("chosen points", points[own], CHOSEN, size=2.5 * POINT_SIZE)
+        self._cloud(
+            "chosen points", self._similarity.points(np.asarray(problem.points)[own]), CHOSEN, size=2.5 * POINT_SIZE
+        )
         segments, _ = geometry.residual_segments(problem, self.image_planes, measures.residuals, camera)
         depth = geometry.depth_of_image(self.image_planes.half[camera : camera + 1], self._size)[0]
         self._lines("chosen residuals", self._on_page(poses[camera], segments, depth), RESIDUAL, 2.0)
