@@ -39,4 +39,5 @@ def plot_history(history: History, initial_cost: float) -> Figure:
         axes.set_yscale("log")
         axes.grid(alpha=0.25)
     below.set_xlabel("iteration")
+    below.xaxis.get_major_locator().set_params(integer=True)
     return figure

@@ -12,12 +12,17 @@ import numpy as np
 
 from jaxba.viewer import geometry
 from jaxba.viewer.extra import viser
+from jaxba.viewer.picture import picture_of
 from jaxba.viewer.recording import Recording
 from jaxba.viewer.sources import Shown
 from jaxba.viewer.stage import ASIDE, POINT_SIZE, SHOWN_POINTS, Stage
 
 PORT = 8080
 """First port that is tried."""
+
+BESIDE = 0.2
+"""How far, as a share of the distance, the scene stands beside the middle: the panel is on the right, what a page in a
+file says on the left."""
 
 WORST = 20
 """Images in the list of the worst."""
@@ -75,7 +80,19 @@ class Viewer:
         with self._lock:
             for one in self.stages:
                 one.choose(camera if one is stage else None)
-            self._about.content = "" if camera is None else about_image(stage, camera)
+            if camera is None:
+                self._about.content, self._picture.visible = "", False
+            else:
+                self._describe(stage, camera)
+
+    def _describe(self, stage: Stage, camera: int) -> None:
+        """Words and a picture of a chosen image."""
+        self._about.content = about_image(stage, camera)
+        residuals = stage.measures.residuals
+        self._picture.image = picture_of(
+            stage.shown.image(camera), stage.problem, stage.image_planes, residuals, camera
+        )
+        self._picture.visible = True
 
     def grow(self, recording: Recording) -> None:
         """Shows the last iteration of a solve that is running, unless another one is being looked at."""
@@ -101,6 +118,7 @@ class Viewer:
         picked = gui.add_dropdown("worst images", (NOTHING, *worst))
         layers = [(name, what) for name, what in LAYERS if any(what in stage.layers() for stage in self.stages)]
         self._about = gui.add_markdown("Click on an image, or choose one of the worst.")
+        self._picture = gui.add_image(np.full((1, 1, 3), 255, np.uint8), visible=False)
         self._slider.on_update(lambda _: self._show(iteration=int(self._slider.value)))
         colour.on_update(lambda _: self._show(colour=colour.value))
         picked.on_update(lambda _: self.choose(*worst.get(picked.value, (self.stages[0], None))))
@@ -121,7 +139,7 @@ class Viewer:
                 if iteration != stage.iteration:  # a slider that is drawn calls more often than it changes
                     stage.show(iteration, colour)
                 if stage.chosen is not None:
-                    self._about.content = about_image(stage, stage.chosen)
+                    self._describe(stage, stage.chosen)
             self._tell()
 
     def _tell(self) -> None:
@@ -160,8 +178,10 @@ def stages(
         click = None if on_click is None else lambda camera, place=place: on_click(found[place], camera)
         found.append(Stage(server, one, f"{place + 1}", place, share, click, caption))
     middle = ASIDE * (len(all_shown) - 1) / 2
-    server.initial_camera.position = (middle, -2.2 - 1.2 * middle, 1.6 + 0.5 * middle)
-    server.initial_camera.look_at = (middle, 0.0, 0.0)
+    away = 2.2 + 1.2 * middle
+    across = middle + BESIDE * (away if on_click else -away)
+    server.initial_camera.position = (across, -away, 0.7 * away)
+    server.initial_camera.look_at = (across, 0.0, 0.0)
     return found
 
 

@@ -20,7 +20,7 @@ from jaxba.problem.similarity import umeyama
 from jaxba.viewer import geometry
 from jaxba.viewer.recording import ENDING, Recording, read_recording, still
 
-LARGEST_SIDE = 320
+LARGEST_SIDE = 480
 """Pixels of the longer side of an image on the page."""
 
 

@@ -245,7 +245,7 @@ class Stage:
     def _label(self, points: np.ndarray) -> None:
         if not self._caption:
             return
-        text = self.shown.name if self._caption == "name" else f"{self.shown.name}: {self.numbers()}"
+        text = self.shown.name if self._caption == "name" else "\n".join([self.shown.name, self.numbers("\n")])
         if "label" in self._nodes:
             self._nodes["label"].text = text
             return
@@ -254,19 +254,22 @@ class Stage:
             f"{self._root}/label", text, position=(0.0, 0.0, top), anchor="bottom-center"
         )
 
-    def numbers(self) -> str:
-        """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error."""
+    def numbers(self, between: str = ", ") -> str:
+        """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error.
+
+        Args:
+            between: what stands between the parts.
+        """
         recording, k = self.shown.recording, self.iteration
         error = f"RMSE {self.measures.rmse:.4g} px"
         if recording.last == 0:
             return error
         if k == 0:
-            return f"start, cost {recording.cost[0]:.5g}, {error}"
+            return between.join(["start", f"cost {recording.cost[0]:.5g}", error])
         how = "" if recording.accepted[k] else ", rejected"
-        return (
-            f"iteration {k} of {recording.last}{how}, cost {recording.cost[k]:.5g}, λ {recording.damping[k]:.2g}, "
-            f"gain {recording.gain_ratio[k]:.2g}, {recording.time_s[k]:.3g} s, {error}"
-        )
+        cost = f"cost {recording.cost[k]:.5g}, {error}"
+        step = f"λ {recording.damping[k]:.2g}, gain {recording.gain_ratio[k]:.2g}, {recording.time_s[k]:.3g} s"
+        return between.join([f"iteration {k} of {recording.last}{how}", cost, step])
 
     def _cloud(self, name: str, points: np.ndarray, of: Any, size: float = POINT_SIZE) -> None:
         points = np.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
