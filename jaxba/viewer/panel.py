@@ -12,7 +12,6 @@ import numpy as np
 
 from jaxba.viewer import geometry
 from jaxba.viewer.extra import viser
-from jaxba.viewer.picture import picture_of
 from jaxba.viewer.recording import Recording
 from jaxba.viewer.sources import Shown
 from jaxba.viewer.stage import ASIDE, POINT_SIZE, SHOWN_POINTS, Stage
@@ -88,10 +87,7 @@ class Viewer:
     def _describe(self, stage: Stage, camera: int) -> None:
         """Words and a picture of a chosen image."""
         self._about.content = about_image(stage, camera)
-        residuals = stage.measures.residuals
-        self._picture.image = picture_of(
-            stage.shown.image(camera), stage.problem, stage.image_planes, residuals, camera
-        )
+        self._picture.image = stage.picture(camera)
         self._picture.visible = True
 
     def grow(self, recording: Recording) -> None:

@@ -31,7 +31,7 @@ class Shown:
     name: str
     recording: Recording
     looks: Looks | None = None
-    """Colours of points and sizes of images; None if they are not known."""
+    """Colours of points, sizes of images and their principal points; None if they are not known."""
 
     truth: Float[np.ndarray, "cameras 3"] | None = None
     """True positions of cameras, in the scene of the last iteration."""
@@ -50,6 +50,18 @@ class Shown:
     def name_of(self, camera: int) -> str:
         """What an image is called."""
         return f"image {camera}" if self.names is None else self.names[camera]
+
+    def size(self, camera: int) -> tuple[float, float]:
+        """Width and height of an image, pixels; 0 if it is not at hand."""
+        if self.images is None or self.names is None:
+            return 0.0, 0.0
+        from PIL import Image
+
+        try:
+            with Image.open(self.images / self.names[camera]) as image:
+                return float(image.width), float(image.height)
+        except (OSError, ValueError):
+            return 0.0, 0.0
 
     def image(self, camera: int) -> UInt8[np.ndarray, "height width 3"] | None:
         """A small version of an image; None if it is not at hand."""
@@ -119,6 +131,9 @@ def _with_frames(one: Shown, sides: Sequence[Sidecar | None], poses: str | None,
         if one.names is None:
             raise ProblemError(f"--images: {display_name(one.name)} does not name its images")
         one = replace(one, images=Path(images))
+    if side is not None and one.looks is None:
+        principal = np.tile([side.calibration.cx, side.calibration.cy], (count, 1))
+        one = replace(one, looks=Looks(None, np.array([one.size(camera) for camera in range(count)]), principal))
     if poses is None and side is not None:
         known = side.contents.get("options", {}).get("poses")
         poses = known if known and Path(known).is_file() else None

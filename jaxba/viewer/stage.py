@@ -15,6 +15,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.viewer import geometry
 from jaxba.viewer.extra import viser
 from jaxba.viewer.measures import Measures, colours, limits, measure
+from jaxba.viewer.picture import picture_of
 from jaxba.viewer.recording import evenly
 from jaxba.viewer.sources import Shown
 
@@ -83,7 +84,11 @@ class Stage:
 
     def colour_choices(self) -> list[str]:
         """What colours of points may mean here; the first is shown at the beginning."""
-        return [*([FILE] if self.shown.looks is not None else []), ERROR, TRACK]
+        return [*([FILE] if self._file_colours is not None else []), ERROR, TRACK]
+
+    @property
+    def _file_colours(self) -> np.ndarray | None:
+        return None if self.shown.looks is None else self.shown.looks.colours
 
     @property
     def problem(self) -> BundleProblem:
@@ -133,6 +138,16 @@ class Stage:
                 handle.image, found = image, found + 1
         return found
 
+    def picture(self, camera: int) -> np.ndarray:
+        """The picture of an image with its residuals, shape (height, width, 3)."""
+        looks, planes = self.shown.looks, self.image_planes
+        size = 2 * planes.half[camera] * planes.focal[camera]
+        principal = size / 2
+        if looks is not None and looks.sizes[camera].all():
+            size, principal = looks.sizes[camera], looks.principal[camera]
+        segments, _ = geometry.residual_segments(self.problem, planes, self.measures.residuals, camera)
+        return picture_of(self.shown.image(camera), size, segments * planes.focal[camera] + principal)
+
     def limits_text(self) -> str:
         """What the colours of points mean."""
         if self.colour == FILE:
@@ -164,8 +179,8 @@ class Stage:
             self._label(points)
 
     def _colours(self, measures: Measures) -> np.ndarray:
-        if self.colour == FILE and self.shown.looks is not None:
-            return self.shown.looks.colours
+        if self.colour == FILE and self._file_colours is not None:
+            return self._file_colours
         if self.colour == TRACK:
             return colours(measures.tracks.astype(float), *self._track_limits)
         return colours(measures.of_point, *self._error_limits)
