@@ -240,7 +240,7 @@ class Stage:
         camera = self.chosen
         own = np.asarray(problem.point_index)[np.asarray(problem.camera_index) == camera]
         self._cloud(
-            "chosen points", self._similarity.points(np.asarray(problem.points)[own]), CHOSEN, size=2.5 * POINT_SIZE
+            "chosen points", self._similarity.points(np.asarray(problem.points)[own]), CHOSEN, size=1.8 * POINT_SIZE
         )
         segments, _ = geometry.residual_segments(problem, self.image_planes, measures.residuals, camera)
         depth = geometry.depth_of_image(self.image_planes.half[camera : camera + 1], self._size)[0]
