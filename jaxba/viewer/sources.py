@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,8 +49,10 @@ class Shown:
         return self.recording.problem
 
     def name_of(self, camera: int) -> str:
-        """What an image is called."""
-        return f"image {camera}" if self.names is None else self.names[camera]
+        """What an image is called, in characters that every page can hold."""
+        if self.names is None:
+            return f"image {camera}"
+        return self.names[camera].encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
     def size(self, camera: int) -> tuple[float, float]:
         """Width and height of an image, pixels; 0 if it is not at hand."""
@@ -134,12 +137,22 @@ def _with_frames(one: Shown, sides: Sequence[Sidecar | None], poses: str | None,
     if side is not None and one.looks is None:
         principal = np.tile([side.calibration.cx, side.calibration.cy], (count, 1))
         one = replace(one, looks=Looks(None, np.array([one.size(camera) for camera in range(count)]), principal))
-    if poses is None and side is not None:
-        known = side.contents.get("options", {}).get("poses")
-        poses = known if known and Path(known).is_file() else None
-    if poses is None:
-        return one
-    table = read_poses(poses)
+    if poses is not None:
+        return replace(one, truth=_truth(one, side, poses))
+    known = None if side is None else side.contents.get("options", {}).get("poses")
+    if known and Path(known).is_file():
+        with suppress(ProblemError):  # nobody asked for it
+            return replace(one, truth=_truth(one, side, known))
+    return one
+
+
+def _truth(one: Shown, side: Sidecar | None, poses: StrPath) -> Float[np.ndarray, "cameras 3"]:
+    """The true path in the scene of the last iteration, by the similarity that takes it to the path found.
+
+    Raises:
+        ProblemError: it cannot be read, or is not one of these cameras.
+    """
+    count, table = one.problem.num_cameras, read_poses(poses)
     if side is not None:
         path = truth_of(side, poses)[:, :, 3]
     elif len(table.numbers) == count:
@@ -147,10 +160,5 @@ def _with_frames(one: Shown, sides: Sequence[Sidecar | None], poses: str | None,
     else:
         has = f"{len(table.numbers)} poses for {count} cameras"
         raise ProblemError(f"{display_name(poses)}: has {has}, and no .frames.json says which are meant")
-    return replace(one, truth=_aligned(path, one))
-
-
-def _aligned(path: Float[np.ndarray, "cameras 3"], one: Shown) -> Float[np.ndarray, "cameras 3"]:
-    """A true path in the scene of the last iteration, by the similarity that takes the path found to it."""
     centers = geometry.poses_of(np.asarray(one.recording.at(one.recording.last).cameras))[:, :, 3]
     return umeyama(path, centers).points(path)
