@@ -90,7 +90,7 @@ def _run(args: Arguments) -> int:
 def check_extra() -> None:
     """Raises a UsageError that names the package to install, if viser is missing."""
     try:
-        from jaxba.viewer import extra  # noqa: F401
+        import jaxba.viewer.extra  # noqa: F401
     except ImportError as error:
         raise common.UsageError(str(error)) from None
 

@@ -130,14 +130,16 @@ def residual_segments(
     """Residuals of an image as segments from each measured pixel towards the predicted one, in its plane.
 
     Returns:
-        The segments, and by how much they are magnified: a root mean square residual is as long as a twentieth of the
-        image's width. Non-finite residuals are left out.
+        The segments, and by how much they are magnified: the median is at least as long as a twentieth of the image's
+        width. None is longer than that width. Non-finite residuals are left out.
     """
     own = np.flatnonzero((np.asarray(problem.camera_index) == camera) & np.isfinite(residuals).all(axis=1))
     pixels, difference = np.asarray(problem.observations)[own], residuals[own]
-    rms = float(np.sqrt((difference**2).sum(axis=1).mean())) if len(own) else 0.0
+    length = np.linalg.norm(difference, axis=1)
+    typical = float(np.median(length)) if len(own) else 0.0
     width = 2 * frusta.half[camera, 0] * frusta.focal[camera, 0]
-    factor = max(1.0, 0.05 * width / rms) if rms > 0 else 1.0
+    factor = max(1.0, 0.05 * width / typical) if typical > 0 else 1.0
+    share = np.minimum(factor, width / np.maximum(length, 1e-300))[:, None]
     cameras = np.full(len(own), camera)
-    ends = [frusta.on_plane(pixels - share * difference, cameras) for share in (0.0, factor)]
+    ends = [frusta.on_plane(place, cameras) for place in (pixels, pixels - share * difference)]
     return np.stack(ends, axis=1), float(factor)

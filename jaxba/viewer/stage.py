@@ -14,6 +14,7 @@ from jaxtyping import Float
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.viewer import geometry
 from jaxba.viewer.extra import viser
+from jaxba.viewer.layers import Layers
 from jaxba.viewer.measures import Measures, colours, limits, measure
 from jaxba.viewer.picture import picture_of
 from jaxba.viewer.recording import evenly
@@ -64,22 +65,18 @@ class Stage:
             on_click: called with the number of an image whose frustum was clicked.
             caption: text above the scene, `""`, `"name"`, or `"numbers"` with those of the iteration.
         """
-        self.shown, self.server, self._root, self._on_click = shown, server, f"/{key}", on_click
+        self.shown, self._server, self._on_click = shown, server, on_click
         self._caption, recording = caption, shown.recording
         self.iteration, self.colour, self.chosen = recording.last, self.colour_choices()[0], None
         self.points = evenly(shown.problem.num_points, points)
         self.frusta = evenly(shown.problem.num_cameras, SHOWN_FRUSTA)
         last = recording.at(recording.last)
         self._similarity = geometry.to_page(last)
-        self._nodes: dict[str, Any] = {}
         self._measured: tuple[int, Measures] | None = None
-        measures = self.measures
-        self._error_limits, self._image_limits = limits(measures.of_point), limits(measures.of_image)
-        self._track_limits = limits(measures.tracks.astype(float))
+        self._set_limits()
         self.image_planes = geometry.frusta_of(last, None if shown.looks is None else shown.looks.sizes)
         self._size = self._size_of_frusta(last)
-        server.scene.add_frame(self._root, show_axes=False, position=(ASIDE * place, 0.0, 0.0))
-        self._handles: dict[int, Any] = {}
+        self._layers = Layers(server, f"/{key}", (ASIDE * place, 0.0, 0.0))
         self._draw()
 
     def colour_choices(self) -> list[str]:
@@ -108,6 +105,8 @@ class Stage:
         self.shown = shown or self.shown
         self.iteration = self.iteration if iteration is None else min(iteration, self.shown.recording.last)
         self.colour = self.colour if colour is None or colour not in self.colour_choices() else colour
+        if shown is not None:
+            self._set_limits()
         self._draw()
 
     def choose(self, camera: int | None) -> None:
@@ -117,22 +116,25 @@ class Stage:
 
     def layer(self, name: str, visible: bool) -> None:
         """Shows or hides `start`, `truth` or `path`."""
-        for node in self._nodes:
-            if node.split()[0] == name:
-                self._nodes[node].visible = visible
+        self._layers.show(name, visible)
 
     def layers(self) -> set[str]:
         """The layers that there are."""
-        return {node.split()[0] for node in self._nodes}
+        return self._layers.names()
 
     def size_points(self, size: float) -> None:
         """Draws points in another size."""
-        self._nodes["points"].point_size = size
+        self._layers.size("points", size)
+
+    @property
+    def drawn(self) -> dict[int, Any]:
+        """Frusta by the numbers of their images."""
+        return self._layers.frusta
 
     def load_images(self) -> int:
         """Puts images into the frusta, and returns how many there were."""
         found = 0
-        for camera, handle in list(self._handles.items()):
+        for camera, handle in list(self.drawn.items()):
             image = self.shown.image(camera)
             if image is not None:
                 handle.image, found = image, found + 1
@@ -156,26 +158,31 @@ class Stage:
         unit = "px" if self.colour == ERROR else "views"
         return f"violet: {low:.3g} {unit} or less; yellow: {high:.3g} or more"
 
+    def _set_limits(self) -> None:
+        measures = self.measures
+        self._error_limits, self._image_limits = limits(measures.of_point), limits(measures.of_image)
+        self._track_limits = limits(measures.tracks.astype(float))
+
     def _draw(self) -> None:
-        problem, measures, similarity = self.problem, self.measures, self._similarity
+        layers, problem, measures, similarity = self._layers, self.problem, self.measures, self._similarity
         points = similarity.points(np.asarray(problem.points)[self.points])
         poses = similarity.poses(geometry.poses_of(np.asarray(problem.cameras)))
-        with self.server.atomic():
-            self._cloud("points", points, self._colours(measures)[self.points])
+        with self._server.atomic():
+            layers.cloud("points", points, self._colours(measures)[self.points], POINT_SIZE)
             shown = set(self.frusta.tolist()) | ({self.chosen} if self.chosen is not None else set())
             of_image = colours(measures.of_image, *self._image_limits)
             for camera in sorted(shown):
                 colour = CHOSEN if camera == self.chosen else tuple(of_image[camera].tolist())
-                self._frustum(camera, poses[camera], colour)
-            for camera in self._handles.keys() - shown:
-                self._handles.pop(camera).remove()
+                half = self.image_planes.half[camera]
+                layers.frustum(camera, poses[camera], half, self._size, colour, self._on_click)
+            for camera in layers.frusta.keys() - shown:
+                layers.frusta.pop(camera).remove()
             self._mark(problem, measures, poses)
-            if "start points" not in self._nodes and self.shown.recording.last > 0:
+            if "start points" not in layers and self.shown.recording.last > 0:
                 self._draw_start()
             if self.shown.truth is not None:
-                if "truth" not in self._nodes:
-                    self._lines("truth", _polyline(similarity.points(self.shown.truth)), TRUTH, 3.0)
-                self._lines("path", _polyline(poses[:, :, 3]), PATH, 2.0)
+                layers.path("truth", similarity.points(self.shown.truth), TRUTH, 3.0)
+                layers.path("path", poses[:, :, 3], PATH, 2.0)
             self._label(points)
 
     def _colours(self, measures: Measures) -> np.ndarray:
@@ -205,46 +212,17 @@ class Stage:
         local = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) * np.asarray(depth)[..., None]
         return np.einsum("...ij,...j->...i", poses[..., :3], local) + poses[..., 3]
 
-    def _frustum(self, camera: int, pose: Float[np.ndarray, "3 4"], colour: tuple[int, int, int]) -> None:
-        quaternion, half = _quaternion(pose[:, :3]), self.image_planes.half[camera]
-        handle = self._handles.get(camera)
-        if handle is not None:
-            handle.wxyz, handle.position = quaternion, pose[:, 3]
-            if handle.color != colour:
-                handle.color = colour
-            return
-        name = f"{self._root}/cameras/{camera}"
-        handle = self.server.scene.add_camera_frustum(
-            name,
-            fov=2 * float(np.arctan(half[1])),
-            aspect=float(half[0] / half[1]),
-            scale=self._size,
-            thickness=1.5,
-            thickness_units="screen",
-            color=colour,
-            wxyz=quaternion,
-            position=pose[:, 3],
-            cast_shadow=False,
-            receive_shadow=False,
-        )
-        self._handles[camera] = handle
-        if self._on_click is not None:
-            handle.on_click(lambda _, camera=camera: self._on_click and self._on_click(camera))
-
     def _mark(self, problem: BundleProblem, measures: Measures, poses: np.ndarray) -> None:
         if self.chosen is None:
-            for name in ("chosen points", "chosen residuals"):
-                if name in self._nodes:
-                    self._nodes.pop(name).remove()
+            self._layers.remove("chosen")
             return
         camera = self.chosen
         own = np.asarray(problem.point_index)[np.asarray(problem.camera_index) == camera]
-        self._cloud(
-            "chosen points", self._similarity.points(np.asarray(problem.points)[own]), CHOSEN, size=1.8 * POINT_SIZE
-        )
+        points = self._similarity.points(np.asarray(problem.points)[own])
+        self._layers.cloud("chosen points", points, CHOSEN, 1.8 * POINT_SIZE)
         segments, _ = geometry.residual_segments(problem, self.image_planes, measures.residuals, camera)
         depth = geometry.depth_of_image(self.image_planes.half[camera : camera + 1], self._size)[0]
-        self._lines("chosen residuals", self._on_page(poses[camera], segments, depth), RESIDUAL, 2.0)
+        self._layers.lines("chosen residuals", self._on_page(poses[camera], segments, depth), RESIDUAL, 2.0)
 
     def _draw_start(self) -> None:
         start = self.shown.problem
@@ -254,20 +232,14 @@ class Stage:
         around = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
         spokes = np.stack([apex, corners], axis=2)
         points = self._similarity.points(np.asarray(start.points)[self.points])
-        self._cloud("start points", points, START, size=0.6 * POINT_SIZE)
-        self._lines("start cameras", np.concatenate([around, spokes], axis=1).reshape(-1, 2, 3), START, 1.0)
+        self._layers.cloud("start points", points, START, 0.6 * POINT_SIZE)
+        self._layers.lines("start cameras", np.concatenate([around, spokes], axis=1).reshape(-1, 2, 3), START, 1.0)
 
-    def _label(self, points: np.ndarray) -> None:
-        if not self._caption:
-            return
-        text = self.shown.name if self._caption == "name" else "\n".join([self.shown.name, self.numbers("\n")])
-        if "label" in self._nodes:
-            self._nodes["label"].text = text
-            return
-        top = float(np.percentile(points[:, 2], 95)) + 0.3
-        self._nodes["label"] = self.server.scene.add_label(
-            f"{self._root}/label", text, position=(0.0, 0.0, top), anchor="bottom-center"
-        )
+    def _label(self, points: Float[np.ndarray, "n 3"]) -> None:
+        if self._caption:
+            words = [self.shown.name, *([self.numbers("\n")] if self._caption == "numbers" else [])]
+            text = "\n".join(words)
+            self._layers.label(text, (0.0, 0.0, float(np.percentile(points[:, 2], 95)) + 0.3))
 
     def numbers(self, between: str = ", ") -> str:
         """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error.
@@ -285,40 +257,3 @@ class Stage:
         cost = f"cost {recording.cost[k]:.5g}, {error}"
         step = f"λ {recording.damping[k]:.2g}, gain {recording.gain_ratio[k]:.2g}, {recording.time_s[k]:.3g} s"
         return between.join([f"iteration {k} of {recording.last}{how}", cost, step])
-
-    def _cloud(self, name: str, points: np.ndarray, of: Any, size: float = POINT_SIZE) -> None:
-        points = np.nan_to_num(points, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
-        node = self._nodes.get(name)
-        if node is not None and len(node.points) == len(points):
-            node.points, node.colors = points, np.asarray(of, np.uint8)
-            return
-        self._nodes[name] = self.server.scene.add_point_cloud(
-            f"{self._root}/{name}",
-            points,
-            np.asarray(of, np.uint8),
-            point_size=size,
-            point_shape="circle",
-            point_shading="flat",
-            precision="float32",
-        )
-
-    def _lines(self, name: str, segments: np.ndarray, colour: tuple[int, int, int], width: float) -> None:
-        node = self._nodes.get(name)
-        if node is not None and len(node.points) == len(segments):
-            node.points = segments.astype(np.float32)
-            return
-        self._nodes[name] = self.server.scene.add_line_segments(
-            f"{self._root}/{name}", segments, colour, thickness=width, thickness_units="screen"
-        )
-
-
-def _polyline(points: np.ndarray) -> np.ndarray:
-    """Segments from each point to the next."""
-    return np.stack([points[:-1], points[1:]], axis=1)
-
-
-def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4"]:
-    """The quaternion wxyz of a rotation."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(rotation).as_quat()[[3, 0, 1, 2]]
