@@ -85,6 +85,7 @@ def test_a_recording_is_named_npz(capsys):
     assert "a recording ends in .npz" in capsys.readouterr().err
 
 
+@pytest.mark.extra
 def test_jaxba_solve_records_what_jaxba_view_opens(model, tmp_path, capsys):
     path = str(tmp_path / "run.npz")
     assert solve.run([model, "--max-iterations", "2", "--record", path]) == 0
