@@ -57,6 +57,7 @@ from jaxba.solver.prepare import Prepared, prepare
 from jaxba.solver.retriangulate import Retriangulation, retriangulate
 from jaxba.solver.solve import Solution, solve
 from jaxba.structure.layout import Layout, build_layout
+from jaxba.viewer.notebook import view
 
 __version__ = "0.1.0"
 
@@ -131,6 +132,7 @@ __all__ = [
     "solve_and_retriangulate",
     "solve_loop",
     "trained_step",
+    "view",
     "with_gauge",
     "with_lens_priors",
     "with_position_priors",

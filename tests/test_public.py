@@ -75,12 +75,19 @@ def test_no_public_function_hides_a_module():
     assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == {"__init__.py", "typing.py", "py.typed"}
 
 
+NEED_VISER = {f"jaxba.viewer.{name}" for name in ("extra", "layers", "live", "page", "panel", "stage")}
+
+
 @pytest.mark.extra
 @pytest.mark.parametrize("module", [m.name for m in pkgutil.walk_packages(jaxba.__path__, "jaxba.")])
 def test_every_module_can_be_imported_and_says_what_it_is_for(module):
     missing = [name for name in ("pyceres", "pycolmap") if importlib.util.find_spec(name) is None]
     if module.startswith("jaxba.peers.") and missing:  # then it says in one line what it needs
         with pytest.raises(ImportError, match=r"this needs pyceres and pycolmap: pip install jaxba\[ceres\]"):
+            importlib.import_module(module)
+        return
+    if module in NEED_VISER and importlib.util.find_spec("viser") is None:
+        with pytest.raises(ImportError, match=r"this needs viser: pip install jaxba\[view\]"):
             importlib.import_module(module)
         return
     assert inspect.getdoc(importlib.import_module(module))

@@ -13,11 +13,12 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from jaxba.cli import common, processes, table
+from jaxba.cli import common, processes, table, view
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import constrained
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.output import check_outputs, check_storable, write_solution
+from jaxba.cli.watching import Watching, check_record
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_colmap, read_problem
@@ -37,7 +38,7 @@ from jaxba.problem.options import (
 )
 from jaxba.runtime.compilation import Compilation
 from jaxba.solver.alternation import solve_and_retriangulate
-from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.covariance import covariance
 from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions
@@ -167,6 +168,13 @@ class Arguments:
     """Output file (.npz) of covariances: poses, lenses, points, points_given_cameras. It needs a gauge, constants or
     priors that fix position, orientation and scale."""
 
+    record: str | None = None
+    """Output file (.npz) of the parameters after every step, for jaxba-view; of more than 20,000 points an even
+    choice."""
+
+    view: bool = False
+    """Watch the solve in the browser while it runs (extra view)."""
+
     log: str | None = None
     """Output file of a JSON record of the solve, compressed by its ending."""
 
@@ -270,6 +278,8 @@ def _run(args: Arguments) -> int:
     several = processes.start(args.coordinator, args.processes, args.process, args.distributed, args.devices)
     if not several:
         return _run_main(args)
+    if (args.record is not None or args.view) and (args.processes is not None or args.distributed):
+        raise common.UsageError("--record and --view are for one process")
     args = replace(args, compilation="full")
     from jaxba.runtime.distributed import MainFailedError, is_main
 
@@ -298,6 +308,10 @@ def _solve(args: Arguments) -> int:
     check_outputs(None, args.covariance, path, "--covariance")
     if args.covariance and args.covariance in (args.output, args.log):
         raise common.UsageError(f"--covariance names the same file as another output, {args.covariance}")
+    if args.record is not None:
+        check_record(args.record, [args.output, args.covariance, args.log, path])
+    if args.view:
+        view.check_extra()
     with common.notes_printed():
         problem = _in_all_processes(args, path) if _is_divided(args) else _problem(args, path)
     check_storable(args.output, problem, path)
@@ -306,7 +320,8 @@ def _solve(args: Arguments) -> int:
     common.prepare_process(untraced=not _is_divided(args))
     name = args.problem or DEFAULT_SCENE
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
-    solution, steps = _iterate(args, problem, policy, options)
+    watching = Watching.of(problem, path, args.record is not None, args.view)
+    solution, steps = _iterate(args, problem, policy, options, watching and watching.watch)
     common.print_line(table.summary(problem, solution, options.loss))
     if args.pad == "yes" or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
@@ -325,6 +340,8 @@ def _solve(args: Arguments) -> int:
         with open_output(args.log) as file:
             file.write(json.dumps(record_to_json(record), allow_nan=False).encode() + b"\n")
         common.print_line(f"wrote {args.log}")
+    if watching:
+        watching.end(args.record)
     return 0
 
 
@@ -367,7 +384,7 @@ def _default_scene() -> BundleProblem:
 
 
 def _iterate(
-    args: Arguments, problem: BundleProblem, policy: DampingPolicy, options: SolveOptions
+    args: Arguments, problem: BundleProblem, policy: DampingPolicy, options: SolveOptions, watch: Watch | None
 ) -> tuple[Solution, list[IterationRecord]]:
     """Solves, and prints every iteration. The first Ctrl-C stops after the current iteration."""
     steps: list[IterationRecord] = []
@@ -382,6 +399,7 @@ def _iterate(
             return interrupt.requested
 
         if not args.retriangulate:
-            return solve(problem, policy, options, callback=show), steps
+            return solve(problem, policy, options, callback=show, watch=watch), steps
         show_search = lambda found: common.print_line(table.retriangulated(found, args.ftol))
-        return solve_and_retriangulate(problem, policy, options, callback=show, on_search=show_search), steps
+        searching = {"on_search": show_search, "watch": watch}
+        return solve_and_retriangulate(problem, policy, options, callback=show, **searching), steps

@@ -14,7 +14,7 @@ import numpy as np
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime.compilation import CompileClock
-from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.loop import History
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
@@ -32,6 +32,7 @@ def solve_and_retriangulate(
     *,
     callback: Callable[[IterationRecord], bool | None] | None = None,
     on_search: Callable[[Retriangulation], None] | None = None,
+    watch: Watch | None = None,
 ) -> Solution:
     """`solve` and, if it converged, `retriangulate`, alternately.
 
@@ -46,6 +47,7 @@ def solve_and_retriangulate(
         callback: as for `solve`; iterations and seconds are counted over all solves.
         on_search: called after every retriangulation, including the last one, whose result is discarded if the decrease
             is too small (`Retriangulation.pays`).
+        watch: as for `solve`; iterations and seconds are counted over all solves.
 
     Returns:
         One solution for all solves. Retriangulation is not an iteration; its time is in `total_s` and `compile_s`.
@@ -56,14 +58,20 @@ def solve_and_retriangulate(
     options = checked_options(options)
     before, stopped = (0, 0.0), False
 
+    def of_all(record: IterationRecord) -> IterationRecord:
+        return record._replace(iteration=record.iteration + before[0], time_s=record.time_s + before[1])
+
     def forward(record: IterationRecord) -> bool:
         nonlocal stopped
-        record_of_all = record._replace(iteration=record.iteration + before[0], time_s=record.time_s + before[1])
-        stopped = callback is not None and bool(callback(record_of_all))
+        stopped = callback is not None and bool(callback(of_all(record)))
         return stopped
 
+    watch_all = None if watch is None else lambda record, now: watch(of_all(record), now)
+
     # a solve with a callback runs from Python, so that all limits use the same programs
-    run = lambda problem, limit: solve(problem, policy, replace(options, max_iterations=limit), callback=forward)
+    run = lambda problem, limit: solve(
+        problem, policy, replace(options, max_iterations=limit), callback=forward, watch=watch_all
+    )
     solution = run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):
         if stopped or not solution.converged or solution.iterations == options.max_iterations:

@@ -8,6 +8,7 @@ optimisation.
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -23,6 +24,7 @@ from jaxba.damping import DampingPolicy, decides_effort, effort_of
 from jaxba.lm.records import LMState, Prices, StepInfo
 from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.lm.termination import Termination, Tolerances
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.candidates import has_repairs
 from jaxba.runtime.compilation import (
@@ -52,6 +54,10 @@ class IterationRecord(NamedTuple):
 
     step: StepInfo
     """Record of the iteration, as Python scalars."""
+
+
+Watch = Callable[[IterationRecord, Callable[[], BundleProblem]], None]
+"""Gets the record of an iteration, and a function that gives the problem with the parameters after it."""
 
 
 class _Loop(NamedTuple):
@@ -148,6 +154,7 @@ def run_stepwise(
     *,
     callback: Callable[[IterationRecord], bool | None],
     stages: Mapping[str, tuple[Stage, ...]],
+    watch: Watch | None = None,
 ) -> Run:
     """Runs iterations until a stopping rule or the callback ends the solve.
 
@@ -158,6 +165,7 @@ def run_stepwise(
         callback: called with every record; a true return value ends the solve.
         stages: stages of compilation of each part of a step, by the name of its function, before it is fully optimised
             (`parts_of`).
+        watch: called before the callback; its time counts nowhere.
 
     Raises:
         ProblemError: the cost of the initial state is not finite.
@@ -200,7 +208,12 @@ def run_stepwise(
         step, end = _unpack(report, step)
         records.append(step)
         quick_iterations += not optimised(levels)
-        wants_stop = callback(IterationRecord(len(records), time.perf_counter() - started - waited, step))
+        record = IterationRecord(len(records), time.perf_counter() - started - waited, step)
+        if watch is not None:
+            began = time.perf_counter()
+            watch(record, functools.partial(setup.problem_at, carry.state))
+            started += time.perf_counter() - began
+        wants_stop = callback(record)
         if end != Termination.RUNNING:
             break
         if wants_stop:

@@ -11,7 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -22,12 +22,15 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, Stage, compile_and_run, compiler_options, stages
-from jaxba.solver.callback_loop import IterationRecord, Run, parts_of, run_stepwise
+from jaxba.solver.callback_loop import IterationRecord, Run, Watch, parts_of, run_stepwise
 from jaxba.solver.diagnosis import cost_of_rounding
 from jaxba.solver.loop import History, history_of, solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, numerics, set_up
 from jaxba.structure.padding import Capacity
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 MIN_HISTORY = 128
 """Smallest length of the histories of the compiled loop, so that all lower limits use one program; larger limits are
@@ -83,6 +86,12 @@ class Solution:
         """Whether a convergence test ended the solve."""
         return self.termination.converged
 
+    def plot(self) -> Figure:
+        """A matplotlib figure of cost and lambda over the iterations; `savefig` writes it, a notebook shows it."""
+        from jaxba.solver.figure import plot_history
+
+        return plot_history(self.history, self.initial_cost)
+
 
 def solve(
     problem: BundleProblem,
@@ -90,6 +99,7 @@ def solve(
     options: SolveOptions | None = None,
     *,
     callback: Callable[[IterationRecord], bool | None] | None = None,
+    watch: Watch | None = None,
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
 
@@ -108,6 +118,8 @@ def solve(
             their variants for plain steps.
         options: options of the solve; None: the defaults.
         callback: called after every iteration; a true return value stops the solve.
+        watch: called before it, with the record and a function that gives the problem with the parameters after the
+            iteration; the time that it takes is not counted.
 
     Returns:
         The optimised problem in NumPy float64 arrays, histories and timings.
@@ -121,11 +133,13 @@ def solve(
     setup = set_up(problem, policy, options)
     with numerics(setup.dtype):
         stages_of_parts = _stages(options.compilation, problem, setup.options)
-        run = functools.partial(run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts)
-        if callback is None and not any(stages_of_parts.values()):
+        run = functools.partial(
+            run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts, watch=watch
+        )
+        if callback is None and watch is None and not any(stages_of_parts.values()):
             run = _run_compiled
         if setup.shards is not None:
-            run = functools.partial(_run_sharded, callback=callback)
+            run = functools.partial(_run_sharded, callback=callback, watch=watch)
         carry, history, initial_cost, quick_iterations, compile_s, total_s = run(
             setup, options.tolerances, options.max_iterations
         )
@@ -171,6 +185,7 @@ def _run_sharded(
     max_iterations: int,
     *,
     callback: Callable[[IterationRecord], bool | None] | None,
+    watch: Watch | None,
 ) -> Run:
     """Runs the loop on several devices: as one program, or an iteration at a time for a callback."""
     assert setup.shards is not None
@@ -181,7 +196,7 @@ def _run_sharded(
         carry = jax.block_until_ready(setup.shards.begin(setup.policy, limit, setup.prices))
         initial_cost = float(carry.state.cost)
         setup.check_cost(carry.state)
-        if callback is None:
+        if callback is None and watch is None:
             length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
             found = setup.shards.run(carry, setup.policy, tolerances, limit, length)
             carry, history = jax.block_until_ready(found)
@@ -193,7 +208,11 @@ def _run_sharded(
                 records.append(history_of(step))
                 time_s = time.perf_counter() - started - clock.seconds
                 record = IterationRecord(len(records), time_s, jax.tree.map(lambda x: x.item(), step))
-                if callback(record) and int(carry.termination) == Termination.RUNNING:
+                if watch is not None:
+                    began = time.perf_counter()
+                    watch(record, functools.partial(setup.problem_at, carry.state))
+                    started += time.perf_counter() - began
+                if callback is not None and callback(record) and int(carry.termination) == Termination.RUNNING:
                     carry = carry._replace(termination=np.asarray(Termination.STOPPED, np.int32))
             history = jax.tree.map(lambda *rows: np.stack(rows), *records)
     total_s = time.perf_counter() - started - clock.seconds

@@ -36,10 +36,11 @@ def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point
     assembled = assemble(model, refine_principal_point=refine_principal_point)
     report(assembled.notes, strict=strict)
     report(hints(model))
-    return assembled.problem.replace(labels=_labels(model, assembled))
+    return assembled.problem.replace(labels=labels_of(model, assembled))
 
 
-def _labels(model: Model, assembled: Assembled) -> Labels:
+def labels_of(model: Model, assembled: Assembled) -> Labels:
+    """What a model calls the parts of its problem."""
     return Labels(
         tuple(image.name.decode("utf-8", "surrogateescape") for image in assembled.images),
         np.array([image.id for image in assembled.images]),

@@ -1,0 +1,112 @@
+"""`jaxba-view`: problems and recorded solves in the browser."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from jaxba.cli import common
+
+if TYPE_CHECKING:
+    from jaxba.viewer.panel import Viewer
+
+NAMED = 5
+"""Worst images that are printed."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Options of `jaxba-view`."""
+
+    files: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Problems in any format that jaxba-solve reads, and recordings of jaxba-solve --record; more than one stand side
+    by side."""
+
+    images: str | None = None
+    """Folder of the images, for files that name them (COLMAP, jaxba-kitti)."""
+
+    poses: str | None = None
+    """KITTI's file of the true poses of the whole sequence. Default: that with which jaxba-kitti made the problem, if
+    it is there."""
+
+    html: str | None = None
+    """Output file: one page that opens without a server and plays the iterations. Nothing is served."""
+
+    port: int = 8080
+    """First port that is tried. The page is reached from this machine only."""
+
+
+def main() -> None:
+    """Entry point of `jaxba-view`."""
+    common.exit_with(run())
+
+
+def run(argv: Sequence[str] | None = None) -> int:
+    """Runs the command. Exit status: 0, or 2 for bad input."""
+    return common.run_command(Arguments, _run, "Look at problems and recorded solves in the browser.", argv)
+
+
+def _run(args: Arguments) -> int:
+    if not args.files:
+        raise common.UsageError("name a problem or a recording")
+    if not 0 < args.port < 65536:
+        raise common.UsageError(f"--port must lie between 1 and 65535, is {args.port}")
+    if args.images is not None and not os.path.isdir(args.images):
+        raise common.UsageError(f"--images {args.images}: is no folder")
+    common.check_writable("--html", args.html)
+    check_extra()
+    from jaxba.viewer.sources import open_all
+
+    with common.notes_printed():
+        shown = open_all(args.files, args.images, args.poses)
+    if args.html:
+        from jaxba.viewer.page import write_page
+
+        write_page(shown, args.html)
+        common.print_line(f"wrote {args.html} ({os.path.getsize(args.html) / 1e6:.1f} MB)")
+        return 0
+    from jaxba.viewer.panel import Viewer, heading, worst_images
+
+    viewer = Viewer(shown, args.port)
+    for stage in viewer.stages:
+        common.print_line(f"{heading(stage).replace('**', '')}, {stage.numbers()}")
+        for text, _ in worst_images(stage, NAMED):
+            common.print_line(f"  worst: {text}")
+    announce(viewer)
+    missing = viewer.load_images()
+    if missing:
+        common.print_line(f"note: {common.counted(missing, 'image')} not found in {args.images}")
+    wait(viewer)
+    return 0
+
+
+def check_extra() -> None:
+    """Raises a UsageError that names the package to install, if viser is missing."""
+    try:
+        import jaxba.viewer.extra  # noqa: F401
+    except ImportError as error:
+        raise common.UsageError(str(error)) from None
+
+
+def announce(viewer: Viewer) -> None:
+    """Prints where the page is, and opens it where there is a display."""
+    common.print_line(f"open {viewer.url}")
+    if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(viewer.url)
+
+
+def wait(viewer: Viewer) -> None:
+    """Serves the page until Ctrl-C."""
+    common.print_line("Ctrl-C ends it")
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        viewer.close()

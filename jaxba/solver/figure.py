@@ -1,0 +1,43 @@
+"""The figure of a solve: cost and lambda over its iterations."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxba.solver.loop import History
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COST, DAMPING, REJECTED = "#0072B2", "#D55E00", "#7F7F7F"
+"""Colours, of Okabe and Ito's palette."""
+
+
+def plot_history(history: History, initial_cost: float) -> Figure:
+    """Cost above and lambda below, over the iterations, on logarithmic axes; steps that were rejected are grey.
+
+    Args:
+        history: of a solution, NumPy arrays.
+        initial_cost: before the first iteration, pixels^2.
+    """
+    from matplotlib.figure import Figure  # late: its import takes 0.3 s
+
+    figure = Figure(figsize=(6.4, 5.2), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    iterations = np.arange(1, len(history.cost) + 1)
+    rejected = ~np.asarray(history.accepted, bool)
+    above.plot([0, *iterations], [initial_cost, *history.cost], color=COST, marker="o", markersize=3)
+    above.set_ylabel("cost (px²)")
+    below.plot(iterations, history.damping, color=DAMPING, marker="o", markersize=3)
+    below.set_ylabel("λ")
+    for axes, values in ((above, np.asarray(history.cost)), (below, np.asarray(history.damping))):
+        if rejected.any():
+            axes.plot(iterations[rejected], values[rejected], "o", color=REJECTED, markersize=5, label="rejected")
+            axes.legend(frameon=False)
+        axes.set_yscale("log")
+        axes.grid(alpha=0.25)
+    below.set_xlabel("iteration")
+    below.xaxis.get_major_locator().set_params(integer=True)
+    return figure

@@ -1,0 +1,1 @@
+"""Problems and solves in the browser. Needs the extra `view`."""

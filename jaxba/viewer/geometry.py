@@ -1,0 +1,145 @@
+"""Where cameras and residuals are drawn: frusta, the similarity to the scene on the page, residuals as segments.
+
+Frusta have the axes of COLMAP and OpenCV: x to the right, y downwards, z forwards.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.camera_models import BAL
+from jaxba.problem.geometry import COLMAP_FLIP, camera_centers, rotation_matrices
+from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.similarity import Similarity
+
+WIDEST = 2.0
+"""Largest half width of a frustum at distance 1: the tangent of 63 degrees. Fisheyes see more than can be drawn."""
+
+
+class Frusta(NamedTuple):
+    """The images of a problem in the plane at distance 1 before each camera."""
+
+    focal: Float[np.ndarray, "cameras 2"]
+    """Focal lengths, pixels."""
+
+    center: Float[np.ndarray, "cameras 2"]
+    """Principal points, pixels of the problem."""
+
+    flipped: Bool[np.ndarray, " cameras"]
+    """Whether y of the problem's pixels is upwards, as BAL's is."""
+
+    half: Float[np.ndarray, "cameras 2"]
+    """Half of width and height in the plane."""
+
+    def on_plane(self, pixels: Float[np.ndarray, "n 2"], cameras: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+        """Places of pixels in the planes of their cameras, without regard to distortion, as an image is shown."""
+        plane = (pixels - self.center[cameras]) / self.focal[cameras]
+        return np.where(self.flipped[cameras, None], plane * COLMAP_FLIP[:2], plane)
+
+
+def frusta_of(problem: BundleProblem, sizes: Float[np.ndarray, "cameras 2"] | None = None) -> Frusta:
+    """The frusta of all cameras.
+
+    Args:
+        problem: cameras and observations.
+        sizes: width and height of images, pixels; None, or 0 for an image: from the principal point, or where there is
+            none as far as its observations reach.
+    """
+    numbers = np.asarray(problem.cameras)[:, POSE_SIZE:]
+    count = len(numbers)
+    focal, center, flipped = np.ones((count, 2)), np.zeros((count, 2)), np.zeros(count, bool)
+    lenses = problem.lenses
+    models, kind = (BAL,), np.zeros(count, int)
+    if lenses is not None:
+        models = lenses.models
+        if lenses.model is not None:
+            kind = np.asarray(lenses.model)[np.asarray(lenses.index)]
+    for at, model in enumerate(models):
+        own = np.flatnonzero(kind == at)
+        flipped[own] = model is BAL
+        if model.focal:
+            focal[own] = numbers[own][:, [model.focal[0], model.focal[-1]]]
+        else:  # a panorama: width and height are numbers of the lens
+            focal[own], center[own] = numbers[own][:, :2] / (2 * np.pi), numbers[own][:, :2] / 2
+        if model.principal_point:
+            center[own] = numbers[own][:, list(model.principal_point)]
+    focal = np.where(np.abs(focal) > 0, np.abs(focal), 1.0)
+    if sizes is not None and sizes.all():
+        reach = sizes / 2
+    else:
+        reach = _reach(problem, center)
+        reach = reach if sizes is None else np.where(sizes > 0, sizes / 2, reach)
+    return Frusta(focal, center, flipped, np.clip(reach / focal, 1e-3, WIDEST))
+
+
+def _reach(problem: BundleProblem, center: Float[np.ndarray, "cameras 2"]) -> Float[np.ndarray, "cameras 2"]:
+    """How far images reach from their principal points: to the corner of the pixels, or where pixels begin in the
+    middle, to the observations of their lens, or of the median image."""
+    reach = np.zeros(center.shape)
+    index = np.asarray(problem.camera_index)
+    np.maximum.at(reach, index, np.abs(np.asarray(problem.observations) - center[index]))
+    lenses = problem.lenses
+    if lenses is not None:
+        of_lens = np.zeros((len(lenses.free), 2))
+        np.maximum.at(of_lens, np.asarray(lenses.index), reach)
+        reach = of_lens[lenses.index]
+    return np.maximum(reach, np.where(center.any(axis=1, keepdims=True), np.abs(center), np.median(reach, axis=0)))
+
+
+def poses_of(cameras: Float[np.ndarray, "cameras parameters"]) -> Float[np.ndarray, "cameras 3 4"]:
+    """Camera-to-world poses `[R | c]` of cameras that look along +z with y downwards."""
+    rotation = (np.diag(COLMAP_FLIP) @ rotation_matrices(cameras[:, :3])).transpose(0, 2, 1)
+    return np.concatenate([rotation, camera_centers(cameras)[:, :, None]], axis=2)
+
+
+def to_page(problem: BundleProblem) -> Similarity:
+    """The similarity to a scene whose middle is the origin, of a size of about one, with the mean of the cameras'
+    upward directions along +z."""
+    poses, points = poses_of(np.asarray(problem.cameras)), np.asarray(problem.points)
+    places = np.concatenate([poses[:, :, 3], points])
+    places = places[np.isfinite(places).all(axis=1)]
+    middle = np.median(points, axis=0)
+    size = float(np.percentile(np.linalg.norm(places - middle, axis=1), 80)) or 1.0
+    up = -poses[:, :, 1].mean(axis=0)
+    length = np.linalg.norm(up)
+    up = up / length if length > 0 else np.array([0.0, 0.0, 1.0])
+    ahead = poses[:, :, 2].mean(axis=0)
+    side = np.cross(ahead, up)
+    if np.linalg.norm(side) < 1e-6:
+        side = np.cross(np.eye(3)[np.abs(up).argmin()], up)
+    side /= np.linalg.norm(side)
+    rotation = np.stack([side, np.cross(up, side), up])
+    return Similarity(1 / size, rotation, -rotation @ middle / size)
+
+
+def depth_of_image(half: Float[np.ndarray, "cameras 2"], scale: float) -> Float[np.ndarray, " cameras"]:
+    """How far before the camera viser draws the image of a frustum: all frusta of a scale have the same volume."""
+    return scale / np.cbrt(half.prod(axis=1) / 3)
+
+
+def residual_segments(
+    problem: BundleProblem,
+    frusta: Frusta,
+    residuals: Float[np.ndarray, "observations 2"],
+    camera: int,
+) -> tuple[Float[np.ndarray, "own 2 2"], float]:
+    """Residuals of an image as segments from each measured pixel towards the predicted one, in its plane.
+
+    Returns:
+        The segments, and by how much they are magnified: the median is at least as long as a twentieth of the image's
+        width. None is longer than that width. Non-finite residuals are left out.
+    """
+    own = np.flatnonzero((np.asarray(problem.camera_index) == camera) & np.isfinite(residuals).all(axis=1))
+    pixels, difference = np.asarray(problem.observations)[own], residuals[own]
+    length = np.linalg.norm(difference, axis=1)
+    typical = float(np.median(length)) if len(own) else 0.0
+    width = 2 * frusta.half[camera, 0] * frusta.focal[camera, 0]
+    factor = max(1.0, 0.05 * width / typical) if typical > 0 else 1.0
+    share = np.minimum(factor, width / np.maximum(length, 1e-300))[:, None]
+    cameras = np.full(len(own), camera)
+    ends = [frusta.on_plane(place, cameras) for place in (pixels, pixels - share * difference)]
+    return np.stack(ends, axis=1), float(factor)

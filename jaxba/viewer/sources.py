@@ -1,0 +1,164 @@
+"""What the viewer shows, from files: problems, recordings, COLMAP's colours, images, KITTI's true paths."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxba.datasets.bal.paths import resolve
+from jaxba.datasets.kitti.evaluate import Sidecar, read_sidecar, sidecar_path, truth_of
+from jaxba.datasets.kitti.poses import read_poses
+from jaxba.io import is_colmap, read_problem
+from jaxba.io.colmap.look import Looks, read_colmap_with_looks
+from jaxba.io.files import StrPath, display_name
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.similarity import umeyama
+from jaxba.viewer import geometry
+from jaxba.viewer.recording import ENDING, Recording, read_recording, still
+
+LARGEST_SIDE = 480
+"""Pixels of the longer side of an image on the page."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A problem or a recorded solve, and what is known of its looks."""
+
+    name: str
+    recording: Recording
+    looks: Looks | None = None
+    """Colours of points, sizes of images and their principal points; None if they are not known."""
+
+    truth: Float[np.ndarray, "cameras 3"] | None = None
+    """True positions of cameras, in the scene of the last iteration."""
+
+    names: tuple[str, ...] | None = None
+    """Names of images."""
+
+    images: Path | None = None
+    """Folder of the images."""
+
+    @property
+    def problem(self) -> BundleProblem:
+        """The problem at the start, of a recording thinned."""
+        return self.recording.problem
+
+    def name_of(self, camera: int) -> str:
+        """What an image is called, in characters that every page can hold."""
+        if self.names is None:
+            return f"image {camera}"
+        return self.names[camera].encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+    def size(self, camera: int) -> tuple[float, float]:
+        """Width and height of an image, pixels; 0 if it is not at hand."""
+        if self.images is None or self.names is None:
+            return 0.0, 0.0
+        from PIL import Image
+
+        try:
+            with Image.open(self.images / self.names[camera]) as image:
+                return float(image.width), float(image.height)
+        except (OSError, ValueError):
+            return 0.0, 0.0
+
+    def image(self, camera: int) -> UInt8[np.ndarray, "height width 3"] | None:
+        """A small version of an image; None if it is not at hand."""
+        if self.images is None or self.names is None:
+            return None
+        from PIL import Image
+
+        try:
+            with Image.open(self.images / self.names[camera]) as image:
+                image.draft("RGB", (2 * LARGEST_SIDE, 2 * LARGEST_SIDE))  # of a JPEG no more than is needed
+                image.thumbnail((LARGEST_SIDE, LARGEST_SIDE))
+                return np.asarray(image.convert("RGB"))
+        except (OSError, ValueError):
+            return None
+
+
+def shown(what: BundleProblem | Recording, name: str) -> Shown:
+    """What is shown of a problem or a recording without a file."""
+    recording = what if isinstance(what, Recording) else still(what)
+    labels = recording.problem.labels
+    return Shown(name, recording, names=labels and labels.names)
+
+
+def open_all(paths: Sequence[str], images: str | None = None, poses: str | None = None) -> list[Shown]:
+    """Opens files.
+
+    Args:
+        paths: of problems in any format that is read, names of downloaded BAL problems, or recordings.
+        images: folder of the images.
+        poses: KITTI's file of the true poses of the whole sequence; None: that with which `jaxba-kitti` made the
+            problem, if it is there.
+
+    Raises:
+        ProblemError: a file cannot be read; one line.
+    """
+    found = [_open(path) for path in paths]
+    sides = [_sidecar(path, one) for path, one in zip(paths, found, strict=True)]
+    return [_with_frames(one, sides, poses, images) for one in found]
+
+
+def _open(path: str) -> Shown:
+    name = Path(path.rstrip("/")).name or path
+    if path.endswith(ENDING):
+        return shown(read_recording(path), name.removesuffix(ENDING))
+    path = resolve(path)
+    if is_colmap(path):
+        problem, looks = read_colmap_with_looks(path)
+        return replace(shown(problem, name), looks=looks)
+    return shown(read_problem(path), name)
+
+
+def _sidecar(path: str, one: Shown) -> Sidecar | None:
+    """The file of frames beside a problem of `jaxba-kitti`, or beside the one that was solved."""
+    for place in (path, one.recording.source):
+        if place and sidecar_path(place).is_file():
+            return read_sidecar(place)
+    return None
+
+
+def _with_frames(one: Shown, sides: Sequence[Sidecar | None], poses: str | None, images: StrPath | None) -> Shown:
+    """With names, images and the true path of a problem of `jaxba-kitti`; the files of one sequence share a sidecar."""
+    count = one.problem.num_cameras
+    side = next((side for side in sides if side is not None and len(side.frames) == count), None)
+    if side is not None and one.names is None:
+        one = replace(one, names=tuple(f"{frame:06d}.png" for frame in side.frames))
+    if images is not None:
+        if one.names is None:
+            raise ProblemError(f"--images: {display_name(one.name)} does not name its images")
+        one = replace(one, images=Path(images))
+    if side is not None and one.looks is None:
+        principal = np.tile([side.calibration.cx, side.calibration.cy], (count, 1))
+        one = replace(one, looks=Looks(None, np.array([one.size(camera) for camera in range(count)]), principal))
+    if poses is not None:
+        return replace(one, truth=_truth(one, side, poses))
+    known = None if side is None else side.contents.get("options", {}).get("poses")
+    if known and Path(known).is_file():
+        with suppress(ProblemError):  # nobody asked for it
+            return replace(one, truth=_truth(one, side, known))
+    return one
+
+
+def _truth(one: Shown, side: Sidecar | None, poses: StrPath) -> Float[np.ndarray, "cameras 3"]:
+    """The true path in the scene of the last iteration, by the similarity that takes it to the path found.
+
+    Raises:
+        ProblemError: it cannot be read, or is not one of these cameras.
+    """
+    count, table = one.problem.num_cameras, read_poses(poses)
+    if side is not None:
+        path = truth_of(side, poses)[:, :, 3]
+    elif len(table.numbers) == count:
+        path = table.matrices[:, :, 3]
+    else:
+        has = f"{len(table.numbers)} poses for {count} cameras"
+        raise ProblemError(f"{display_name(poses)}: has {has}, and no .frames.json says which are meant")
+    centers = geometry.poses_of(np.asarray(one.recording.at(one.recording.last).cameras))[:, :, 3]
+    return umeyama(path, centers).points(path)

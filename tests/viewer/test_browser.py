@@ -1,0 +1,207 @@
+"""The viewer's page and the one in a file, in headless Chromium: pixels, no error, no request elsewhere.
+
+Points and frusta of a problem without colours are viridis's, what is chosen is orange; software rendering gives them to
+within a few shades.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import socket
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxba
+
+pytest.importorskip("viser", reason="needs the extra: pip install jaxba[view]")
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+
+CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+
+pytestmark = [
+    pytest.mark.extra,
+    pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="needs Debian's packages chromium and chromium-driver"),
+    pytest.mark.filterwarnings("default"),  # of viser and its server
+]
+
+FLAGS = (
+    *("--headless=new", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--window-size=900,700", "--disable-dev-shm-usage"),
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+)
+
+READY_S = 60.0
+"""Software rendering on a busy machine takes a while."""
+
+ORANGE = (255, 120, 0)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"performance": "ALL", "browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    driver.set_script_timeout(READY_S)
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture(scope="module")
+def recording():
+    from jaxba.viewer.recording import Recorder
+
+    problem = jaxba.random_scene(jaxba.SceneConfig(cameras=8, points=300, trajectory="orbit"), 0)
+    recorder = Recorder(problem)
+    jaxba.solve(problem, "ceres", jaxba.SolveOptions(max_iterations=5), watch=recorder)
+    return recorder.recording()
+
+
+@pytest.fixture
+def viewer(recording, browser):
+    from jaxba.viewer.panel import Viewer
+    from jaxba.viewer.sources import shown
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    found = Viewer([shown(recording, "run")], port)
+    for log in ("browser", "performance"):
+        browser.get_log(log)  # what went before
+    yield found
+    browser.get("about:blank")
+    found.close()
+
+
+def picture(browser) -> np.ndarray:
+    """Pixels of the page, shape (height, width, 3)."""
+    from PIL import Image
+
+    return np.asarray(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"), np.int16)
+
+
+def scene(browser) -> np.ndarray:
+    """Pixels of the scene, left of the panel."""
+    return picture(browser)[:, :560]
+
+
+def coloured(pixels: np.ndarray) -> int:
+    """Number of pixels that are neither grey nor white: points and frusta, not background or text."""
+    return int((pixels.max(axis=2) - pixels.min(axis=2) > 60).sum())
+
+
+def like(pixels: np.ndarray, colour: tuple[int, int, int]) -> int:
+    """Number of pixels of nearly a colour."""
+    return int((np.abs(pixels - colour).max(axis=2) < 40).sum())
+
+
+def wait_for(what, browser) -> None:
+    end = time.monotonic() + READY_S
+    while not what():
+        if time.monotonic() > end:
+            pytest.fail(f"the page did not get there; {coloured(scene(browser))} coloured pixels")
+        time.sleep(0.3)
+
+
+def check_silent(browser, *allowed: str) -> None:
+    """No error on the console, as of a name that does not resolve, and no request but to these origins."""
+    errors = [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"]
+    assert errors == []
+    asked = []
+    for line in browser.get_log("performance"):
+        message = json.loads(line["message"])["message"]
+        for key in ("request", "url"):
+            found = message["params"].get(key)
+            url = found.get("url") if isinstance(found, dict) else found
+            if message["method"] in ("Network.requestWillBeSent", "Network.webSocketCreated") and url:
+                asked.append(url)
+    assert asked
+    assert [url for url in asked if not url.startswith((*allowed, "data:", "blob:"))] == []
+
+
+def test_the_page_shows_points_and_frusta_and_the_slider_changes_them(browser, viewer):
+    browser.get(viewer.url)
+    wait_for(lambda: coloured(scene(browser)) > 500, browser)
+    time.sleep(2)
+    last = scene(browser)
+    from selenium.webdriver.common.by import By
+
+    text = browser.find_element(By.TAG_NAME, "body").text
+    assert "8 images, " in text
+    assert f"iteration {viewer.stages[0].shown.recording.last} of" in text
+    slider = browser.find_element(By.CSS_SELECTOR, "[role=slider]")
+    slider.send_keys("\ue012" * 10)  # arrow to the left
+    wait_for(lambda: "start, cost" in browser.find_element(By.TAG_NAME, "body").text, browser)
+    wait_for(lambda: (np.abs(scene(browser) - last).max(axis=2) > 60).sum() > 200, browser)
+    check_silent(browser, viewer.url, viewer.url.replace("http", "ws"))
+
+
+def test_a_click_on_a_frustum_marks_its_points(browser, viewer):
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.by import By
+
+    browser.get(viewer.url)
+    wait_for(lambda: coloured(scene(browser)) > 500, browser)
+    time.sleep(2)
+    before = like(scene(browser), ORANGE)
+    body = browser.find_element(By.TAG_NAME, "body")
+    chosen = lambda: viewer.stages[0].chosen is not None
+    colours = {tuple(handle.color) for handle in viewer.stages[0].drawn.values()}
+    pixels = scene(browser)
+    near = np.min([np.abs(pixels - np.array(colour)).max(axis=2) for colour in colours], axis=0) < 25
+    rows, columns = np.nonzero(near)
+    middle = body.size["width"] // 2, body.size["height"] // 2
+    for at in range(0, len(rows), max(len(rows) // 40, 1)):
+        x, y = int(columns[at]), int(rows[at])
+        ActionChains(browser).move_to_element_with_offset(body, x - middle[0], y - middle[1]).click().perform()
+        time.sleep(0.4)
+        if chosen():
+            break
+    assert chosen(), "no frustum was hit"
+    wait_for(lambda: like(scene(browser), ORANGE) > before + 100, browser)
+    wait_for(lambda: "observations, RMSE" in body.text, browser)
+
+
+def test_a_page_in_a_file_plays_without_a_server(browser, recording, tmp_path):
+    from jaxba.viewer.page import write_page
+    from jaxba.viewer.sources import shown
+
+    path = tmp_path / "run.html"
+    write_page([shown(recording, "run")], path)
+    assert path.stat().st_size < 2e6
+    for log in ("browser", "performance"):
+        browser.get_log(log)
+    browser.get(f"file://{path}")
+    wait_for(lambda: coloured(scene(browser)) > 500, browser)
+    first = scene(browser)
+    wait_for(lambda: (np.abs(scene(browser) - first).max(axis=2) > 60).sum() > 200, browser)
+    assert "worst images" in browser.find_element("tag name", "body").text
+    check_silent(browser, "file://")
+
+
+def test_a_solve_is_watched_while_it_runs(browser, viewer, recording):
+    from dataclasses import replace
+
+    browser.get(viewer.url)
+    count = recording.last + 1
+    wait_for(lambda: f"iteration {recording.last} of" in browser.find_element("tag name", "body").text, browser)
+    rows = ("state", "cost", "damping", "gain_ratio", "time_s")
+    longer = {name: np.append(getattr(recording, name), getattr(recording, name)[-1]) for name in rows}
+    threading.Thread(target=viewer.grow, args=(replace(recording, **longer),)).start()
+    wait_for(lambda: f"iteration {count} of {count}" in browser.find_element("tag name", "body").text, browser)
+
+
+def test_the_command_says_what_is_missing(tmp_path, capsys):
+    from jaxba.cli.view import run
+
+    assert run([str(Path(tmp_path) / "no.npz")]) == 2
+    assert "cannot read" in capsys.readouterr().err
