@@ -6,6 +6,7 @@ and marker in all figures made from the same records.
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 import re
@@ -23,6 +24,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
 from jaxba.bench import profile
+from jaxba.bench.levels import levels, merged, representatives, time_is_log
 from jaxba.bench.profile import Target
 from jaxba.bench.records import Record, TracePoint
 
@@ -35,8 +37,8 @@ LINES = ("-", (0, (6, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (1.5, 1.2)))
 MARKERS = "osD^vP*X"
 """Markers, one per colour."""
 
-RESERVED = ("classic", "ceres", "learned")
-"""Solvers that always get the first styles, so that different reports can be compared."""
+RESERVED = ("classic", "ceres", "learned", "guarded", "bold", "ceres+refine3", "ceres+embedded", "nielsen+embedded")
+"""Solvers that have the first styles in every figure, those of the documents included."""
 
 ZOOM_ITERATIONS = 10
 """Iterations in the zoomed part of the damping chart. Source: the paper's figure."""
@@ -44,17 +46,8 @@ ZOOM_ITERATIONS = 10
 DENSE_TICKS = 200.0
 """A logarithmic axis has ticks at 1, 2 and 5 up to this ratio of its limits; up to a ratio of 5, ticks are linear."""
 
-LOG_TIME_SPREAD = 20.0
-"""The time axis is logarithmic if the longest solve takes more than this times the shortest."""
-
-CLIPPING = 1e3
-"""A convergence plot reaches below the lowest tolerance line by this factor."""
-
 LABEL_DISTANCE = 0.06
 """Fraction of the axis height below which the labels of two dashed lines would overlap."""
-
-PAPER_TOLERANCES = (0.1, 0.001)
-"""Values of tau with dashed lines in the convergence plot. Source: the paper's figure."""
 
 
 @dataclass(frozen=True)
@@ -71,14 +64,12 @@ class Style:
 
 
 def solver_styles(solvers: Iterable[str]) -> dict[str, Style]:
-    """A style for each solver: the first ones for `RESERVED`, then in the given order."""
-    names = list(dict.fromkeys(solvers))
-    ranked = [*RESERVED, *(name for name in names if name not in RESERVED)]
-    n = len(COLOURS)
-    style = {
-        name: Style(COLOURS[i % n], LINES[(i + i // n) % len(LINES)], MARKERS[i % n]) for i, name in enumerate(ranked)
-    }
-    return {name: style[name] for name in names}
+    """A style for each solver: one of `RESERVED` has its own, others the first that are free, in the given order."""
+    names, n = list(dict.fromkeys(solvers)), len(COLOURS)
+    taken = {name: RESERVED.index(name) for name in names if name in RESERVED}
+    free = (i for i in itertools.count() if i not in taken.values())
+    rank = {name: taken[name] if name in taken else next(free) for name in names}
+    return {name: Style(COLOURS[i % n], LINES[(i + i // n) % len(LINES)], MARKERS[i % n]) for name, i in rank.items()}
 
 
 def plot_profiles(
@@ -137,27 +128,20 @@ def plot_convergence(
     Distances far below the lowest line are drawn at the bottom. The repeat of median time is drawn.
     """
     styles = solver_styles(profile.solver_names(records))
-    runs = _representatives(records, problem)
-    f0, f_star = profile.initial_costs(records)[problem], profile.best_cost(records, known_best)[problem]
-    lowest = min((p.cost for r in runs.values() for p in r.trace if p.cost > 0), default=1e-30)
-    taus = {tau: profile.threshold(f0, f_star, tau) for tau in sorted({*PAPER_TOLERANCES, tolerance}, reverse=True)}
-    gaps = {e: profile.relative_threshold(f0, f_star, e) - f_star for e in profile.RELATIVE_TOLERANCES}
-    floored = {e for e in gaps if not e * f_star > profile.ZERO_RESIDUAL_FLOOR * f0}
-    unit, name = (f0, "f_0") if len(floored) == len(gaps) else (f_star, "f^*")
-    unit = unit if unit > 0 else 1.0
-    least_gap = min(gaps.values()) / CLIPPING or 1e-30
+    runs = representatives(records, problem)
+    lines = levels(records, problem, tolerance, known_best)
     figure, axes = _figure(2, 2, width=10.5, height=7.6)
     figure.suptitle(_safe(problem))
     for column, measure in enumerate(("time_s", "iteration")):
-        scale = "log" if measure == "time_s" and _spread(runs.values()) > LOG_TIME_SPREAD else "linear"
+        scale = "log" if measure == "time_s" and time_is_log(runs.values()) else "linear"
         for solver, run in runs.items():
             points = [p for p in run.trace if math.isfinite(p.cost) and math.isfinite(p.time_s)]
             points = [p for p in points if p.time_s > 0] if scale == "log" else points
             x = [getattr(p, measure) for p in points]
             style = {"marker": styles[solver].marker, "markersize": 3.5, "markevery": max(1, len(points) // 12)}
             style |= {"zorder": 3} | styles[solver].line()
-            axes[0][column].plot(x, [max(p.cost, lowest / 10) for p in points], **style)
-            axes[1][column].plot(x, [max(p.cost - f_star, least_gap) / unit for p in points], **style)
+            axes[0][column].plot(x, [max(p.cost, lines.lowest / 10) for p in points], **style)
+            axes[1][column].plot(x, [lines.gap(p.cost) for p in points], **style)
         for one in axes[:, column]:
             one.set_yscale("log")
             one.set_xscale(scale)
@@ -168,11 +152,10 @@ def plot_convergence(
         axes[1][column].set_xlabel("solve time (s)" if measure == "time_s" else "iteration")
     for one in axes[:, 0]:
         _log_ticks(one.yaxis)  # shared with the right column
-    labels = {e: "zero-residual floor" if e in floored else f"f*(1+{e:g})" for e in gaps}
-    _dashed(axes[0], [(f"τ = {tau:g}", cost) for tau, cost in taus.items()])
-    _dashed(axes[1], [(labels[e], gap / unit) for e, gap in gaps.items()])
+    _dashed(axes[0], lines.costs)
+    _dashed(axes[1], lines.gaps)
     axes[0][0].set_ylabel("cost (pixels²)")
-    axes[1][0].set_ylabel(rf"$(f - f^*)\,/\,{name}$")
+    axes[1][0].set_ylabel(rf"$(f - f^*)\,/\,{'f_0' if lines.unit_name == 'f0' else 'f^*'}$")
     _legend(figure, {solver: styles[solver] for solver in runs})
     return figure
 
@@ -185,7 +168,7 @@ def plot_lambda(records: Sequence[Record], problem: str) -> Figure:
     more than ten iterations. lambda = 0 is drawn at the lower edge. The repeat of median time is drawn.
     """
     styles = solver_styles(profile.solver_names(records))
-    runs = _representatives(records, problem)
+    runs = representatives(records, problem)
     lines = {s: [p for p in r.trace[1:] if math.isfinite(p.damping)] for s, r in runs.items()}
     lines = {solver: line for solver, line in lines.items() if line}
     values = [p.damping for line in lines.values() for p in line]
@@ -260,25 +243,6 @@ def _damping_line(axes: Axes, line: Sequence[TracePoint], style: Style, low: flo
         axes.plot(x, [y[i] for i in x], linestyle="none", zorder=3, **marks)
 
 
-def _representatives(records: Sequence[Record], problem: str) -> dict[str, Record]:
-    """For each solver, the repeat with the (lower) median solve time."""
-    runs: dict[str, list[Record]] = {}
-    for r in records:
-        if r.problem == problem:
-            runs.setdefault(r.solver, []).append(r)
-    return {solver: sorted(items, key=_end)[(len(items) - 1) // 2] for solver, items in runs.items()}
-
-
-def _end(record: Record) -> float:
-    return record.trace[-1].time_s if record.trace and math.isfinite(record.trace[-1].time_s) else math.inf
-
-
-def _spread(runs: Iterable[Record]) -> float:
-    """Longest over shortest solve time."""
-    ends = [end for end in map(_end, runs) if 0 < end < math.inf]
-    return max(ends) / min(ends) if ends else 1.0
-
-
 def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Figure, Any]:
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, sharey="row")
@@ -287,21 +251,14 @@ def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Figur
     return figure, axes
 
 
-def _dashed(row: Iterable[Axes], lines: Sequence[tuple[str, float]]) -> None:
+def _dashed(row: Iterable[Axes], lines: Mapping[str, float]) -> None:
     """Draws horizontal dashed lines in axes that share y, labelled at the right. Lines too close share a label."""
     *_, last = row = list(row)
-    found = sorted((y, label) for label, y in dict(lines).items() if math.isfinite(y) and y > 0)
     for axes in row:
-        for y, _ in found:
-            axes.axhline(y, color="0.35", linestyle=(0, (4, 3)), linewidth=0.8, zorder=1)
-    bottom, top = map(math.log, last.get_ylim())
-    groups: list[tuple[float, list[str]]] = []
-    for y, label in found:
-        if groups and math.log(y / groups[-1][0]) < LABEL_DISTANCE * (top - bottom):
-            groups[-1][1].append(label)
-        else:
-            groups.append((y, [label]))
-    for y, labels in groups:
+        for y in lines.values():
+            if math.isfinite(y) and y > 0:
+                axes.axhline(y, color="0.35", linestyle=(0, (4, 3)), linewidth=0.8, zorder=1)
+    for y, labels in merged(lines, *last.get_ylim(), LABEL_DISTANCE):
         where: dict[str, Any] = {"xy": (1.0, y), "xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
         last.annotate("\n".join(labels[::-1]), **where, xytext=(4, 0), va="center", fontsize="small", color="0.25")
 

@@ -21,6 +21,9 @@ from jaxba.bench.records import Record
 ITERATION_LIMIT = 100
 """A solve that has not converged within this many iterations is a failure. Source: the paper."""
 
+PAPER_TOLERANCES = (0.1, 0.001)
+"""Values of tau in the target `f <= f* + tau (f0 - f*)`. Source: the paper's figures."""
+
 RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)
 """Values of epsilon in the target `f <= f*(1 + epsilon)`."""
 
@@ -70,10 +73,20 @@ class Target:
         )
 
 
-def standard_targets(tolerance: float) -> tuple[Target, ...]:
-    """The targets in tables: tau with the given tolerance, the relative ones, own end, converged."""
+def taus(tolerance: float) -> list[float]:
+    """The paper's values of tau and the given one, the largest first."""
+    return sorted({*PAPER_TOLERANCES, tolerance}, reverse=True)
+
+
+def cost_targets(tolerance: float) -> tuple[Target, ...]:
+    """Costs relative to the best one: the paper's values of tau and the given one, and the relative tolerances."""
     relative = (Target("relative", epsilon) for epsilon in RELATIVE_TOLERANCES)
-    return (Target("tau", tolerance), *relative, Target("own_end", OWN_END_TOLERANCE), Target("converged"))
+    return (*(Target("tau", tau) for tau in taus(tolerance)), *relative)
+
+
+def standard_targets(tolerance: float) -> tuple[Target, ...]:
+    """The targets in tables: those of `cost_targets`, own end, converged."""
+    return (*cost_targets(tolerance), Target("own_end", OWN_END_TOLERANCE), Target("converged"))
 
 
 @dataclass(frozen=True)

@@ -1,45 +1,20 @@
-"""Writes the results of a benchmark: `summary.json`, figures and a self-contained `report.html`."""
+"""Writes the results of a benchmark: `summary.json`, figures, and `report.html`, one page that needs no other file."""
 
 from __future__ import annotations
 
-import base64
-import html
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jaxba.bench import plots, profile
+from jaxba.bench import charts, page, plots, profile
 from jaxba.bench.profile import RELATIVE_TOLERANCES, Target
 from jaxba.bench.records import Record
 from jaxba.bench.summary import Summary, summarize, write_summary
 from jaxba.bench.tables import Table, tables
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import write_text
-
-_CSS = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; margin: 2rem auto; max-width: 76rem; padding: 0 1rem; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
-th, td { padding: .2rem .6rem; text-align: right; border-bottom: 1px solid #ddd; white-space: nowrap; }
-th.name, td.name { text-align: left; }
-thead th { border-bottom: 2px solid #888; }
-tbody tr:nth-child(even) { background: #f6f6f6; }
-.note { color: #555; font-size: 13px; max-width: 60rem; }
-.warning { background: #fff4d6; border-left: 4px solid #d08700; padding: .4rem .8rem; margin: .4rem 0; }
-figure { margin: 1rem 0; } img { max-width: 100%; height: auto; }
-"""
-
-
-@dataclass(frozen=True)
-class ReportFigure:
-    """A figure of the report."""
-
-    title: str
-    caption: str
-    svg: bytes
 
 
 def write_all(
@@ -59,7 +34,8 @@ def write_all(
         records: at least one.
         out_dir: folder; created if it does not exist.
         tolerance: tau of the performance profile, in (0, 1).
-        metadata: device, threads, versions and the like, shown as a table; from the records by default.
+        metadata: device, threads, versions and the like, shown on top; from the records by default. That of the name
+            `command` is shown as code.
         known_best: best known costs of some problems, see `profile.best_cost`.
 
     Raises:
@@ -75,13 +51,10 @@ def write_all(
     summary = summarize(records, tolerance, known_best, metadata or run_metadata(records))
     files = [folder / "summary.json"]
     write_summary(files[0], summary)
-    figures = []
-    for stem, title, caption, figure in _figures(records, tolerance, known_best):
-        paths = plots.save_figure(figure, folder / stem)
-        files += paths
-        figures.append(ReportFigure(title, caption, paths[1].read_bytes()))
+    for stem, figure in _figures(records, tolerance, known_best):
+        files += plots.save_figure(figure, folder / stem)
     report = folder / "report.html"
-    write_text(report, to_html(summary, figures))
+    write_text(report, to_html(records, summary, tolerance, known_best))
     return [*files, report]
 
 
@@ -112,47 +85,49 @@ def file_names(problems: Iterable[str]) -> dict[str, str]:
 
 
 def _figures(records: Sequence[Record], tolerance: float, known_best: Mapping[str, float] | None):
-    """Yields (file stem, title, caption, figure). A generator, so that only one figure is in memory."""
-    caption = (
-        "Fraction of all problems, including those that no solver solved, that a solver solves within a factor (x "
-        "axis) of the time or iterations of the best solver on that problem."
-    )
+    """Yields (file stem, figure). A generator, so that only one figure is in memory."""
     single, relative = [Target("tau", tolerance)], [Target("relative", epsilon) for epsilon in RELATIVE_TOLERANCES]
-    figure = plots.plot_profiles(records, single, known_best)
-    yield f"profile_tau_{tolerance:g}", f"Performance profile, τ = {tolerance:g}", caption, figure
-    figure = plots.plot_profiles(records, relative, known_best)
-    yield "profile_relative", "Performance profiles, relative tolerances", caption, figure
+    yield f"profile_tau_{tolerance:g}", plots.plot_profiles(records, single, known_best)
+    yield "profile_relative", plots.plot_profiles(records, relative, known_best)
     for problem, name in file_names(profile.problem_names(records)).items():
-        text = "Accepted cost over solve time and iterations; dashed: tolerances. Below: distance to the best cost."
-        figure = plots.plot_convergence(records, problem, tolerance, known_best)
-        yield f"convergence_{name}", f"Convergence: {problem}", text, figure
-        text = "Lambda of every iteration, hollow where the step was rejected. Right: the last iterations, enlarged."
-        yield f"lambda_{name}", f"Damping: {problem}", text, plots.plot_lambda(records, problem)
+        yield f"convergence_{name}", plots.plot_convergence(records, problem, tolerance, known_best)
+        yield f"lambda_{name}", plots.plot_lambda(records, problem)
 
 
-def to_html(summary: Summary, figures: Sequence[ReportFigure] = ()) -> str:
-    """The report as one HTML document without external resources. All names are escaped."""
-    profiles, others = figures[:2], figures[2:]
-    parts = [f'<p class="warning">{html.escape(warning)}</p>' for warning in summary.warnings]
-    parts.append(_table(_metadata_table(summary)))
-    parts.append(_table(_problem_table(summary)))
+PROFILES = (
+    "Fraction of all problems, including those that no solver solved, that a solver solves within a factor (x axis) of "
+    "the iterations or time of the best solver on that problem, hidden or not. τ: cost at most f* + τ(f0 - f*)."
+)
+
+RUNS = "The repeat of median time of each solver. Dashed: the tolerances."
+
+
+def to_html(
+    records: Sequence[Record],
+    summary: Summary,
+    tolerance: float = 1e-3,
+    known_best: Mapping[str, float] | None = None,
+) -> str:
+    """The report as one HTML document that loads nothing (`page`). The arguments are those of `write_all`."""
+    styles = plots.solver_styles(profile.solver_names(records))
+    profiles = charts.profile_charts(records, tolerance, known_best)
+    every, rows, by_problem = list(profiles), [], {}
+    for problem in profile.problem_names(records):
+        found, runs = charts.problem_charts(records, problem, tolerance, known_best, len(rows))
+        numbered = list(enumerate(found, start=len(every)))
+        every, rows = every + found, rows + runs
+        by_problem[problem] = page.charts(numbered)
     *main, details = tables(summary)
-    parts += [_table(table) for table in main]
-    parts += [_figure(figure) for figure in profiles]
-    parts.append(_table(details))
-    parts += [_figure(figure) for figure in others]
-    body = "\n".join(parts)
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>jaxba benchmark</title><style>{_CSS}</style></head>\n<body>"
-        f"<h1>jaxba benchmark</h1>\n{body}\n</body></html>\n"
-    )
-
-
-def _metadata_table(summary: Summary) -> Table:
-    rows = [(str(name), str(value)) for name, value in summary.metadata.items()]
-    return Table("Run", ("property", "value"), rows, "", text_columns=2)
+    sections = [
+        page.section("Performance profiles", page.note(PROFILES), page.charts(enumerate(profiles))),
+        page.section("Convergence and damping", page.note(RUNS), page.groups("problem", by_problem)),
+        *(page.table(table, styles) for table in main),
+        page.table(details, styles),
+        page.table(_problem_table(summary)),
+    ]
+    facts = {str(name): str(value) for name, value in summary.metadata.items()}
+    content = page.Page("jaxba benchmark", facts, sections, every, styles, charts.AXES, rows, warnings=summary.warnings)
+    return page.to_html(content)
 
 
 def _problem_table(summary: Summary) -> Table:
@@ -167,26 +142,4 @@ def _problem_table(summary: Summary) -> Table:
         rows,
         "Costs are half the sum of squared residuals, pixels².",
         text_columns=2,
-    )
-
-
-def _table(table: Table) -> str:
-    def row(cells: Iterable[str], tag: str) -> str:
-        kinds = [' class="name"' if i < table.text_columns else "" for i in range(len(table.header))]
-        return (
-            "<tr>" + "".join(f"<{tag}{k}>{html.escape(c)}</{tag}>" for k, c in zip(kinds, cells, strict=True)) + "</tr>"
-        )
-
-    head, body = row(table.header, "th"), "\n".join(row(cells, "td") for cells in table.rows)
-    note = f'<p class="note">{html.escape(table.note)}</p>' if table.note else ""
-    grid = f'<div class="scroll"><table><thead>{head}</thead><tbody>\n{body}\n</tbody></table></div>'
-    return f"<h2>{html.escape(table.title)}</h2>\n{grid}\n{note}"
-
-
-def _figure(figure: ReportFigure) -> str:
-    data = base64.b64encode(figure.svg).decode()
-    title = html.escape(figure.title)
-    image = f'<img alt="{title}" src="data:image/svg+xml;base64,{data}">'
-    return (
-        f'<figure><h2>{title}</h2>{image}<figcaption class="note">{html.escape(figure.caption)}</figcaption></figure>'
     )

@@ -13,6 +13,7 @@ from jaxba.bench.summary import YARDSTICKS, Comparison, Summary
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table as RichTable
 
 
 @dataclass(frozen=True)
@@ -171,17 +172,22 @@ def to_markdown(summary: Summary, details: bool = True) -> str:
 
 def print_summary(summary: Summary, console: Console, details: bool = True) -> None:
     """Prints all tables to a rich console, warnings first."""
-    from rich.table import Table as RichTable
     from rich.text import Text
 
     for warning in summary.warnings:
         console.print(Text(f"warning: {warning}", style="yellow"))
     for table in tables(summary, details):
-        drawn = RichTable(
-            title=Text(table.title), caption=Text(table.note), title_justify="left", caption_justify="left"
-        )
-        for i, name in enumerate(table.header):
-            drawn.add_column(Text(name), justify="left" if i < table.text_columns else "right", overflow="fold")
-        for row in table.rows:
-            drawn.add_row(*(Text(cell) for cell in row))
-        console.print(drawn)
+        console.print(to_rich(table))
+
+
+def to_rich(table: Table) -> RichTable:
+    """The table for a rich console."""
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    drawn = RichTable(title=Text(table.title), caption=Text(table.note), title_justify="left", caption_justify="left")
+    for i, name in enumerate(table.header):
+        drawn.add_column(Text(name), justify="left" if i < table.text_columns else "right", overflow="fold")
+    for row in table.rows:
+        drawn.add_row(*(Text(cell) for cell in row))
+    return drawn

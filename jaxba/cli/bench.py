@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import glob
 import os
 import re
@@ -72,10 +73,12 @@ def main() -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Runs the command. Exit status: 0 if all runs are done, 2 for bad input, 130 after Ctrl-C (results are kept)."""
-    return common.run_command(Arguments, _bench, "Compares solvers: tables, performance profiles, plots.", argv)
+    command = common.command_line("jaxba-bench", argv)
+    bench = functools.partial(_bench, command=command)
+    return common.run_command(Arguments, bench, "Compares solvers: tables, performance profiles, plots.", argv)
 
 
-def _bench(args: Arguments) -> int:
+def _bench(args: Arguments, command: str) -> int:
     args = _with_suite(args)
     solvers = [name for name in (args.solvers or DEFAULT_SOLVERS).split(",") if name.strip()]
     tolerance = 1e-3 if args.tolerance is None else float(args.tolerance)
@@ -94,12 +97,12 @@ def _bench(args: Arguments) -> int:
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
     try:
         with run.only_writer(Path(args.out)):
-            return _run_missing(Path(args.out), jobs, settings, tolerance, args.strict)
+            return _run_missing(Path(args.out), jobs, settings, tolerance, args.strict, command)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
 
 
-def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, strict: bool) -> int:
+def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, strict: bool, command: str) -> int:
     """Runs the jobs that the folder has no record of, and writes the report. Raises OSError if a file cannot be
     written."""
     from rich.console import Console
@@ -127,7 +130,8 @@ def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, stric
         status = common.INTERRUPTED
     if records:
         console.print("drawing", highlight=False)
-        files = report.write_all(records, folder, tolerance, metadata={**report.run_metadata(records), **run.machine()})
+        metadata = {"command": command, **report.run_metadata(records), **run.machine()}
+        files = report.write_all(records, folder, tolerance, metadata=metadata)
         print_summary(summarize(records, tolerance), console, details=console.width >= DETAILS_WIDTH)
         console.print(f"wrote {len(files)} files; see {folder / 'report.html'}", highlight=False)
     return status

@@ -7,6 +7,7 @@ import errno
 import gc
 import os
 import re
+import shlex
 import signal
 import stat
 import sys
@@ -78,6 +79,13 @@ def run_command(
             if isinstance(error, UnwritableStreamError):
                 return print_error(str(error))
             raise
+
+
+def command_line(name: str, argv: Sequence[str] | None) -> str:
+    """The command as a shell takes it, in one line; `argv` as for `run_command`."""
+    from jaxba.io.files import display_name
+
+    return display_name(shlex.join([name, *(sys.argv[1:] if argv is None else argv)]))
 
 
 def _parse_and_run(

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from jaxba.cli import common
 from jaxba.cli.interrupt import Interrupt
+from jaxba.cli.training_view import TrainingView
+
+if TYPE_CHECKING:
+    from jaxba.bench.tables import Table
+    from jaxba.training.log import Row
 
 DEFAULT_CONFIG = "default"
 """Default preset of a new run."""
@@ -23,6 +30,12 @@ OF_AGENT = "policy-{}.safetensors"
 
 CURVE = "curve"
 """Stem of the files with the learning curve."""
+
+PAGE = "report.html"
+"""File with curves, episodes and the table, interactive."""
+
+EPISODES = 6
+"""Held-out scenes whose episodes are in the page."""
 
 FILE_WIDTH = 160
 """Width of the table in characters if the output is not a terminal."""
@@ -53,6 +66,9 @@ class Arguments:
     cameras, the last fifth of every problem held out. With a configuration that has classes of the family windows these
     are cut; else all its classes are."""
 
+    wandb: str | None = None
+    """Project at Weights & Biases that gets the log, too; needs the extra `wandb`."""
+
     resume: bool = False
     """Continue the run in the folder from its last checkpoint, with the same results as without the interruption."""
 
@@ -65,16 +81,20 @@ def main() -> None:
 def run(argv: Sequence[str] | None = None) -> int:
     """Runs the command. Exit status: 0 if the policy was written, 2 for bad input, 130 after Ctrl-C (the run is
     saved)."""
-    return common.run_command(Arguments, _train, "Trains a damping policy on random scenes.", argv)
+    command = common.command_line("jaxba-train", argv)
+    train = functools.partial(_train, command=command)
+    return common.run_command(Arguments, train, "Trains a damping policy on random scenes.", argv)
 
 
-def _train(args: Arguments) -> int:
+def _train(args: Arguments, command: str) -> int:
     import jax
 
     from jaxba.game import scene_bank
+    from jaxba.io import settings
     from jaxba.runtime import process
     from jaxba.training import config as configs
     from jaxba.training import driver, task
+    from jaxba.training.wandb_log import WandbLog
 
     jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
     overrides = tuple(item for group in args.overrides for item in group)
@@ -88,6 +108,7 @@ def _train(args: Arguments) -> int:
         if args.problems and config is not None:
             config = configs.with_problems(config, _check_problems(args.problems))
         config = driver.prepare_folder(folder, config, args.resume, overrides)
+        board = WandbLog(args.wandb, folder, settings.plain(config)) if args.wandb else None
     except (configs.SettingsError, driver.TrainError) as error:
         raise common.UsageError(str(error)) from None
     common.prepare_process()
@@ -95,19 +116,27 @@ def _train(args: Arguments) -> int:
     with (
         process.single_blas_thread(),
         Interrupt("chunk", graceful=False) as interrupt,
-        _Progress(console, config) as progress,
+        TrainingView(console, config) as view,
+        ExitStack() as ends,
     ):
+        if board:
+            ends.callback(board.close)
         try:
             with common.notes_printed(lambda _: None):  # they were printed when the problems were checked
-                work = task.build(config, folder, progress.stage)
-            progress.rules = work.rules
+                work = task.build(config, folder, view.stage)
+            view.rules = work.rules
             interrupt.graceful = True
 
             def keep(best: tuple[driver.Best, ...]) -> None:
                 _write_policies(folder, config, work, best)
-                progress.best = best
+                view.best = best
 
-            hooks = driver.Hooks(progress.stage, progress.rows, keep, lambda: interrupt.requested)
+            def show(rows: list[Row]) -> None:
+                view.rows(rows)
+                if board:
+                    board.write(rows)
+
+            hooks = driver.Hooks(view.stage, show, keep, lambda: interrupt.requested)
             outcome = driver.train(config, work.game, work.evaluate, folder, hooks)
             interrupt.graceful = False
         except KeyboardInterrupt:
@@ -122,7 +151,7 @@ def _train(args: Arguments) -> int:
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
             return common.INTERRUPTED
-        return _finish(folder, work, outcome.best, console, progress)
+        return _finish(folder, work, outcome.best, console, view, command)
 
 
 def _check_problems(problems: Sequence[str]) -> list[str]:
@@ -137,7 +166,7 @@ def _check_problems(problems: Sequence[str]) -> list[str]:
 
 
 def _console() -> Any:
-    """A console for the progress. Brackets in names are not interpreted as markup."""
+    """A console for the view. Brackets in names are not interpreted as markup."""
     from rich.console import Console
 
     options: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
@@ -170,137 +199,63 @@ def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -
     return list(files)
 
 
-def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, progress: _Progress) -> int:
-    """Writes the policies and the learning curve, and prints the comparison with the rules."""
+def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: TrainingView, command: str) -> int:
+    """Writes the policies, the learning curve and the page, and prints the comparison with the rules."""
+    from jaxba.bench import run as bench_run
     from jaxba.bench.plots import save_figure
+    from jaxba.bench.tables import to_rich
+    from jaxba.cli import training_page
     from jaxba.cli.training_curve import plot_curve
+    from jaxba.game.episode import replay
+    from jaxba.runtime.atomic import write_text
     from jaxba.training import log
     from jaxba.training.driver import best_of
 
-    files = _write_policies(folder, work.config, work, best)
-    paid = work.config.game.reward == "price"
+    files, rows = _write_policies(folder, work.config, work, best), log.read(folder)
+    rules_of_game = work.config.game
+    paid = rules_of_game.reward == "price"
     rules = {name: {**one._asdict(), "score": one.price if paid else one.mean} for name, one in work.rules.items()}
-    figure = plot_curve(log.read(folder), rules, work.config.game.tolerance)
+    figure = plot_curve(rows, rules, rules_of_game.tolerance)
     files += save_figure(figure, folder / CURVE)
-    progress.stage("comparing with the rules")
+    view.stage("comparing with the rules")
     compared = work.compare([one.actor for one in best])
-    progress.__exit__()
-    count = sum(len(scene_bank.initial_cost) for scene_bank in work.held_out)
-    console.print(_table(compared, work.config.game.tolerance, count))
+    table = _table(compared, rules_of_game.tolerance, sum(len(bank.initial_cost) for bank in work.held_out))
+    view.stage("playing some episodes")
     chosen = best_of(best)
+    kind, bank = work.config.bank.classes[0], work.held_out[0]
+    policy, limit = work.policy(chosen.actor), rules_of_game.max_iterations
+    episodes = [
+        replay(kind, bank, k, policy, work.game.options, limit) for k in range(min(EPISODES, len(bank.initial_cost)))
+    ]
+    facts = {"command": command, "agents": str(work.config.seeds), **bench_run.machine()}
+    page = folder / PAGE
+    write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts, paid))
+    view.__exit__()
+    drawn = to_rich(table)
+    drawn.columns[0].no_wrap = drawn.columns[-1].no_wrap = True
+    console.print(drawn)
     console.print(f"best on training scenes: agent {chosen.agent + 1} after chunk {chosen.chunk}")
-    console.print(f"wrote {', '.join(str(file) for file in files)}")
+    console.print(f"wrote {', '.join(str(file) for file in [*files, page])}")
     return 0
 
 
-def _table(compared: Any, tolerance: float, count: int) -> Any:
-    from rich.table import Table
+def _table(compared: Any, tolerance: float, count: int) -> Table:
+    """Scores on the held-out scenes, and what the trained policies pay over each other row."""
+    from jaxba.bench.tables import Table
 
-    table = Table(
-        title=f"iterations to f*(1 + {tolerance:g}) on {count} held-out scenes",
-        title_justify="left",
-        title_style="bold",
-    )
-    table.add_column("policy", no_wrap=True)
     agents = len(next(iter(compared.by_agent.values())))
-    single = [f"{k + 1}" for k in range(agents)] if agents > 1 else []
-    for name in (
-        "mean",
-        "geom. mean",
-        "median",
-        "p90",
-        "failures",
-        "converged",
-        "final gap",
-        "price",
-        *single,
-        "trained over it [95%]",
-    ):
-        table.add_column(name, justify="right")
+    single = tuple(f"agent {k + 1}" for k in range(agents)) if agents > 1 else ()
+    rows = []
     for name, score in compared.scores.items():
-        own = [f"{x:.2f}" for x in compared.by_agent.get(name, ())] or [""] * agents
+        own = [f"{x:.2f}" for x in compared.by_agent.get(name, ())] or ["-"] * agents
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
-        table.add_row(
-            name,
-            *numbers,
-            f"{100 * score.failures:.1f} %",
-            f"{score.to_convergence:.2f}",
-            f"{score.end:.1e}",
-            f"{score.price:.2f}",
-            *(own if single else ()),
-            "{:.3f} [{:.3f}, {:.3f}]".format(*compared.ratios[name]) if name in compared.ratios else "",
-        )
-    return table
-
-
-class _Progress:
-    """A progress bar on a terminal; otherwise lines of text."""
-
-    def __init__(self, console: Any, config: Any) -> None:
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-        self.console, self.config = console, config
-        self.rules: Mapping[str, Any] = {}
-        self.best: Sequence[Any] = ()  # the best policies that this process has trained
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(bar_width=20),
-            TimeElapsedColumn(),
-            TextColumn("ETA"),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[now]}"),
-            console=console,
-            transient=True,
-            speed_estimate_period=600,
-            disable=not console.is_terminal,
-        )
-        self._task: Any = None
-
-    def __enter__(self) -> _Progress:
-        self._bar.start()
-        self._task = self._bar.add_task("starting", total=None, now="")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def stage(self, description: str) -> None:
-        """Reports the start of a stage."""
-        self._bar.update(self._task, description=description, now="")
-        if not self.console.is_terminal:
-            self.console.print(description)
-
-    def rows(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Reports a finished chunk, by its rows of the training log."""
-        row, total = rows[0], self.config.chunks
-        now = f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s"
-        ended = [(one["episode/length"], one["episode/ceres"]) for one in rows if one["episodes"]]
-        if ended:
-            length, rule = (sum(x) / len(ended) for x in zip(*ended, strict=True))
-            now += f", {length:.1f} iterations (Ceres' rule {rule:.1f})"
-        description = f"chunk {row['chunk']}/{total}"
-        if self._bar.tasks[0].total is None:
-            self._bar.reset(self._task, total=total, completed=row["chunk"] - 1)
-        self._bar.update(self._task, description=description, total=total, completed=row["chunk"], now=now)
-        if not self.console.is_terminal:
-            self.console.print(f"{description}: {now}, {row['wall_s']:.0f} s")
-        if "held_out/score" in row:
-            self.console.print(f"{description}: {self._held_out(rows)}")
-
-    def _held_out(self, rows: Sequence[Mapping[str, Any]]) -> str:
-        from jaxba.training.task import CONSTANT
-
-        values = lambda name: [row[name] for row in rows if row.get(name) is not None]
-        mean = lambda name: sum(values(name)) / len(rows)
-        paid = self.config.game.reward == "price"
-        text = f"held out {mean('held_out/score'):.2f} {'plain steps paid' if paid else 'iterations'}"
-        if len(rows) > 1:
-            text += f" ({min(values('held_out/score')):.2f} to {max(values('held_out/score')):.2f})"
-        text += f", p90 {mean('held_out/p90'):.0f}, failures {100 * mean('held_out/failures'):.1f} %"
-        shown = [name for name in ("ceres", "ceres+embedded", CONSTANT) if name in self.rules]
-        rules = [f"{name} {self.rules[name].price if paid else self.rules[name].mean:.2f}" for name in shown]
-        if rules:
-            text += f" ({', '.join(rules)})"
-        if any(one.chunk == rows[0]["chunk"] for one in self.best):
-            text += ", best so far"
-        return text
+        ends = f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}", f"{score.price:.2f}"
+        ratio = "{:.3f} [{:.3f}, {:.3f}]".format(*compared.ratios[name]) if name in compared.ratios else "-"
+        rows.append((name, *numbers, *ends, *(own if single else ()), ratio))
+    header = ("policy", "mean", "geom. mean", "median", "p90", "failures", "converged", "final gap", "price")
+    return Table(
+        f"Iterations to f*(1 + {tolerance:g}) on {count} held-out scenes",
+        (*header, *single, "trained over it [95%]"),
+        rows,
+        "A failure counts as the limit. The last column: what the trained policies pay over this one, scene by scene.",
+    )

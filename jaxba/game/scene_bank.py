@@ -95,6 +95,13 @@ def info_of(
     )
 
 
+def worth_solving(kind: SceneClass, info: ProblemInfo) -> Int[np.ndarray, " kept"]:
+    """Rows of the scenes that have enough observations, and a start that is not too far away."""
+    error = jnp.sqrt(2 * info.cost / jnp.maximum(info.observations, 1))
+    largest = PAPER_ERROR_ANGLE if kind.family == "paper" else MAX_ERROR_ANGLE
+    return np.flatnonzero((error < largest * info.focal) & (info.observations >= MIN_OBSERVATIONS))
+
+
 @functools.partial(jax.jit, static_argnames=("kind",))
 def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
     """The cost of every start, pixels squared."""
@@ -195,9 +202,7 @@ def solve_scenes(
     count = len(scenes.mask)
     initial = initial_costs(kind, scenes)
     info = info_of(kind, scenes, initial, limit)
-    error = jnp.sqrt(2 * initial / jnp.maximum(info.observations, 1))
-    largest = PAPER_ERROR_ANGLE if kind.family == "paper" else MAX_ERROR_ANGLE
-    keep = np.flatnonzero((error < largest * info.focal) & (info.observations >= MIN_OBSERVATIONS))
+    keep = worth_solving(kind, info)
     scenes, initial, info = jax.tree.map(lambda x: x[keep], (scenes, initial, info))
     if warm_share:
         scenes, initial = warm_starts(kind, scenes, initial, jax.random.fold_in(key, count), warm_share, options)

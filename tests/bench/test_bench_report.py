@@ -1,5 +1,7 @@
 """Figures and the report: files, names, consistency of styles, odd inputs. Warnings are errors."""
 
+import html
+import json
 import math
 import re
 import xml.etree.ElementTree as ElementTree
@@ -12,7 +14,8 @@ import pytest
 from jaxba.bench import plots
 from jaxba.bench.profile import Target
 from jaxba.bench.records import Record, TracePoint
-from jaxba.bench.report import file_names, run_metadata, write_all
+from jaxba.bench.report import file_names, run_metadata, to_html, write_all
+from jaxba.bench.summary import summarize
 from jaxba.problem.bundle_problem import ProblemError
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -35,19 +38,32 @@ def names(folder):
 
 
 class Tags(HTMLParser):
-    """Collects sources of loaded content and checks that tags close."""
+    """Collects scripts and sources of loaded content, and checks that tags close."""
 
     def __init__(self):
         super().__init__()
-        self.stack, self.sources = [], []
+        self.stack, self.sources, self.scripts = [], [], []
 
     def handle_starttag(self, tag, attrs):
         self.sources += [value for key, value in attrs if key in ("src", "href")]
         if tag not in ("meta", "img"):
             self.stack.append(tag)
 
+    def handle_data(self, data):
+        if self.stack and self.stack[-1] == "script":
+            self.scripts.append(data)
+
     def handle_endtag(self, tag):
         assert self.stack.pop() == tag
+
+
+def page_of(records, tolerance=1e-3, **metadata):
+    """The report without figures: its text, its tags, and the data of its charts."""
+    text = to_html(records, summarize(records, tolerance, metadata=metadata), tolerance)
+    parser = Tags()
+    parser.feed(text)
+    assert parser.stack == []
+    return text, parser, json.loads(parser.scripts[0])
 
 
 def test_write_all_writes_the_documented_files(tmp_path):
@@ -70,17 +86,51 @@ def test_write_all_writes_the_documented_files(tmp_path):
             ElementTree.parse(path)
 
 
-def test_report_is_self_contained_well_formed_and_escaped(tmp_path):
+def test_report_is_self_contained_well_formed_and_escaped():
     hostile = "<script>alert(1)</script>&\"'"
-    write_all([make_record(hostile, hostile, 3)], tmp_path, metadata={hostile: hostile})
-    text = (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert "<script" not in text
-    parser = Tags()
-    parser.feed(text)
-    assert parser.stack == []
-    assert len(parser.sources) == 4
-    assert all(s.startswith("data:image/svg+xml;base64,") for s in parser.sources)
-    assert not re.search(r"url\(|@import|https?://", text)
+    text, parser, book = page_of([make_record(hostile, hostile, 3)], **{hostile: hostile, "command": hostile})
+    assert "<script>alert" not in text
+    assert parser.sources == []
+    assert len(parser.scripts) == 3
+    assert "default-src 'none'" in text
+    styles = text[text.index("<style>") : text.index("</style>")]
+    assert not re.search(r"url\(|@import", styles)
+    assert {trace["name"] for chart in book["charts"] for trace in chart["data"]} == {html.escape(hostile)}
+
+
+def test_charts_of_the_report_have_the_numbers_of_the_records():
+    records = [
+        make_record(p, s, n, rate=r) for p in "ab" for s, n, r in (("x", 12, 0.1), ("y", 12, 0.37), ("z", 12, 0.37))
+    ]
+    text, _, book = page_of(records, 1e-2)
+    titles = re.findall("<h3>(.*?)</h3>", text)
+    assert titles[:6] == ["τ = 0.1", "τ = 0.01", "τ = 0.001", "f*(1+0.01)", "f*(1+0.001)", "f*(1+0.0001)"]
+    charts = dict(zip(titles[:9], book["charts"][:9], strict=True))
+    x, y, _ = charts["f*(1+0.01)"]["data"]
+    # as in the figures: x needs 3 accepted steps to 1e-2 of its best cost, y and z 9 iterations with two rejections
+    assert [x["x"]["iterations"][0], x["y"]["iterations"][0]] == [1.0, 100.0]
+    assert [3.0, 100.0] in [list(p) for p in zip(y["x"]["iterations"], y["y"]["iterations"], strict=True)]
+    assert text.count("The same curve by iterations: y = z.") == 6 + 2
+    cost = charts["Accepted cost (pixels²)"]["data"][1]
+    rows = np.array([row[:4] for row in book["rows"][cost["rows"]]], float)
+    trace = records[1].trace
+    np.testing.assert_allclose(rows[:, 0], [p.iteration for p in trace])
+    np.testing.assert_allclose(rows[:, 1], [p.time_s for p in trace], rtol=1e-6)
+    np.testing.assert_allclose(cost["y"], [p.cost for p in trace], rtol=1e-6)
+    damping = charts["Damping λ"]["data"][1]
+    np.testing.assert_allclose(damping["y"][1:], [p.damping for p in trace[1:]], rtol=1e-6)
+    assert [symbol.endswith("-open") for symbol in damping["marker"]["symbol"]] == [not p.accepted for p in trace]
+    heights = [shape["y0"] for shape in charts["Accepted cost (pixels²)"]["layout"]["shapes"]]
+    best = records[0].final_cost
+    assert heights == pytest.approx([best + tau * (1000 - best) for tau in (0.1, 0.01, 0.001)], rel=1e-6)
+
+
+def test_a_solver_has_one_colour_in_all_charts_and_figures():
+    records = [make_record(p, s, 12) for p in "ab" for s in ("q", "classic", "learned", "r")]
+    _, _, book = page_of(records)
+    colours = {(trace["meta"], trace["line"]["color"]) for chart in book["charts"] for trace in chart["data"]}
+    styles = plots.solver_styles(["q", "classic", "learned", "r"])
+    assert colours == {(name, style.color) for name, style in styles.items()}
 
 
 @pytest.mark.parametrize(
@@ -114,6 +164,9 @@ def test_many_solvers_have_different_styles_and_yardsticks_always_the_same():
     styles = plots.solver_styles(solvers)
     assert len({(s.color, str(s.linestyle)) for s in styles.values()}) == len(solvers)
     assert styles["classic"] == plots.solver_styles(["x", "classic"])["classic"]
+    alone = plots.solver_styles(["mine", "ceres", "bold"])
+    assert alone["bold"] == plots.solver_styles(["bold"])["bold"]
+    assert len({style.color for style in alone.values()}) == 3
     assert list(styles) == solvers
 
 
