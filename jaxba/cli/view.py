@@ -16,6 +16,10 @@ from jaxba.cli import common
 
 if TYPE_CHECKING:
     from jaxba.viewer.panel import Viewer
+    from jaxba.viewer.sources import Shown
+
+LARGEST_EPISODE = 40
+"""Most iterations of an episode: those of the training presets."""
 
 NAMED = 5
 """Worst images that are printed."""
@@ -36,6 +40,12 @@ class Arguments:
     """KITTI's file of the true poses of the whole sequence. Default: that with which jaxba-kitti made the problem, if
     it is there."""
 
+    policy: str | None = None
+    """Instead of files: an episode of the game, played by a policy: a file of jaxba-train, or a name."""
+
+    scene: int = 0
+    """Number of the random scene of --policy."""
+
     html: str | None = None
     """Output file: one page that opens without a server and plays the iterations. Nothing is served."""
 
@@ -54,8 +64,12 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(args: Arguments) -> int:
-    if not args.files:
-        raise common.UsageError("name a problem or a recording")
+    if not args.files and args.policy is None:
+        raise common.UsageError("name a problem or a recording, or a policy by --policy")
+    if args.files and args.policy is not None:
+        raise common.UsageError("--policy plays a random scene, not a file")
+    if args.scene < 0:
+        raise common.UsageError(f"--scene must not be negative, is {args.scene}")
     if not 0 < args.port < 65536:
         raise common.UsageError(f"--port must lie between 1 and 65535, is {args.port}")
     if args.images is not None and not os.path.isdir(args.images):
@@ -65,7 +79,7 @@ def _run(args: Arguments) -> int:
     from jaxba.viewer.sources import open_all
 
     with common.notes_printed():
-        shown = open_all(args.files, args.images, args.poses)
+        shown = open_all(args.files, args.images, args.poses) if args.policy is None else [_episode(args)]
     if args.html:
         from jaxba.viewer.page import write_page
 
@@ -85,6 +99,38 @@ def _run(args: Arguments) -> int:
         common.print_line(f"note: {common.counted(missing, 'image')} not found in {args.images}")
     wait(viewer)
     return 0
+
+
+def _episode(args: Arguments) -> Shown:
+    """An episode on a scene of the game's default class."""
+    import jax
+    import numpy as np
+
+    import jaxba
+    from jaxba.game.episode import draw
+    from jaxba.game.random_scenes import SceneClass
+    from jaxba.viewer.recording import Recording
+    from jaxba.viewer.sources import shown
+
+    assert args.policy is not None
+    jax.config.update("jax_enable_x64", True)  # the game's type
+    policy = jaxba.make_policy(args.policy)
+    options = jaxba.trained_step(policy)
+    played = draw(SceneClass(), jax.random.key(0), args.scene, policy, options, LARGEST_EPISODE)
+    start = np.array([np.nan])
+    recording = Recording(
+        problem=played.problem,
+        whole=played.problem.num_points,
+        cameras=played.cameras,
+        points=played.points,
+        state=np.arange(len(played.cost)),
+        cost=played.cost,
+        damping=np.concatenate([start, played.damping]),
+        gain_ratio=np.concatenate([start, played.gain_ratio]),
+        time_s=played.paid,
+        unit="plain steps paid",
+    )
+    return shown(recording, f"scene {args.scene}, {args.policy}")
 
 
 def check_extra() -> None:

@@ -205,3 +205,9 @@ def test_the_command_says_what_is_missing(tmp_path, capsys):
 
     assert run([str(Path(tmp_path) / "no.npz")]) == 2
     assert "cannot read" in capsys.readouterr().err
+
+
+def test_an_episode_of_the_game_is_written_as_a_page(tmp_path):
+    page = tmp_path / "episode.html"
+    assert run(["--policy", "guarded", "--scene", "1", "--html", str(page)]) == 0
+    assert page.stat().st_size > 500_000
