@@ -1,12 +1,12 @@
 """COLMAP models solved by jaxba and by COLMAP: seconds, memory, final cost.
 
-    python -m benchmarks.colmap_speed [--images 3000] [--points 30000] [--track 5] [--policy guarded]
+    python -m benchmarks.colmap_speed [--images 3000] [--points 30000] [--track 5] [--compilation auto]
     python -m benchmarks.colmap_speed --models FOLDER ... --solvers explicit,sparse,implicit,colmap
 
 Without models it is a random scene whose images share one OPENCV lens. Needs the extra `ceres`. Each side is a process
 of its own; memory is its largest resident set. Both read the same COLMAP model, have a squared loss and stop at a
-relative decrease of 1e-6. Seconds of ours are those of set-up and iterations in fully compiled programs; compilation is
-apart. COLMAP uses all cores.
+relative decrease of 1e-6. Seconds of ours are those of set-up and iterations, by default in fully compiled programs;
+compilation is apart, and takes most of the memory. COLMAP uses all cores.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ def make(folder: str, images: int, points: int, track: float) -> None:
     jaxba.write_colmap(with_lens(start, [780.0, 780.0, 640.0, 480.0, 0.0, 0.0, 0.0, 0.0], pixels), folder)
 
 
-def ours(folder: str, policy: str, solver: Any) -> dict[str, float | str]:
+def ours(folder: str, policy: str, solver: Any, compilation: Any) -> dict[str, float | str]:
     """Solves with jaxba."""
     import jaxba
 
     problem = jaxba.read_colmap(folder)
     tolerances = jaxba.Tolerances(ftol=FTOL)
-    options = jaxba.SolveOptions(tolerances=tolerances, linear_solver=solver, compilation="full", pad=False)
+    options = jaxba.SolveOptions(tolerances=tolerances, linear_solver=solver, compilation=compilation, pad=False)
     found = jaxba.solve(problem, policy, options)
     return {
         "initial": found.initial_cost,
@@ -105,11 +105,12 @@ def main() -> None:
     parser.add_argument("--track", type=float, default=5.0)
     parser.add_argument("--policy", default="guarded")
     parser.add_argument("--solvers", default="auto,colmap")
+    parser.add_argument("--compilation", default="full")
     parser.add_argument("--side", nargs=2, metavar=("SIDE", "FOLDER"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.side:
         side, folder = args.side
-        found = colmaps(folder) if side == "colmap" else ours(folder, args.policy, side)
+        found = colmaps(folder) if side == "colmap" else ours(folder, args.policy, side, args.compilation)
         found["memory_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
         print(json.dumps(found))
         return
@@ -119,7 +120,8 @@ def main() -> None:
         for folder in args.models or (made,):
             for side in args.solvers.split(","):
                 command = [sys.executable, "-m", "benchmarks.colmap_speed", "--side", side, folder]
-                done = subprocess.run([*command, "--policy", args.policy], capture_output=True, text=True)
+                command += ["--policy", args.policy, "--compilation", args.compilation]
+                done = subprocess.run(command, capture_output=True, text=True)
                 name = Path(folder).name if args.models else "random scene"
                 print(name, side, done.stdout.strip() or done.stderr.strip().splitlines()[-1:], flush=True)
 
