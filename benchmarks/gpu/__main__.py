@@ -1,4 +1,5 @@
-"""An LM step on a GPU: phases, floating point types, throughput of small scenes, memory.
+"""An LM step on a GPU: phases, floating point types, several devices, throughput of small scenes and of training,
+memory.
 
     python -m benchmarks.gpu [--problems scene:ladybug-1197,...] [--out benchmarks/gpu/results.json] [--any-device]
 
@@ -20,18 +21,23 @@ import jax
 import jax.numpy as jnp
 
 import jaxba
+from benchmarks import sac
 from benchmarks.phases import HEADING, bandwidth, measure, timed
 from jaxba.bench.sources import sources
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.solver.cost_model import choose
 from jaxba.solver.options import SolveOptions
 from jaxba.structure.layout import layout_for
+from jaxba.training.sac import SacConfig
 
 PROBLEMS = "scene:ladybug-49,scene:random-150,scene:ladybug-1197,scene:venice-1778"
 """Random scenes, which need no files on the machine with the GPU."""
 
 BATCHES = (256, 4096, 16384)
 """Numbers of small scenes in a batch."""
+
+ENVIRONMENTS = (64, 512, 4096)
+"""Numbers of environments of a training."""
 
 
 def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, Any]]:
@@ -53,6 +59,28 @@ def steps(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, A
                 "cost": second.final_cost,
                 "cg": float(second.history.cg_iterations.mean()),
             }
+
+
+def divided(problem: jaxba.BundleProblem, iterations: int) -> Iterator[dict[str, Any]]:
+    """Seconds per iteration with points divided among 1, 2, 4, ... of the devices, by the implicit solver."""
+    count = 1
+    while count <= len(jax.devices()):
+        options = SolveOptions(
+            linear_solver="implicit", devices=count, max_iterations=iterations, compilation="full", pad=False
+        )
+        jaxba.solve(problem, "ceres", options)
+        found = jaxba.solve(problem, "ceres", options)
+        seconds = found.total_s / found.iterations
+        yield {"devices": count, "seconds_per_iteration": seconds, "cost": found.final_cost, "setup_s": found.setup_s}
+        count *= 2
+
+
+def training_throughput(envs: int) -> dict[str, float]:
+    """Environment steps and gradient updates per second of SAC's compiled loop on so many pendulums."""
+    measure = sac.ours(SacConfig(), envs, 512)
+    samples = [measure() for _ in range(3)]
+    updates = statistics.median(sample.updates / sample.wall_s for sample in samples)
+    return {"updates_per_s": updates, "steps_per_s": updates * envs}
 
 
 def scene_throughput(count: int, dtype: Any) -> float:
@@ -109,6 +137,10 @@ def main() -> int:
         for step in steps(problem, args.iterations):
             print(step, flush=True)
             entry["steps"].append(step)
+        entry["divided"] = []
+        for row in divided(problem, args.iterations):
+            print(row, flush=True)
+            entry["divided"].append(row)
         entry["peak_bytes"] = peak_bytes()
         results["problems"][source.name] = entry
     for count in map(int, args.batches.split(",")):
@@ -117,6 +149,10 @@ def main() -> int:
             name = f"{count} x {jnp.dtype(dtype).name}"
             results["scenes"][name] = statistics.median(rates)
             print(f"scenes 10 x 10, {name}: {results['scenes'][name]:.0f} steps/s", flush=True)
+    results["training"] = {}
+    for envs in ENVIRONMENTS:
+        results["training"][str(envs)] = training_throughput(envs)
+        print(f"training, {envs} environments: {results['training'][str(envs)]}", flush=True)
     if args.out:
         Path(args.out).write_text(json.dumps(results, indent=1) + "\n")
     return 0
