@@ -1,0 +1,157 @@
+"""Several processes and several devices: JAX's own runtime, which has to be started before anything is computed.
+
+All processes run the same program on the same arguments. Where only the first may act, since it reads or writes files,
+`together` hands what it found to the others.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import socket
+import time
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+
+T = TypeVar("T")
+
+START_S = 300
+"""Seconds that processes wait for each other at the start. JAX's default."""
+
+HEARTBEAT_S = 30
+"""Seconds after which a process that was not heard of counts as dead, and JAX ends the others. JAX's default is 100."""
+
+
+class DistributedError(ValueError):
+    """Processes or devices that cannot be used. The message is one line for a person."""
+
+
+class MainFailedError(Exception):
+    """The first process has failed, and says why itself."""
+
+
+def initialize(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
+    """Connects this process with the others, before any computation with JAX. On CPUs they talk by gloo.
+
+    Args:
+        coordinator: `HOST:PORT` of the first process, on a port that is free there.
+        processes: how many there are.
+        process: number of this one, from 0. Without all three JAX finds them under Slurm, Open MPI and Kubernetes.
+
+    Raises:
+        DistributedError: bad arguments, none were found, or the first process cannot be reached or use its port.
+        RuntimeError: JAX has computed already.
+    """
+    given = [x is not None for x in (coordinator, processes, process)]
+    if any(given) and not all(given):
+        raise DistributedError("coordinator, number of processes and number of this process must be given together")
+    if coordinator is not None and processes is not None and process is not None:
+        _check(coordinator, processes, process)
+    try:
+        jax.distributed.initialize(
+            coordinator, processes, process, initialization_timeout=START_S, heartbeat_timeout_seconds=HEARTBEAT_S
+        )
+    except ValueError as error:
+        raise DistributedError(f"no coordinator was given, and JAX found none: {error}") from None
+
+
+def _check(coordinator: str, processes: int, process: int) -> None:
+    """Refuses what would end the process inside JAX's runtime with a page of text."""
+    if not 0 <= process < processes:
+        raise DistributedError(f"process {process} is none of 0 to {processes - 1}")
+    host, _, number = coordinator.rpartition(":")
+    if not host or not number.isdecimal() or not 0 < int(number) < 2**16:
+        raise DistributedError(f"coordinator must be HOST:PORT, not {coordinator!r}")
+    port = int(number)
+    if process == 0:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("", port))
+            except OSError as error:
+                raise DistributedError(f"coordinator {coordinator}: {error.strerror or error}") from None
+        return
+    deadline = time.monotonic() + START_S
+    while True:
+        try:
+            socket.create_connection((host.strip("[]"), port), timeout=START_S).close()
+            return
+        except OSError as error:
+            if time.monotonic() > deadline:
+                reason = f"no answer for {START_S} s ({error.strerror or error})"
+                raise DistributedError(f"coordinator {coordinator}: {reason}") from None
+            time.sleep(0.2)
+
+
+def is_main() -> bool:
+    """Whether this is the first process, which alone prints and writes. Starts JAX: `use_devices` comes before."""
+    return not jax.distributed.is_initialized() or jax.process_index() == 0
+
+
+def use_devices(count: int | None) -> list[jax.Device]:
+    """The first devices of every process, in the order of the processes.
+
+    A CPU is one device; where nothing was computed yet it becomes as many virtual ones as are asked for.
+
+    Args:
+        count: in each process. None: one, or all that there are if there are several processes.
+
+    Raises:
+        DistributedError: a process has fewer.
+    """
+    if count is not None:
+        if count < 1:
+            raise DistributedError(f"at least one device is needed, not {count}")
+        if count > 1:
+            with contextlib.suppress(RuntimeError):  # JAX has started
+                jax.config.update("jax_num_cpu_devices", count)
+    if count is None and jax.process_count() == 1:
+        count = 1
+    found = jax.local_devices()
+    if count is not None and len(found) < count:
+        kind = found[0].platform.upper()
+        raise DistributedError(f"{count} devices asked for, {len(found)} of kind {kind} found")
+    own = lambda process: [x for x in jax.devices() if x.process_index == process][:count]
+    return [device for process in range(jax.process_count()) for device in own(process)]
+
+
+def together(work: Callable[[], T]) -> T:
+    """What a function returns in the first process, in all of them; the others wait and do not call it.
+
+    Raises:
+        MainFailedError: it raised something, in the others; in the first process that itself.
+    """
+    if jax.process_count() == 1:
+        return work()
+    if not is_main():
+        found = _broadcast(b"")
+        if not found:
+            raise MainFailedError
+        return pickle.loads(found)
+    try:
+        result = work()
+    except BaseException:
+        _broadcast(b"")
+        raise
+    _broadcast(pickle.dumps(result))
+    return result
+
+
+def _broadcast(content: bytes) -> bytes:
+    """The content that the first process has, in all of them."""
+    size = int(multihost_utils.broadcast_one_to_all(np.asarray(len(content), np.int32)))
+    padded = np.zeros(size, np.uint8)
+    if is_main():
+        padded[:] = np.frombuffer(content, np.uint8)
+    return np.asarray(multihost_utils.broadcast_one_to_all(padded)).tobytes() if size else b""
+
+
+def to_host(x: Any) -> np.ndarray:
+    """The whole of an array that lies on devices of several processes, in each of them."""
+    if x.is_fully_addressable or x.is_fully_replicated:
+        return np.asarray(x)
+    return np.asarray(multihost_utils.process_allgather(x, tiled=True))
