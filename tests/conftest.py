@@ -34,6 +34,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("compilation") == "quick" and not hasattr(config, "workerinput"):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {_flags_of_level_quick()}".strip()
     jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_num_cpu_devices", 2)
     cache = getattr(config, "cache", None)
     if cache is not None:
         folder = cache.mkdir(f"xla-{_machine()}")
