@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 import pickle
 import socket
 import time
@@ -31,6 +32,9 @@ HEARTBEAT_S = 30
 WAIT_MS = 1 << 30
 """Milliseconds, twelve days, that processes wait for what the first one does. Gloo's collectives wait for half an
 hour."""
+
+THREADS = 8
+"""Of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill."""
 
 _done = itertools.count()
 
@@ -117,6 +121,9 @@ def use_devices(count: int | None) -> list[jax.Device]:
         if count < 1:
             raise DistributedError(f"at least one device is needed, not {count}")
         if count > 1:
+            # devices share XLA's threads, and batched factorisations of several at a time wait for each other for ever
+            # where there are few
+            os.environ.setdefault("NPROC", str(THREADS * count))
             with contextlib.suppress(RuntimeError):  # JAX has started
                 jax.config.update("jax_num_cpu_devices", count)
     if count is None and jax.process_count() == 1:
