@@ -28,17 +28,18 @@ class Interrupt:
     atomically.
     """
 
-    def __init__(self, unit: str, *, graceful: bool) -> None:
+    def __init__(self, unit: str, *, graceful: bool, announce: bool = True) -> None:
         """Does nothing yet.
 
         Args:
             unit: what is finished after the first Ctrl-C, for the message, e.g. `iteration`.
             graceful: initial value of the attribute, which can be changed later.
+            announce: whether to print that message.
         """
         self.unit, self.graceful, self.requested = unit, graceful, False
         # signals that the thread and the handler have seen; Python calls the handler once for several signals
         self._received, self._handled = 0, 0
-        self._message = [True]  # empty when the message has been printed
+        self._message = [True] * announce  # empty when the message has been printed
 
     def __enter__(self) -> Interrupt:
         self._receiver, sender = socket.socketpair()

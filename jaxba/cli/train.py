@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from jaxba.cli import common
+from jaxba.cli import common, processes
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.training_view import TrainingView
 
@@ -70,7 +70,25 @@ class Arguments:
     """Project at Weights & Biases that gets the log, too; needs the extra `wandb`."""
 
     resume: bool = False
-    """Continue the run in the folder from its last checkpoint, with the same results as without the interruption."""
+    """Continue the run in the folder from its last checkpoint, with the same results as without the interruption: bit
+    for bit on the same number of devices, to rounding on another."""
+
+    devices: int | None = None
+    """Devices of each process, among which agents are divided if their number is a multiple, else environments and
+    batches. On a CPU virtual ones, which gain nothing. Default: one; with several processes all that there are."""
+
+    coordinator: str | None = None
+    """HOST:PORT of the first of several processes, which prints, reads and writes for all. Each is started with the
+    same options but --process."""
+
+    processes: int | None = None
+    """Number of processes."""
+
+    process: int | None = None
+    """Number of this process, from 0."""
+
+    distributed: bool = False
+    """Find the last three under Slurm, Open MPI or Kubernetes."""
 
 
 def main() -> None:
@@ -89,33 +107,68 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _train(args: Arguments, command: str) -> int:
     import jax
 
-    from jaxba.game import scene_bank
-    from jaxba.io import settings
-    from jaxba.runtime import process
-    from jaxba.training import config as configs
-    from jaxba.training import driver, task
-    from jaxba.training.wandb_log import WandbLog
+    from jaxba.runtime.distributed import MainFailedError, is_main
 
     jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
+    devices = processes.start(args.coordinator, args.processes, args.process, args.distributed, args.devices)
+    try:
+        return _run(args, devices, command)
+    except MainFailedError:
+        return common.BAD_INPUT
+    except common.UsageError:  # that all processes have found
+        if is_main():
+            raise
+        return common.BAD_INPUT
+
+
+def _prepare(args: Arguments, folder: Path, name: str) -> Any:
+    """The configuration of the run, and its folder."""
+    from jaxba.training import config as configs
+    from jaxba.training import driver
+
     overrides = tuple(item for group in args.overrides for item in group)
     overrides += () if args.seeds is None else (f"seeds={args.seeds}",)
-    name = args.config or DEFAULT_CONFIG
-    folder = Path(args.out or Path("runs") / Path(name).stem)
     try:
         config = None if args.resume and args.config is None else configs.load(name, overrides)
         if args.problems and config is None:
             raise common.UsageError("--problems: a resumed run has its scenes in its folder")
         if args.problems and config is not None:
             config = configs.with_problems(config, _check_problems(args.problems))
-        config = driver.prepare_folder(folder, config, args.resume, overrides)
-        board = WandbLog(args.wandb, folder, settings.plain(config)) if args.wandb else None
+        return driver.prepare_folder(folder, config, args.resume, overrides)
     except (configs.SettingsError, driver.TrainError) as error:
         raise common.UsageError(str(error)) from None
+
+
+def _board(args: Arguments, folder: Path, config: Any) -> Any:
+    """The log at Weights & Biases, if one is asked for."""
+    if not args.wandb:
+        return None
+    from jaxba.io import settings
+    from jaxba.training.driver import TrainError
+    from jaxba.training.wandb_log import WandbLog
+
+    try:
+        return WandbLog(args.wandb, folder, settings.plain(config))
+    except TrainError as error:
+        raise common.UsageError(str(error)) from None
+
+
+def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
+    from jaxba.game import scene_bank
+    from jaxba.io.settings import SettingsError
+    from jaxba.runtime import process
+    from jaxba.runtime.distributed import is_main, together
+    from jaxba.training import driver, task
+
+    name = args.config or DEFAULT_CONFIG
+    folder = Path(args.out or Path("runs") / Path(name).stem)
+    config = together(lambda: _prepare(args, folder, name))
+    board = _board(args, folder, config) if is_main() else None
     common.prepare_process()
-    console = _console()
+    console = _console(quiet=not is_main())
     with (
         process.single_blas_thread(),
-        Interrupt("chunk", graceful=False) as interrupt,
+        Interrupt("chunk", graceful=False, announce=is_main()) as interrupt,
         TrainingView(console, config) as view,
         ExitStack() as ends,
     ):
@@ -137,12 +190,12 @@ def _train(args: Arguments, command: str) -> int:
                     board.write(rows)
 
             hooks = driver.Hooks(view.stage, show, keep, lambda: interrupt.requested)
-            outcome = driver.train(config, work.game, work.evaluate, folder, hooks)
+            outcome = driver.train(config, work.game, work.evaluate, folder, hooks, devices)
             interrupt.graceful = False
         except KeyboardInterrupt:
             console.print(f"interrupted; go on from the last checkpoint with {_again(folder)}")
             return common.INTERRUPTED
-        except (driver.TrainError, configs.SettingsError, scene_bank.TooFewScenes) as error:
+        except (driver.TrainError, SettingsError, scene_bank.TooFewScenes) as error:
             raise common.UsageError(str(error)) from None
         except OSError as error:
             raise common.UsageError(
@@ -151,7 +204,7 @@ def _train(args: Arguments, command: str) -> int:
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
             return common.INTERRUPTED
-        return _finish(folder, work, outcome.best, console, view, command)
+        return together(lambda: _finish(folder, work, outcome.best, console, view, command))
 
 
 def _check_problems(problems: Sequence[str]) -> list[str]:
@@ -165,11 +218,11 @@ def _check_problems(problems: Sequence[str]) -> list[str]:
     return paths
 
 
-def _console() -> Any:
+def _console(quiet: bool) -> Any:
     """A console for the view. Brackets in names are not interpreted as markup."""
     from rich.console import Console
 
-    options: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False}
+    options: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False, "quiet": quiet}
     console = Console(**options)
     return console if console.is_terminal else Console(**options, width=FILE_WIDTH)
 

@@ -30,6 +30,7 @@ from jaxba.damping.clock import duration
 from jaxba.damping.features import Memory, begin, observation_size, observe, record
 from jaxba.damping.guard import GuardState, action_of, damping_of, effort_for
 from jaxba.damping.rules import Ceres
+from jaxba.game.devices import all_rows, own_rows
 from jaxba.game.protocol import Step
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import step_groups
@@ -132,6 +133,14 @@ class Game:
     options: StepOptions = field(metadata={"static": True})
     """Of the LM step, those of the agent's configuration included (`AgentConfig.step_options`)."""
 
+    devices: int = field(default=1, metadata={"static": True})
+    """See `protocol.Environment`. Divides the environments of every class."""
+
+    @property
+    def shares(self) -> GameState:
+        """Which parts of the state are divided among devices."""
+        return GameState(True, False)  # pyright: ignore[reportArgumentType]  # a prefix of the tree
+
     @property
     def num_envs(self) -> int:
         """Environments that step together."""
@@ -156,7 +165,7 @@ class Game:
         """New episodes everywhere."""
         key, *keys = jax.random.split(key, 1 + len(self.kinds))
         episodes = tuple(
-            jax.vmap(lambda k, bank=bank: self._fresh(bank, k))(jax.random.split(k, count))
+            jax.vmap(lambda k, bank=bank: self._fresh(bank, k))(own_rows(jax.random.split(k, count), self.devices))
             for bank, k, count in zip(self.banks, keys, self.envs, strict=True)
         )
         state = GameState(episodes, key)
@@ -165,7 +174,7 @@ class Game:
     def observations(self, state: GameState) -> Float[Array, "envs features"]:
         """What is observed everywhere, for the next actions."""
         seen = [
-            jax.vmap(functools.partial(self._observe, bank))(part)
+            all_rows(jax.vmap(functools.partial(self._observe, bank))(part), self.devices)
             for bank, part in zip(self.banks, state.episodes, strict=True)
         ]
         return jnp.concatenate(seen)
@@ -214,11 +223,11 @@ class Game:
         key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
         parts, after, start = [], [], 0
         for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
-            part, start = action[start : start + count], start + count
-
+            own = own_rows((action[start : start + count], jax.random.split(k, count)), self.devices)
+            start += count
             play = functools.partial(self._play, kind)
-            episodes, step = step_groups(play, episodes, part, jax.random.split(k, count), shared=bank)
-            parts.append(step)
+            episodes, step = step_groups(play, episodes, *own, shared=bank)
+            parts.append(all_rows(step, self.devices))
             after.append(episodes)
         return GameState(tuple(after), key), jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
@@ -269,8 +278,8 @@ class Game:
         last quarter. Numbers of an action other than lambda are uniform in all of them."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
-        guard = jax.tree.map(lambda *x: jnp.concatenate(x), *(part.memory.guard for part in state.episodes))
-        rule = jax.vmap(_rule_damping)(guard) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
+        rules = [all_rows(jax.vmap(_rule_damping)(part.memory.guard), self.devices) for part in state.episodes]
+        rule = jnp.concatenate(rules) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
         action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
         return uniform.at[1::2, 0].set(action[1::2])

@@ -7,6 +7,8 @@ All processes run the same program on the same arguments. Where only the first m
 from __future__ import annotations
 
 import contextlib
+import itertools
+import os
 import pickle
 import socket
 import time
@@ -15,6 +17,7 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+from jax._src import distributed as runtime  # its key-value store has no public name
 from jax.experimental import multihost_utils
 
 T = TypeVar("T")
@@ -24,6 +27,16 @@ START_S = 300
 
 HEARTBEAT_S = 30
 """Seconds after which a process that was not heard of counts as dead, and JAX ends the others. JAX's default is 100."""
+
+
+WAIT_MS = 1 << 30
+"""Milliseconds, twelve days, that processes wait for what the first one does. Gloo's collectives wait for half an
+hour."""
+
+THREADS = 8
+"""Of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill."""
+
+_done = itertools.count()
 
 
 class DistributedError(ValueError):
@@ -51,6 +64,7 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
         raise DistributedError("coordinator, number of processes and number of this process must be given together")
     if coordinator is not None and processes is not None and process is not None:
         _check(coordinator, processes, process)
+    jax.config.update("jax_enable_preemption_service", False)  # it would catch SIGTERM, and the process live on
     try:
         jax.distributed.initialize(
             coordinator, processes, process, initialization_timeout=START_S, heartbeat_timeout_seconds=HEARTBEAT_S
@@ -107,6 +121,9 @@ def use_devices(count: int | None) -> list[jax.Device]:
         if count < 1:
             raise DistributedError(f"at least one device is needed, not {count}")
         if count > 1:
+            # devices share XLA's threads, and batched factorisations of several at a time wait for each other for ever
+            # where there are few
+            os.environ.setdefault("NPROC", str(THREADS * count))
             with contextlib.suppress(RuntimeError):  # JAX has started
                 jax.config.update("jax_num_cpu_devices", count)
     if count is None and jax.process_count() == 1:
@@ -125,19 +142,23 @@ def together(work: Callable[[], T]) -> T:
     Raises:
         MainFailedError: it raised something, in the others; in the first process that itself.
     """
-    if jax.process_count() == 1:
+    if not jax.distributed.is_initialized() or jax.process_count() == 1:
         return work()
+    client: Any = runtime.global_state.client
+    name = f"jaxba/{next(_done)}"
     if not is_main():
+        client.blocking_key_value_get(name, WAIT_MS)
         found = _broadcast(b"")
         if not found:
             raise MainFailedError
         return pickle.loads(found)
+    content = b""
     try:
         result = work()
-    except BaseException:
-        _broadcast(b"")
-        raise
-    _broadcast(pickle.dumps(result))
+        content = pickle.dumps(result)
+    finally:
+        client.key_value_set(name, "done")
+        _broadcast(content)
     return result
 
 

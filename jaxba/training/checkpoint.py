@@ -22,6 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxba.runtime import distributed
+
 _PREFIX = "step_"
 _METADATA = "metadata"
 
@@ -31,33 +33,51 @@ class CheckpointError(ValueError):
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
-    """Leaves of a tree by path, copied to the host; random keys as arrays."""
+    """Leaves of a tree by path, copied to the host from all devices; random keys as arrays."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    return {_name(path): np.array(jax.random.key_data(x) if _is_key(x) else x) for path, x in leaves}
+    whole = lambda x: np.array(distributed.to_host(x) if isinstance(x, jax.Array) else x)
+    return {_name(path): whole(jax.random.key_data(x) if _is_key(x) else x) for path, x in leaves}
 
 
-def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
-    """The inverse of `pack`, on the device and in newly allocated memory.
+def check(arrays: Mapping[str, Any], like: Any) -> None:
+    """Compares leaves by path with a tree.
 
     Args:
-        arrays: leaves by path.
+        arrays: see `pack`.
         like: a tree of the expected structure, of arrays or of `jax.ShapeDtypeStruct`.
 
     Raises:
         CheckpointError: a leaf is missing, or is of another shape or type.
     """
-
-    def leaf(path: Any, expected: Any) -> Any:
-        name = _name(path)
-        if name not in arrays:
+    for path, leaf in jax.tree_util.tree_flatten_with_path(like)[0]:
+        if (name := _name(path)) not in arrays:
             raise CheckpointError(f"{name} is missing")
-        value = jnp.array(arrays[name], copy=True)  # a copy, since training donates its argument
-        if _is_key(expected):
-            value = jax.random.wrap_key_data(value)
+        value, expected = arrays[name], jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
         if (value.shape, value.dtype) != (expected.shape, expected.dtype):
             found, wanted = (f"{x.dtype}{list(x.shape)}" for x in (value, expected))
             raise CheckpointError(f"{name} is {found}, not {wanted}")
-        return value
+
+
+def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
+    """The inverse of `pack`, in newly allocated memory.
+
+    Args:
+        arrays: leaves by path.
+        like: see `check`; a `jax.ShapeDtypeStruct` with a sharding says on which devices a leaf lies.
+
+    Raises:
+        CheckpointError: see `check`.
+    """
+    check(arrays, like)
+
+    def leaf(path: Any, expected: Any) -> Any:
+        value, sharding = arrays[_name(path)], getattr(expected, "sharding", None)
+        new = lambda part: jnp.array(part, copy=True)  # a copy, since training donates its argument
+        if sharding is None or isinstance(expected, jax.Array):
+            value = new(value)
+        else:
+            value = jax.make_array_from_callback(value.shape, sharding, lambda rows: new(value[rows]))
+        return jax.random.wrap_key_data(value) if _is_key(expected) else value
 
     return jax.tree_util.tree_map_with_path(leaf, like)
 
@@ -100,7 +120,7 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
     reason = ""
     with _quiet_tasks():
         try:
-            with ocp.StandardCheckpointer() as checkpointer:
+            with ocp.StandardCheckpointer(**_alone()) as checkpointer:
                 checkpointer.save(path, content, force=True)
                 checkpointer.wait_until_finished()
         except Exception as error:  # of a full disk Orbax makes a ValueError with a page of text
@@ -115,6 +135,18 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
     for item in folder.iterdir():
         if item.name.startswith(_PREFIX) and item.name not in complete:
             shutil.rmtree(item, ignore_errors=True)
+
+
+def _alone() -> dict[str, Any]:
+    """Options by which Orbax does not wait for other processes, of which none calls it."""
+    import orbax.checkpoint as ocp
+
+    if jax.process_count() == 1:
+        return {}
+    one = ocp.options.MultiprocessingOptions(
+        primary_host=jax.process_index(), active_processes={jax.process_index()}, barrier_sync_key_prefix="jaxba"
+    )
+    return {"multiprocessing_options": one}
 
 
 @contextmanager
@@ -153,7 +185,7 @@ def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, A
 
     path = (folder / f"{_PREFIX}{step}").absolute()
     try:
-        with ocp.PyTreeCheckpointer() as checkpointer:
+        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler(**_alone()), **_alone()) as checkpointer:
             content = checkpointer.restore(path)
         arrays = {name: np.asarray(value) for name, value in content.items()}
         return arrays, dict(json.loads(arrays.pop(_METADATA).tobytes()))

@@ -4,7 +4,10 @@ A run has a folder with `config.yaml`, `metrics.jsonl`, `tensorboard/` and `chec
 state, the best policy of every agent so far, and its score. A run that is resumed goes on from the last checkpoint that
 can be read, removes from the log what was written after it, and repeats that, with the same numbers.
 
-All agents of a run are trained side by side, in one program over an axis of agents.
+All agents of a run are trained side by side, in one program over an axis of agents. Several devices divide the agents
+or, if their number is no multiple, the environments (`train_loop.py`). A checkpoint holds whole arrays and can be
+resumed on any number of devices: from the same state, every number is the same to rounding, and bit for bit on as many
+devices as before. Of several processes the first one alone evaluates, reads and writes.
 """
 
 from __future__ import annotations
@@ -21,11 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.io import settings
+from jaxba.runtime import distributed
 from jaxba.runtime.atomic import TEMPORARY, write_text
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig, load, to_yaml
 from jaxba.training.log import Log, Row
-from jaxba.training.train_loop import LoopState, run_agents, start_agents
+from jaxba.training.placement import Placement
+from jaxba.training.train_loop import LoopState, agent_shares, run_agents, start_agents, state_shares
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -57,7 +62,7 @@ class Outcome(NamedTuple):
     """Result of a call of `train`."""
 
     finished: bool  # false if `Hooks.stop` ended it
-    best: tuple[Best, ...]  # of every agent; empty if nothing was evaluated yet
+    best: tuple[Best, ...]  # of every agent; empty if nothing was evaluated yet, or in another process than the first
     state: LoopState  # of all agents, on a leading axis
 
 
@@ -137,6 +142,7 @@ def train(
     evaluate: Callable[[Any], Mapping[str, float]],
     folder: Path,
     hooks: Hooks | None = None,
+    devices: Sequence[jax.Device] | None = None,
 ) -> Outcome:
     """Trains to the end, from the last checkpoint in the folder if there is one.
 
@@ -145,35 +151,53 @@ def train(
         env: a `protocol.Environment`.
         evaluate: metrics of an actor's parameters by their names in the log, deterministic; `SCORE` is one of them.
         folder: see `prepare_folder`.
-        hooks: callbacks.
+        hooks: callbacks; of several processes the first one has them called.
+        devices: the same in all processes; JAX's default device if None.
 
     Raises:
-        TrainError: the losses are not finite any more, or no checkpoint can be used or written.
+        TrainError: the losses are not finite any more, no checkpoint can be used or written, or the agents and
+            environments cannot be divided among the devices.
+        MainFailedError: the first process has failed, and this is another.
     """
-    run = _Run(config, env, evaluate, folder, hooks or Hooks())
+    run = _Run(config, env, evaluate, folder, hooks or Hooks(), devices or ())
     try:
         return run.finish()
     finally:
-        run.log.close()
+        if run.log is not None:
+            run.log.close()
 
 
 class _Run:
     """A run between two chunks."""
 
-    def __init__(self, config: TrainConfig, env: Any, evaluate: Any, folder: Path, hooks: Hooks) -> None:
-        self.config, self.env, self.evaluate, self.hooks = config, env, evaluate, hooks
+    def __init__(
+        self,
+        config: TrainConfig,
+        env: Any,
+        evaluate: Any,
+        folder: Path,
+        hooks: Hooks,
+        devices: Sequence[jax.Device],
+    ) -> None:
+        self.config, self.evaluate, self.hooks = config, evaluate, hooks
+        try:
+            self.placement = Placement(devices)
+            self.env = self.placement.on_all(self.placement.divide(config, env))
+        except ValueError as error:
+            raise TrainError(str(error)) from None
         self.folder = folder / CHECKPOINTS
         self.chunk, self.wall_s = 0, 0.0
         self.evaluated = 0  # chunk after which the agents were evaluated last
         self.best: tuple[Best, ...] = ()
-        like = jax.eval_shape(lambda: start_agents(config.sac, config.loop, env, self._keys()))
-        if checkpoint.steps(self.folder):
+        like: Any = jax.eval_shape(lambda: start_agents(config.sac, config.loop, env, self._keys()))
+        like = self.placement.described(like, state_shares(self.env))
+        if distributed.together(lambda: bool(checkpoint.steps(self.folder))):
             self._restore_latest(like)
         else:
-            self._begin()
+            self._begin(like)
         hooks.stage("compiling the training loop")
-        self._compiled = run_agents.lower(config.sac, config.loop, env, self.state).compile()
-        self.log = Log(folder, self.chunk, hooks.stage)
+        self._compiled = run_agents.lower(config.sac, config.loop, self.env, self.state, self.placement.mesh).compile()
+        self.log = Log(folder, self.chunk, hooks.stage) if distributed.is_main() else None
 
     def _keys(self) -> Any:
         """Random keys of the agents; scenes have another one."""
@@ -181,50 +205,60 @@ class _Run:
             jax.random.key(self.config.seed), 1 + jnp.arange(self.config.seeds)
         )
 
-    def _begin(self) -> None:
+    def _begin(self, like: Any) -> None:
         self.hooks.stage("filling the replay buffer")
-        fresh = start_agents(self.config.sac, self.config.loop, self.env, self._keys())
+        keys = self.placement.spread(self._keys(), agent_shares(self.env))
+        fresh = start_agents(self.config.sac, self.config.loop, self.env, keys, self.placement.mesh)
         self.state: LoopState = checkpoint.unpack(
-            checkpoint.pack(fresh), fresh
+            checkpoint.pack(fresh), like
         )  # the same memory layout as after a checkpoint
 
     def _restore_latest(self, like: Any) -> None:
         """Restores the last checkpoint that can be used; one that was cut short says nothing about those before."""
+        (self.chunk, self.wall_s, self.evaluated, best), arrays = distributed.together(lambda: self._read_latest(like))
+        self.state = checkpoint.unpack(arrays, {"state": like})["state"]
+        if best and distributed.is_main():
+            host = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), like.learner.actor)
+            actors = checkpoint.unpack(arrays, {"best": host})["best"]
+            self.best = tuple(Best(_agent(actors, k), agent=k, **one) for k, one in enumerate(best))
+
+    def _read_latest(self, like: Any) -> tuple[list[Any], dict[str, np.ndarray]]:
+        """Metadata and arrays."""
         reasons = []
         for step in reversed(checkpoint.steps(self.folder)):
             try:
-                self._restore(step, like)
+                metadata, arrays = self._read(step, like)
             except checkpoint.CheckpointError as error:
                 reasons.append(str(error))
                 continue
             if reasons:
-                self.hooks.stage(f"{reasons[0]}; going on from the one before, after chunk {self.chunk}")
-            return
+                self.hooks.stage(f"{reasons[0]}; going on from the one before, after chunk {metadata[0]}")
+            return metadata, arrays
         others = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         raise TrainError(f"the last checkpoint does not fit: {reasons[0]}{others}; begin in a new folder")
 
-    def _restore(self, step: int, like: Any) -> None:
+    def _read(self, step: int, like: Any) -> tuple[list[Any], dict[str, np.ndarray]]:
         arrays, metadata = checkpoint.restore(self.folder, step)
         try:
-            chunk, wall_s, evaluated, best = (metadata[name] for name in _METADATA)
-            tree: dict[str, Any] = {"state": like}
-            if best:
-                tree["best"] = like.learner.actor
-            tree = checkpoint.unpack(arrays, tree)
-            found = [Best(_agent(tree["best"], k), agent=k, **one) for k, one in enumerate(best)]
+            found = [metadata[name] for name in _METADATA]
+            best = [Best(None, agent=k, **one) for k, one in enumerate(found[-1])]
         except (KeyError, TypeError) as error:
             raise checkpoint.CheckpointError(f"checkpoint {step} was written by another version: {error}") from None
-        self.state, self.best = tree["state"], tuple(found)
-        self.chunk, self.wall_s, self.evaluated = chunk, wall_s, evaluated
+        checkpoint.check(arrays, {"state": like, **({"best": like.learner.actor} if best else {})})
+        return found, arrays
 
     def _save(self) -> None:
-        tree: dict[str, Any] = {"state": self.state}
+        arrays = checkpoint.pack({"state": self.state})
+        distributed.together(lambda: self._write(arrays))
+
+    def _write(self, arrays: dict[str, np.ndarray]) -> None:
         if self.best:
-            tree["best"] = jax.tree.map(lambda *x: jnp.stack(x), *(one.actor for one in self.best))
+            actors = jax.tree.map(lambda *x: jnp.stack(x), *(one.actor for one in self.best))
+            arrays = {**checkpoint.pack({"best": actors}), **arrays}
         best = [{"score": one.score, "chunk": one.chunk} for one in self.best]
         metadata: dict[str, Any] = dict(zip(_METADATA, (self.chunk, self.wall_s, self.evaluated, best), strict=True))
         try:
-            checkpoint.save(self.folder, self.chunk, checkpoint.pack(tree), metadata, self.config.keep)
+            checkpoint.save(self.folder, self.chunk, arrays, metadata, self.config.keep)
         except checkpoint.CheckpointError as error:
             raise TrainError(f"{error}; --resume goes on from the one before") from None
 
@@ -232,30 +266,36 @@ class _Run:
         """Trains the remaining chunks."""
         config = self.config
         while self.chunk < config.chunks:
-            self._advance()
-            stopping = self.hooks.stop()
+            stopping = self._advance()
             if stopping or self.chunk % config.checkpoint_every == 0 or self.chunk == config.chunks:
                 self._save()
             if stopping:
                 return Outcome(False, self.best, self.state)
         if self.evaluated != self.chunk:  # `chunks` was larger when the run began
             self.hooks.stage("evaluating the last policies")
-            self._evaluate()
+            actors = self._actors()
+            distributed.together(lambda: self._evaluate(actors))
         return Outcome(True, self.best, self.state)
 
-    def _advance(self) -> None:
-        """One chunk, its evaluation if one is due, and its rows of the log."""
-        before = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
+    def _actors(self) -> list[Any]:
+        """Copies of the policies of all agents, to be evaluated."""
+        self.evaluated = self.chunk  # in every process
+        whole = jax.tree.map(distributed.to_host, self.state.learner.actor)
+        return [_agent(whole, k) for k in range(self.config.seeds)]
+
+    def _advance(self) -> bool:
+        """One chunk, its evaluation if one is due, and its rows of the log. Whether the run is to end."""
+        before = [distributed.to_host(x) for x in (self.state.env_steps, self.state.updates)]
         wall, cpu = time.perf_counter(), time.process_time()
         self.state, found = self._compiled(self.env, self.state)
-        means = jax.tree.map(np.asarray, found)
+        means = jax.tree.map(distributed.to_host, found)
         seconds, cpu = time.perf_counter() - wall, time.process_time() - cpu
         self.chunk += 1
         self.wall_s += seconds
         bad = np.flatnonzero(~np.all([np.isfinite(means[x]) for x in ("critic_loss", "actor_loss", "q_mean")], axis=0))
         if len(bad):
             raise TrainError(f"chunk {self.chunk} of agent {bad[0] + 1}: the losses are not finite any more")
-        counts = [np.asarray(x) for x in (self.state.env_steps, self.state.updates)]
+        counts = [distributed.to_host(x) for x in (self.state.env_steps, self.state.updates)]
         steps, updates = (float(np.sum(new - old)) / seconds for new, old in zip(counts, before, strict=True))
         clocks = {"wall_s": self.wall_s, "chunk_s": seconds, "steps_per_s": steps, "updates_per_s": updates}
         clocks |= {"cpu_per_wall": cpu / seconds}
@@ -263,24 +303,30 @@ class _Run:
         for k in range(self.config.seeds):
             row: Row = {"seed": k, "chunk": self.chunk, "env_steps": int(counts[0][k]), "updates": int(counts[1][k])}
             rows.append({**row, **clocks, **{name: float(value[k]) for name, value in means.items()}})
-        if self.chunk % self.config.evaluate_every == 0 or self.chunk == self.config.chunks:
+        due = self.chunk % self.config.evaluate_every == 0 or self.chunk == self.config.chunks
+        actors = self._actors() if due else []
+        return distributed.together(lambda: self._report(rows, actors))
+
+    def _report(self, rows: list[Row], actors: list[Any]) -> bool:
+        """Writes the rows of a chunk, with the scores of the policies if there are any. Whether the run is to end."""
+        if actors:
             wall = time.perf_counter()
-            for row, scores in zip(rows, self._evaluate(), strict=True):
+            for row, scores in zip(rows, self._evaluate(actors), strict=True):
                 row |= scores
             seconds = time.perf_counter() - wall
             rows = [{**row, "evaluate_s": seconds} for row in rows]
-        self.hooks.rows([self.log.write(row) for row in rows])
+        if self.log is not None:
+            self.hooks.rows([self.log.write(row) for row in rows])
+        return self.hooks.stop()
 
-    def _evaluate(self) -> list[dict[str, float]]:
+    def _evaluate(self, actors: list[Any]) -> list[dict[str, float]]:
         """Metrics of every agent's policy, which is kept if it is better than all before of this agent."""
         found, best = [], []
-        for k in range(self.config.seeds):
-            actor = _agent(self.state.learner.actor, k)
+        for k, actor in enumerate(actors):
             scores = {name: float(value) for name, value in self.evaluate(actor).items()}
             better = not self.best or scores[SCORE] < self.best[k].score
             best.append(Best(actor, scores[SCORE], k, self.chunk) if better else self.best[k])
             found.append(scores)
-        self.evaluated = self.chunk
         if any(one.chunk == self.chunk for one in best):
             self.best = tuple(best)
             self.hooks.best(self.best)
@@ -289,4 +335,4 @@ class _Run:
 
 def _agent(tree: Any, number: int) -> Any:
     """A copy of one agent's part: the next chunk donates the memory of all."""
-    return jax.tree.map(lambda x: jnp.copy(x[number]), tree)
+    return jax.tree.map(lambda x: jnp.array(x[number], copy=True), tree)

@@ -17,6 +17,7 @@ import optax
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxba.game import devices as shared
 from jaxba.training import networks
 from jaxba.training.replay import Transition
 
@@ -192,13 +193,16 @@ def act(
     return networks.squash(mean) if key is None else networks.sample_action(mean, log_std, key)[0]
 
 
-def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Learner, dict[str, Float[Array, ""]]]:
+def update(
+    config: SacConfig, learner: Learner, batch: Transition, devices: int = 1
+) -> tuple[Learner, dict[str, Float[Array, ""]]]:
     """One gradient step: critics, then actor, then temperature or value network, then target network.
 
     Args:
         config: static.
         learner: before the step.
         batch: transitions with one leading axis.
+        devices: number of devices, of which each has its share of the batch; gradients are averaged over them.
 
     Returns:
         The new learner, and `critic_loss`, `actor_loss`, `q_mean`, `entropy` (nats, of the action in (-1, 1)),
@@ -220,7 +224,7 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
 
     if config.variant == "twin":
         mean, log_std = actor_network.apply(learner.actor, next_public)
-        next_action, next_log = networks.sample_action(mean, log_std, next_key)
+        next_action, next_log = networks.sample_action(mean, log_std, next_key, devices)
         values = critic_network.apply(learner.target, next_observation, next_action)
         future = jnp.min(values, axis=0) - temperature * next_log
     else:
@@ -231,16 +235,18 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
         values = critic_network.apply(params, observation, action)
         return jnp.sum(jnp.mean((values - target_value) ** 2, axis=-1)), jnp.mean(values)
 
-    (critic_error, q_mean), gradient = jax.value_and_grad(critic_loss, has_aux=True)(learner.critic)
+    found = jax.value_and_grad(critic_loss, has_aux=True)(learner.critic)
+    (critic_error, q_mean), gradient = shared.mean(found, devices)
     critic = step("critic", learner.critic, gradient)
 
     def actor_loss(params):
         mean, log_std = actor_network.apply(params, public)
-        chosen, log_prob = networks.sample_action(mean, log_std, policy_key)
+        chosen, log_prob = networks.sample_action(mean, log_std, policy_key, devices)
         soft = jnp.min(critic_network.apply(critic, observation, chosen), axis=0) - temperature * log_prob
         return -jnp.mean(soft), (soft, -jnp.mean(log_prob))
 
     (actor_error, (soft, entropy)), gradient = jax.value_and_grad(actor_loss, has_aux=True)(learner.actor)
+    actor_error, entropy, gradient = shared.mean((actor_error, entropy, gradient), devices)
     actor = step("actor", learner.actor, gradient)
     metrics = {
         "critic_loss": critic_error,
@@ -259,7 +265,7 @@ def update(config: SacConfig, learner: Learner, batch: Transition) -> tuple[Lear
         def value_loss(params):
             return jnp.mean((_value(config).apply(params, observation) - soft) ** 2)
 
-        metrics["value_loss"], gradient = jax.value_and_grad(value_loss)(value)
+        metrics["value_loss"], gradient = shared.mean(jax.value_and_grad(value_loss)(value), devices)
         source = value = step("value", value, gradient)
 
     updates = learner.updates + 1

@@ -26,6 +26,7 @@ from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks, select
 from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.problem.options import StepOptions
+from jaxba.runtime import distributed
 from jaxba.runtime.atomic import atomic_write
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig
@@ -157,7 +158,8 @@ def build(
     report: Callable[[str], None] = lambda _: None,
     baselines: Sequence[str] | None = None,
 ) -> Task:
-    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder.
+    """Makes scenes and plays the baselines, or reads what an earlier call left in the folder. Of several processes the
+    first one does, for all.
 
     Args:
         config: of the run that the folder belongs to.
@@ -169,28 +171,42 @@ def build(
         ValueError: too few scenes are usable, or another version wrote the files. One line for a person.
         OSError: the folder cannot be written or read.
     """
-    path = folder / BANK
-    if path.is_file():
-        report("reading the scenes")
-        splits = read_banks(path)
-    else:
-        key = jax.random.key(config.seed)
-        splits = make_banks(
-            config.bank, key, config.bank.options, config.game.max_iterations, report, config.game.tolerance
-        )
-        _write_banks(path, splits)
+    splits = distributed.together(lambda: _splits(config, folder, report))
     banks = [split.train for split in splits]
     game = make_game(config.game, config.bank.classes, banks, config.envs, config.step_options)
     held_out = tuple(split.held_out for split in splits)
+    runs = distributed.together(lambda: _baseline_runs(config, folder, game, held_out, report, baselines))
+    return Task(config, game, held_out, runs)
+
+
+def _splits(config: TrainConfig, folder: Path, report: Callable[[str], None]) -> list[Split]:
+    path = folder / BANK
+    if path.is_file():
+        report("reading the scenes")
+        return read_banks(path)
+    key, limit = jax.random.key(config.seed), config.game.max_iterations
+    splits = make_banks(config.bank, key, config.bank.options, limit, report, config.game.tolerance)
+    _write_banks(path, splits)
+    return splits
+
+
+def _baseline_runs(
+    config: TrainConfig,
+    folder: Path,
+    game: Game,
+    held_out: tuple[Bank, ...],
+    report: Callable[[str], None],
+    baselines: Sequence[str] | None,
+) -> dict[str, Runs]:
     path = folder / RULES
     if path.is_file():
-        return Task(config, game, held_out, _read_runs(path))
+        return _read_runs(path)
     report("baselines on the held-out scenes")
     policies = baseline_policies(config, game.options, baselines or BASELINES)
     if config.game.reward == "price":
         found = best_constant_action(
             config.bank.classes,
-            banks,
+            game.banks,
             config.game.agent,
             game.options,
             config.game.tolerance,
@@ -200,7 +216,7 @@ def build(
         policies[CONSTANT] = found, game.options
     runs = _play(config, held_out, policies)
     _write_runs(path, runs)
-    return Task(config, game, held_out, runs)
+    return runs
 
 
 def baseline_policies(

@@ -2,6 +2,10 @@
 
 No data leaves the device within a chunk. A chunk compiles once per configuration and environment; the driver evaluates,
 saves checkpoints and logs between chunks.
+
+Several devices either have agents of their own, and nothing to tell each other, or share the environments and the
+batches of all agents. Then every device holds the whole replay buffer, so that a batch is the same for any number of
+devices: a collective for each class of scenes in a vector step and two in an update (`game/devices.py`).
 """
 
 from __future__ import annotations
@@ -14,8 +18,11 @@ import chex
 import jax
 import jax.numpy as jnp
 from jax import Array
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 from jaxtyping import Float, Int
 
+from jaxba.game.devices import AXIS
 from jaxba.game.protocol import Environment, Step
 from jaxba.training import replay as ring
 from jaxba.training import sac as agent
@@ -142,7 +149,8 @@ def run_chunk(
         key, act_key, sample_key = jax.random.split(state.key, 3)
         action = agent.act(sac, state.learner.actor, state.observation, act_key)
         state, step = _play(env, state._replace(key=key), action)
-        learn = lambda learner, key: agent.update(sac, learner, ring.sample(state.replay, key, sac.batch))
+        sample = lambda key: ring.sample(state.replay, key, sac.batch, env.devices)
+        learn = lambda learner, key: agent.update(sac, learner, sample(key), env.devices)
         keys = jax.random.split(sample_key, loop.updates_per_step)
         learner, learned = jax.lax.scan(learn, state.learner, keys)
         state = state._replace(learner=learner, updates=state.updates + loop.updates_per_step)
@@ -166,22 +174,57 @@ def run_chunk(
     return state, metrics
 
 
-@functools.partial(jax.jit, static_argnames=("sac", "loop"))
-def start_agents(sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array) -> LoopState:
+@functools.partial(jax.jit, static_argnames=("sac", "loop", "mesh"))
+def start_agents(
+    sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array, mesh: Mesh | None = None
+) -> LoopState:
     """`start` for several agents, which share the environment's scenes; the state has a first axis of agents.
 
     Args:
         sac: static.
         loop: static.
-        env: a pytree.
+        env: a pytree; divided among the devices of the mesh, or else these have equal shares of the agents.
         keys: one of each agent.
+        mesh: static; of one axis `devices.AXIS`, or None for one device.
     """
-    return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
+
+    def run(env: Environment, keys: Array) -> LoopState:
+        return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
+
+    if mesh is None:
+        return run(env, keys)
+    spread = jax.shard_map(
+        run, mesh=mesh, in_specs=(P(), agent_shares(env)), out_specs=state_shares(env), check_vma=False
+    )
+    return spread(env, keys)
 
 
-@functools.partial(jax.jit, static_argnames=("sac", "loop"), donate_argnames=("state",))
+@functools.partial(jax.jit, static_argnames=("sac", "loop", "mesh"), donate_argnames=("state",))
 def run_agents(
-    sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
+    sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState, mesh: Mesh | None = None
 ) -> tuple[LoopState, dict[str, Float[Array, " agents"]]]:
     """`run_chunk` for the agents of `start_agents`; the state is donated, too."""
-    return jax.vmap(lambda one: run_chunk(sac, loop, env, one))(state)
+
+    def run(env: Environment, state: LoopState) -> tuple[LoopState, dict[str, Array]]:
+        return jax.vmap(lambda one: run_chunk(sac, loop, env, one))(state)
+
+    if mesh is None:
+        return run(env, state)
+    shares = state_shares(env)
+    spread = jax.shard_map(
+        run, mesh=mesh, in_specs=(P(), shares), out_specs=(shares, agent_shares(env)), check_vma=False
+    )
+    return spread(env, state)
+
+
+def agent_shares(env: Environment) -> P:
+    """How arrays with a first axis of agents lie on several devices: divided, unless the environments are."""
+    return P(AXIS) if env.devices == 1 else P()
+
+
+def state_shares(env: Any) -> Any:
+    """The same for the state of `start_agents`, as a prefix of its tree."""
+    if env.devices == 1:
+        return P(AXIS)
+    own = jax.tree.map(lambda divided: P(None, AXIS) if divided else P(), env.shares)
+    return LoopState(P(), P(), own, P(), P(), P(), P())  # pyright: ignore[reportArgumentType]
