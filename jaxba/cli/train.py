@@ -163,7 +163,9 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
     name = args.config or DEFAULT_CONFIG
     folder = Path(args.out or Path("runs") / Path(name).stem)
     config = together(lambda: _prepare(args, folder, name))
-    board = _board(args, folder, config) if is_main() else None
+    boards: list[Any] = []
+    together(lambda: boards.append(_board(args, folder, config)))
+    board = boards[0] if boards else None  # of the first process alone
     common.prepare_process()
     console = _console(quiet=not is_main())
     with (

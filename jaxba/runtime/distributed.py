@@ -185,6 +185,6 @@ def gather(values: list[T]) -> list[T]:
 
 def to_host(x: Any) -> np.ndarray:
     """The whole of an array that lies on devices of several processes, in each of them."""
-    if x.is_fully_addressable or x.is_fully_replicated:
+    if isinstance(x, np.ndarray) or x.is_fully_addressable or x.is_fully_replicated:
         return np.asarray(x)
     return np.asarray(multihost_utils.process_allgather(x, tiled=True))
