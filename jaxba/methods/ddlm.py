@@ -147,7 +147,7 @@ def decomposed_round(
         jnp.clip(fraction, MIN_STEP_FRACTION, 1),
         jax.tree.map(jnp.max, found.work),
         new_cost < cost,
-        is_weightless(linear, cost, options.loss),
+        is_weightless(layout, linear, cost, options.loss),
     )
 
 

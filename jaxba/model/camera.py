@@ -220,10 +220,11 @@ def project(
     rotation = frame.rotation
     rotated = [row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in rotation]
     local = [rotated[k] + frame.translation[k] for k in range(3)]
-    placed = None
+    placed: list[Array] | None = None
     if frame.place is not None:
         turn, m = frame.place[:9], frame.place[9:]
-        placed = [sum(turn[3 * i + k] * local[k] for k in range(3)) for i in range(3)]
+        p, q, r = local
+        placed = [turn[3 * i] * p + turn[3 * i + 1] * q + turn[3 * i + 2] * r for i in range(3)]
         local = [placed[k] + m[k] for k in range(3)]
     x, y, z = local
     if frame.models is not None and mask is not None:
@@ -308,7 +309,7 @@ def _through_rig(frame: Frames, projection: Projection, rows: list[list[Array]])
     assert frame.place is not None
     assert projection.placed is not None
     turn, (x, y, z) = frame.place[:9], projection.placed
-    by_frame = [[sum(row[i] * turn[3 * i + k] for i in range(3)) for k in range(3)] for row in rows]
+    by_frame = [[a * turn[k] + b * turn[3 + k] + c * turn[6 + k] for k in range(3)] for a, b, c in rows]
     by_extrinsics: list[list[Callable[[], Array]]] = [
         [
             lambda b=b, c=c: y * c - z * b,

@@ -61,13 +61,14 @@ class Rigs:
     def of(self, cameras: Int[np.ndarray, " kept"]) -> Rigs:
         """The same for a subset of the cameras; the numbering of frames is unchanged."""
         free = None if self.free is None else np.asarray(self.free)[cameras]
-        return Rigs(*(np.asarray(part)[cameras] for part in (self.frame, self.rotation, self.translation)), free)
+        frame, rotation, translation = (np.asarray(x)[cameras] for x in (self.frame, self.rotation, self.translation))
+        return Rigs(frame, rotation, translation, free)
 
     @property
     def turned(self) -> Bool[np.ndarray, " cameras"]:
         """Whether the axes of a camera are not those of its frame, but for their signs."""
         diagonal = np.abs(np.diagonal(np.asarray(self.rotation), axis1=1, axis2=2)) > 1 - 1e-12
-        return ~diagonal.all(axis=1)
+        return np.logical_not(diagonal.all(axis=1))
 
 
 def checked_rigs(rigs: Rigs, cameras: np.ndarray, lenses: Lenses | None) -> Rigs:

@@ -46,15 +46,17 @@ def refine_cameras(
     products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient = products[:, :, :width], products[:, :, width]
     unknowns = layout.unknowns
-    has_priors = unknowns is not None and unknowns.priors is not None
-    if has_priors:
+    if unknowns is not None and unknowns.priors is not None:
         terms = prior_terms(unknowns, cameras, alone=True)
         blocks, gradient = blocks + terms.blocks, gradient + terms.gradient
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
     own_cost = lambda costs: sum_over_devices(layout, compute_unfused(each_sum, costs, index=layout.slot_camera))
-    of_priors = lambda cameras: prior_costs(unknowns, cameras) if has_priors else 0.0
+
+    def of_priors(cameras: Array) -> Array | float:
+        return 0.0 if unknowns is None or unknowns.priors is None else prior_costs(unknowns, cameras)
+
     before = own_cost(linear.costs) + of_priors(cameras)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:

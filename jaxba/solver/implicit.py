@@ -188,7 +188,7 @@ def _solve_transposed(
         rows = y[0].T if unknowns is None else unknowns.expanded(y[0].T)
         return camera.moved(cameras, rows, unknowns), points + y[1]
 
-    def of_frames(cameras: Array) -> Array:
+    def of_frames(cameras: AnyArray) -> Array:
         """Cameras as the inputs have them, as those of the state."""
         if unknowns is None or not unknowns.in_rigs:
             return jnp.asarray(cameras)

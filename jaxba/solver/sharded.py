@@ -32,7 +32,9 @@ from jaxba.structure.layout import Layout
 from jaxba.structure.shards import deal_points, shard_of, sharded_layout
 
 _DIVIDED, _EVERYWHERE = PartitionSpec(AXIS), PartitionSpec()
-_CARRY = Carry(LMState(_EVERYWHERE, _DIVIDED, _EVERYWHERE), _EVERYWHERE, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE)
+_STATE: Any = _EVERYWHERE, _DIVIDED, _EVERYWHERE
+_REST: Any = (_EVERYWHERE,) * 4
+_CARRY = Carry(LMState(*_STATE), *_REST)
 """Where the parts of a carry are: points are divided, all else is on every device."""
 
 
