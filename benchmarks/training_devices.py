@@ -3,7 +3,7 @@
     python -m benchmarks.training_devices [--devices 1,2,4] [--config fast] [--steps 32]
 
 Devices on one CPU share its cores: what they show is the CPU time of each, XLA's count of operations of each, and that
-the numbers stay. Each number of devices is a process of its own. Scenes are random and unsolved, since only work counts.
+the numbers stay. Each number of devices is a process of its own. Scenes are random and unsolved: only work counts.
 """
 
 from __future__ import annotations
