@@ -33,7 +33,7 @@ from jaxba import (
 )
 from jaxba.lm.records import StepInfo
 from jaxba.problem import geometry
-from jaxba.problem.rigs import in_frames
+from jaxba.problem.frames import in_frames
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.segment_sums import point_sum, point_sums, tree_sum
 

@@ -5,7 +5,7 @@ A *frame* is what the cameras of a rig took at one moment. The pose of its camer
     R_c = M R_r,    t_c = M t_r + m,
 
 with the rotation M and the translation m of the camera in the rig: its extrinsics. A solve works on frames
-(`in_frames`): a camera is `[pose of its frame, lens, angle-axis of M, m]`. Cameras of a frame share its pose, and
+(problem/frames.py): a camera is `[pose of its frame, lens, angle-axis of M, m]`. Cameras of a frame share its pose, and
 extrinsics are shared and free or constant as the numbers of a lens are.
 
 Source: COLMAP 3.12 and later, `Rig` and `Frame`.
@@ -14,16 +14,12 @@ Source: COLMAP 3.12 and later, `Rig` and `Frame`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.problem.intrinsics import POSE_SIZE, Lenses
+from jaxba.problem.intrinsics import Lenses
 from jaxba.typing import AnyArray, register_pytree
-
-if TYPE_CHECKING:
-    from jaxba.problem.bundle_problem import BundleProblem
 
 EXTRINSICS_SIZE = 6
 """Numbers of the extrinsics of a camera: angle-axis (radians) of M and m (scene units)."""
@@ -121,50 +117,6 @@ def _checked_free(
         pair = f"{first[group[bad[0]]]} and {bad[0]}"
         raise ValueError(f"cameras {pair} share a lens, but are in different places of their rigs, which are free")
     return free
-
-
-def in_frames(problem: BundleProblem) -> BundleProblem:
-    """The problem with the poses of frames, and the extrinsics of each camera after its lens.
-
-    Without rigs, or where no two observed cameras are of one frame, it is the problem itself, without rigs.
-    """
-    from scipy.spatial.transform import Rotation
-
-    rigs = problem.rigs
-    if rigs is None:
-        return problem
-    frame, cameras = np.asarray(rigs.frame), np.asarray(problem.cameras)
-    seen = np.unique(problem.camera_index)
-    if len(np.unique(frame[seen])) == len(seen):
-        return problem.replace(rigs=None)
-    rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
-    moved = cameras[:, 3:6] - translation
-    of_frame = rotation.transpose(0, 2, 1) @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
-    poses = np.hstack([Rotation.from_matrix(of_frame).as_rotvec(), np.einsum("nji,nj->ni", rotation, moved)])
-    known, first = np.unique(frame[seen], return_index=True)
-    at, leader = np.isin(frame, known), np.arange(len(frame))
-    leader[at] = seen[first[np.searchsorted(known, frame[at])]]
-    poses = poses[leader]  # bit for bit the same in a frame
-    extrinsics = np.hstack([Rotation.from_matrix(rotation).as_rotvec(), translation])
-    return problem.replace(cameras=np.hstack([poses, cameras[:, POSE_SIZE:], extrinsics]))
-
-
-def out_of_frames(
-    problem: BundleProblem, cameras: Float[np.ndarray, "cameras more"]
-) -> tuple[Float[np.ndarray, "cameras parameters"], Rigs]:
-    """Cameras and rigs for cameras of a problem as `in_frames` has them. Constant extrinsics are copied exactly."""
-    from scipy.spatial.transform import Rotation
-
-    assert problem.rigs is not None
-    rigs, extrinsics = problem.rigs, cameras[:, -EXTRINSICS_SIZE:]
-    free = np.zeros(len(cameras), bool) if rigs.free is None else np.asarray(rigs.free)
-    rotation = np.where(free[:, None, None], Rotation.from_rotvec(extrinsics[:, :3]).as_matrix(), rigs.rotation)
-    translation = np.where(free[:, None], extrinsics[:, 3:], rigs.translation)
-    turned = rotation @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
-    moved = np.einsum("nij,nj->ni", rotation, cameras[:, 3:6]) + translation
-    own = cameras[:, POSE_SIZE:-EXTRINSICS_SIZE]
-    cameras = np.hstack([Rotation.from_matrix(turned).as_rotvec(), moved, own])
-    return cameras, replace(rigs, rotation=rotation, translation=translation)
 
 
 def with_unseen_of_frames(

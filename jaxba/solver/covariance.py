@@ -23,11 +23,12 @@ from jaxba.lm.step import initial_state
 from jaxba.model.linearize import Linearization, linearize, only_free
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, lens_size
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Coordinates, StepOptions
 from jaxba.problem.preprocess import far_middle, shift
-from jaxba.problem.rigs import EXTRINSICS_SIZE, in_frames
+from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.solver.prepare import numerics
 from jaxba.structure.layout import Layout, layout_for
 

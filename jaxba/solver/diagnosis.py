@@ -12,9 +12,9 @@ from jaxba.lm.step import initial_state
 from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, view_terms
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.frames import in_frames
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
-from jaxba.problem.rigs import in_frames
 from jaxba.refinement.acceptance import COST_ROUNDING
 from jaxba.runtime.compilation import compile_and_run, program
 from jaxba.structure.layout import Layout, build_layout

@@ -41,9 +41,10 @@ from jaxba.lm.step import initial_state
 from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
-from jaxba.problem.rigs import EXTRINSICS_SIZE, in_frames
+from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, numerics, set_up
 from jaxba.solver.solve import solve

@@ -18,10 +18,11 @@ from jaxba.damping.registry import GUARDED
 from jaxba.lm.records import LMState, Prices
 from jaxba.lm.step import initial_state
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.frames import in_frames, out_of_frames
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import far_middle, shift
-from jaxba.problem.rigs import in_frames, out_of_frames, with_unseen_of_frames
+from jaxba.problem.rigs import with_unseen_of_frames
 from jaxba.runtime import distributed, process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.solver.cost_model import choose_linear_solver, prices

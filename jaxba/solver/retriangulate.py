@@ -25,9 +25,9 @@ from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.frames import in_frames
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
-from jaxba.problem.rigs import in_frames
 from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process

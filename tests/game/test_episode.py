@@ -18,6 +18,7 @@ from jaxba.game.scene_bank import MIN_OBSERVATIONS, Bank, info_of, initial_costs
 LIMIT = 12
 
 
+@pytest.mark.slow
 def test_an_episode_is_that_of_the_bank_and_its_parameters_have_its_costs():
     scenes = make_scenes(KIND, jax.random.key(5), TRIES)
     costs = initial_costs(KIND, scenes)

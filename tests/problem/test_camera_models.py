@@ -100,6 +100,7 @@ def test_a_users_own_model_is_solved_and_a_second_one_of_its_name_is_refused():
         del CAMERA_MODELS["UNIFIED"]
 
 
+@pytest.mark.slow
 def test_mixed_models_end_at_one_cost_with_every_linear_solver_and_embedded_iterations():
     problem, ways = scene(*MIXED), (("guarded", "explicit"), ("ceres", "sparse"), ("ceres", "implicit"))
     options = lambda solver: SolveOptions(linear_solver=solver, max_iterations=60)

@@ -163,8 +163,10 @@ def test_priors_that_do_not_fit_are_refused_in_one_line():
     problem = known()
     parts, priors = support.arrays(problem), problem.priors
     assert support.same_bits(BundleProblem.create(*parts, priors=priors).priors, priors)
+    names = ("positions", "position_whitening", "rotations", "rotation_whitening")
+    fewer = replace(priors, **{name: getattr(priors, name)[:5] for name in names})
     with pytest.raises(ProblemError, match=r"positions of priors must have shape \(6, 3\), not \(5, 3\)"):
-        BundleProblem.create(*parts, priors=replace(priors, positions=priors.positions[:5]))
+        BundleProblem.create(*parts, priors=fewer)
     with pytest.raises(ProblemError, match="lens_weight of priors are not finite"):
         BundleProblem.create(*parts, priors=replace(priors, lens_weight=priors.lens_weight * np.nan))
 

@@ -27,8 +27,8 @@ from jaxba import (
 )
 from jaxba.methods.registry import make_method
 from jaxba.problem import geometry
+from jaxba.problem.frames import in_frames, out_of_frames
 from jaxba.problem.options import ConjugateGradients, Coordinates
-from jaxba.problem.rigs import in_frames, out_of_frames
 
 FRAME = np.array([0, 1, 0, 2, 1, 3], np.int32)
 MANIFOLD = Coordinates(rotation="manifold")
@@ -208,6 +208,7 @@ def test_covariances_are_those_of_the_dense_inverse_seen_by_each_camera(make):
     np.testing.assert_allclose(found.between(0, 2), whole[np.ix_(pair, pair)], rtol=1e-5, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_priors_are_of_cameras_and_not_of_their_frames():
     problem, rng = stereo(), np.random.default_rng(2)
     centers = geometry.camera_centers(problem.cameras) + 0.2 * rng.normal(size=(6, 3))

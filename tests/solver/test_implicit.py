@@ -33,7 +33,8 @@ def constrained() -> jaxba.BundleProblem:
     return jaxba.with_position_priors(problem, places, 0.01 * np.eye(3), images=[1, 2, 3, 4], align=False)
 
 
-@pytest.mark.parametrize("linear_solver", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("linear_solver", ["explicit", "implicit"])
 def test_derivatives_by_observations_priors_and_constants_are_those_of_differences(linear_solver):
     problem, rng = constrained(), np.random.default_rng(1)
     inputs = jax.tree.map(jnp.asarray, inputs_of(problem))

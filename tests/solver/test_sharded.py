@@ -92,7 +92,8 @@ def test_a_dense_product_and_a_far_scene_with_odd_observations_are_divided_too()
     compare(support.tiny(), "learned", dtype="float32", rtol=1e-4)
 
 
-@pytest.mark.parametrize("linear_solver", ["explicit", pytest.param("implicit", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("linear_solver", ["explicit", "implicit"])
 def test_lenses_constants_and_priors_are_divided_too(linear_solver):
     problem = general()
     found = compare(problem, "ceres+refine1", linear_solver=linear_solver).problem
