@@ -14,7 +14,7 @@ from jaxba.problem.constraints import Gauge, hold, with_gauge
 from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_position_priors
 
-PARTS = ("poses", "rotations", "points", "extrinsics")
+PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
 """What `--constant` names besides numbers of lenses."""
 
 KEYS = {
@@ -45,7 +45,10 @@ def constrained(
         problem = _applied(problem, file, key, settings.pop(key))
     try:
         numbers = [one.replace("-", "_") for one in constant if one not in PARTS]
-        parts: dict[str, Any] = {part: "all" for part in PARTS if part in constant}
+        parts: dict[str, Any] = {part: "all" for part in PARTS[:4] if part in constant}
+        for part, held in (("frames", "poses"), ("frame-rotations", "rotations")):
+            if part in constant:
+                parts.setdefault(held, _with_known_places(problem))
         problem = hold(problem, numbers=numbers, **parts)
     except ValueError as error:
         raise UsageError(f"--constant: {error}") from None
@@ -55,6 +58,23 @@ def constrained(
     for key, value in settings.items():
         problem = _applied(problem, file, key, value)
     return with_gauge(problem, gauge or in_file)
+
+
+def _with_known_places(problem: BundleProblem) -> np.ndarray:
+    """One camera or more of every frame, whose pose is the frame's: its place in the rig is constant.
+
+    Raises:
+        ValueError: a frame has none.
+    """
+    rigs = problem.rigs
+    if rigs is None or rigs.free is None:
+        return np.ones(problem.num_cameras, bool)
+    known = ~np.asarray(rigs.free)
+    lost = np.setdiff1d(rigs.frame, np.asarray(rigs.frame)[known])
+    if len(lost):
+        first = int(np.flatnonzero(np.asarray(rigs.frame) == lost[0])[0])
+        raise ValueError(f"the frame of image {first} has no image of a camera with a constant place in its rig")
+    return known
 
 
 def _applied(problem: BundleProblem, file: str | None, key: str, value: Any) -> BundleProblem:

@@ -139,8 +139,8 @@ class Arguments:
     """Optimise principal points of a COLMAP model, too."""
 
     constant: tuple[str, ...] = ()
-    """What stays as it is: poses, rotations, points, focal, distortion, principal-point, or numbers of lenses such as
-    k2."""
+    """What stays as it is: poses, rotations, points, focal, distortion, principal-point, numbers of lenses such as k2;
+    of rigs extrinsics, frames (their poses, not where cameras are in them) and frame-rotations."""
 
     gauge: Gauge | None = None
     """Fix position, orientation and scale. two-cameras: the pose of one camera, and a number of another's translation.
@@ -303,27 +303,14 @@ def _solve(args: Arguments) -> int:
     if args.problem == "":
         raise common.UsageError("the name of the problem is empty")
     policy, options = solve_options(args)
-    path = None if args.problem is None else resolve(args.problem)
-    check_outputs(args.output, args.log, path)
-    check_outputs(None, args.covariance, path, "--covariance")
-    if args.covariance and args.covariance in (args.output, args.log):
-        raise common.UsageError(f"--covariance names the same file as another output, {args.covariance}")
-    if args.record is not None:
-        check_record(args.record, [args.output, args.covariance, args.log, path])
-    if args.view:
-        view.check_extra()
-    with common.notes_printed():
-        problem = _in_all_processes(args, path) if _is_divided(args) else _problem(args, path)
-    check_storable(args.output, problem, path)
-    if args.covariance and problem.constants is None and problem.priors is None:
-        raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
+    path, problem = _in_all_processes(args) if _is_divided(args) else _checked(args)
     common.prepare_process(untraced=not _is_divided(args))
     name = args.problem or DEFAULT_SCENE
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     watching = Watching.of(problem, path, args.record is not None, args.view)
     solution, steps = _iterate(args, problem, policy, options, watching and watching.watch)
     common.print_line(table.summary(problem, solution, options.loss))
-    if args.pad == "yes" or solution.capacity is not None:
+    if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
     if args.output:
         write_solution(args.output, solution.problem, path)
@@ -350,15 +337,31 @@ def _is_divided(args: Arguments) -> bool:
     return args.devices is not None or args.processes is not None or args.distributed
 
 
-def _in_all_processes(args: Arguments, path: str | None) -> BundleProblem:
+def _in_all_processes(args: Arguments) -> tuple[str | None, BundleProblem]:
+    """What the first process checks and reads."""
     from jaxba.runtime.distributed import together
 
-    return together(lambda: _problem(args, path))
+    return together(lambda: _checked(args))
 
 
-def _problem(args: Arguments, path: str | None) -> BundleProblem:
-    problem = _default_scene() if path is None else _read(args, path)
-    return constrained(problem, args.constant, args.gauge, args.constraints)
+def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
+    """The path of the problem and the problem, after all checks of files."""
+    path = None if args.problem is None else resolve(args.problem)
+    check_outputs(args.output, args.log, path)
+    check_outputs(None, args.covariance, path, "--covariance")
+    if args.covariance and args.covariance in (args.output, args.log):
+        raise common.UsageError(f"--covariance names the same file as another output, {args.covariance}")
+    if args.record is not None:
+        check_record(args.record, [args.output, args.covariance, args.log, path])
+    if args.view:
+        view.check_extra()
+    with common.notes_printed():
+        problem = _default_scene() if path is None else _read(args, path)
+        problem = constrained(problem, args.constant, args.gauge, args.constraints)
+    check_storable(args.output, problem, path)
+    if args.covariance and problem.constants is None and problem.priors is None:
+        raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
+    return path, problem
 
 
 def _read(args: Arguments, path: str) -> BundleProblem:

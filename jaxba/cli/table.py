@@ -194,9 +194,13 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     """Notes on the data: cameras and points without observations, points with one, points behind cameras."""
     cameras = np.bincount(np.asarray(problem.camera_index), minlength=problem.num_cameras)
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
+    alone = cameras == 0
+    if problem.rigs is not None:  # others move with their frame
+        frame = np.asarray(problem.rigs.frame)
+        alone = alone & ~np.isin(frame, frame[cameras > 0])
     before, after = (int(np.sum(geometry.depths(p) <= 0)) for p in (problem, solution.problem))
     found = [
-        (int(np.sum(cameras == 0)), "camera", "without observations; poses stay as they are"),
+        (int(np.sum(alone)), "camera", "without observations; poses stay as they are"),
         (int(np.sum(points == 0)), "point", "without observations; positions stay as they are"),
         (int(np.sum(points == 1)), "point", "seen once; damping alone fixes the depth"),
     ]

@@ -159,10 +159,15 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
     from jaxba.runtime import process
     from jaxba.runtime.distributed import is_main, together
     from jaxba.training import driver, task
+    from jaxba.training.placement import Placement
 
     name = args.config or DEFAULT_CONFIG
     folder = Path(args.out or Path("runs") / Path(name).stem)
     config = together(lambda: _prepare(args, folder, name))
+    try:
+        Placement(devices).check(config)
+    except ValueError as error:
+        raise common.UsageError(f"--devices: {error}") from None
     boards: list[Any] = []
     together(lambda: boards.append(_board(args, folder, config)))
     board = boards[0] if boards else None  # of the first process alone

@@ -90,7 +90,7 @@ def _run(args: Arguments) -> int:
 
     viewer = Viewer(shown, args.port)
     for stage in viewer.stages:
-        common.print_line(f"{heading(stage).replace('**', '')}, {stage.numbers()}")
+        common.print_line(f"{heading(stage)}, {stage.numbers()}")
         for text, _ in worst_images(stage, NAMED):
             common.print_line(f"  worst: {text}")
     announce(viewer)

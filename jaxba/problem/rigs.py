@@ -38,7 +38,7 @@ class Rigs:
     """
 
     frame: Int[AnyArray, " cameras"]
-    """Frame of each camera, int32. A camera alone in its frame has M = I and m = 0, whatever is said of it."""
+    """Frame of each camera, int32."""
 
     rotation: Float[AnyArray, "cameras 3 3"]
     """M: from the rig to the camera (BAL's axes)."""
@@ -86,6 +86,14 @@ def checked_rigs(rigs: Rigs, cameras: np.ndarray, lenses: Lenses | None) -> Rigs
     count = len(cameras)
     if (frame.shape, rotation.shape, translation.shape) != ((count,), (count, 3, 3), (count, 3)):
         raise ValueError(f"rigs must say of each of {count} cameras its frame and its place in the rig")
+    if frame.dtype.kind not in "iu":
+        raise ValueError(f"frames of rigs must be integers, not {frame.dtype}")
+    finite = np.logical_and.reduce(np.isfinite(np.hstack([rotation.reshape(-1, 9), translation])), axis=1)
+    known = np.where(finite[:, None, None], rotation, 0.0)
+    away = np.abs(known @ known.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    proper = finite & (away <= LARGEST_DISAGREEMENT) & (np.linalg.det(known) > 0)
+    if not proper.all():
+        raise ValueError(f"the place of camera {np.argmin(proper)} in its rig is no rotation and translation")
     rotations = Rotation.from_rotvec(cameras[:, :3]).as_matrix()
     _, first, group = np.unique(frame, return_index=True, return_inverse=True)
     rig_rotation = np.einsum("nji,njk->nik", rotation, rotations)

@@ -118,6 +118,7 @@ def use_devices(count: int | None) -> list[jax.Device]:
         DistributedError: a process has fewer.
     """
     if count is not None:
+        count = int(count)
         if count < 1:
             raise DistributedError(f"at least one device is needed, not {count}")
         if count > 1:

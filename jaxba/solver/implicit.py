@@ -139,7 +139,8 @@ def _transposed(
     cotangents: tuple[Array, Array],
 ) -> SolveInputs:
     """Cotangents of the inputs for those of the solution."""
-    setup = set_up(solved, policy, replace(options, pad=False, dtype="float64"))
+    options = replace(options, pad=False, devices=1)
+    setup = set_up(solved, policy, replace(options, dtype="float64"))
     step = replace(
         setup.options,
         coordinates=replace(setup.options.coordinates, rotation="manifold"),
@@ -149,7 +150,7 @@ def _transposed(
         raise ProblemError("derivatives need a scene near the origin: shift it first (its extent is much smaller)")
     numbered = np.stack([np.arange(solved.num_observations, dtype=float)] * 2, axis=1)
     with numerics(np.dtype("float64")):
-        slots = set_up(solved.replace(observations=numbered), policy, replace(options, pad=False)).layout.pixels[0]
+        slots = set_up(solved.replace(observations=numbered), policy, options).layout.pixels[0]
         order = np.concatenate([np.asarray(members) for members in setup.layout.bucket_points])
         here = in_frames(solved)
         arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, inputs, cotangents)
@@ -244,8 +245,10 @@ def _start_of_constants(layout: Layout, cameras: Array) -> Array:
         constant = free.T == 0
     elif unknowns is not None:
         constant = unknowns.expanded(jnp.ones((unknowns.width, cameras.shape[0]))).T == 0
-    if unknowns is None or unknowns.members is None:  # else its lens may be that of a camera that is seen
-        constant = constant | ~jnp.asarray(layout.camera_seen)[:, None]
+    unseen = jnp.broadcast_to(~jnp.asarray(layout.camera_seen)[:, None], constant.shape)
+    if unknowns is not None and unknowns.members is not None:  # its lens may be that of a camera that is seen
+        unseen = unseen.at[:, POSE_SIZE:].set(False)
+    constant = constant | unseen
     kept = jnp.where(constant, cameras, 0)
     return (kept - jax.lax.stop_gradient(kept)).T
 

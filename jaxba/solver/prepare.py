@@ -135,6 +135,8 @@ def prepare(
         ValueError, ProblemError: as `solve`.
     """
     setup = set_up(problem, policy, options)
+    if setup.shards is not None:
+        raise ProblemError("prepare is for one device; jaxba.solve divides a problem among several")
     with numerics(setup.dtype), CompileClock() as clock:
         state = jax.block_until_ready(setup.initial(compile_and_run))
     setup.check_cost(state)

@@ -213,6 +213,7 @@ def _free_extrinsics(problem: BundleProblem, index: Int[np.ndarray, " cameras"])
     if problem.constants is not None:
         constant = np.zeros((index.max() + 1, EXTRINSICS_SIZE), bool)
         np.logical_or.at(constant, index, np.asarray(problem.constants.poses))
+        constant |= constant[:, 3:].any(axis=1, keepdims=True)  # M turns t_r, too
         free &= ~constant[index]
     return free
 
@@ -224,6 +225,7 @@ def _frames(
     constant numbers of one camera are constant in its frame."""
     assert problem.rigs is not None
     frame = np.asarray(problem.rigs.frame).astype(np.int64)
+    _, own = np.unique(frame, return_inverse=True)
     frame = np.where(seen, frame, frame.max(initial=0) + 1 + np.arange(len(frame)))
     _, frame = np.unique(frame, return_inverse=True)
     part = ~pose_free[:, 3:].all(axis=1) & pose_free[:, 3:].any(axis=1)
@@ -231,8 +233,8 @@ def _frames(
     if bad.size:
         raise ProblemError(f"part of the translation of camera {bad[0]} is constant, which is turned in its rig")
     constant = np.zeros(pose_free.shape, bool)
-    np.logical_or.at(constant, frame, ~pose_free)
-    return frame.astype(np.int32), ~constant[frame]
+    np.logical_or.at(constant, own, ~pose_free)  # also of cameras that nothing sees
+    return frame.astype(np.int32), ~constant[own]
 
 
 def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> Priors:

@@ -33,12 +33,23 @@ class Placement:
         Raises:
             ValueError: environments or batches cannot be divided either.
         """
-        if self.mesh is None or config.seeds % self.mesh.size == 0:
+        if self.check(config):
             return env
+        assert self.mesh is not None
+        return replace(env, devices=self.mesh.size)
+
+    def check(self, config: TrainConfig) -> bool:
+        """Whether the devices divide the agents, or there is nothing to divide.
+
+        Raises:
+            ValueError: they divide neither the agents nor environments and batches.
+        """
+        if self.mesh is None or config.seeds % self.mesh.size == 0:
+            return True
         for name, count in (*(("envs", count) for count in config.envs), ("sac.batch", config.sac.batch)):
             if count % self.mesh.size:
                 raise ValueError(f"{name} must be a multiple of the {self.mesh.size} devices, is {count}")
-        return replace(env, devices=self.mesh.size)
+        return False
 
     def described(self, tree: Any, shares: Any) -> Any:
         """Shapes and types of a tree, and how it lies on the devices: as a prefix of it says."""

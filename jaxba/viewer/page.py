@@ -31,7 +31,8 @@ def write_page(all_shown: Sequence[Shown], path: StrPath) -> None:
         drawn = stages(server, all_shown, points=PAGE_POINTS, caption="numbers")
         for stage in drawn:
             stage.load_images()
-            stage.choose(int(stage.measures.worst()[0]))
+            if len(worst := stage.measures.worst()):
+                stage.choose(int(worst[0]))
         last = max(stage.shown.recording.last for stage in drawn)
         summary = _summary(drawn)
         for stage in drawn:
@@ -57,7 +58,7 @@ def _summary(drawn: Sequence[Stage]) -> str:
     """What the scene cannot say, in a corner of the page."""
     parts = []
     for stage in drawn:
-        parts.append(f"<p>{html.escape(heading(stage).replace('**', ''))}; {html.escape(stage.numbers())}")
+        parts.append(f"<p>{html.escape(heading(stage))}; {html.escape(stage.numbers())}")
         if meaning := stage.limits_text():
             parts.append(f"<br>points: {html.escape(stage.colour)}, {html.escape(meaning)}")
         items = "".join(f"<li>{html.escape(text)}</li>" for text, _ in worst_images(stage, LISTED))

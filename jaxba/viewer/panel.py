@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
@@ -104,7 +106,7 @@ class Viewer:
     def _panel(self) -> None:
         gui, last = self.server.gui, max(stage.shown.recording.last for stage in self.stages)
         gui.configure_theme(show_share_button=False, show_logo=False)
-        gui.add_markdown("\n\n".join(map(heading, self.stages)))
+        gui.add_markdown("\n\n".join(f"**{plain(stage.shown.name)}**: {sizes(stage)}" for stage in self.stages))
         self._slider = gui.add_slider("iteration", 0, max(last, 1), 1, last, visible=last > 0)
         self._numbers = gui.add_markdown("")
         choices = list(dict.fromkeys(name for stage in self.stages for name in stage.colour_choices()))
@@ -142,7 +144,7 @@ class Viewer:
         """Numbers of the iteration beside the slider."""
         lines = []
         for stage in self.stages:
-            name = f"**{stage.shown.name}**: " if len(self.stages) > 1 else ""
+            name = f"**{plain(stage.shown.name)}**: " if len(self.stages) > 1 else ""
             meaning = stage.limits_text()
             lines.append(f"{name}{stage.numbers()}" + (f"  \n*{meaning}*" if meaning else ""))
         self._numbers.content = "\n\n".join(lines)
@@ -181,7 +183,17 @@ def stages(
     return found
 
 
+def plain(name: str) -> str:
+    """A name as Markdown that means just its characters: viser renders HTML and Markdown as they come."""
+    return re.sub(r"([\\`*_{}\[\]()#+.!|~>-])", r"\\\1", html.escape(name)) if name else name
+
+
 def heading(stage: Stage) -> str:
+    """The name of what is shown, its sizes, and how much of it; plain text."""
+    return f"{stage.shown.name}: {sizes(stage)}"
+
+
+def sizes(stage: Stage) -> str:
     """Sizes of what is shown, and how much of it."""
     recording, problem = stage.shown.recording, stage.shown.problem
     points, cameras = len(stage.points), len(stage.frusta)
@@ -189,7 +201,7 @@ def heading(stage: Stage) -> str:
     of_cameras = f"{cameras:,} of {problem.num_cameras:,}" if cameras < problem.num_cameras else f"{cameras:,}"
     thinned = recording.whole > problem.num_points
     of = " of these points" if thinned else ""
-    return f"**{stage.shown.name}**: {of_cameras} images, {of_points}, {problem.num_observations:,} observations{of}"
+    return f"{of_cameras} images, {of_points}, {problem.num_observations:,} observations{of}"
 
 
 def worst_images(stage: Stage, count: int = WORST) -> list[tuple[str, int]]:
@@ -208,7 +220,7 @@ def about_image(stage: Stage, camera: int) -> str:
     of = f", rank {rank[0] + 1} of {len(measures.worst())} from the worst" if len(rank) else ""
     _, factor = geometry.residual_segments(stage.problem, stage.image_planes, measures.residuals, camera)
     return (
-        f"**{stage.shown.name_of(camera)}**: {measures.seen[camera]:,} observations, "
+        f"**{plain(stage.shown.name_of(camera))}**: {measures.seen[camera]:,} observations, "
         f"RMSE {measures.of_image[camera]:.3g} px{of}. Residuals are drawn {factor:.3g} times as long as they are, "
         "from the measured pixel to the predicted one."
     )

@@ -7,6 +7,7 @@ holds an even choice of the points, and the observations of these.
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -190,8 +191,21 @@ def read_recording(path: StrPath) -> Recording:
             ids = np.arange(problem.num_cameras)
             problem = problem.replace(labels=Labels(tuple(map(str, found["names"])), ids, ids[:0], ids[:0]))
         history: dict[str, Any] = {key: found[key] for key in _HISTORY}
+        _check(problem, points, history, len(found.get("names", problem.cameras)))
         return Recording(problem, int(found["whole"]), points=points, source=str(found["source"]), **history)
     except OSError as error:
         raise ProblemError(f"cannot read {name}: {reason(error)}") from None
-    except (ValueError, KeyError, IndexError, TypeError, EOFError, zipfile.BadZipFile):
+    except (ValueError, KeyError, IndexError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error):
         raise ProblemError(f"{name}: is not a recording of jaxba-solve --record") from None
+
+
+def _check(problem: BundleProblem, points: np.ndarray, history: dict[str, np.ndarray], names: int) -> None:
+    """Raises a ValueError if the parts of a recording do not fit each other."""
+    state, cameras = history["state"], history["cameras"]
+    rows = [history[key].shape == (len(state),) for key in ("state", "cost", "damping", "gain_ratio", "time_s")]
+    steps = np.diff(state, prepend=0)
+    whole = state.dtype.kind in "iu" and len(state) and state[0] == 0 and ((steps == 0) | (steps == 1)).all()
+    shapes = cameras.shape[1:] == problem.cameras.shape and points.shape == (len(cameras), *problem.points.shape)
+    fit = all(rows) and whole and shapes and state[-1] == len(cameras) - 1 and names == problem.num_cameras
+    if not (fit and np.isfinite(cameras).all() and np.isfinite(points).all()):
+        raise ValueError("the parts of the recording do not fit")

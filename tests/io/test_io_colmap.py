@@ -31,6 +31,7 @@ from jaxba import (
 from jaxba.bench.records import read_records
 from jaxba.bench.sources import sources
 from jaxba.cli.bench import run as run_bench
+from jaxba.cli.constraints import constrained
 from jaxba.cli.solve import run
 from jaxba.io.colmap.lenses import AS_BAL
 from jaxba.problem import geometry
@@ -416,6 +417,18 @@ def test_rigs_end_where_colmap_has_them_and_are_written_as_rigs(tmp_path, linear
     write_colmap(solution.problem, tmp_path / "out", like=folder)
     np.testing.assert_allclose(colmap_cost(tmp_path / "out"), solution.final_cost, rtol=1e-9)
     np.testing.assert_allclose(geometry.cost(read_problem(tmp_path / "out")), solution.final_cost, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("held", "option"),
+    [("frames", {"refine_rig_from_world": False}), ("frame-rotations", {"constant_rig_from_world_rotation": True})],
+)
+def test_frames_that_are_constant_let_places_in_rigs_move_as_in_colmap(tmp_path, held, option):
+    folder = write(rigs_of(3), tmp_path / "model")
+    problem = constrained(read_problem(folder), (held,), None, None)
+    solution = solve(problem, "ceres", SolveOptions(max_iterations=100))
+    truth = adjusted_by_colmap(folder, tmp_path / "truth", lenses=True, **option)
+    np.testing.assert_allclose(solution.final_cost, truth, rtol=1e-5)
 
 
 def test_a_rig_that_does_not_say_where_a_camera_is_is_refused(tmp_path):

@@ -236,6 +236,21 @@ def test_priors_are_of_cameras_and_not_of_their_frames():
         assert cost(found.problem.replace(cameras=cameras, rigs=rigs)) > found.final_cost
 
 
+def test_what_is_held_of_a_camera_is_held_of_its_frame_and_its_place():
+    problem = stereo()
+    poses = np.zeros((6, 6), bool)
+    poses[2, 3:] = True
+    held_translation = problem.replace(constants=Constants(poses, np.zeros(problem.num_points, bool)))
+    unseen = problem.camera_index != 2
+    parts = (problem.observations[unseen], problem.camera_index[unseen], problem.point_index[unseen])
+    blind = BundleProblem.create(problem.cameras, problem.points, *parts, lenses=problem.lenses, rigs=problem.rigs)
+    for here, numbers in ((held_translation, slice(3, 6)), (hold(blind, poses=[2]), slice(6))):
+        found = solve(here, "ceres", SolveOptions(max_iterations=5))
+        np.testing.assert_array_equal(found.problem.cameras[2, numbers], problem.cameras[2, numbers])
+        np.testing.assert_allclose(geometry.cost(found.problem), found.final_cost, rtol=1e-9)
+        BundleProblem.create(found.problem.cameras, *support.arrays(found.problem)[1:], rigs=held(found.problem))
+
+
 def test_a_camera_that_nothing_sees_moves_with_its_frame():
     problem = rigged()
     seen = problem.camera_index != 2
@@ -270,6 +285,11 @@ def test_what_rigs_do_not_support_is_one_line():
     wrong[2] += 1.0
     with pytest.raises(ProblemError, match="cameras 0 and 2 of one frame are not where their rig has them"):
         BundleProblem.create(*support.arrays(problem), rigs=Rigs(rigs.frame, rigs.rotation, wrong))
+    for at, value in ((3, np.zeros((3, 3))), (3, np.diag([1.0, 1.0, -1.0])), (2, np.full((3, 3), np.nan))):
+        bad = np.array(rigs.rotation)
+        bad[at] = value
+        with pytest.raises(ProblemError, match=f"the place of camera {at} in its rig is no rotation and translation"):
+            BundleProblem.create(*support.arrays(problem), rigs=Rigs(rigs.frame, bad, rigs.translation))
     free = Rigs(*[getattr(rigs, name) for name in ("frame", "rotation", "translation")], np.ones(6, bool))
     with pytest.raises(ProblemError, match="free extrinsics of rigs need lenses"):
         BundleProblem.create(*support.arrays(problem), rigs=free)

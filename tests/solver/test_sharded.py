@@ -154,26 +154,41 @@ def test_what_several_devices_cannot_do_is_one_line():
         solve(problem, "ceres", SolveOptions(devices=DEVICES))
     with pytest.raises(ProblemError, match="several devices are for plain LM, not for poba"):
         solve(support.tiny(), "ceres", SolveOptions(devices=DEVICES, method="poba"))
+    with pytest.raises(ProblemError, match="prepare is for one device"):
+        jaxba.prepare(support.tiny(), "ceres", SolveOptions(devices=DEVICES))
     with pytest.raises(ValueError, match="devices must be"):
         SolveOptions(devices=0)
 
 
-def test_two_processes_solve_as_one(tmp_path):
+def run_two(file, output) -> tuple[list[int], list[str]]:
+    """Exit statuses of two processes that solve a file, and what they print."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    file = tmp_path / "scene.txt"
-    jaxba.write_problem(sequence(), file)
     command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", str(file), "--policy", "ceres"]
     command += ["--linear-solver", "implicit", "--max-iterations", "4", "--compilation", "full"]
-    ends = ["--output", str(tmp_path / "out.txt"), "--coordinator", address, "--processes", "2", "--process"]
+    ends = ["--output", str(output), "--coordinator", address, "--processes", "2", "--process"]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     started = [
         subprocess.Popen([*command, *ends, str(k)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
         for k in range(2)
     ]
-    printed = [process.communicate(timeout=240)[0].decode() for process in started]
-    assert [process.returncode for process in started] == [0, 0], printed
+    try:
+        printed = [process.communicate(timeout=240)[0].decode() for process in started]
+    finally:
+        for process in started:
+            process.kill()
+    return [process.returncode for process in started], printed
+
+
+def test_two_processes_solve_as_one_and_end_together(tmp_path):
+    file = tmp_path / "scene.txt"
+    jaxba.write_problem(sequence(), file)
+    statuses, printed = run_two(file, tmp_path / "nowhere" / "out.txt")
+    assert statuses == [2, 2]
+    assert "nowhere" in printed[0]
+    statuses, printed = run_two(file, tmp_path / "out.txt")
+    assert statuses == [0, 0], printed
     assert "4 iterations" in printed[0]
     assert all(line.startswith("[Gloo]") for line in printed[1].splitlines())  # which is C++'s
     one = solve(sequence(), "ceres", SolveOptions(linear_solver="implicit", max_iterations=4)).final_cost

@@ -213,3 +213,9 @@ def test_an_episode_of_the_game_is_written_as_a_page(tmp_path):
 
     assert run(["--policy", "guarded", "--scene", "1", "--html", str(page)]) == 0
     assert page.stat().st_size > 500_000
+
+
+def test_names_are_characters_and_nothing_else():
+    from jaxba.viewer.panel import plain
+
+    assert plain("<b>*a*_1") == r"&lt;b&gt;\*a\*\_1"

@@ -64,6 +64,28 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path):
             read_recording(str(tmp_path / name))
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"state": np.zeros(0, int)},
+        {"state": np.array([0.0, 1.0])},
+        {"cost": np.zeros(1)},
+        {"time_s": np.zeros((2, 2))},
+        {"names": np.array(["one"])},
+        {"cameras": np.full((2, 6, 9), np.nan)},
+        {"points": np.zeros((2, 1, 3), np.float32)},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_a_recording_whose_parts_do_not_fit_is_one_line(recorded, tmp_path, change):
+    write_recording(recorded[0](), tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz") as file:
+        arrays = {key: file[key] for key in file.files}
+    np.savez(tmp_path / "bad.npz", **(arrays | change))
+    with pytest.raises(jaxba.ProblemError, match=r"bad\.npz: is not a recording"):
+        read_recording(str(tmp_path / "bad.npz"))
+
+
 def test_a_thinned_problem_has_the_errors_of_its_points(problem):
     from jaxba.viewer.measures import measure
 

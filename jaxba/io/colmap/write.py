@@ -104,7 +104,10 @@ def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target:
             seen = [(camera, image) for camera, image in frame.images if image in changed]
             if not seen:
                 continue
-            camera, image = seen[0]
+            reference = [pair for pair in frame.images if place_in_rig(model, frame, pair[0]) is None]
+            kept = [pair for pair in reference if pair[1] in new_images and pair[1] not in changed]
+            # the image of the reference sensor has the frame's pose itself
+            camera, image = next(iter([*kept, *(pair for pair in seen if pair in reference), seen[0]]))
             place = place_in_rig(model, frame, camera)
             pose = new_images[image].pose
             moved = pose if place is None else composed(inverse(place), pose)
