@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-import time
+import threading
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -152,7 +152,6 @@ def wait(viewer: Viewer) -> None:
     """Serves the page until Ctrl-C."""
     common.print_line("Ctrl-C ends it")
     try:
-        while True:
-            time.sleep(3600)
+        threading.Event().wait()
     except KeyboardInterrupt:
         viewer.close()

@@ -49,7 +49,7 @@ class Frames(NamedTuple):
     lens: Float[Array, "numbers ..."] | list[Array]  # f (pixels), k1, k2 of BAL
     model: Int[Array, "..."] | None = None  # position in the models; None: the only one
     models: Models | None = None  # None: all cameras are BAL's
-    place: Float[Array, "12 ..."] | None = None  # M by rows, and m: from the frame of a rig to the camera
+    from_rig: Float[Array, "12 ..."] | None = None  # M by rows, and m: from the frame of a rig to the camera
 
     def at(self, index: Int[AnyArray, " n"]) -> Frames:
         """The frames of the cameras in `index`.
@@ -58,14 +58,14 @@ class Frames(NamedTuple):
         for every index.
         """
         rotation = jnp.asarray(self.rotation).reshape(9, -1)
-        place = [] if self.place is None else self.place
+        place = [] if self.from_rig is None else self.from_rig
         table = fusion_barrier(jnp.stack([*rotation, *self.translation, *self.lens, *place]))
         # not fused with its uses, in which a gather keeps the compiler from vectorising
         table = compute_unfused(take, table, jnp.asarray(index), index=index)
         model = None if self.model is None else take(self.model, jnp.asarray(index))
         end = len(table) - len(place)
         found = Frames(table[:9].reshape(3, 3, -1), table[9:12], table[12:end], model, self.models)
-        return found if self.place is None else found._replace(place=table[end:])
+        return found if self.from_rig is None else found._replace(from_rig=table[end:])
 
 
 class Projection(NamedTuple):
@@ -174,7 +174,7 @@ def frames(cameras: Float[Array, "parameters cameras"], unknowns: Unknowns | Non
     if unknowns is not None and unknowns.in_rigs:
         rotation, translation = rotation_matrix(cameras[-6:-3]), cameras[-3:]
         place = jnp.concatenate([rotation.reshape(9, -1), translation])
-        found = found._replace(lens=cameras[6:-6], place=place)
+        found = found._replace(lens=cameras[6:-6], from_rig=place)
     if unknowns is None or unknowns.models is None:
         return found
     model = None if unknowns.model is None else jnp.asarray(unknowns.model)
@@ -221,8 +221,8 @@ def project(
     rotated = [row[0] * points[0] + row[1] * points[1] + row[2] * points[2] for row in rotation]
     local = [rotated[k] + frame.translation[k] for k in range(3)]
     placed: list[Array] | None = None
-    if frame.place is not None:
-        turn, m = frame.place[:9], frame.place[9:]
+    if frame.from_rig is not None:
+        turn, m = frame.from_rig[:9], frame.from_rig[9:]
         p, q, r = local
         placed = [turn[3 * i] * p + turn[3 * i + 1] * q + turn[3 * i + 2] * r for i in range(3)]
         local = [placed[k] + m[k] for k in range(3)]
@@ -284,7 +284,7 @@ def derivatives(frame: Frames, projection: Projection, columns: tuple[int, ...] 
         dz/dw = -dz/dP [R X]x            dz/dX = dz/dP R             dz/d(f, k1, k2) = (d, f |p|^2, f |p|^4) p
     """
     by_camera_point, by_lens = (_bal_derivatives if frame.models is None else _model_derivatives)(frame, projection)
-    if frame.place is not None:
+    if frame.from_rig is not None:
         by_camera_point, by_extrinsics = _through_rig(frame, projection, by_camera_point)
         by_lens = [[*own, *more] for own, more in zip(by_lens, by_extrinsics, strict=True)]
     columns = tuple(range(len(by_lens[0]))) if columns is None else columns
@@ -306,9 +306,9 @@ Rows = tuple[list[list[Array]], list[list[Callable[[], Array]]]]
 def _through_rig(frame: Frames, projection: Projection, rows: list[list[Array]]) -> Rows:
     """From `dz/dP` of a camera in a rig, the derivative by the point in its frame, and by its extrinsics: left
     perturbation of M, and m."""
-    assert frame.place is not None
+    assert frame.from_rig is not None
     assert projection.placed is not None
-    turn, (x, y, z) = frame.place[:9], projection.placed
+    turn, (x, y, z) = frame.from_rig[:9], projection.placed
     by_frame = [[a * turn[k] + b * turn[3 + k] + c * turn[6 + k] for k in range(3)] for a, b, c in rows]
     by_extrinsics: list[list[Callable[[], Array]]] = [
         [

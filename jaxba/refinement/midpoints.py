@@ -59,8 +59,8 @@ def _ray_terms(undistortions: int, views: Views) -> list[Array]:
     camera_ray = [undistorted[0] * inverse_norm, undistorted[1] * inverse_norm, -inverse_norm]
     to_world = lambda vector: [sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)]
     offset = list(frame.translation)
-    if frame.place is not None:  # first from the camera to its frame
-        turn, m = frame.place[:9], frame.place[9:]
+    if frame.from_rig is not None:  # first from the camera to its frame
+        turn, m = frame.from_rig[:9], frame.from_rig[9:]
         back = lambda vector: [sum(turn[3 * j + i] * vector[j] for j in range(3)) for i in range(3)]
         camera_ray, offset = back(camera_ray), [t + b for t, b in zip(offset, back(m), strict=True)]
     ray, center = to_world(camera_ray), [-x for x in to_world(offset)]

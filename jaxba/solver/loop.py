@@ -201,17 +201,41 @@ def solve_loop(
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
     carry = begin(problem_info(layout, state, options, iteration_limit, prices), policy, state)
 
-    def step_of(c: Carry) -> tuple[LMState, StepInfo]:
-        effort = effort_of(policy, c.policy)
-        return lm_step(layout, c.state, c.damping, options, policy.min_gain, c.iteration, effort)
+    return loop_from(layout, carry, policy, tolerances, options, max_iterations, iteration_limit)
 
-    shapes = jax.eval_shape(lambda c: history_of(step_of(c)[1]), carry)
-    empty = jax.tree.map(lambda s: jnp.zeros((max_iterations, *s.shape), s.dtype), shapes)
+
+def iterate(
+    layout: Layout,
+    carry: Carry,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    options: StepOptions,
+    limit: Any,
+) -> tuple[Carry, StepInfo]:
+    """One iteration of the loop. Arguments as for `solve_loop`."""
+    effort = effort_of(policy, carry.policy)
+    state, step = lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration, effort)
+    return advance(carry, state, step, policy, tolerances, limit, num_partitions(layout)), step
+
+
+def loop_from(
+    layout: Layout,
+    carry: Carry,
+    policy: DampingPolicy,
+    tolerances: Tolerances,
+    options: StepOptions,
+    length: int,
+    limit: Any,
+) -> tuple[Carry, History]:
+    """The loop from a carry to its end; histories have the given length. Other arguments as for `solve_loop`."""
+    once = lambda carry: iterate(layout, carry, policy, tolerances, options, limit)
+    shapes = jax.eval_shape(lambda carry: history_of(once(carry)[1]), carry)
+    empty = jax.tree.map(lambda s: jnp.zeros((length, *s.shape), s.dtype), shapes)
 
     def body(loop: tuple[Carry, History]) -> tuple[Carry, History]:
-        carry, history = loop
-        state, step = step_of(carry)
-        history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, history_of(step))
-        return advance(carry, state, step, policy, tolerances, iteration_limit, num_partitions(layout)), history
+        before, history = loop
+        after, step = once(before)
+        history = jax.tree.map(lambda all_, one: all_.at[before.iteration].set(one), history, history_of(step))
+        return after, history
 
     return lax.while_loop(lambda loop: loop[0].termination == Termination.RUNNING, body, (carry, empty))

@@ -12,21 +12,19 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, Int
 
-from jaxba.damping import DampingPolicy, effort_of
+from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState, Prices, StepInfo
-from jaxba.lm.step import lm_step
-from jaxba.lm.termination import Termination, Tolerances
+from jaxba.lm.termination import Tolerances
 from jaxba.model.linearize import cost
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
-from jaxba.solver.loop import Carry, History, advance, begin, history_of, problem_info
+from jaxba.solver.loop import Carry, History, begin, iterate, loop_from, problem_info
 from jaxba.structure.devices import AXIS
 from jaxba.structure.layout import Layout
 from jaxba.structure.shards import deal_points, shard_of, sharded_layout
@@ -156,11 +154,6 @@ def _begin(
     return on_all(layout, cameras, points, policy, limit, prices)
 
 
-def _step(layout: Layout, carry: Carry, policy: DampingPolicy, options: StepOptions) -> tuple[LMState, StepInfo]:
-    effort = effort_of(policy, carry.policy)
-    return lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration, effort)
-
-
 @functools.partial(jax.jit, static_argnames=("mesh", "options"))
 def _iterate(
     layout: Layout,
@@ -172,14 +165,8 @@ def _iterate(
     mesh: Mesh,
     options: StepOptions,
 ) -> tuple[Carry, StepInfo]:
-    def iterate(layout: Layout, carry: Carry, policy: Any, tolerances: Tolerances, limit: Array) -> Any:
-        layout, carry = _own(layout), _divided(carry, lambda x: x[0])
-        state, step = _step(layout, carry, policy, options)
-        return _divided(advance(carry, state, step, policy, tolerances, limit, 1), lambda x: x[None]), step
-
-    places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
-    on_all = jax.shard_map(iterate, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
-    return on_all(layout, carry, policy, tolerances, limit)
+    one = lambda layout, carry, policy, tolerances, limit: iterate(layout, carry, policy, tolerances, options, limit)
+    return _on_all(mesh, one)(layout, carry, policy, tolerances, limit)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "options", "length"))
@@ -194,21 +181,18 @@ def _run(
     options: StepOptions,
     length: int,
 ) -> tuple[Carry, History]:
-    def run(layout: Layout, carry: Carry, policy: Any, tolerances: Tolerances, limit: Array) -> Any:
-        layout, carry = _own(layout), _divided(carry, lambda x: x[0])
-        shapes = jax.eval_shape(lambda c: history_of(_step(layout, c, policy, options)[1]), carry)
-        empty = jax.tree.map(lambda s: jnp.zeros((length, *s.shape), s.dtype), shapes)
+    whole = lambda layout, carry, policy, tolerances, limit: loop_from(
+        layout, carry, policy, tolerances, options, length, limit
+    )
+    return _on_all(mesh, whole)(layout, carry, policy, tolerances, limit)
 
-        def body(loop: tuple[Carry, History]) -> tuple[Carry, History]:
-            carry, history = loop
-            state, step = _step(layout, carry, policy, options)
-            history = jax.tree.map(lambda all_, one: all_.at[carry.iteration].set(one), history, history_of(step))
-            return advance(carry, state, step, policy, tolerances, limit, 1), history
 
-        more = lambda loop: loop[0].termination == Termination.RUNNING
-        carry, history = lax.while_loop(more, body, (carry, empty))
-        return _divided(carry, lambda x: x[None]), history
+def _on_all(mesh: Mesh, function: Callable[..., tuple[Carry, Any]]) -> Callable[..., tuple[Carry, Any]]:
+    """A function of a device's layout, a carry, and what is everywhere, on all devices."""
+
+    def on_one(layout: Layout, carry: Carry, *everywhere: Any) -> tuple[Carry, Any]:
+        carry, found = function(_own(layout), _divided(carry, lambda x: x[0]), *everywhere)
+        return _divided(carry, lambda x: x[None]), found
 
     places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
-    on_all = jax.shard_map(run, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
-    return on_all(layout, carry, policy, tolerances, limit)
+    return jax.shard_map(on_one, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)

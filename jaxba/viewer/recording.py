@@ -195,6 +195,7 @@ def read_recording(path: StrPath) -> Recording:
         return Recording(problem, int(found["whole"]), points=points, source=str(found["source"]), **history)
     except OSError as error:
         raise ProblemError(f"cannot read {name}: {reason(error)}") from None
+    # zipfile raises the NotImplementedError, for a compression that a flipped byte names
     except (ValueError, KeyError, IndexError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error):
         raise ProblemError(f"{name}: is not a recording of jaxba-solve --record") from None
 

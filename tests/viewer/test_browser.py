@@ -112,6 +112,18 @@ def wait_for(what, browser) -> None:
         time.sleep(0.3)
 
 
+def settled(browser) -> np.ndarray:
+    """The scene when it is drawn and stands still: four looks in a row are the same."""
+    looks: list[np.ndarray] = []
+
+    def is_still() -> bool:
+        looks.append(scene(browser))
+        return coloured(looks[-1]) > 500 and len(looks) > 3 and all((look == looks[-1]).all() for look in looks[-4:])
+
+    wait_for(is_still, browser)
+    return looks[-1]
+
+
 def check_silent(browser, *allowed: str) -> None:
     """No error on the console, as of a name that does not resolve, and no request but to these origins."""
     errors = [line["message"] for line in browser.get_log("browser") if line["level"] == "SEVERE"]
@@ -130,9 +142,7 @@ def check_silent(browser, *allowed: str) -> None:
 
 def test_the_page_shows_points_and_frusta_and_the_slider_changes_them(browser, viewer):
     browser.get(viewer.url)
-    wait_for(lambda: coloured(scene(browser)) > 500, browser)
-    time.sleep(2)
-    last = scene(browser)
+    last = settled(browser)
     from selenium.webdriver.common.by import By
 
     text = browser.find_element(By.TAG_NAME, "body").text
@@ -150,9 +160,7 @@ def test_a_click_on_a_frustum_marks_its_points(browser, viewer):
     from selenium.webdriver.common.by import By
 
     browser.get(viewer.url)
-    wait_for(lambda: coloured(scene(browser)) > 500, browser)
-    time.sleep(2)
-    before = like(scene(browser), ORANGE)
+    before = like(settled(browser), ORANGE)
     body = browser.find_element(By.TAG_NAME, "body")
     chosen = lambda: viewer.stages[0].chosen is not None
     colours = {tuple(handle.color) for handle in viewer.stages[0].drawn.values()}
