@@ -31,6 +31,7 @@ from benchmarks.metrics import Metric, to_json, to_text
 from jaxba.game.protocol import Step
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig, run_chunk, start
+from jaxba.typing import register_pytree
 
 VARIABLE = "JAXBA_SBX"
 """Environment variable with the path of a Python interpreter that has sbx-rl."""
@@ -52,7 +53,7 @@ class _Swing(NamedTuple):
     key: Array
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Pendulum:
     """Gymnasium's Pendulum-v1: mass 1 kg, length 1 m, gravity 10 m/s^2, torque at most 2 Nm, steps of 0.05 s."""

@@ -57,6 +57,7 @@ from jaxba.solver.prepare import Prepared, prepare
 from jaxba.solver.retriangulate import Retriangulation, retriangulate
 from jaxba.solver.solve import Solution, solve
 from jaxba.structure.layout import Layout, build_layout
+from jaxba.typing import register_pytree
 from jaxba.viewer.notebook import view
 
 __version__ = "0.1.0"
@@ -124,6 +125,7 @@ __all__ = [
     "read_colmap",
     "read_problem",
     "register_camera_model",
+    "register_pytree",
     "release",
     "retriangulate",
     "save_policy",

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxba.game.protocol import Step
+from jaxba.typing import register_pytree
 
 
 class ToyState(NamedTuple):
@@ -21,7 +22,7 @@ class ToyState(NamedTuple):
     key: Array
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Toy:
     """An episode is dealt +1 or -1 and sees it, perhaps with a clock."""

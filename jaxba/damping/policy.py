@@ -44,8 +44,8 @@ class ProblemInfo(NamedTuple):
 class DampingPolicy(Protocol):
     """Chooses lambda for every iteration.
 
-    A policy is a frozen dataclass and a pytree: its numbers are traced, so that changing one never
-    recompiles, and its class selects the code. Both functions are pure and jittable.
+    A policy is a frozen dataclass and a pytree (`jaxba.register_pytree`): its numbers are traced, so that changing
+    one never recompiles, and its class selects the code. Both functions are pure and jittable.
 
     A policy may have two more functions. `effort(state)` gives the point iterations of the next iteration, and
     whether it may have repairs (`jaxba.linear.step.Effort`). `step_options(base)` gives the `StepOptions` that it was

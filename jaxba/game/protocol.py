@@ -32,9 +32,9 @@ class Step(NamedTuple):
 
 @runtime_checkable
 class Environment(Protocol):
-    """A batch of environments that reset themselves. A pytree: its arrays are traced, its sizes static.
+    """A batch of environments that reset themselves. A pytree (`jaxba.register_pytree`).
 
-    Observations must be finite.
+    Its arrays are traced, its sizes static. Observations must be finite.
     """
 
     @property

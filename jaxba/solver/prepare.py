@@ -203,8 +203,20 @@ def _check_policy(policy: object) -> None:
     name = type(policy).__name__
     if missing:
         raise ValueError(f"policy {name} has no {' and no '.join(missing)} (see jaxba.DampingPolicy)")
-    if jax.tree_util.treedef_is_leaf(jax.tree.structure(policy)):
-        raise ValueError(f"policy {name} is no pytree: decorate its dataclass with jax.tree_util.register_dataclass")
+    structure = jax.tree.structure(policy)
+    if jax.tree_util.treedef_is_leaf(structure):
+        raise ValueError(f"policy {name} is no pytree: decorate its dataclass with jaxba.register_pytree")
+    for other, seen in _structures.items():
+        if other is not type(policy) and seen == structure:  # see `register_pytree`
+            raise ValueError(
+                f"policy {name} cannot be told from policy {other.__name__} of this process, whose compiled program "
+                "might run in its place: decorate it with jaxba.register_pytree, not with JAX's register_dataclass"
+            )
+    _structures[type(policy)] = structure
+
+
+_structures: dict[type, Any] = {}
+"""The last structure of a policy of each class, for `_check_policy`."""
 
 
 def _exact(problem: BundleProblem, found: BundleProblem) -> dict[str, np.ndarray]:

@@ -46,6 +46,15 @@ def test_static_fields_are_part_of_the_structure():
     assert jax.tree.structure(Pair(1, 2)) != jax.tree.structure(Pair(1, 2, "other"))
 
 
+def test_classes_with_equal_fields_are_different_structures():
+    @register_pytree
+    @dataclasses.dataclass(frozen=True)
+    class Other(Pair):
+        pass
+
+    assert jax.tree.structure(Pair(1, 2)) != jax.tree.structure(Other(1, 2))
+
+
 def test_a_tree_is_rebuilt_without_the_checks_of_its_constructor():
     assert jax.tree.map(str, Pair(1, 2)).left == "1"
     with pytest.raises(ValueError, match="left is a name"):

@@ -24,7 +24,7 @@ from jax import monitoring
 from jax.experimental.compilation_cache import compilation_cache
 from support import solve
 
-from jaxba import Loss, make_policy
+from jaxba import Loss, make_policy, register_pytree
 from jaxba.io import write_problem
 from jaxba.lm.step import try_step
 from jaxba.problem.options import Refinement, StepOptions
@@ -264,7 +264,7 @@ def test_programs_with_code_of_other_packages_are_not_stored(function, static, a
 
 def test_two_rules_of_a_user_are_not_confused(folder):
     def rule(factor):
-        @jax.tree_util.register_dataclass
+        @register_pytree
         @dataclasses.dataclass(frozen=True)
         class Constant(type(make_policy("constant:1e-3"))):
             def propose(self, state, step):

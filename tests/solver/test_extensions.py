@@ -11,7 +11,7 @@ import pytest
 import support
 
 import jaxba
-from jaxba import DampingPolicy, Loss, ProblemInfo, SolveOptions, StepInfo
+from jaxba import DampingPolicy, Loss, ProblemInfo, SolveOptions, StepInfo, register_pytree
 from jaxba.problem import geometry
 
 
@@ -59,7 +59,7 @@ def test_geman_mcclure_counts_what_its_formula_says():
     assert solution.final_cost < solution.initial_cost < 0.5 * scale**2 * support.tiny().num_observations
 
 
-@jax.tree_util.register_dataclass
+@register_pytree
 @dataclass(frozen=True)
 class Steady:
     """Lambda is divided by one number after an accepted step and multiplied by another after a rejected one."""
@@ -94,6 +94,27 @@ def test_a_policy_written_by_hand_drives_a_solve(callback):
 
 def test_a_policy_written_by_hand_brings_a_plain_step():
     assert jaxba.prepare(support.tiny(), Steady()).options == jaxba.StepOptions()
+
+
+def test_policies_that_jax_cannot_tell_apart_are_refused():
+    """Their programs would be mistaken for each other, now and then, without a word."""
+
+    def make(fall: float) -> object:
+        @jax.tree_util.register_dataclass
+        @dataclass(frozen=True)
+        class Twin(Steady):
+            def propose(self, state: jax.Array, step: StepInfo) -> tuple[jax.Array, jax.Array]:
+                return state / fall, state / fall
+
+        return Twin()
+
+    first, second = make(2.0), make(3.0)
+    jaxba.prepare(support.tiny(), first)
+    with pytest.raises(
+        ValueError, match=r"Twin cannot be told from policy Twin of this process.*jaxba\.register_pytree"
+    ):
+        jaxba.prepare(support.tiny(), second)
+    jaxba.prepare(support.tiny(), first)
 
 
 class OnlyStarts:

@@ -17,6 +17,7 @@ from jaxba.game.protocol import Step
 from jaxba.training import sac
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig, LoopState, run_chunk, start
+from jaxba.typing import register_pytree
 
 GAMMA = 0.8
 TWIN = SacConfig(
@@ -201,6 +202,7 @@ def test_compiles_once() -> None:
     assert int(state.updates) == 3 * 5 * 2
 
 
+@register_pytree
 @dataclasses.dataclass(frozen=True)
 class OneRewardForAll(toys.Toy):
     """A mistake: a reward that would be broadcast over all environments."""
@@ -208,9 +210,6 @@ class OneRewardForAll(toys.Toy):
     def step(self, state: Any, action: jax.Array) -> tuple[Any, Step]:
         after, step = super().step(state, action)
         return after, step._replace(reward=step.reward[:1])
-
-
-jax.tree_util.register_dataclass(OneRewardForAll)
 
 
 def test_an_environment_of_other_shapes_than_the_protocols_is_refused(unchecked) -> None:
