@@ -112,9 +112,21 @@ def _parse_and_run(
 
         if out_of_memory(error):
             return print_error("not enough memory")
+        _end_if_alone(error)
         if isinstance(error, OSError) and error.errno in FULL:
             return print_error(f"{error.filename or 'a file'}: {error.strerror}")
         raise
+
+
+def _end_if_alone(error: Exception) -> None:
+    """Ends this process with one line if another one of the run has ended, for which JAX would wait."""
+    from jaxba.runtime.distributed import has_lost_process
+
+    if has_lost_process(error):
+        status = print_error("another process of this run has ended, and so does this one")
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
 
 
 @contextmanager

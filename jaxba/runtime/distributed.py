@@ -36,6 +36,10 @@ hour."""
 THREADS = 8
 """Of XLA for each virtual device. With one for each, two and four devices on two cores came to a standstill."""
 
+LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")
+"""What errors say that JAX raises where another process is gone: its collectives, and its service of processes. They
+have no class of their own."""
+
 _done = itertools.count()
 
 
@@ -104,6 +108,11 @@ def _check(coordinator: str, processes: int, process: int) -> None:
 def is_main() -> bool:
     """Whether this is the first process, which alone prints and writes. Starts JAX: `use_devices` comes before."""
     return not jax.distributed.is_initialized() or jax.process_index() == 0
+
+
+def has_lost_process(error: BaseException) -> bool:
+    """Whether an error was raised because another process of this run is gone."""
+    return jax.distributed.is_initialized() and any(word in str(error) for word in LOST_WORDS)
 
 
 def use_devices(count: int | None) -> list[jax.Device]:

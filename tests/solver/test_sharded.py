@@ -160,19 +160,24 @@ def test_what_several_devices_cannot_do_is_one_line():
         SolveOptions(devices=0)
 
 
-def run_two(file, output) -> tuple[list[int], list[str]]:
-    """Exit statuses of two processes that solve a file, and what they print."""
+def start_two(file, *options: str, stderr: int = subprocess.STDOUT) -> list[subprocess.Popen]:
+    """Two processes that solve a file."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
-    command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", str(file), "--policy", "ceres"]
-    command += ["--linear-solver", "implicit", "--max-iterations", "4", "--compilation", "full"]
-    ends = ["--output", str(output), "--coordinator", address, "--processes", "2", "--process"]
+    command = [sys.executable, "-c", "from jaxba.cli.solve import main; main()", str(file), *options]
+    command += ["--linear-solver", "implicit", "--compilation", "full"]
+    ends = ["--coordinator", address, "--processes", "2", "--process"]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    started = [
-        subprocess.Popen([*command, *ends, str(k)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        for k in range(2)
-    ]
+    start = lambda k: subprocess.Popen(
+        [*command, *ends, str(k)], env=environment, stdout=subprocess.PIPE, stderr=stderr
+    )
+    return [start(k) for k in range(2)]
+
+
+def run_two(file, output) -> tuple[list[int], list[str]]:
+    """Exit statuses of two processes that solve a file, and what they print."""
+    started = start_two(file, "--policy", "ceres", "--max-iterations", "4", "--output", str(output))
     try:
         printed = [process.communicate(timeout=240)[0].decode() for process in started]
     finally:
@@ -193,3 +198,22 @@ def test_two_processes_solve_as_one_and_end_together(tmp_path):
     assert all(line.startswith("[Gloo]") for line in printed[1].splitlines())  # which is C++'s
     one = solve(sequence(), "ceres", SolveOptions(linear_solver="implicit", max_iterations=4)).final_cost
     np.testing.assert_allclose(geometry.cost(jaxba.read_problem(tmp_path / "out.txt")), one, rtol=1e-9)
+
+
+def test_a_process_that_dies_ends_the_other_with_one_line(tmp_path):
+    file = tmp_path / "scene.txt"
+    jaxba.write_problem(sequence(), file)
+    # lambda so large that no rule of stopping is met
+    started = start_two(file, "--policy", "constant:1e9", "--max-iterations", "1000000", stderr=subprocess.PIPE)
+    try:
+        assert started[0].stdout is not None
+        while started[0].stdout.readline().split()[:1] != [b"3"]:
+            assert started[0].poll() is None
+        started[1].kill()
+        _, errors = started[0].communicate(timeout=240)
+    finally:
+        for process in started:
+            process.kill()
+            process.communicate()
+    assert errors == b"error: another process of this run has ended, and so does this one\n"
+    assert started[0].returncode == 2
