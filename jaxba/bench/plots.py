@@ -27,9 +27,7 @@ from jaxba.bench import profile
 from jaxba.bench.levels import levels, merged, representatives, time_is_log
 from jaxba.bench.profile import Target
 from jaxba.bench.records import Record, TracePoint
-
-COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#7F7F7F")
-"""Okabe and Ito's palette, safe for colour-blind readers; grey for its yellow, which is too light for lines."""
+from jaxba.solver.figure import COLOURS
 
 LINES = ("-", (0, (6, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (1.5, 1.2)))
 """Line styles, a different one for each next solver, so that curves can be told apart in black and white."""

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from jaxba.bench.plots import COLOURS, LINES, MARKERS
+from jaxba.bench.plots import LINES, MARKERS
+from jaxba.solver.figure import COLOURS
 from jaxba.training.log import Row
 
 SHOWN = {"score": "mean iterations", "p90": "90th percentile of the iterations", "failures": "failures (%)"}

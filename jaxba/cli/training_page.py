@@ -160,7 +160,8 @@ def _faint(color: str) -> str:
 
 def _episode_charts(episodes: Sequence[Episode]) -> list[Chart]:
     """Lambda, effort and cost over the iterations of some episodes."""
-    from jaxba.bench.plots import COLOURS, MARKERS
+    from jaxba.bench.plots import MARKERS
+    from jaxba.solver.figure import COLOURS
 
     def chart(title: str, y: Callable[[Episode], Any], axis: dict[str, Any], starts: int) -> Chart:
         traces = []

@@ -11,8 +11,10 @@ from jaxba.solver.loop import History
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COST, DAMPING, REJECTED = "#0072B2", "#D55E00", "#7F7F7F"
-"""Colours, of Okabe and Ito's palette."""
+COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9", "#7F7F7F")
+"""Okabe and Ito's palette, safe for colour-blind readers; grey for its yellow, which is too light for lines."""
+
+COST, DAMPING, REJECTED = COLOURS[1], COLOURS[2], COLOURS[-1]
 
 
 def plot_history(history: History, initial_cost: float) -> Figure:

@@ -13,6 +13,7 @@ from io import StringIO
 import numpy as np
 
 from jaxba.viewer import geometry
+from jaxba.viewer.curve import CostCurve, colour_of
 from jaxba.viewer.extra import viser
 from jaxba.viewer.recording import Recording
 from jaxba.viewer.sources import Shown
@@ -106,9 +107,13 @@ class Viewer:
     def _panel(self) -> None:
         gui, last = self.server.gui, max(stage.shown.recording.last for stage in self.stages)
         gui.configure_theme(show_share_button=False, show_logo=False)
-        gui.add_markdown("\n\n".join(f"**{plain(stage.shown.name)}**: {sizes(stage)}" for stage in self.stages))
+        lines = [f"**{plain(stage.shown.name)}**: {sizes(stage)}" for stage in self.stages]
+        if len(lines) > 1:
+            lines = [f'<font color="{colour_of(k)}">●</font> {line}' for k, line in enumerate(lines)]
+        gui.add_markdown("\n\n".join(lines))
         self._slider = gui.add_slider("iteration", 0, max(last, 1), 1, last, visible=last > 0)
         self._numbers = gui.add_markdown("")
+        self._curve = CostCurve(self.server, self.stages)
         choices = list(dict.fromkeys(name for stage in self.stages for name in stage.colour_choices()))
         colour = gui.add_dropdown("colour", choices, initial_value=self.stages[0].colour)
         size = gui.add_slider("size of points", 0.001, 0.03, 0.001, POINT_SIZE)
@@ -148,6 +153,7 @@ class Viewer:
             meaning = stage.limits_text()
             lines.append(f"{name}{stage.numbers()}" + (f"  \n*{meaning}*" if meaning else ""))
         self._numbers.content = "\n\n".join(lines)
+        self._curve.update()
 
 
 LAYERS = (("start, grey", "start"), ("true path, blue", "truth"), ("path, red", "path"))

@@ -140,6 +140,18 @@ def check_silent(browser, *allowed: str) -> None:
     assert [url for url in asked if not url.startswith((*allowed, "data:", "blob:"))] == []
 
 
+def curve_pixels(browser) -> int:
+    """Pixels of the chart of costs that have the colour of the curve."""
+    from PIL import Image
+
+    from jaxba.viewer.curve import colour_of
+
+    chart = browser.find_element("css selector", ".uplot canvas")
+    pixels = np.asarray(Image.open(io.BytesIO(chart.screenshot_as_png)).convert("RGB"), float)
+    blue = [int(colour_of(0)[k : k + 2], 16) for k in (1, 3, 5)]
+    return int((np.abs(pixels - blue).max(axis=2) < 40).sum())
+
+
 def test_the_page_shows_points_and_frusta_and_the_slider_changes_them(browser, viewer):
     browser.get(viewer.url)
     last = settled(browser)
@@ -148,10 +160,16 @@ def test_the_page_shows_points_and_frusta_and_the_slider_changes_them(browser, v
     text = browser.find_element(By.TAG_NAME, "body").text
     assert "8 images, " in text
     assert f"iteration {viewer.stages[0].shown.recording.last} of" in text
+    assert curve_pixels(browser) > 50
     slider = browser.find_element(By.CSS_SELECTOR, "[role=slider]")
     slider.send_keys("\ue012" * 10)  # arrow to the left
     wait_for(lambda: "start, cost" in browser.find_element(By.TAG_NAME, "body").text, browser)
     wait_for(lambda: (np.abs(scene(browser) - last).max(axis=2) > 60).sum() > 200, browser)
+    recorded = viewer.stages[0].shown.recording.cost
+    iterations, cost, shown = viewer._curve._chart.data
+    np.testing.assert_array_equal(iterations, np.arange(len(recorded)))
+    np.testing.assert_array_equal(cost, recorded)
+    np.testing.assert_array_equal(shown, [recorded[0], *[np.nan] * (len(recorded) - 1)])
     check_silent(browser, viewer.url, viewer.url.replace("http", "ws"))
 
 

@@ -1,0 +1,64 @@
+"""The costs of recorded solves as curves in the panel, with a dot at the iteration that is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxba.solver.figure import COLOURS
+from jaxba.viewer.extra import viser
+from jaxba.viewer.stage import Stage
+
+ASPECT = 1.6
+"""Width over height."""
+
+DOT = 9
+"""Diameter of the dot, pixels."""
+
+LABELS = 70
+"""Width of the numbers at the axis of costs, pixels."""
+
+
+def colour_of(stage: int) -> str:
+    """The colour of the curve of a stage."""
+    return COLOURS[(stage + 1) % len(COLOURS)]
+
+
+class CostCurve:
+    """A chart in the panel; there is none where nothing was recorded."""
+
+    def __init__(self, server: viser.ViserServer, stages: Sequence[Stage]) -> None:
+        self._stages = stages
+        several = len(stages) > 1
+        series: list[dict] = [{"label": "iteration"}]
+        for k, stage in enumerate(stages):
+            colour = colour_of(k)
+            label = f"cost, {stage.shown.name}" if several else "cost (px²)"
+            dot = {"show": True, "size": DOT, "fill": colour}
+            series.append({"label": label, "stroke": colour, "width": 2, "points": {"show": False}})
+            series.append({"label": "shown", "stroke": colour, "width": 0, "points": dot})
+        self._chart = server.gui.add_uplot(
+            self._data(),
+            tuple(series),  # pyright: ignore[reportArgumentType] (dictionaries of uPlot)
+            scales={"x": {"time": False}, "y": {"distr": 3}},
+            axes=({}, {"size": LABELS}),
+            padding=(14, 14, 0, 0),
+            legend={"show": False},
+            aspect=ASPECT,
+            visible=max(stage.shown.recording.last for stage in stages) > 0,
+        )
+
+    def update(self) -> None:
+        """Draws the curves of recordings that have grown, and the dots where the stages are."""
+        self._chart.data = self._data()
+
+    def _data(self) -> tuple[np.ndarray, ...]:
+        """Iterations, then for each stage its cost, at the end for ever, and that of the iteration shown, else NaN."""
+        iterations = np.arange(max(stage.shown.recording.last for stage in self._stages) + 1.0)
+        found = [iterations]
+        for stage in self._stages:
+            recorded = stage.shown.recording.cost
+            cost = np.pad(recorded, (0, len(iterations) - len(recorded)), mode="edge")
+            found += [cost, np.where(iterations == stage.iteration, cost, np.nan)]
+        return tuple(found)
