@@ -10,14 +10,14 @@ from jaxba.solver.figure import COLOURS
 from jaxba.viewer.extra import viser
 from jaxba.viewer.stage import Stage
 
-ASPECT = 1.6
+ASPECT = 2.0
 """Width over height."""
 
 DOT = 9
 """Diameter of the dot, pixels."""
 
-LABELS = 70
-"""Width of the numbers at the axis of costs, pixels."""
+LABELS, FONT = 80, "10px sans-serif"
+"""Width of the numbers at the axis of costs, pixels: a thousand million has room."""
 
 
 def colour_of(stage: int) -> str:
@@ -42,7 +42,7 @@ class CostCurve:
             self._data(),
             tuple(series),  # pyright: ignore[reportArgumentType] (dictionaries of uPlot)
             scales={"x": {"time": False}, "y": {"distr": 3}},
-            axes=({}, {"size": LABELS}),
+            axes=({"font": FONT}, {"font": FONT, "size": LABELS}),
             padding=(14, 14, 0, 0),
             legend={"show": False},
             aspect=ASPECT,
