@@ -11,8 +11,10 @@ import itertools
 import os
 import pickle
 import socket
+import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -24,6 +26,9 @@ T = TypeVar("T")
 
 START_S = 300
 """Seconds that processes wait for each other at the start. JAX's default."""
+
+PATIENCE_S = 5
+"""Seconds after which a process says that it waits for others at the start."""
 
 HEARTBEAT_S = 30
 """Seconds after which a process that was not heard of counts as dead, and JAX ends the others. JAX's default is 100."""
@@ -54,6 +59,8 @@ class MainFailedError(Exception):
 def initialize(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
     """Connects this process with the others, before any computation with JAX. On CPUs they talk by gloo.
 
+    Where not all have started after `START_S` the process ends with one line.
+
     Args:
         coordinator: `HOST:PORT` of the first process, on a port that is free there.
         processes: how many there are.
@@ -70,11 +77,36 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
         _check(coordinator, processes, process)
     jax.config.update("jax_enable_preemption_service", False)  # it would catch SIGTERM, and the process live on
     try:
-        jax.distributed.initialize(
-            coordinator, processes, process, initialization_timeout=START_S, heartbeat_timeout_seconds=HEARTBEAT_S
-        )
+        with _deadline(START_S):
+            jax.distributed.initialize(
+                coordinator,
+                processes,
+                process,
+                initialization_timeout=2 * START_S,  # at whose end it would abort the process with a stack trace
+                heartbeat_timeout_seconds=HEARTBEAT_S,
+            )
     except ValueError as error:
         raise DistributedError(f"no coordinator was given, and JAX found none: {error}") from None
+
+
+@contextlib.contextmanager
+def _deadline(seconds: float) -> Iterator[None]:
+    """In which processes wait for each other: says so after a while, and ends this one at the deadline."""
+
+    def give_up() -> None:
+        print(f"error: not all processes of this run have started in {seconds:g} s", file=sys.stderr, flush=True)
+        os._exit(2)
+
+    say = lambda: print("note: waiting for the other processes", file=sys.stderr, flush=True)
+    timers = threading.Timer(PATIENCE_S, say), threading.Timer(seconds, give_up)
+    for timer in timers:
+        timer.daemon = True
+        timer.start()
+    try:
+        yield
+    finally:
+        for timer in timers:
+            timer.cancel()
 
 
 def _check(coordinator: str, processes: int, process: int) -> None:
