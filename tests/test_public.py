@@ -75,7 +75,7 @@ def test_no_public_function_hides_a_module():
     assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == {"__init__.py", "typing.py", "py.typed"}
 
 
-NEED_VISER = {f"jaxba.viewer.{name}" for name in ("extra", "layers", "live", "page", "panel", "stage")}
+NEED_VISER = {f"jaxba.viewer.{name}" for name in ("curve", "extra", "layers", "live", "page", "panel", "stage")}
 
 
 @pytest.mark.extra
