@@ -102,10 +102,10 @@ def best_candidate(
     def advance(search: Search) -> Search:
         if not options.refinement.camera_rounds:
             return next_search(against, search, search.cameras)
-        # a loop of at most one iteration: under vmap both branches of a condition would be computed
-        last, refining = search.candidate, jnp.any(search.refining).astype(jnp.int32)
-        refine = lambda _, __: refine_cameras(parts.layout, last.cameras, last.points, options)
-        return next_search(against, search, loops.fori_loop(0, refining, refine, last.cameras))
+        last = search.candidate
+        refine = lambda cameras, points: refine_cameras(parts.layout, cameras, points, options)
+        refined = loops.run_if(jnp.any(search.refining), refine, (last.cameras, last.points), last.cameras)
+        return next_search(against, search, refined)
 
     # full step, shorter steps, pattern moves and camera rounds are iterations of one loop, so that the program contains
     # the evaluation of a candidate only once

@@ -169,9 +169,8 @@ def refine_from_starts(
     Returns:
         As `refine_points`.
     """
-    # a loop of at most one iteration: under vmap both branches of a condition would be computed
-    candidates = lambda _, __: jnp.stack(choose_starts(layout, frames, points, loss, previous))
-    candidates = loops.fori_loop(0, jnp.minimum(starts, 1), candidates, jnp.stack([points, points]))
+    choose = lambda frames, points, previous: jnp.stack(choose_starts(layout, frames, points, loss, previous))
+    candidates = loops.run_if(starts > 0, choose, (frames, points, previous), jnp.stack([points, points]))
 
     def refine_start(number: Array, best: tuple[Array, Array]) -> tuple[Array, Array]:
         found, costs = refine_points(layout, frames, candidates[number], loss, iterations, previous, min_decrease)

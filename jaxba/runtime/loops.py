@@ -41,6 +41,26 @@ def fori_loop(
     return lax.while_loop(lambda loop: loop[0] < end, advance, (begin, start))[1]
 
 
+def run_if(needed: Any, function: Callable[..., Carry], arguments: tuple[Any, ...], otherwise: Carry) -> Carry:
+    """`function(*arguments)` where it is needed, else `otherwise`: a loop of at most one iteration.
+
+    Under `vmap` both branches of `jax.lax.cond` would be computed; this is, once one of the batch needs it. What does
+    not change in a loop XLA computes before it, needed or not: so the arguments pass a barrier that is in the loop.
+
+    Args:
+        needed: whether, a boolean or 0 or 1.
+        function: of arrays or pytrees of arrays.
+        arguments: its arguments. What it closes over may be computed from in any case.
+        otherwise: of the type of its result.
+    """
+
+    def body(k: Array, _: Carry) -> Carry:
+        inside, _ = lax.optimization_barrier((arguments, k))
+        return function(*inside)
+
+    return fori_loop(0, jnp.asarray(needed, jnp.int32), body, otherwise)
+
+
 def map_rows(function: Callable[[Any], Any], rows: Any, used: Int[AnyArray, ""] | None = None) -> Any:
     """`jax.lax.map`, never taken for a small loop: the results for the entries of a leading axis, one after the other.
 

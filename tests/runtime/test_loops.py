@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -59,3 +61,37 @@ def test_xla_does_not_take_a_loop_over_long_vectors_for_a_small_one():
     assert "xla_cpu_small_call" not in program(loops.fori_loop)
     if "xla_cpu_small_call" not in program(lax.fori_loop):
         pytest.skip("this jaxlib takes no such loop for a small one: the loops of jax.lax would do")
+
+
+@pytest.mark.parametrize("needed", [True, False])
+def test_what_is_not_needed_is_the_other_value(needed):
+    found = jax.jit(lambda n, x: loops.run_if(n, lambda x: 2 * x, (x,), x + 1))(needed, jnp.arange(3.0))
+    np.testing.assert_array_equal(found, [0, 2, 4] if needed else [1, 2, 3])
+
+
+def test_members_of_a_batch_need_it_or_not():
+    needed, x = jnp.asarray([True, False]), jnp.arange(6.0).reshape(2, 3)
+    found = jax.vmap(lambda n, x: loops.run_if(n, lambda x: 2 * x, (x,), -x))(needed, x)
+    np.testing.assert_array_equal(found, jnp.stack([2 * x[0], -x[1]]))
+
+
+def _always(text: str, operation: str) -> bool:
+    """Whether a compiled program has an operation outside of its loops."""
+    parts = {name: part for part in text.split("\n\n") if (name := re.search(r"^(?:ENTRY )?%?([\w.-]+) ", part, re.M))}
+    parts = {name[1]: part for name, part in parts.items()}
+    (entry,) = (part for part in parts.values() if part.lstrip().startswith("ENTRY"))
+    fused = [parts[name] for name in re.findall(r"calls=%?([\w.-]+)", entry)]
+    return any(f" {operation}(" in part for part in [entry, *fused])
+
+
+@pytest.mark.xla
+def test_what_is_not_needed_is_not_computed():
+    """XLA takes what does not change in a loop out of it: so it does where the arguments pass no barrier."""
+    without = lambda needed, f, x, otherwise: loops.fori_loop(0, needed.astype(int), lambda *_: f(*x), otherwise)
+    text = {
+        run: jax.jit(lambda n, x, run=run: run(n, jnp.sin, (x,), x)).lower(True, np.ones(1000)).compile().as_text()
+        for run in (loops.run_if, without)
+    }
+    assert "sine" in text[loops.run_if]
+    assert not _always(text[loops.run_if], "sine")
+    assert _always(text[without], "sine")
