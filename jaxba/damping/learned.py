@@ -13,12 +13,19 @@ from jaxtyping import Float
 
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import Memory, begin, observe, record
-from jaxba.damping.guard import damping_of, effort_for
+from jaxba.damping.guard import GuardState, damping_of, effort_for, initial_guard, update_guard
 from jaxba.damping.policy import ProblemInfo
 from jaxba.linear.step import Effort
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
 from jaxba.typing import AnyArray, register_pytree
+
+
+class Guarded(NamedTuple):
+    """State of a policy that observes nothing: what its guard remembers."""
+
+    guard: GuardState
+    effort: Effort | None  # of the next step; None if it is fixed
 
 
 class AgentPolicy(ABC):
@@ -41,7 +48,7 @@ class AgentPolicy(ABC):
         """See `policy.observes_prices`."""
         return self.config.observes_prices
 
-    def effort(self, state: Memory) -> Effort | None:
+    def effort(self, state: Memory | Guarded) -> Effort | None:
         """See `policy.effort_of`."""
         return state.effort
 
@@ -80,6 +87,19 @@ class ConstantAction(AgentPolicy):
     def act(self, observation: Float[Array, " features"]) -> Float[Array, " actions"]:
         """The action, whatever the observation."""
         return jnp.asarray(self.action, jnp.float32)
+
+    def init(self, info: ProblemInfo) -> tuple[Guarded, Float[Array, ""]]:
+        """See `DampingPolicy`."""
+        return self._allowed(initial_guard(info.cost.dtype))
+
+    def propose(self, state: Guarded, step: StepInfo) -> tuple[Guarded, Float[Array, ""]]:
+        """See `DampingPolicy`."""
+        return self._allowed(update_guard(self.config, state.guard, step))
+
+    def _allowed(self, guard: GuardState) -> tuple[Guarded, Float[Array, ""]]:
+        action = jnp.asarray(self.action, jnp.float32)
+        state = Guarded(guard, effort_for(self.config, guard, action))
+        return state, damping_of(self.config, guard, action[0])
 
 
 def boldest(config: AgentConfig) -> ConstantAction:

@@ -50,7 +50,7 @@ def test_bold_is_a_network_that_always_asks_for_the_smallest_lambda(embedded):
 def test_bolds_lambda_is_the_smallest_of_all_that_the_guard_allows():
     policy = make_policy("bold")
     config, wishes = policy.config, jnp.linspace(-1, 1, 9, dtype=jnp.float32)
-    state, damping = policy.init(info())
+    state, damping = begin(config, info()), policy.init(info())[1]
     for accepted in (ACCEPTED, REJECTED, ACCEPTED, ACCEPTED, ACCEPTED, REJECTED, REJECTED, ACCEPTED):
         allowed = [float(damping_of(config, state.guard, wish)) for wish in wishes]
         assert float(damping) == min(allowed)
