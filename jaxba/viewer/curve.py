@@ -46,12 +46,13 @@ class CostCurve:
             padding=(14, 14, 0, 0),
             legend={"show": False},
             aspect=ASPECT,
-            visible=max(stage.shown.recording.last for stage in stages) > 0,
         )
+        self.update()
 
     def update(self) -> None:
         """Draws the curves of recordings that have grown, and the dots where the stages are."""
-        self._chart.data = self._data()
+        data = self._data()
+        self._chart.data, self._chart.visible = data, len(data[0]) > 1
 
     def _data(self) -> tuple[np.ndarray, ...]:
         """Iterations, then for each stage its cost, at the end for ever, and that of the iteration shown, else NaN."""

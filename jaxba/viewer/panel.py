@@ -99,7 +99,7 @@ class Viewer:
             stage = self.stages[0]
             newest = stage.iteration == stage.shown.recording.last
             stage.show(recording.last if newest else None, shown=replace(stage.shown, recording=recording))
-            self._slider.max = max(recording.last, 1)
+            self._slider.max, self._slider.visible = max(recording.last, 1), recording.last > 0
             if newest:
                 self._slider.value = recording.last
             self._tell()

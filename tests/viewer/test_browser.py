@@ -226,6 +226,26 @@ def test_a_solve_is_watched_while_it_runs(browser, viewer, recording):
     wait_for(lambda: f"iteration {count} of {count}" in browser.find_element("tag name", "body").text, browser)
 
 
+def test_slider_and_curve_come_with_the_first_iteration(recording):
+    from dataclasses import replace
+
+    from jaxba.viewer.panel import Viewer
+    from jaxba.viewer.sources import shown
+
+    rows = ("state", "cost", "damping", "gain_ratio", "time_s")
+    start = replace(recording, **{name: getattr(recording, name)[:1] for name in rows})
+    viewer = Viewer([shown(start, "run")])
+    try:
+        assert not viewer._slider.visible
+        assert not viewer._curve._chart.visible
+        viewer.grow(recording)
+        assert viewer._slider.visible
+        assert viewer._curve._chart.visible
+        assert viewer._slider.value == recording.last
+    finally:
+        viewer.close()
+
+
 def test_the_command_says_what_is_missing(tmp_path, capsys):
     from jaxba.cli.view import run
 
