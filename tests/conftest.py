@@ -52,7 +52,7 @@ def _flags_of_level_quick() -> str:
     XLA ends a process whose flags it does not know, so another process asks which ones it knows. That one may import
     jaxba, too: here it must not be imported before the import hook of jaxtyping is there.
     """
-    code = "from jaxba.runtime.compilation import compiler_options; print(compiler_options('quick') or {})"
+    code = "from jaxba.runtime.compilation import compiler_options; print(compiler_options('quick'))"
     told = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True).stdout
     return " ".join(f"--{name}={str(value).lower()}" for name, value in ast.literal_eval(told).items())
 

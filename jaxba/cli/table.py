@@ -75,7 +75,7 @@ def _constants(problem: BundleProblem) -> list[str]:
 
 def compiled(compilation: str, problem: BundleProblem) -> str:
     """How the step of a solve is compiled, as text."""
-    if compilation == "full" or compiler_options("quick") is None:
+    if compilation == "full" or not compiler_options("quick"):
         return "compiled fully"
     if compilation == "quick":
         return "compiled quickly"

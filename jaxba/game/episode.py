@@ -21,6 +21,7 @@ from jaxba.lm.step import lm_step, state_at
 from jaxba.lm.termination import converged_in_cost
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.jit import jit
 
 TRIES = 64
 """Scenes of which `draw` takes the first that is worth solving; 85% of the default class are."""
@@ -119,7 +120,7 @@ class _Played(NamedTuple):
     converged: Array
 
 
-@functools.partial(jax.jit, static_argnames=("kind", "options", "limit"))
+@functools.partial(jit, static_argnames=("kind", "options", "limit"))
 def _played(
     kind: SceneClass,
     scene: Scenes,

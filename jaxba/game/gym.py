@@ -16,6 +16,7 @@ from jax import Array
 from jaxba.damping.features import FEATURE_LIMIT
 from jaxba.game.env import Game, GameState
 from jaxba.game.protocol import Step
+from jaxba.runtime.jit import jit
 from jaxba.runtime.process import forked_from_jax
 
 try:
@@ -86,18 +87,18 @@ class _Compiled:
         return observation[:, : self.game.observation_size - self.game.privileged_size]
 
 
-_reset = jax.jit(lambda game, key: game.reset(key))
-_step = jax.jit(lambda game, state, action: game.step(state, action))
+_reset = jit(lambda game, key: game.reset(key))
+_step = jit(lambda game, state, action: game.step(state, action))
 
 
-@jax.jit
+@jit
 def _reset_some(game: Game, state: GameState, key: Array, chosen: Array) -> tuple[GameState, Array]:
     fresh, _ = game.reset(key)
     merged = game.merged(chosen, fresh, state)
     return merged, game.observations(merged)
 
 
-@jax.jit
+@jit
 def _step_some(game: Game, state: GameState, action: Array, chosen: Array) -> tuple[GameState, Step]:
     """A step of the chosen environments; the others stay where they are, with no reward and no end."""
     after, step = game.step(state, action)

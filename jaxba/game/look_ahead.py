@@ -23,6 +23,7 @@ from jaxba.game.env import Episode, Game
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import step_groups
 from jaxba.game.scene_bank import Bank
+from jaxba.runtime.jit import jit
 
 
 class Played(NamedTuple):
@@ -105,7 +106,7 @@ def _result(game: Game, run: _Run) -> Played:
     return Played(paid, run.success, iteration)
 
 
-@functools.partial(jax.jit, static_argnames=("number", "looks"))
+@functools.partial(jit, static_argnames=("number", "looks"))
 def _look_ahead(game: Game, number: int, policy: AgentPolicy, actions: Array, looks: bool) -> Played:
     kind, bank = game.kinds[number], game.banks[number]
     advance = _advance(game, kind, bank)

@@ -23,6 +23,7 @@ from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.jit import jit
 
 GRID = tuple(10.0**decade for decade in (-8, -7, -6, -5, -4, -3, -2, -1, 0))
 """Lambdas tried from every state."""
@@ -69,7 +70,7 @@ def beam_search(
     return jnp.concatenate([start.cost[None], costs])
 
 
-@functools.partial(jax.jit, static_argnames=("kind", "options", "iterations", "width", "grid"))
+@functools.partial(jit, static_argnames=("kind", "options", "iterations", "width", "grid"))
 def _search(
     kind: SceneClass, bank: Bank, options: StepOptions, iterations: int, width: int, grid: tuple[float, ...]
 ) -> Array:

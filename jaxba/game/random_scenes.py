@@ -17,6 +17,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.model import camera
+from jaxba.runtime.jit import jit
 from jaxba.structure.density import DENSE_UNKNOWNS
 from jaxba.structure.track_buckets import TILED_POINTS
 
@@ -97,7 +98,7 @@ class _Rig(NamedTuple):
     intrinsics: Float[Array, "3 cameras"]  # f, k1, k2
 
 
-@functools.partial(jax.jit, static_argnames=("kind", "count", "dtype"))
+@functools.partial(jit, static_argnames=("kind", "count", "dtype"))
 def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
     """Random scenes, the unusable ones included; see `scene_bank.solve_scenes`. Not of the family `windows`.
 

@@ -23,6 +23,7 @@ from jaxba.lm.records import LMState, Prices, StepInfo
 from jaxba.lm.step import lm_step, state_at
 from jaxba.lm.termination import converged_in_cost
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.jit import jit
 
 T = TypeVar("T")
 
@@ -140,7 +141,7 @@ def play(
     return Trajectories(np.where(past, last, costs), dampings[:-1], iterations[:-1], converged[:-1], paid)
 
 
-@functools.partial(jax.jit, static_argnames=("kind", "options", "limit"))
+@functools.partial(jit, static_argnames=("kind", "options", "limit"))
 def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: Array) -> _Loop:
     layout = class_layout(kind, options)
     count = bank.initial_cost.shape[0]

@@ -28,6 +28,7 @@ from jaxba.lm.records import Prices
 from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, Refinement, StepOptions, check_count
+from jaxba.runtime.jit import jit
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose lowest cost is the best known one, each with point iterations."""
@@ -102,7 +103,7 @@ def worth_solving(kind: SceneClass, info: ProblemInfo) -> Int[np.ndarray, " kept
     return np.flatnonzero((error < largest * info.focal) & (info.observations >= MIN_OBSERVATIONS))
 
 
-@functools.partial(jax.jit, static_argnames=("kind",))
+@functools.partial(jit, static_argnames=("kind",))
 def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
     """The cost of every start, pixels squared."""
     layout = class_layout(kind, StepOptions())

@@ -21,6 +21,7 @@ from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState
 from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.jit import jit
 
 ITERATIONS = 10
 """Largest number of iterations before a warm start; the number is uniform from one on."""
@@ -29,7 +30,7 @@ DAMPING = (1e-4, 1.0)
 """Lambda of these iterations, log-uniform per scene: from Ceres' first one to one at which damping dominates."""
 
 
-@functools.partial(jax.jit, static_argnames=("kind", "options"))
+@functools.partial(jit, static_argnames=("kind", "options"))
 def warm_starts(
     kind: SceneClass,
     scenes: Scenes,

@@ -34,6 +34,7 @@ from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
 from jaxba.runtime.atomic import atomic_write
+from jaxba.runtime.jit import jit
 from jaxba.typing import register_pytree
 
 MAX_SLOPE = 1.0
@@ -138,7 +139,7 @@ def train(config: ZeroNetConfig, game: Game, agent: AgentConfig, key: Array) -> 
     return ZeroNet(jax.tree.map(np.asarray, layers), agent), np.asarray(means)
 
 
-@functools.partial(jax.jit, static_argnames=("config",))
+@functools.partial(jit, static_argnames=("config",))
 def _train(
     config: ZeroNetConfig, game: Game, net: ZeroNet, key: Array
 ) -> tuple[tuple[Layer, ...], Float[Array, " updates"]]:

@@ -28,6 +28,7 @@ from jaxba.peers.model import half_rotation
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.runtime.jit import jit
 from jaxba.solver.prepare import layout_order, write_back
 from jaxba.structure.layout import Layout, layout_for
 
@@ -135,7 +136,7 @@ class StepAcceptance:
         return write_back(self.run.colmap.start, self.layout, layout_order(self.layout), self.state, self.options)
 
 
-@functools.partial(jax.jit, static_argnames="options")
+@functools.partial(jit, static_argnames="options")
 def _evaluate(
     layout: Layout,
     state: LMState,

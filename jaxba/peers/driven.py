@@ -27,6 +27,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
+from jaxba.runtime.jit import jit
 from jaxba.solver.loop import after_step
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution
@@ -38,8 +39,8 @@ REJECTED_DAMPING_FRACTION = 0.0
 """Assumed `damping_fraction` of a rejected step, which Ceres does not return. Steps are rejected for too little
 damping, so that it is near 0: for jaxba's own steps it was 0.0003 to 0.006 on Ladybug-49 and kittistereo00s."""
 
-_after_step = jax.jit(after_step)
-_init = jax.jit(lambda policy, info: policy.init(info))
+_after_step = jit(after_step)
+_init = jit(lambda policy, info: policy.init(info))
 
 
 class _SummaryRecorder(pyceres.IterationCallback):

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from jaxba.peers.colmap import SMALLEST_DEPTH
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.runtime.jit import jit
 
 
 class Observations(NamedTuple):
@@ -38,7 +39,7 @@ def observations_of(problem: BundleProblem, pixels: np.ndarray) -> Observations:
     return Observations(jnp.asarray(pixels.T), jnp.asarray(problem.camera_index), jnp.asarray(problem.point_index))
 
 
-@jax.jit
+@jit
 def step_metrics(observations: Observations, before: Any, after: Any) -> StepMetrics:
     """Metrics of the step between two sets of parameters `(poses [c, 7], lenses [c, 5], points [p, 3])`."""
     poses, lenses, points = before

@@ -26,6 +26,7 @@ from jax import monitoring
 
 from jaxba.runtime.executable_cache import CachedExecutable, ExecutableCache, watch_compilation
 from jaxba.runtime.fusion import fast_compilation
+from jaxba.runtime.jit import Options, jit, known_options, right_options
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -38,7 +39,7 @@ COMPILATIONS: tuple[str, ...] = get_args(Compilation)
 Level = Literal["full", "medium", "quick"]
 """How much one program is optimised."""
 
-COMPILER_OPTIONS: dict[Level, dict[str, bool | int]] = {
+COMPILER_OPTIONS: dict[Level, Options] = {
     "medium": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
     "quick": {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
 }
@@ -105,27 +106,14 @@ def level_after(runs: int, before: tuple[Stage, ...]) -> Level:
 
 
 @functools.cache
-def compiler_options(level: Level) -> dict[str, bool | int] | None:
-    """Options of a level that this jaxlib knows; None for `full`, where it knows none, and on a GPU."""
-    if level not in COMPILER_OPTIONS or jax.default_backend() != "cpu":
-        return None
-    wanted = COMPILER_OPTIONS[level]
-    if _are_known(wanted):
-        return dict(wanted)
-    return {name: value for name, value in wanted.items() if _are_known({name: value})} or None
-
-
-def _are_known(options: dict[str, bool | int]) -> bool:
-    try:
-        jax.jit(lambda: 0, compiler_options=options).lower().compile()
-    except jax.errors.JaxRuntimeError:
-        return False
-    return True
+def compiler_options(level: Level) -> Options:
+    """Options of a level that this jaxlib knows; none for `full`, and on a GPU."""
+    return known_options(COMPILER_OPTIONS.get(level, {})) if jax.default_backend() == "cpu" else {}
 
 
 def uses_older_emitters(level: Level) -> bool:
     """Whether programs of a level are compiled by XLA's older kernel emitters, for which `fast_compilation` is made."""
-    return OLDER_EMITTERS in (compiler_options(level) or {})
+    return OLDER_EMITTERS in compiler_options(level)
 
 
 class Program:
@@ -133,7 +121,7 @@ class Program:
 
     def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
-        self.options: Any = compiler_options(level)
+        self.options = right_options() | compiler_options(level)
         self.fast = uses_older_emitters(level)
         self.jitted = jax.jit(
             _strongly_typed(function), static_argnames=static, compiler_options=self.options, keep_unused=True
@@ -318,7 +306,7 @@ def traced_once(*static: str) -> Callable[[Function], Function]:
     Args:
         static: names of its static arguments.
     """
-    return lambda function: cast(Function, jax.jit(function, static_argnames=static))
+    return lambda function: cast(Function, jit(function, static_argnames=static))
 
 
 class CompileClock:

@@ -29,6 +29,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.options import Coordinates, StepOptions
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.problem.rigs import EXTRINSICS_SIZE
+from jaxba.runtime.jit import jit
 from jaxba.solver.prepare import numerics
 from jaxba.structure.layout import Layout, layout_for
 
@@ -113,7 +114,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     given, problem = problem, in_frames(problem if offset is None else shift(problem, -offset))
     with numerics(np.dtype("float64")):
         layout = layout_for(problem, options)
-        linear = jax.device_get(jax.jit(_linear, static_argnames="options")(layout, problem, options))
+        linear = jax.device_get(jit(_linear, static_argnames="options")(layout, problem, options))
     index, count = _unknown_index(problem, layout)
     members = np.concatenate([np.asarray(points) for points in layout.bucket_points])
     mask = np.asarray(layout.slot_mask)

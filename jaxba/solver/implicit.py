@@ -45,6 +45,7 @@ from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
+from jaxba.runtime.jit import jit
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, numerics, set_up
 from jaxba.solver.solve import solve
@@ -154,7 +155,7 @@ def _transposed(
         order = np.concatenate([np.asarray(members) for members in setup.layout.bucket_points])
         here = in_frames(solved)
         arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, inputs, cotangents)
-        found, residual = jax.jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
+        found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
     if not float(residual) < 1e-4:
         raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
     return found

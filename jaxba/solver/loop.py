@@ -21,6 +21,7 @@ from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, only_free
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.jit import jit
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout, num_partitions
 from jaxba.structure.segment_sums import point_sum
@@ -167,7 +168,7 @@ def history_of(step: StepInfo) -> History:
     )
 
 
-@functools.partial(jax.jit, static_argnames=("options", "max_iterations"))
+@functools.partial(jit, static_argnames=("options", "max_iterations"))
 def solve_loop(
     layout: Layout,
     state: LMState,

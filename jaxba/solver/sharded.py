@@ -24,6 +24,7 @@ from jaxba.model.linearize import cost
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
+from jaxba.runtime.jit import jit
 from jaxba.solver.loop import Carry, History, begin, iterate, loop_from, problem_info
 from jaxba.structure.devices import AXIS
 from jaxba.structure.layout import Layout
@@ -131,7 +132,7 @@ def _divided(carry: Carry, points: Callable[[Array], Array]) -> Carry:
     return carry._replace(state=carry.state._replace(points=points(carry.state.points)))
 
 
-@functools.partial(jax.jit, static_argnames=("mesh", "options"))
+@functools.partial(jit, static_argnames=("mesh", "options"))
 def _begin(
     layout: Layout,
     cameras: Float[Array, "parameters cameras"],
@@ -154,7 +155,7 @@ def _begin(
     return on_all(layout, cameras, points, policy, limit, prices)
 
 
-@functools.partial(jax.jit, static_argnames=("mesh", "options"))
+@functools.partial(jit, static_argnames=("mesh", "options"))
 def _iterate(
     layout: Layout,
     carry: Carry,
@@ -169,7 +170,7 @@ def _iterate(
     return _on_all(mesh, one)(layout, carry, policy, tolerances, limit)
 
 
-@functools.partial(jax.jit, static_argnames=("mesh", "options", "length"))
+@functools.partial(jit, static_argnames=("mesh", "options", "length"))
 def _run(
     layout: Layout,
     carry: Carry,

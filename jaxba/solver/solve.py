@@ -172,7 +172,7 @@ def solve(
 def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
     """The stages of compilation of each part of a step, before it is fully optimised."""
     parts = parts_of(options)
-    if compilation == "full" or compiler_options("quick") is None:
+    if compilation == "full" or not compiler_options("quick"):
         return dict.fromkeys(parts, ())
     if compilation == "quick":
         return dict.fromkeys(parts, (Stage("quick", sys.maxsize),))

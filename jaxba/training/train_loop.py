@@ -24,6 +24,7 @@ from jaxtyping import Float, Int
 
 from jaxba.game.devices import AXIS
 from jaxba.game.protocol import Environment, Step
+from jaxba.runtime.jit import jit
 from jaxba.training import replay as ring
 from jaxba.training import sac as agent
 from jaxba.training.replay import Replay, Transition
@@ -95,7 +96,7 @@ def _check_step(env: Environment, step: Step) -> None:
     chex.assert_shape([step.reward, step.terminated, step.truncated, *step.metrics.values()], (env.num_envs,))
 
 
-@functools.partial(jax.jit, static_argnames=("sac", "loop"))
+@functools.partial(jit, static_argnames=("sac", "loop"))
 def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> LoopState:
     """An untrained agent, and a replay buffer with `warmup_steps` demonstrated transitions.
 
@@ -127,7 +128,7 @@ def start(sac: SacConfig, loop: LoopConfig, env: Environment, key: Array) -> Loo
     return jax.lax.scan(body, state, jax.random.split(warmup_key, steps))[0]
 
 
-@functools.partial(jax.jit, static_argnames=("sac", "loop"), donate_argnames=("state",))
+@functools.partial(jit, static_argnames=("sac", "loop"), donate_argnames=("state",))
 def run_chunk(
     sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState
 ) -> tuple[LoopState, dict[str, Float[Array, ""]]]:
@@ -174,7 +175,7 @@ def run_chunk(
     return state, metrics
 
 
-@functools.partial(jax.jit, static_argnames=("sac", "loop", "mesh"))
+@functools.partial(jit, static_argnames=("sac", "loop", "mesh"))
 def start_agents(
     sac: SacConfig, loop: LoopConfig, env: Environment, keys: Array, mesh: Mesh | None = None
 ) -> LoopState:
@@ -199,7 +200,7 @@ def start_agents(
     return spread(env, keys)
 
 
-@functools.partial(jax.jit, static_argnames=("sac", "loop", "mesh"), donate_argnames=("state",))
+@functools.partial(jit, static_argnames=("sac", "loop", "mesh"), donate_argnames=("state",))
 def run_agents(
     sac: SacConfig, loop: LoopConfig, env: Environment, state: LoopState, mesh: Mesh | None = None
 ) -> tuple[LoopState, dict[str, Float[Array, " agents"]]]:
