@@ -13,13 +13,13 @@ import numpy as np
 
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.facing import set_aside, without_views_of
+from jaxba.problem.facing import set_aside
 from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.loop import History
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
-from jaxba.solver.retriangulate import Retriangulation, retriangulate
+from jaxba.solver.retriangulate import Retriangulation, retriangulate_without
 from jaxba.solver.solve import Solution, solve_without
 
 MAX_ROUNDS = 5
@@ -80,7 +80,7 @@ def solve_and_retriangulate(
             break
         started = time.perf_counter()
         with CompileClock() as clock:
-            found = retriangulate(without_views_of(solution.problem, away), options.loss)
+            found = retriangulate_without(away, solution.problem, options.loss)
         seconds = time.perf_counter() - started - clock.seconds
         solution = replace(solution, total_s=solution.total_s + seconds, compile_s=solution.compile_s + clock.seconds)
         if on_search:
@@ -88,8 +88,7 @@ def solve_and_retriangulate(
         if not found.pays(options.tolerances.ftol):
             break
         before = solution.iterations, solution.total_s
-        moved = problem.replace(cameras=found.problem.cameras, points=found.problem.points, rigs=found.problem.rigs)
-        solution = _joined(solution, run(moved, options.max_iterations - solution.iterations))
+        solution = _joined(solution, run(found.problem, options.max_iterations - solution.iterations))
     return solution
 
 
