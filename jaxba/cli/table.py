@@ -213,8 +213,9 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     if before.any() or after.any():
         of_image = np.bincount(problem.camera_index[after if after.any() else before], minlength=problem.num_cameras)
         most = np.argsort(-of_image, kind="stable")[: np.count_nonzero(of_image)]
+        why = ": is the scene mirrored, or of another convention?" if 2 * np.sum(before) > len(before) else ""
         lines.append(
             f"note: observations behind their camera: {np.sum(before)} at the start, {np.sum(after)} at the end "
-            f"(most of {image_names(problem, most)})"
+            f"(most of {image_names(problem, most)}){why}"
         )
     return lines

@@ -51,10 +51,12 @@ def set_aside(problem: BundleProblem) -> Int[np.ndarray, " away"]:
 def aside_text(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> str:
     """How many views of which images are left out since they lie behind, one line."""
     views = int(np.isin(problem.camera_index, away).sum())
-    whose, stays = f"{len(away)} images that face", "their poses stay as they are"
+    whose, stay = f"{len(away)} images that face", "their poses stay as they are"
     if len(away) == 1:
-        whose, stays = "an image that faces", "its pose stays as it is"
-    return f"left out {views} observations of {whose} away from them ({image_names(problem, away)}); {stays}"
+        whose, stay = "an image that faces", "its pose stays as it is"
+    if problem.rigs is not None:
+        stay = "only a rig moves them" if len(away) > 1 else "only its rig moves it"
+    return f"left out {views} observations of {whose} away from them ({image_names(problem, away)}); {stay}"
 
 
 def image_names(problem: BundleProblem, cameras: Int[np.ndarray, " some"]) -> str:
