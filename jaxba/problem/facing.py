@@ -3,6 +3,10 @@
 A perspective lens sees a point behind it where the mirror image of the point in front of it would be. Such a view has
 a residual and a slope like any other, but no step leads from there to the front. A few of them do no harm: point
 iterations bring points back. An image that is turned round pulls all others after it.
+
+Half of the views is a border with room on both sides. Measured: starts of random scenes twelve times as far away as
+usual have at most an eighth of an image's views behind it, Ladybug-49 a hundredth, images turned by 100 degrees two
+thirds or more.
 """
 
 from __future__ import annotations
