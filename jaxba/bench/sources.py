@@ -11,6 +11,7 @@ from jaxba.io import read_problem
 from jaxba.io.files import display_name, strip_compression
 from jaxba.io.formats import by_ending, holds_problem
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.facing import set_aside, without_views_of
 from jaxba.scenes import SceneConfig, random_scene, scene_like
 
 SCENE_PREFIX = "scene:"
@@ -61,7 +62,8 @@ class Source:
             ProblemError: the input is invalid; the message is one line.
         """
         if not self.location.startswith(SCENE_PREFIX):
-            return read_problem(self.location, strict=strict)
+            problem = read_problem(self.location, strict=strict)
+            return without_views_of(problem, set_aside(problem))  # of all solvers alike
         name, seed = _scene(self.location)
         return random_scene(DEFAULT_SCENES.get(name) or scene_like(name), seed)
 

@@ -27,6 +27,7 @@ from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constraints import Gauge, hold
+from jaxba.problem.facing import aside_text, facing_away
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import (
     ConjugateGradients,
@@ -358,6 +359,8 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     with common.notes_printed():
         problem = _default_scene() if path is None else _read(args, path)
         problem = constrained(problem, args.constant, args.gauge, args.constraints)
+    if args.strict and len(away := facing_away(problem)):
+        raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)
     if args.covariance and problem.constants is None and problem.priors is None:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
@@ -392,7 +395,7 @@ def _iterate(
     """Solves, and prints every iteration. The first Ctrl-C stops after the current iteration."""
     steps: list[IterationRecord] = []
     alone = args.processes is None and not args.distributed  # processes must do the same
-    with Interrupt("iteration", graceful=alone) as interrupt:
+    with common.notes_printed(), Interrupt("iteration", graceful=alone) as interrupt:
 
         def show(record: IterationRecord) -> bool:
             if not steps:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxba.cli.common import counted
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.facing import image_names, views_behind, without_views_of
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.compilation import Part, compiler_options, stages
@@ -113,6 +115,8 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
 def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None) -> str:
     """The result of a solve in a few lines. `loss` is that of the solve; None: squared residuals."""
     state = "converged" if solution.converged else "not converged"
+    problem, end = (without_views_of(p, solution.set_aside) for p in (problem, solution.problem))
+    solution = replace(solution, problem=end)
     # from the residuals, since the cost may be that of a robust loss
     rms = [np.sqrt(2 * geometry.cost(p) / p.num_observations) for p in (problem, solution.problem)]
     # COLMAP prints the root of the cost over the number of residuals
@@ -195,16 +199,23 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     cameras = np.bincount(np.asarray(problem.camera_index), minlength=problem.num_cameras)
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
     alone = cameras == 0
+    alone[solution.set_aside] = False
     if problem.rigs is not None:  # others move with their frame
         frame = np.asarray(problem.rigs.frame)
         alone = alone & ~np.isin(frame, frame[cameras > 0])
-    before, after = (int(np.sum(geometry.depths(p) <= 0)) for p in (problem, solution.problem))
+    before, after = (views_behind(p) for p in (problem, solution.problem))
     found = [
         (int(np.sum(alone)), "camera", "without observations; poses stay as they are"),
         (int(np.sum(points == 0)), "point", "without observations; positions stay as they are"),
         (int(np.sum(points == 1)), "point", "seen once; damping alone fixes the depth"),
     ]
     lines = [f"note: {counted(count, noun)} {text}" for count, noun, text in found if count]
-    if before or after:
-        lines.append(f"note: observations behind their camera: {before} at the start, {after} at the end")
+    if before.any() or after.any():
+        of_image = np.bincount(problem.camera_index[after if after.any() else before], minlength=problem.num_cameras)
+        most = np.argsort(-of_image, kind="stable")[: np.count_nonzero(of_image)]
+        why = ": is the scene mirrored, or of another convention?" if 2 * np.sum(before) > len(before) else ""
+        lines.append(
+            f"note: observations behind their camera: {np.sum(before)} at the start, {np.sum(after)} at the end "
+            f"(most of {image_names(problem, most)}){why}"
+        )
     return lines

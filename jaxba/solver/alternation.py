@@ -13,13 +13,14 @@ import numpy as np
 
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.facing import set_aside
 from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.loop import History
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
-from jaxba.solver.retriangulate import Retriangulation, retriangulate
-from jaxba.solver.solve import Solution, solve
+from jaxba.solver.retriangulate import Retriangulation, retriangulate_without
+from jaxba.solver.solve import Solution, solve_without
 
 MAX_ROUNDS = 5
 """Most retriangulations. Source: COLMAP, ba_global_max_refinements."""
@@ -56,6 +57,7 @@ def solve_and_retriangulate(
         ValueError, ProblemError: as `solve`.
     """
     options = checked_options(options)
+    away = set_aside(problem)
     before, stopped = (0, 0.0), False
 
     def of_all(record: IterationRecord) -> IterationRecord:
@@ -69,8 +71,8 @@ def solve_and_retriangulate(
     watch_all = None if watch is None else lambda record, now: watch(of_all(record), now)
 
     # a solve with a callback runs from Python, so that all limits use the same programs
-    run = lambda problem, limit: solve(
-        problem, policy, replace(options, max_iterations=limit), callback=forward, watch=watch_all
+    run = lambda problem, limit: solve_without(
+        away, problem, policy, replace(options, max_iterations=limit), callback=forward, watch=watch_all
     )
     solution = run(problem, options.max_iterations)
     for _ in range(MAX_ROUNDS):
@@ -78,7 +80,7 @@ def solve_and_retriangulate(
             break
         started = time.perf_counter()
         with CompileClock() as clock:
-            found = retriangulate(solution.problem, options.loss)
+            found = retriangulate_without(away, solution.problem, options.loss)
         seconds = time.perf_counter() - started - clock.seconds
         solution = replace(solution, total_s=solution.total_s + seconds, compile_s=solution.compile_s + clock.seconds)
         if on_search:

@@ -23,6 +23,7 @@ from jaxba.lm.step import initial_state
 from jaxba.model.linearize import Linearization, linearize, only_free
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.facing import facing_away, without_views_of
 from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, lens_size
 from jaxba.problem.losses import Loss
@@ -110,8 +111,9 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
             them), or something that is not constant is not determined by what is observed.
     """
     options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
+    given, problem = problem, without_views_of(problem, facing_away(problem))
     offset = far_middle(problem)
-    given, problem = problem, in_frames(problem if offset is None else shift(problem, -offset))
+    problem = in_frames(problem if offset is None else shift(problem, -offset))
     with numerics(np.dtype("float64")):
         layout = layout_for(problem, options)
         linear = jax.device_get(jit(_linear, static_argnames="options")(layout, problem, options))

@@ -41,6 +41,7 @@ from jaxba.lm.step import initial_state
 from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.facing import facing_away
 from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
@@ -140,8 +141,8 @@ def _transposed(
     cotangents: tuple[Array, Array],
 ) -> SolveInputs:
     """Cotangents of the inputs for those of the solution."""
-    options = replace(options, pad=False, devices=1)
-    setup = set_up(solved, policy, replace(options, dtype="float64"))
+    options, away = replace(options, pad=False, devices=1), facing_away(_with_inputs(solved, inputs))
+    setup = set_up(solved, policy, replace(options, dtype="float64"), away)
     step = replace(
         setup.options,
         coordinates=replace(setup.options.coordinates, rotation="manifold"),
@@ -151,9 +152,9 @@ def _transposed(
         raise ProblemError("derivatives need a scene near the origin: shift it first (its extent is much smaller)")
     numbered = np.stack([np.arange(solved.num_observations, dtype=float)] * 2, axis=1)
     with numerics(np.dtype("float64")):
-        slots = set_up(solved.replace(observations=numbered), policy, options).layout.pixels[0]
+        slots = set_up(solved.replace(observations=numbered), policy, options, away).layout.pixels[0]
         order = np.concatenate([np.asarray(members) for members in setup.layout.bucket_points])
-        here = in_frames(solved)
+        here = in_frames(setup.counted)
         arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, inputs, cotangents)
         found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
     if not float(residual) < 1e-4:

@@ -18,6 +18,7 @@ from jaxba.damping.registry import GUARDED
 from jaxba.lm.records import LMState, Prices
 from jaxba.lm.step import initial_state
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.facing import set_aside, without_views_of
 from jaxba.problem.frames import in_frames, out_of_frames
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
@@ -52,6 +53,12 @@ class Setup:
 
     problem: BundleProblem
     """The problem as it was given."""
+
+    counted: BundleProblem
+    """The problem that is solved: without the views of `away`."""
+
+    away: Int[np.ndarray, " away"]
+    """Cameras whose views are left out (problem/facing.py)."""
 
     layout: Layout
     """Observations and index arrays, on the device."""
@@ -96,15 +103,19 @@ class Setup:
 
     def problem_at(self, state: LMState) -> BundleProblem:
         """The problem with the parameters of a state, as NumPy float64; what is not optimised is copied exactly."""
+        found = self._counted_at(state)
+        return self.problem.replace(cameras=found.cameras, points=found.points, rigs=found.rigs)
+
+    def _counted_at(self, state: LMState) -> BundleProblem:
         order = layout_order(self.layout) if self.shards is None else self.shards.order.reshape(-1)
         points = np.asarray(distributed.to_host(state.points), np.float64)
         points = points if self.shards is None else np.moveaxis(points, 0, 1).reshape(3, -1)
         state = state._replace(points=points)
         if self.offset is None:
-            return write_back(self.problem, self.layout, order, state, self.options)
-        moved = shift(self.problem, -self.offset)
+            return write_back(self.counted, self.layout, order, state, self.options)
+        moved = shift(self.counted, -self.offset)
         found = shift(write_back(moved, self.layout, order, state, self.options), self.offset)
-        return found.replace(priors=self.problem.priors, **_exact(self.problem, found))
+        return found.replace(**_exact(self.counted, found))
 
 
 @dataclass(frozen=True)
@@ -151,15 +162,21 @@ def numerics(dtype: np.dtype[Any]) -> Iterator[None]:
 
 
 def set_up(
-    problem: BundleProblem, policy: str | DampingPolicy = DEFAULT_POLICY, options: SolveOptions | None = None
+    problem: BundleProblem,
+    policy: str | DampingPolicy = DEFAULT_POLICY,
+    options: SolveOptions | None = None,
+    away: Int[np.ndarray, " away"] | None = None,
 ) -> Setup:
-    """`prepare` without the initial state. Arguments and errors as there."""
+    """`prepare` without the initial state. Arguments and errors as there; `away`: whose views are left out, if that is
+    decided."""
     options = checked_options(options)
     if not isinstance(problem, BundleProblem):
         raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
     if isinstance(policy, str):
         policy, options = resolve_policy(policy, options)
     _check_policy(policy)
+    given, away = problem, set_aside(problem) if away is None else away
+    problem = without_views_of(given, away)
     step = options.step_options(policy)
     if problem.rigs is not None:  # cameras of a frame stay together
         step = replace(
@@ -184,7 +201,7 @@ def set_up(
         known = prices(problem, step, observations) if observes_prices(policy) else Prices()
         known = jax.tree.map(lambda x: np.asarray(x, dtype), known)
         setup_s = time.perf_counter() - started
-    return Setup(problem, layout, step, policy, capacity, offset, start, dtype, known, setup_s, shards)
+    return Setup(given, problem, away, layout, step, policy, capacity, offset, start, dtype, known, setup_s, shards)
 
 
 def _pads(problem: BundleProblem, options: SolveOptions) -> bool:

@@ -18,13 +18,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxba.lm.step import initial_state
 from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.facing import facing_away, without_views_of
 from jaxba.problem.frames import in_frames
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
@@ -89,7 +90,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Every point starts from the midpoint of the rays of its pixels and at several distances from the first camera that
     sees it (`START_DISTANCES`), and takes `POINT_ITERATIONS` Gauss-Newton steps from each start. It moves to the best
     result, if the cost falls enough (`MIN_RELATIVE_GAIN`, `MIN_GAIN`) and it is behind no more cameras than before.
-    Constant points stay.
+    Constant points stay. Images that face away from their points are left out, as by `solve`.
 
     Args:
         problem: best at the end of a solve: at a bad start points would be fitted to wrong cameras.
@@ -101,6 +102,14 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Raises:
         ProblemError: the cost is not finite.
     """
+    return retriangulate_without(facing_away(problem), problem, loss)
+
+
+def retriangulate_without(
+    away: Int[np.ndarray, " away"], problem: BundleProblem, loss: Loss | None = None
+) -> Retriangulation:
+    """`retriangulate` where it is known which images face away."""
+    given, problem = problem, without_views_of(problem, away)
     with jax.enable_x64(True), process.single_blas_thread():
         here = in_frames(problem)
         layout = build_layout(here, pairs=False, grid=False)
@@ -112,15 +121,15 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
         origin[:, real] = components_first(geometry.camera_centers(problem.cameras)[first[order[real]]])
         level = level_after(EQUIVALENT_STEPS, stages("acceptance", problem.num_observations))
         search = program(_search, "loss", level=level)
-        given = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
-        found = jax.device_get(compile_and_run(search, *given))
+        arguments = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
+        found = jax.device_get(compile_and_run(search, *arguments))
         process.release_programs()  # see `release_programs`: too many programs end a process
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem, loss))
     points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real
     points[order[moved]] = items_first(np.asarray(found.points))[moved]
     return Retriangulation(
-        problem.replace(points=points), int(moved.sum()), float(found.cost_before), float(found.cost_after)
+        given.replace(points=points), int(moved.sum()), float(found.cost_before), float(found.cost_after)
     )
 
 

@@ -10,11 +10,12 @@ import functools
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.lm.termination import Termination, Tolerances
@@ -81,6 +82,9 @@ class Solution:
     quick_iterations: int = 0
     """Number of iterations, the first ones, that ran at least in part in programs that were not fully optimised."""
 
+    set_aside: Int[np.ndarray, " away"] = field(default_factory=lambda: np.zeros(0, int))
+    """Cameras that face away from their points (problem/facing.py). Their views count in no cost, and they stay."""
+
     @property
     def converged(self) -> bool:
         """Whether a convergence test ended the solve."""
@@ -106,6 +110,9 @@ def solve(
     A scene far from the origin relative to its size, as georeferenced scenes are, is shifted to the origin, solved and
     shifted back (`preprocess.FAR`).
 
+    An image with more than half of its views behind it is left out with a ProblemWarning (`Solution.set_aside`), unless
+    half of the images are like that.
+
     Many problems of different shapes can be solved in one process: before compiled programs exceed the number
     of memory mappings that Linux allows a process, all of them are dropped (`process.release_programs`) and compiled
     again when needed.
@@ -129,8 +136,22 @@ def solve(
         ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
             the method does not support what the problem has (shared lenses, priors, rigs).
     """
+    return solve_without(None, problem, policy, options, callback=callback, watch=watch)
+
+
+def solve_without(
+    away: Int[np.ndarray, " away"] | None,
+    problem: BundleProblem,
+    policy: str | DampingPolicy,
+    options: SolveOptions | None,
+    *,
+    callback: Callable[[IterationRecord], bool | None] | None,
+    watch: Watch | None,
+) -> Solution:
+    """`solve` where it is known which images face away; None: it is not."""
     options = checked_options(options)
-    setup = set_up(problem, policy, options)
+    setup = set_up(problem, policy, options, away)
+    problem = setup.counted
     with numerics(setup.dtype):
         stages_of_parts = _stages(options.compilation, problem, setup.options)
         run = functools.partial(
@@ -166,6 +187,7 @@ def solve(
             total_s=total_s,
             capacity=setup.capacity,
             quick_iterations=quick_iterations,
+            set_aside=setup.away,
         )
 
 

@@ -1,0 +1,102 @@
+"""Images that face away from their points: which they are, and a problem without their views.
+
+A perspective lens sees a point behind it where the mirror image of the point in front of it would be. Such a view has
+a residual and a slope like any other, but no step leads from there to the front. A few of them do no harm: point
+iterations bring points back. An image that is turned round pulls all others after it.
+
+Half of the views is a border with room on both sides. Measured: starts of random scenes twelve times as far away as
+usual have at most an eighth of an image's views behind it, Ladybug-49 a hundredth, images turned by 100 degrees two
+thirds or more.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemWarning
+from jaxba.problem.intrinsics import POSE_SIZE
+
+NAMED = 3
+"""Most images that a message names."""
+
+_OFF_AXIS = 0.1, 0.2, 1.0
+
+
+def views_behind(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
+    """Observations of points behind their camera; none of lenses that tell such a point from its mirror image, as
+    fisheyes do."""
+    return (geometry.depths(problem) <= 0) & _sees_mirrored(problem)[np.asarray(problem.camera_index)]
+
+
+def facing_away(problem: BundleProblem) -> Int[np.ndarray, " away"]:
+    """Cameras with more than half of their views behind them.
+
+    None if at least half of the observed cameras have that: then the scene is mirrored, of another convention, or too
+    far from a solution for poses to be told from points.
+    """
+    views = np.bincount(problem.camera_index, minlength=problem.num_cameras)
+    behind = np.bincount(problem.camera_index[views_behind(problem)], minlength=problem.num_cameras)
+    away = np.flatnonzero(2 * behind > views)
+    return away if 2 * len(away) < np.count_nonzero(views) else away[:0]
+
+
+def set_aside(problem: BundleProblem) -> Int[np.ndarray, " away"]:
+    """`facing_away`, with a ProblemWarning that names these cameras: a solve leaves their views out."""
+    away = facing_away(problem)
+    if len(away):
+        warnings.warn(aside_text(problem, away), ProblemWarning, stacklevel=3)
+    return away
+
+
+def aside_text(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> str:
+    """How many views of which images are left out since they lie behind, one line."""
+    views = int(np.isin(problem.camera_index, away).sum())
+    whose, stay = f"{len(away)} images that face", "their poses stay as they are"
+    if len(away) == 1:
+        whose, stay = "an image that faces", "its pose stays as it is"
+    if problem.rigs is not None:
+        stay = "only a rig moves them" if len(away) > 1 else "only its rig moves it"
+    return f"left out {views} observations of {whose} away from them ({image_names(problem, away)}); {stay}"
+
+
+def image_names(problem: BundleProblem, cameras: Int[np.ndarray, " some"]) -> str:
+    """The first `NAMED` of some cameras by the names of their images, or by number where a file has no names."""
+    labels = problem.labels
+    names = [f"camera {at}" if labels is None else labels.names[at] for at in cameras[:NAMED]]
+    more = len(cameras) - len(names)
+    return ", ".join(names) + (f" and {more} more" if more else "")
+
+
+def without_views_of(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> BundleProblem:
+    """The problem without the observations of some cameras. Cameras and points keep their places."""
+    if not len(away):
+        return problem
+    keep = ~np.isin(problem.camera_index, away)
+    return problem.replace(
+        observations=np.asarray(problem.observations)[keep],
+        camera_index=np.asarray(problem.camera_index)[keep],
+        point_index=np.asarray(problem.point_index)[keep],
+        whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
+    )
+
+
+def _sees_mirrored(problem: BundleProblem) -> Bool[np.ndarray, " cameras"]:
+    """Cameras whose lens has the same pixel for a point and its mirror image."""
+    lenses = problem.lenses
+    found = np.ones(problem.num_cameras, bool)
+    if lenses is None or lenses.all_bal:
+        return found
+    numbers = np.asarray(problem.cameras, np.float64)[:, POSE_SIZE:]
+    index = np.asarray(lenses.index)
+    model_of = np.zeros(len(index), int) if lenses.model is None else np.asarray(lenses.model)[index]
+    for number, model in enumerate(lenses.models):
+        own = np.flatnonzero(model_of == number)
+        lens = list(numbers[own, : len(model)].T)
+        with np.errstate(all="ignore"):
+            front, back = (model.project(lens, *(np.full(len(own), s * x) for x in _OFF_AXIS)) for s in (1, -1))
+        found[own] = (front[0] == back[0]) & (front[1] == back[1])
+    return found
