@@ -18,7 +18,8 @@ from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import constrained
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.output import check_outputs, check_storable, write_solution
-from jaxba.cli.watching import Watching, check_record
+from jaxba.cli.overwriting import policy_file
+from jaxba.cli.watching import Watching
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_colmap, read_problem
@@ -347,12 +348,11 @@ def _in_all_processes(args: Arguments) -> tuple[str | None, BundleProblem]:
 def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     """The path of the problem and the problem, after all checks of files."""
     path = None if args.problem is None else resolve(args.problem)
-    check_outputs(args.output, args.log, path)
-    check_outputs(None, args.covariance, path, "--covariance")
-    if args.covariance and args.covariance in (args.output, args.log):
-        raise common.UsageError(f"--covariance names the same file as another output, {args.covariance}")
-    if args.record is not None:
-        check_record(args.record, [args.output, args.covariance, args.log, path])
+    if args.record is not None and not args.record.endswith(".npz"):
+        raise common.UsageError(f"--record {args.record}: a recording ends in .npz")
+    outputs = {"--log": args.log, "--covariance": args.covariance, "--record": args.record}
+    read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
+    check_outputs(args.output, outputs, path, read)
     if args.view:
         view.check_extra()
     with common.notes_printed():

@@ -8,6 +8,7 @@ import threading
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -75,6 +76,7 @@ def _run(args: Arguments) -> int:
     if args.images is not None and not os.path.isdir(args.images):
         raise common.UsageError(f"--images {args.images}: is no folder")
     common.check_writable("--html", args.html)
+    _check_apart(args)
     check_extra()
     from jaxba.viewer.sources import open_all
 
@@ -99,6 +101,19 @@ def _run(args: Arguments) -> int:
         common.print_line(f"note: {common.counted(missing, 'image')} not found in {args.images}")
     wait(viewer)
     return 0
+
+
+def _check_apart(args: Arguments) -> None:
+    """Refuses a page in the place of a file that is shown."""
+    if args.html is None:
+        return
+    from jaxba.cli.overwriting import PROBLEM, check_apart, policy_file, problem_files
+    from jaxba.datasets.bal.paths import resolve
+
+    files = [file for name in args.files for file in problem_files(resolve(name))]
+    images = [] if args.images is None else [one for one in Path(args.images).rglob("*") if one.suffix != ".html"]
+    read = {PROBLEM: files, "the file of --poses": [args.poses], "an image": images}
+    check_apart({"--html": [args.html]}, {**read, "the file of --policy": [policy_file(args.policy or "")]})
 
 
 def _episode(args: Arguments) -> Shown:

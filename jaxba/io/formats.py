@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from jaxba.io.colmap import is_colmap, read_colmap
+from jaxba.io.colmap.records import PARTS, RIG_PARTS
 from jaxba.io.files import READ_ERRORS, StrPath, display_name, strip_compression
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
@@ -96,6 +97,9 @@ FORMATS = (
 
 RECONSTRUCTION = "reconstruction.json"
 """File by which a folder of OpenSfM is known."""
+
+TRACKS = tuple(f"tracks.csv{ending}" for ending in ("", ".gz", ".bz2", ".xz"))
+"""Files of OpenSfM's observations, beside the reconstruction."""
 
 OTHER_ENDINGS = (
     *(".abc", ".b3dm", ".bin", ".blend", ".csv", ".dae", ".db", ".dot", ".e57", ".fbx", ".g2o", ".glb", ".gltf"),
@@ -190,6 +194,23 @@ def read_folder(path: StrPath) -> BundleProblem:
     if (Path(path) / RECONSTRUCTION).is_file() and not is_colmap(path):
         return _read_json(Path(path) / RECONSTRUCTION)
     return read_colmap(path)
+
+
+def files_of(path: StrPath) -> list[StrPath]:
+    """The files that a problem of this path is read from, or would be if they were there.
+
+    A folder has those of a COLMAP model and of OpenSfM, whose tracks also lie beside a `.json` file.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        beside = [folder.with_name(name) for name in TRACKS] if ending(path) == ".json" else []
+        return [path, *beside]
+    return [*model_files(path), *(folder / name for name in (RECONSTRUCTION, *TRACKS))]
+
+
+def model_files(folder: StrPath) -> list[Path]:
+    """The files that a COLMAP model in a folder may have."""
+    return [Path(folder) / f"{part}{suffix}" for part in (*PARTS, *RIG_PARTS) for suffix in (".bin", ".txt")]
 
 
 def _beginning(path: StrPath) -> bytes:

@@ -440,7 +440,10 @@ BAD = {
         lambda tiny: [str(tiny), "--output", "o.zip.gz"],
         "cannot write o.zip.gz: files with .zip",
     ),
-    "log is the problem": (lambda tiny: [str(tiny), "--log", f"{tiny.parent}/../in/tiny.txt"], "the problem's file"),
+    "log is the problem": (
+        lambda tiny: [str(tiny), "--log", f"{tiny.parent}/../in/tiny.txt"],
+        "is a file of the problem",
+    ),
     "log in a missing folder": (lambda tiny: [str(tiny), "--log", str(tiny.parent / "no" / "log.json")], "--log"),
     "log is a directory": (lambda tiny: [str(tiny), "--log", str(tiny.parent)], "--log"),
 }
