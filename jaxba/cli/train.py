@@ -215,7 +215,7 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
             ) from None
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
-            return common.INTERRUPTED
+            return interrupt.status
         return together(lambda: _finish(folder, work, outcome.best, console, view, command))
 
 
