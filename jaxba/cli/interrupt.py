@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 import time
+from types import FrameType
 
 from jaxba.cli.common import ENDED, INTERRUPTED
 
@@ -88,7 +89,7 @@ class Interrupt:
                 elif self.graceful:
                     self._request(numbers[0])
 
-    def _handle(self, number: int, frame: object) -> None:
+    def _handle(self, number: int, frame: FrameType | None) -> None:
         """The signal handler, which Python calls in the main thread between two instructions."""
         self._handled += 1
         self.status = 128 + number
