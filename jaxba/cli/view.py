@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import sys
 import threading
 import webbrowser
@@ -51,7 +52,11 @@ class Arguments:
     """Output file: one page that opens without a server and plays the iterations. Nothing is served."""
 
     port: int = 8080
-    """First port that is tried. The page is reached from this machine only."""
+    """First port that is tried."""
+
+    host: str = "127.0.0.1"
+    """Address of this machine at which the page is reached, without a password. Default: from this machine only;
+    0.0.0.0: from every machine that reaches this one."""
 
 
 def main() -> None:
@@ -75,6 +80,7 @@ def _run(args: Arguments) -> int:
         raise common.UsageError(f"--port must lie between 1 and 65535, is {args.port}")
     if args.images is not None and not os.path.isdir(args.images):
         raise common.UsageError(f"--images {args.images}: is no folder")
+    _check_host(args.host)
     common.check_writable("--html", args.html)
     _check_apart(args)
     check_extra()
@@ -90,7 +96,7 @@ def _run(args: Arguments) -> int:
         return 0
     from jaxba.viewer.panel import Viewer, heading, worst_images
 
-    viewer = Viewer(shown, args.port)
+    viewer = Viewer(shown, args.port, args.host)
     for stage in viewer.stages:
         common.print_line(f"{heading(stage)}, {stage.numbers()}")
         for text, _ in worst_images(stage, NAMED):
@@ -101,6 +107,16 @@ def _run(args: Arguments) -> int:
         common.print_line(f"note: {common.counted(missing, 'image')} not found in {args.images}")
     wait(viewer)
     return 0
+
+
+def _check_host(host: str) -> None:
+    """Refuses what is no address of this machine."""
+    try:
+        family, kind, _, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as server:
+            server.bind(place)
+    except (OSError, UnicodeError) as error:
+        raise common.UsageError(f"--host {host}: {getattr(error, 'strerror', None) or error}") from None
 
 
 def _check_apart(args: Arguments) -> None:

@@ -8,6 +8,7 @@ import os
 import re
 import signal
 import stat
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ import pytest
 import support
 from support import solve
 
-from jaxba import Refinement, SolveOptions, StepOptions, read_bal, write_bal
+from jaxba import Refinement, SolveOptions, StepOptions, read_bal, read_problem, write_bal, write_bundler
 from jaxba.bench.records import record_from_json
 from jaxba.cli import table
 from jaxba.cli.solve import Arguments, run, solve_options
@@ -131,6 +132,30 @@ def test_the_iteration_limit_is_reported_and_not_an_error(tiny, tmp_path, capsys
     assert "not converged: iteration limit" in printed
     assert "2 iterations" in printed
     assert geometry.cost(read_bal(output)) < geometry.cost(support.tiny())
+
+
+def test_without_iterations_the_cost_is_printed_and_the_problem_converted(tiny, tmp_path, capsys):
+    output, model = tmp_path / "same.txt", tmp_path / "model"
+    assert run([str(tiny), "--max-iterations", "0", "--output", str(output), "--record", f"{tmp_path}/r.npz"]) == 0
+    printed = capsys.readouterr().out
+    cost = f"{geometry.cost(support.tiny()):.6e}"
+    assert f"not converged: iteration limit\ncost {cost} -> {cost} " in printed
+    assert output.read_bytes() == tiny.read_bytes()
+    assert run([str(tiny), "--max-iterations", "0", "--output", f"{model}/"]) == 0
+    np.testing.assert_allclose(read_problem(model).points, support.tiny().points, rtol=1e-12)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no /dev/stdin")
+def test_a_problem_comes_in_and_goes_out_by_the_standard_streams(tmp_path):
+    write_bundler(support.tiny(), tmp_path / "given")
+    with open(tmp_path / "given", "rb") as file:
+        given = file.read()
+    code = "from jaxba.cli.solve import main; main()"
+    words = ["-", "--max-iterations", "0", "--output", "-"]
+    ran = subprocess.run([sys.executable, "-c", code, *words], input=given, capture_output=True, check=True)
+    (tmp_path / "solved.txt").write_bytes(ran.stdout)
+    np.testing.assert_allclose(read_bal(tmp_path / "solved.txt").cameras, support.tiny().cameras, rtol=1e-12)
+    assert b"/dev/stdin: 6 cameras, 40 points" in ran.stderr
 
 
 def test_a_rejected_step_is_marked(tiny, capsys):
@@ -413,8 +438,7 @@ BAD = {
         lambda tiny: [str(tiny), "--method", "stba", "--dtype", "mixed"],
         "mixed types are for plain LM",
     ),
-    "no iterations": (lambda tiny: [str(tiny), "--max-iterations", "0"], "--max-iterations must be at least 1"),
-    "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be at least 1"),
+    "negative iterations": (lambda tiny: [str(tiny), "--max-iterations", "-3"], "--max-iterations must be at least 0"),
     "too many iterations": (lambda tiny: [str(tiny), "--max-iterations", "10000000000"], "at most 2147483647"),
     "negative ftol": (lambda tiny: [str(tiny), "--ftol", "-1e-6"], "--ftol must not be negative"),
     "ftol that is no number": (lambda tiny: [str(tiny), "--ftol", "nan"], "--ftol must not be negative"),
