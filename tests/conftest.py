@@ -11,6 +11,7 @@ import gc
 import hashlib
 import os
 import platform
+import signal
 import subprocess
 import sys
 import tempfile
@@ -109,6 +110,18 @@ def few_programs():
     yield
     process.MAPPINGS_SHARE = share
     process.release_programs()
+
+
+@pytest.fixture(autouse=True)
+def ctrl_c():
+    """Ctrl-C has Python's handler, and so the system's in child processes, also where the shell that started pytest
+    ignores it, as `nohup` and many job systems do."""
+    ignored = signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+    if ignored:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    if ignored:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @pytest.fixture

@@ -94,12 +94,25 @@ def _bench(args: Arguments, command: str) -> int:
 
     problems = sources(list(args.problems)) if args.problems else default_sources()
     jobs = run.plan(problems, solvers, repeats)
+    _check_apart(args, jobs)
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
     try:
         with run.only_writer(Path(args.out)):
             return _run_missing(Path(args.out), jobs, settings, tolerance, args.strict, command)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
+
+
+def _check_apart(args: Arguments, jobs: Any) -> None:
+    """Refuses results in the place of a file that is read."""
+    from jaxba.bench import run
+    from jaxba.cli.overwriting import PROBLEM, check_apart, policy_file, problem_files
+
+    names = (run.SETTINGS, run.RESULTS, "summary.json", "report.html")
+    problems = [one for job in jobs for one in problem_files(job.source.location)]
+    policies = [policy_file(job.solver.policy) for job in jobs]
+    read = {PROBLEM: problems, "a policy": policies, "the file of --suite": [args.suite]}
+    check_apart({"--out": [Path(args.out, name) for name in names]}, read)
 
 
 def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, strict: bool, command: str) -> int:

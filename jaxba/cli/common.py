@@ -26,8 +26,15 @@ Arguments = TypeVar("Arguments")
 BAD_INPUT = 2
 """Exit status for invalid input."""
 
-DEFAULTS = (signal.default_int_handler, on_early_interrupt)
-"""Handlers of Ctrl-C that a command may replace: Python's own, and that of a command which is starting."""
+TERMINATED = 128 + signal.SIGTERM
+"""Exit status after SIGTERM, as shells define it."""
+
+ENDED = {INTERRUPTED: "interrupted", TERMINATED: "terminated"}
+"""Last line of a command that a signal has ended."""
+
+DEFAULTS = {signal.SIGINT: (signal.default_int_handler, on_early_interrupt), signal.SIGTERM: (signal.SIG_DFL,)}
+"""Handlers that a command may replace: Python's own, and that of a command which is starting. A signal that is ignored,
+as Ctrl-C is under `nohup`, stays so."""
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or may not be written: no fault of the program, wherever they come up."""
@@ -55,7 +62,7 @@ def run_command(
 ) -> int:
     """Parses the command line and runs `main`.
 
-    Expected errors are printed as one line to stderr, and so is a Ctrl-C that `main` does not handle.
+    Expected errors are printed as one line to stderr, and so is a Ctrl-C or SIGTERM that `main` does not handle.
 
     Args:
         arguments: dataclass of the arguments, from which tyro makes the parser.
@@ -64,18 +71,18 @@ def run_command(
         argv: the command line; `sys.argv[1:]` if None.
 
     Returns:
-        The exit status: that of `main`, 2 after an error, or 130 after Ctrl-C.
+        The exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
     """
-    with catch_interrupts() as interrupted, tolerant_streams():
+    with catch_interrupts() as stopped, tolerant_streams():
         try:
             status = _parse_and_run(arguments, main, description, argv)
             print(end="", flush=True)
-            return status
+            return stopped() or status if status == INTERRUPTED else status
         except (KeyboardInterrupt, Exception) as error:
             # inside libraries Ctrl-C may have become another error
-            if isinstance(error, KeyboardInterrupt) or interrupted():
-                print("interrupted", file=sys.stderr)
-                return INTERRUPTED
+            if isinstance(error, KeyboardInterrupt) or stopped():
+                print(ENDED.get(stopped(), ENDED[INTERRUPTED]), file=sys.stderr)
+                return stopped() or INTERRUPTED
             if isinstance(error, UnwritableStreamError):
                 return print_error(str(error))
             raise
@@ -130,37 +137,40 @@ def _end_if_alone(error: Exception) -> None:
 
 
 @contextmanager
-def catch_interrupts() -> Iterator[Callable[[], bool]]:
-    """A context in which Ctrl-C raises KeyboardInterrupt; its value tells whether that has happened.
+def catch_interrupts() -> Iterator[Callable[[], int]]:
+    """A context in which Ctrl-C and SIGTERM raise KeyboardInterrupt; its value gives the exit status of the last signal
+    that has come, or 0.
 
-    Nothing is changed in a thread other than the first, where signals are not handled, nor where Ctrl-C is ignored or
-    has a handler already.
+    Nothing is changed in a thread other than the first, where signals are not handled, nor for a signal that is ignored
+    or has a handler already.
     """
     seen: list[int] = []
 
-    def handle(*_: Any) -> None:
-        seen.append(1)
+    def handle(number: int, _: Any) -> None:
+        seen.append(128 + number)
         raise KeyboardInterrupt
 
-    ours = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) in DEFAULTS
+    main_thread = threading.current_thread() is threading.main_thread()
+    ours = [number for number, known in DEFAULTS.items() if main_thread and signal.getsignal(number) in known]
     if not ours:
-        yield lambda: False
+        yield lambda: 0
         return
 
     def again(lost: Any) -> None:
         """Python drops an exception in a callback of the garbage collector, of which JAX has one: raise it later."""
         if lost.exc_type is KeyboardInterrupt:
-            threading.Timer(RAISE_AGAIN_S, _thread.interrupt_main).start()
+            threading.Timer(RAISE_AGAIN_S, _thread.interrupt_main, [seen[-1] - 128]).start()
         else:
             hook(lost)
 
-    before, hook = signal.signal(signal.SIGINT, handle), sys.unraisablehook
+    before, hook = {number: signal.signal(number, handle) for number in ours}, sys.unraisablehook
     sys.unraisablehook = again
     try:
-        yield lambda: bool(seen)
+        yield lambda: seen[-1] if seen else 0
     finally:
         sys.unraisablehook = hook
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Container
 from pathlib import Path
 from typing import Any, get_args
 
@@ -9,6 +11,7 @@ import numpy as np
 
 from jaxba.cli.common import UsageError
 from jaxba.io.configurations import SettingsError, read_file
+from jaxba.io.text import number
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.constraints import Gauge, hold, with_gauge
 from jaxba.problem.losses import Loss
@@ -87,7 +90,7 @@ def _applied(problem: BundleProblem, file: str | None, key: str, value: Any) -> 
 
 def _read(file: str) -> dict[str, Any]:
     try:
-        settings = read_file(Path(file), file)
+        settings = read_file(Path(file), file, as_text=True)
     except SettingsError as error:
         raise UsageError(f"--constraints {error}") from None
     unknown = [key for key in settings if key not in KEYS]
@@ -96,19 +99,44 @@ def _read(file: str) -> dict[str, Any]:
     return settings
 
 
+def _named(wanted: Any, names: Container[str] = ()) -> Any:
+    """What a list of the file means: of each text a name if there is such a one, else an id or a position.
+
+    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules. The word `all`
+    alone is all; another word alone is a list of it.
+    """
+    if isinstance(wanted, str):
+        return wanted if wanted == "all" else _named([wanted] if wanted else [], names)
+    plain = lambda one: isinstance(one, str) and one not in names and re.fullmatch(r"0|[1-9]\d*", one, re.ASCII)
+    return [int(one) if plain(one) else one for one in wanted]
+
+
+def _numbers(value: Any) -> Any:
+    """Numbers for the texts of a value. Raises ValueError."""
+    return number(value) if isinstance(value, str) else [_numbers(one) for one in value]
+
+
 def _apply(problem: BundleProblem, key: str, value: Any) -> BundleProblem:
     labels = problem.labels
-    images = lambda wanted: wanted if labels is None else labels.images_at(wanted)
+
+    def images(wanted: Any) -> Any:
+        found = _named(wanted, () if labels is None else frozenset(labels.names))
+        return found if labels is None or found == "all" else labels.images_at(found)
+
+    def ids(wanted: Any, at: str) -> Any:
+        found = _named(wanted)
+        return found if labels is None or found == "all" else getattr(labels, at)(found)
+
     if key == "constant_poses":
         return hold(problem, poses=images(value))
     if key == "constant_rotations":
         return hold(problem, rotations=images(value))
     if key == "constant_points":
-        return hold(problem, points=value if labels is None else labels.points_at(value))
+        return hold(problem, points=ids(value, "points_at"))
     if key == "constant_cameras":
-        return hold(problem, lenses=value if labels is None else labels.lenses_at(value))
+        return hold(problem, lenses=ids(value, "lenses_at"))
     if key == "constant_extrinsics":
-        return hold(problem, extrinsics=value if labels is None else labels.lenses_at(value))
+        return hold(problem, extrinsics=ids(value, "lenses_at"))
     if key == "constant_numbers":
         return hold(problem, numbers=value)
     if key == "position_priors":
@@ -116,8 +144,9 @@ def _apply(problem: BundleProblem, key: str, value: Any) -> BundleProblem:
         if unknown:
             raise ValueError(f"unknown key {unknown[0]!r}; there are positions, stddev, loss and loss_scale")
         positions = value["positions"]
-        spread = np.broadcast_to(np.asarray(value.get("stddev", 1.0), np.float64), 3)
-        loss = Loss(value.get("loss", "squared"), float(value.get("loss_scale", 1.0)))
+        spread = np.broadcast_to(np.asarray(_numbers(value.get("stddev", "1")), np.float64), 3)
+        loss = Loss(value.get("loss", "squared"), _numbers(value.get("loss_scale", "1")))
         at = np.asarray(images(list(positions))).tolist()
-        return with_position_priors(problem, list(positions.values()), np.diag(spread**2), images=at, loss=loss)
+        measured = [_numbers(one) for one in positions.values()]
+        return with_position_priors(problem, measured, np.diag(spread**2), images=at, loss=loss)
     raise ValueError("unknown key")

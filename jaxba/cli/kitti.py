@@ -167,6 +167,7 @@ def _build(args: Arguments) -> int:
 
     with common.notes_printed():
         sequence, poses = _inputs(args)
+    _check_apart([args.out], sequence, args)
     front = FrontEndOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
     options = BuildOptions(
         front,
@@ -183,6 +184,7 @@ def _build(args: Arguments) -> int:
         with _Progress(console) as progress:
             built = build(sequence, options, cache, poses, progress.report)
         parts = _parts(built, args)
+        _check_apart([path for _, path in parts], sequence, args)
         files = [_write(part, path, sequence, args) for part, path in parts]
     except KeyboardInterrupt:
         console.print("interrupted; what is done is kept, run the same command again to continue")
@@ -196,6 +198,18 @@ def _build(args: Arguments) -> int:
             console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")
     console.print(f"wrote {', '.join(files)}")
     return 0
+
+
+def _check_apart(problems: Sequence[str], sequence: Any, args: Arguments) -> None:
+    """Refuses a problem, or the frames beside one, in the place of a file of the sequence."""
+    from jaxba.cli.overwriting import check_apart
+    from jaxba.datasets.kitti.evaluate import sidecar_path
+    from jaxba.datasets.kitti.sequence import files_of
+
+    written = {"--out": [*problems, *map(sidecar_path, problems)]}
+    own = [*sequence.images, *files_of(args.sequence, sequence.folder)]
+    read = {"the file of --poses": [args.poses], "the file of --calibration": [args.calibration]}
+    check_apart(written, {"a file of the sequence": own, **read})
 
 
 def _inputs(args: Arguments) -> tuple[Any, Any]:
@@ -287,6 +301,7 @@ def _evaluate(args: EvaluateArguments) -> int:
     from jaxba.datasets.kitti import evaluate, plots
     from jaxba.runtime.atomic import write_text
 
+    _check_results_apart(args)
     side = evaluate.read_sidecar(args.problem)
     truth = None if args.poses is None else evaluate.truth_of(side, args.poses)
     with common.notes_printed():
@@ -309,6 +324,18 @@ def _evaluate(args: EvaluateArguments) -> int:
     console.print(_evaluate_table(results, truth))
     console.print(f"wrote {files[0]} and {len(results) + (truth is not None) + 2} files beside it")
     return 0
+
+
+def _check_results_apart(args: EvaluateArguments) -> None:
+    """Refuses results in the place of a file that is compared."""
+    from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
+    from jaxba.io.files import strip_compression
+
+    files, folder = [args.problem, *args.solutions], Path(args.out)
+    names = [f"poses-{number}-{Path(strip_compression(path)).stem}.txt" for number, path in enumerate(files)]
+    names += ["evaluation.json", "poses-truth.txt", "top-view.png", "top-view.svg"]
+    read = {PROBLEM: [one for path in files for one in problem_files(path)], "the file of --poses": [args.poses]}
+    check_apart({"--out": [folder / name for name in names]}, read)
 
 
 def _caption(result: Any) -> str:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
+from collections.abc import Mapping
 
 from jaxba.cli import common, table
+from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
 from jaxba.io import check_output, formats, is_colmap, is_folder, write_colmap, write_problem
 from jaxba.io.bal import check_bal_lenses
+from jaxba.io.files import StrPath
 from jaxba.problem.bundle_problem import BundleProblem
 
 
@@ -20,9 +23,9 @@ def is_model(output: str, source: str | None) -> bool:
     """
     if is_folder(output):
         return True
-    if source is None or not is_colmap(source):
+    if source is None or not is_colmap(source) or formats.is_file_name(output):
         return False
-    return not formats.is_file_name(output)
+    return not os.path.exists(output) or os.path.isfile(output)  # a stream or device is no folder's name
 
 
 def _is_like_source(output: str, source: str | None) -> bool:
@@ -30,11 +33,21 @@ def _is_like_source(output: str, source: str | None) -> bool:
     return source is not None and is_colmap(source) and is_model(output, source)
 
 
-def check_outputs(output: str | None, log: str | None, source: str | None, name: str = "--log") -> None:
-    """Checks that the output files can be written and differ from each other and from the problem.
+def check_outputs(
+    output: str | None, others: Mapping[str, str | None], source: str | None, read: Mapping[str, str | None]
+) -> None:
+    """Checks that the output files can be written, and that none is another one or a file that is read.
+
+    Only the solution may replace its own problem.
+
+    Args:
+        output: of `--output`.
+        others: the other output files by their options.
+        source: path of the problem.
+        read: other files that are read, by what they are.
 
     Raises:
-        UsageError, ProblemError: they cannot; the message is one line.
+        UsageError, ProblemError: they cannot be, or one is; the message is one line.
     """
     if output and is_model(output, source):
         common.check_folder("--output", output)
@@ -43,11 +56,15 @@ def check_outputs(output: str | None, log: str | None, source: str | None, name:
     else:
         common.check_writable("--output", output)
         check_output(output or "")
-    common.check_writable(name, log)
-    if log and output and Path(log).resolve() == Path(output).resolve():
-        raise common.UsageError(f"--output and --log name the same file, {output}")
-    if log and source and Path(log).resolve() == Path(source).resolve():
-        raise common.UsageError(f"{name} names the problem's file, {log}")
+    for option, path in others.items():
+        common.check_writable(option, path)
+    solution: list[StrPath | None] = [output]
+    if output and is_model(output, source):
+        solution = [*formats.model_files(output)]
+    written = {option: [path] for option, path in others.items()}
+    check_apart({"--output": solution, **written}, {what: [path] for what, path in read.items()})
+    replaced = output and source and os.path.exists(output) and os.path.samefile(output, source)
+    check_apart({"--output": [] if replaced else solution, **written}, {PROBLEM: problem_files(source)})
 
 
 def check_storable(output: str | None, problem: BundleProblem, source: str | None) -> None:

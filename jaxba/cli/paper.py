@@ -59,6 +59,8 @@ def run(argv: Sequence[str] | None = None) -> int:
 def _paper(args: Arguments) -> int:
     from rich.console import Console
 
+    from jaxba.cli.overwriting import check_apart
+    from jaxba.io.configurations import find
     from jaxba.io.settings import SettingsError
     from jaxba.paper import config as configs
     from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
@@ -81,6 +83,7 @@ def _paper(args: Arguments) -> int:
     stem = Path(name).stem
     folder = Path(args.out or Path("runs") / ("paper" if stem == FULL else f"paper-{stem}"))
     report = Path(args.report or folder / REPORT)
+    check_apart({"--report": [report], "--out": [folder / TIMES]}, {"the file of --config": [find("paper", name)]})
     _open(folder, config)
     common.check_writable("--report", str(report))
     common.prepare_process()

@@ -18,7 +18,9 @@ from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import constrained
 from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.output import check_outputs, check_storable, write_solution
-from jaxba.cli.watching import Watching, check_record
+from jaxba.cli.overwriting import policy_file
+from jaxba.cli.streams import whole_input
+from jaxba.cli.watching import Watching
 from jaxba.damping import DampingPolicy
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_colmap, read_problem
@@ -49,6 +51,9 @@ from jaxba.solver.solve import Solution, solve
 DEFAULTS = SolveOptions()
 """Defaults of the options, those of `jaxba.solve`."""
 
+STREAM = "-"
+"""Name of standard input for a problem, and of standard output for a file."""
+
 _STDOUT = 1
 """File descriptor of standard output."""
 
@@ -65,8 +70,8 @@ class Arguments:
 
     problem: Annotated[str | None, tyro.conf.Positional] = None
     """BAL file, Bundler .out file, VisualSFM .nvm file, or a .json or .sfm file of OpenSfM, OpenMVG or AliceVision,
-    plain or .bz2, .gz, .xz; the folder of a COLMAP model; or the name of a downloaded BAL problem such as ladybug-49
-    (see jaxba-data). Default: a random scene."""
+    plain or .bz2, .gz, .xz; the folder of a COLMAP model; the name of a downloaded BAL problem such as ladybug-49
+    (see jaxba-data); or - for a file on standard input. Default: a random scene."""
 
     policy: str = DEFAULT_POLICY
     """Damping policy, which chooses lambda: guarded (1e-8 until a step fails), learned (the shipped network for the
@@ -113,7 +118,7 @@ class Arguments:
     it pays. Finds points in wrong local minima, and so a lower cost, for more iterations."""
 
     max_iterations: int = DEFAULTS.max_iterations
-    """Limit of linear solves."""
+    """Limit of linear solves. 0: only compute the cost, and write the problem as it is."""
 
     ftol: float = DEFAULTS.tolerances.ftol
     """Converged when the relative decrease of the cost by an accepted step is below this."""
@@ -158,9 +163,9 @@ class Arguments:
     """Scale of the robust loss, pixels: residuals well below it count quadratically."""
 
     output: str | None = None
-    """Output file in BAL format, compressed by its ending, .out for Bundler's format, or .ply for a viewer; also
-    /dev/stdout. A folder that is there, or a name that ends in /, becomes a COLMAP model. If the problem is one: every
-    name does, unless it ends in .txt, .bal, .out, .ply, .bz2, .gz or .xz."""
+    """Output file in BAL format, compressed by its ending, .out for Bundler's format, or .ply for a viewer; - is
+    standard output. A folder that is there, or a name that ends in /, becomes a COLMAP model. If the problem is one:
+    every name does, unless it ends in .txt, .bal, .out, .ply, .bz2, .gz or .xz."""
 
     strict: bool = False
     """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point."""
@@ -272,6 +277,8 @@ def _about_option(message: str) -> str:
 
 
 def _run(args: Arguments) -> int:
+    streams = {name: "/dev/stdout" for name in ("output", "log") if getattr(args, name) == STREAM}
+    args = replace(args, **streams)
     if args.device == "cpu":
         import jax
 
@@ -306,7 +313,8 @@ def _solve(args: Arguments) -> int:
     policy, options = solve_options(args)
     path, problem = _in_all_processes(args) if _is_divided(args) else _checked(args)
     common.prepare_process(untraced=not _is_divided(args))
-    name = args.problem or DEFAULT_SCENE
+    name = DEFAULT_SCENE if args.problem is None else path if args.problem == STREAM else args.problem
+    assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     watching = Watching.of(problem, path, args.record is not None, args.view)
     solution, steps = _iterate(args, problem, policy, options, watching and watching.watch)
@@ -347,13 +355,12 @@ def _in_all_processes(args: Arguments) -> tuple[str | None, BundleProblem]:
 
 def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     """The path of the problem and the problem, after all checks of files."""
-    path = None if args.problem is None else resolve(args.problem)
-    check_outputs(args.output, args.log, path)
-    check_outputs(None, args.covariance, path, "--covariance")
-    if args.covariance and args.covariance in (args.output, args.log):
-        raise common.UsageError(f"--covariance names the same file as another output, {args.covariance}")
-    if args.record is not None:
-        check_record(args.record, [args.output, args.covariance, args.log, path])
+    path = _path(args.problem)
+    if args.record is not None and not args.record.endswith(".npz"):
+        raise common.UsageError(f"--record {args.record}: a recording ends in .npz")
+    outputs = {"--log": args.log, "--covariance": args.covariance, "--record": args.record}
+    read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
+    check_outputs(args.output, outputs, path, read)
     if args.view:
         view.check_extra()
     with common.notes_printed():
@@ -365,6 +372,16 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     if args.covariance and problem.constants is None and problem.priors is None:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")
     return path, problem
+
+
+def _path(problem: str | None) -> str | None:
+    """Where a problem is read; None for the built-in scene."""
+    if problem != STREAM:
+        return problem and resolve(problem)
+    try:
+        return whole_input()
+    except OSError as error:
+        raise common.UsageError(f"standard input: {error.strerror or error}") from None
 
 
 def _read(args: Arguments, path: str) -> BundleProblem:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
+import stat
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
@@ -53,6 +56,21 @@ class TolerantStream:
             discard(self._stream)
             if not (self._discard_all or isinstance(error, BrokenPipeError)):
                 raise UnwritableStreamError(f"standard output: {error.strerror or error}") from None
+
+
+def whole_input() -> str:
+    """A path from which standard input can be read, more than once: all that comes through a pipe is kept first.
+
+    Raises:
+        OSError: there is none, or it cannot be kept.
+    """
+    if not stat.S_ISREG(os.fstat(0).st_mode):
+        with tempfile.TemporaryFile() as copy, open(0, "rb", closefd=False) as given:
+            shutil.copyfileobj(given, copy)
+            copy.flush()
+            os.dup2(copy.fileno(), 0)
+        os.lseek(0, 0, os.SEEK_SET)
+    return "/dev/stdin"
 
 
 def discard(stream: Any) -> None:

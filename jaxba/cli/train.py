@@ -123,6 +123,8 @@ def _train(args: Arguments, command: str) -> int:
 
 def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     """The configuration of the run, and its folder."""
+    from jaxba.cli.overwriting import check_apart
+    from jaxba.io import configurations
     from jaxba.training import config as configs
     from jaxba.training import driver
 
@@ -134,6 +136,9 @@ def _prepare(args: Arguments, folder: Path, name: str) -> Any:
             raise common.UsageError("--problems: a resumed run has its scenes in its folder")
         if args.problems and config is not None:
             config = configs.with_problems(config, _check_problems(args.problems))
+        if config is not None and not args.resume:  # the configuration of a run that goes on is its own
+            read = {"the file of --config": [configurations.find("train", name)]}
+            check_apart({"--out": [folder / driver.CONFIG]}, read)
         return driver.prepare_folder(folder, config, args.resume, overrides)
     except (configs.SettingsError, driver.TrainError) as error:
         raise common.UsageError(str(error)) from None
@@ -210,7 +215,7 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
             ) from None
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
-            return common.INTERRUPTED
+            return interrupt.status
         return together(lambda: _finish(folder, work, outcome.best, console, view, command))
 
 

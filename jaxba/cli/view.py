@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import socket
 import sys
 import threading
 import webbrowser
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
@@ -50,7 +52,11 @@ class Arguments:
     """Output file: one page that opens without a server and plays the iterations. Nothing is served."""
 
     port: int = 8080
-    """First port that is tried. The page is reached from this machine only."""
+    """First port that is tried."""
+
+    host: str = "127.0.0.1"
+    """Address of this machine at which the page is reached, without a password. Default: from this machine only;
+    0.0.0.0: from every machine that reaches this one."""
 
 
 def main() -> None:
@@ -74,7 +80,9 @@ def _run(args: Arguments) -> int:
         raise common.UsageError(f"--port must lie between 1 and 65535, is {args.port}")
     if args.images is not None and not os.path.isdir(args.images):
         raise common.UsageError(f"--images {args.images}: is no folder")
+    _check_host(args.host)
     common.check_writable("--html", args.html)
+    _check_apart(args)
     check_extra()
     from jaxba.viewer.sources import open_all
 
@@ -88,7 +96,7 @@ def _run(args: Arguments) -> int:
         return 0
     from jaxba.viewer.panel import Viewer, heading, worst_images
 
-    viewer = Viewer(shown, args.port)
+    viewer = Viewer(shown, args.port, args.host)
     for stage in viewer.stages:
         common.print_line(f"{heading(stage)}, {stage.numbers()}")
         for text, _ in worst_images(stage, NAMED):
@@ -99,6 +107,29 @@ def _run(args: Arguments) -> int:
         common.print_line(f"note: {common.counted(missing, 'image')} not found in {args.images}")
     wait(viewer)
     return 0
+
+
+def _check_host(host: str) -> None:
+    """Refuses what is no address of this machine."""
+    try:
+        family, kind, _, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as server:
+            server.bind(place)
+    except (OSError, UnicodeError) as error:
+        raise common.UsageError(f"--host {host}: {getattr(error, 'strerror', None) or error}") from None
+
+
+def _check_apart(args: Arguments) -> None:
+    """Refuses a page in the place of a file that is shown."""
+    if args.html is None:
+        return
+    from jaxba.cli.overwriting import PROBLEM, check_apart, policy_file, problem_files
+    from jaxba.datasets.bal.paths import resolve
+
+    files = [file for name in args.files for file in problem_files(resolve(name))]
+    images = [] if args.images is None else [one for one in Path(args.images).rglob("*") if one.suffix != ".html"]
+    read = {PROBLEM: files, "the file of --poses": [args.poses], "an image": images}
+    check_apart({"--html": [args.html]}, {**read, "the file of --policy": [policy_file(args.policy or "")]})
 
 
 def _episode(args: Arguments) -> Shown:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,19 +14,6 @@ if TYPE_CHECKING:
     from jaxba.viewer.live import Watcher
     from jaxba.viewer.panel import Viewer
     from jaxba.viewer.recording import Recorder
-
-
-def check_record(path: str, others: Sequence[str | None]) -> None:
-    """Checks that a recording can be written, and that no other file of the command has its name.
-
-    Raises:
-        UsageError: it cannot, or one has.
-    """
-    if not path.endswith(".npz"):
-        raise common.UsageError(f"--record {path}: a recording ends in .npz")
-    common.check_writable("--record", path)
-    if any(other and Path(other).resolve() == Path(path).resolve() for other in others):
-        raise common.UsageError(f"--record names the same file as another one, {path}")
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from jaxba.io.distortion import Distortion
 from jaxba.io.files import StrPath
 from jaxba.io.foreign import FIXED, ForeignLens
 from jaxba.io.json_records import Record, read_json
-from jaxba.io.remarks import note
+from jaxba.io.remarks import note, note_unused
 from jaxba.io.sfm_data import UNDEFINED, Landmark, View, build, checked_pose, part
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -32,6 +32,12 @@ DISTORTIONS = {
 
 SENSOR_WIDTH = 36.0
 """Millimetres, where a file does not say. Source: `loadIntrinsic`."""
+
+PARTS = ("version", "featuresFolders", "matchesFolders", "views", "intrinsics", "poses", "structure")
+"""Parts of a file that are read, or say where features are."""
+
+LOCKS = ("scaleLocked", "offsetLocked", "distortionLocked")
+"""Flags of intrinsics that hold a part of them; `locked`, which holds all, is read."""
 
 _PROGRAM = "AliceVision"
 
@@ -81,8 +87,16 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         locked += pose.get("locked").flag() if pose.has("locked") else False
     if locked:
         note(path, f"{locked} of {len(poses)} poses are locked in the file, but are optimised here")
-    landmarks = _landmarks(part(document, "structure", _PROGRAM))
-    return build(path, views, poses, intrinsics, lambda number: _lens(intrinsics[number], version), landmarks)
+    landmarks = list(_landmarks(part(document, "structure", _PROGRAM)))
+    unused = document.unknown(PARTS)
+    for lock in LOCKS:
+        unused[lock] = sum(one.has(lock) and one.get(lock).flag() for one in intrinsics.values())
+    scales = [scale for _, of_landmark in landmarks for scale in of_landmark]
+    if len(set(scales)) > 1:  # AliceVision divides residuals by them
+        unused["scales of key-points"] = len(scales)
+    note_unused(path, unused)
+    lens = lambda number: _lens(intrinsics[number], version)
+    return build(path, views, poses, intrinsics, lens, [landmark for landmark, _ in landmarks])
 
 
 def _numbered(record: Record, key: str, what: str) -> Iterator[tuple[int, Record]]:
@@ -135,9 +149,10 @@ def _focal(value: Record, version: tuple[int, ...], width: float) -> tuple[float
     return focal, focal * ratio if version >= (1, 2, 5) else focal / ratio
 
 
-def _landmarks(structure: Record) -> Iterator[Landmark]:
+def _landmarks(structure: Record) -> Iterator[tuple[Landmark, list[float]]]:
+    """The points, and the scales of their key-points where the file has them."""
     for number, value in _numbered(structure, "landmarkId", "landmark"):
-        views, pixels = [], []
+        views, pixels, scales = [], [], []
         for view, seen in _numbered(
             value.get("observations"), "observationId", f"landmark {number}: observation in view"
         ):
@@ -145,4 +160,6 @@ def _landmarks(structure: Record) -> Iterator[Landmark]:
                 seen.fail("has no x: have AliceVision write observations with their features")
             views.append(view)
             pixels.append(seen.get("x").vector(2))
-        yield Landmark(value.get("X").vector(3), views, pixels)
+            if seen.has("scale"):
+                scales.append(seen.get("scale").number())
+        yield Landmark(value.get("X").vector(3), views, pixels), scales

@@ -87,16 +87,21 @@ def read(kind: Kind, name: str) -> dict[str, Any]:
     return merged
 
 
-def parse(text: str, name: str) -> Any:
+def parse(text: str, name: str, *, as_text: bool = False) -> Any:
     """Plain data from YAML.
 
+    Args:
+        text: to read.
+        name: whose text it is, for messages.
+        as_text: whether all scalars stay the text that they are, as names must: `000010`, `1_000`, `yes`, `null`.
+
     Raises:
-        SettingsError: not YAML; `name` says whose text it is.
+        SettingsError: not YAML.
     """
     import yaml
 
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, yaml.BaseLoader if as_text else yaml.SafeLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
@@ -109,8 +114,8 @@ def _folder(kind: Kind) -> Path:
     return installed if installed.is_dir() else _PACKAGE.parent / "configs" / kind
 
 
-def read_file(path: Path, name: str) -> dict[str, Any]:
-    """The mapping in a YAML file; an empty file says nothing.
+def read_file(path: Path, name: str, *, as_text: bool = False) -> dict[str, Any]:
+    """The mapping in a YAML file; an empty file says nothing. Arguments as for `parse`.
 
     Raises:
         SettingsError: it cannot be read, or is no mapping; `name` says which file.
@@ -121,8 +126,8 @@ def read_file(path: Path, name: str) -> dict[str, Any]:
         raise SettingsError(f"{name}: not text") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a null character
         raise SettingsError(f"{name}: {reason(error)}") from None
-    data = parse(text, name)
-    if data is None:
+    data = parse(text, name, as_text=as_text)
+    if data is None or data == "":
         return {}
     if not isinstance(data, dict):
         raise SettingsError(f"{name}: must be a mapping of settings to their values")

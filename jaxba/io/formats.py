@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from jaxba.io.colmap import is_colmap, read_colmap
+from jaxba.io.colmap.records import PARTS, RIG_PARTS
 from jaxba.io.files import READ_ERRORS, StrPath, display_name, strip_compression
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
@@ -73,6 +75,7 @@ def _read_nvm(path: StrPath) -> BundleProblem:
 def _read_json(path: StrPath) -> BundleProblem:
     """Reads OpenSfM's, OpenMVG's or AliceVision's file, which are told apart by their contents."""
     from jaxba.io import alicevision, json_records, openmvg, opensfm
+    from jaxba.io.recognise import nerfstudio
 
     document = json_records.read_json(path)
     for recognised, read in (
@@ -82,6 +85,10 @@ def _read_json(path: StrPath) -> BundleProblem:
     ):
         if recognised(document):
             return read(document, path)
+    if nerfstudio(document.value):
+        document.fail(
+            "is nerfstudio's transforms.json, which has poses but no points: give the COLMAP model it was made from"
+        )
     document.fail(f"is JSON, but not of a program that is known here; {formats_read()}")
 
 
@@ -97,6 +104,9 @@ FORMATS = (
 RECONSTRUCTION = "reconstruction.json"
 """File by which a folder of OpenSfM is known."""
 
+TRACKS = tuple(f"tracks.csv{ending}" for ending in ("", ".gz", ".bz2", ".xz"))
+"""Files of OpenSfM's observations, beside the reconstruction."""
+
 OTHER_ENDINGS = (
     *(".abc", ".b3dm", ".bin", ".blend", ".csv", ".dae", ".db", ".dot", ".e57", ".fbx", ".g2o", ".glb", ".gltf"),
     *(".graph", ".h5", ".hdf5", ".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mg"),
@@ -108,7 +118,7 @@ OTHER_ENDINGS = (
 )
 """Endings of what is neither read nor written, so that a name with one of them is a mistake."""
 
-_SNIFFED = 64
+_SNIFFED = 1024
 """Bytes at the beginning of a file that tell its format."""
 
 
@@ -141,22 +151,36 @@ def formats_written() -> str:
 
 
 def read(path: StrPath) -> BundleProblem:
-    """Reads a file in the format of its ending, or else of its first bytes. Raises ProblemError."""
+    """Reads a file in the format of its ending, or else of its first bytes.
+
+    Raises:
+        ProblemError: it cannot be read; one line. Of a file of another program it says what that is.
+    """
     known = by_ending(path)
-    if known is not None and known is not FORMATS[0]:
-        if known.read is None:
-            raise ProblemError(f"cannot read {display_name(path)}: {known.name} is only written; {formats_read()}")
-        return known.read(path)
+    if known is not None and known.read is None:
+        raise ProblemError(f"cannot read {display_name(path)}: {known.name} is only written; {formats_read()}")
     try:
-        return _read_bal(path)
+        return _read_bal(path) if known is None or known.read is None else known.read(path)
     except ProblemError as error:
         begin = _beginning(path)
-        found = next((one for one in FORMATS if one.read and begin.startswith(one.begins)), None) if begin else None
-        if found is not None and found.read is not None:
+        found = next((one for one in FORMATS if begin.lstrip().startswith(one.begins)), None) if begin else None
+        if found is not None and found.read is not None and known in (None, FORMATS[0]):
             return found.read(path)
-        if begin and not begin[:1].isdigit() and not begin.startswith((b"+", b"-", b".")):
-            raise ProblemError(f"{error}; {formats_read()}") from error
-        raise
+        raise _explained(path, begin, error) from error
+
+
+def _explained(path: StrPath, begin: bytes, error: ProblemError) -> ProblemError:
+    """The error of a reader, or what the file is instead, if that is known."""
+    from jaxba.io.recognise import recognised
+
+    what = recognised(path, begin) if begin else None
+    if what is not None:
+        return ProblemError(f"{display_name(path)}: is {what}{'' if ': ' in what else f'; {formats_read()}'}")
+    if ending(path) in OTHER_ENDINGS and begin:
+        return ProblemError(f"{error}; files with {ending(path)} are not read; {formats_read()}")
+    if by_ending(path) in (None, FORMATS[0]) and re.match(rb"\s*[^\s\d+.-]", begin):  # no number, as BAL begins
+        return ProblemError(f"{error}; {formats_read()}")
+    return error
 
 
 def writer(path: StrPath) -> Writer:
@@ -192,8 +216,25 @@ def read_folder(path: StrPath) -> BundleProblem:
     return read_colmap(path)
 
 
+def files_of(path: StrPath) -> list[StrPath]:
+    """The files that a problem of this path is read from, or would be if they were there.
+
+    A folder has those of a COLMAP model and of OpenSfM, whose tracks also lie beside a `.json` file.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        beside = [folder.with_name(name) for name in TRACKS] if ending(path) == ".json" else []
+        return [path, *beside]
+    return [*model_files(path), *(folder / name for name in (RECONSTRUCTION, *TRACKS))]
+
+
+def model_files(folder: StrPath) -> list[Path]:
+    """The files that a COLMAP model in a folder may have."""
+    return [Path(folder) / f"{part}{suffix}" for part in (*PARTS, *RIG_PARTS) for suffix in (".bin", ".txt")]
+
+
 def _beginning(path: StrPath) -> bytes:
-    """First bytes of a regular file after blanks, decompressed; empty if they cannot be read (again)."""
+    """First bytes of a regular file, decompressed; empty if they cannot be read (again)."""
     from jaxba.io.encoding import open_text
 
     if not Path(path).is_file():
@@ -202,7 +243,7 @@ def _beginning(path: StrPath) -> bytes:
         with open_text(path) as blocks:
             text = b""
             for block in blocks:
-                text = (text + block).lstrip()[:_SNIFFED]
+                text = (text + block)[:_SNIFFED]
                 if len(text) == _SNIFFED:
                     break
             return text

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, NoReturn
 
 import numpy as np
@@ -51,6 +51,13 @@ class Record:
         if key not in self.value:
             self.fail(f"has no {key}")
         return Record(self.value[key], self.name, f"{self.where}: {key}" if self.where else key)
+
+    def unknown(self, known: Collection[str]) -> dict[str, int]:
+        """Sizes of the values of other keys than the known ones, without those that are empty."""
+        others = {key: value for key, value in self.value.items() if key not in known and value}
+        return {
+            display_name(key): len(value) if isinstance(value, (list, dict)) else 1 for key, value in others.items()
+        }
 
     def rows(self) -> Iterator[Record]:
         """The values of a list; an empty text is an empty list, as AliceVision writes one. Raises ProblemError."""

@@ -20,7 +20,7 @@ from jaxba.io.distortion import Distortion
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import FIXED, ForeignLens, assemble
-from jaxba.io.remarks import note_origin
+from jaxba.io.remarks import note, note_origin
 from jaxba.io.text import LineReader, NumberReader, number
 from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -74,6 +74,8 @@ def read_nvm(path: StrPath) -> BundleProblem:
         if not count:
             raise ProblemError(f"{name}: its first model has no points")
         tracks = read_tracks(reader, 1, count, len(images.focal), reader.field)
+        if tracks.end < values.size and values[tracks.end] > 0:  # the number of images of the next model, or 0
+            note(path, "only the first model of the file is read")
     note_origin(path, tracks.pixels)
     lenses, lens_of = _lenses(header, images)
     poses = images.rotations, images.translations

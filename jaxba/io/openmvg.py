@@ -13,6 +13,7 @@ from jaxba.io.distortion import Distortion
 from jaxba.io.files import StrPath
 from jaxba.io.foreign import ForeignLens
 from jaxba.io.json_records import Record, read_json
+from jaxba.io.remarks import note_unused
 from jaxba.io.sfm_data import UNDEFINED, Landmark, View, build, checked_pose, part
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -27,6 +28,12 @@ MODELS = {
     "fisheye": ("fisheye", 4),
 }
 """Camera models that are read: where their coefficients stand, and how many they are."""
+
+PRIORS = {"use_pose_center_prior": "priors of positions", "use_pose_rotation_prior": "priors of rotations"}
+"""What views may hold besides, and the flags that say so. Source: OpenMVG, sfm/sfm_view_priors_io.cpp."""
+
+PARTS = (VERSION, "root_path", "views", "intrinsics", "extrinsics", "structure")
+"""Parts of a file that are read, or say where images are."""
 
 _FIRST = 1 << 31
 """Bit of a number that marks the first coming of a class or an object. Source: cereal, `detail::msb_32bit`."""
@@ -59,8 +66,11 @@ def is_openmvg(document: Record) -> bool:
 def from_document(document: Record, path: StrPath) -> BundleProblem:
     """As `read_openmvg`, from the contents of its file. Raises ProblemError."""
     views = {}
+    unused = dict.fromkeys(PRIORS.values(), 0)
     for key, value in _map(part(document, "views", _PROGRAM), "view"):
         data = value.get("ptr_wrapper").get("data").called(value.where)
+        for flag, what in PRIORS.items():
+            unused[what] += data.has(flag) and data.get(flag).flag()
         number = data.get("id_view").integer() if data.has("id_view") else key
         pose, intrinsic = (
             data.get(one).integer() if data.has(one) else UNDEFINED for one in ("id_pose", "id_intrinsic")
@@ -71,6 +81,7 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     for key, value in _map(part(document, "extrinsics", _PROGRAM), "pose"):
         poses[key] = checked_pose(value, value.get("rotation").matrix(), value.get("center").vector(3))
     landmarks = _landmarks(part(document, "structure", _PROGRAM))
+    note_unused(path, unused | document.unknown(PARTS))
     return build(path, views, poses, intrinsics, lambda key: _lens(*intrinsics[key]), landmarks)
 
 

@@ -19,7 +19,7 @@ from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import ALL_FREE, ForeignLens, assemble
 from jaxba.io.json_records import Record, read_json
-from jaxba.io.remarks import note
+from jaxba.io.remarks import note, note_unused
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import are_rotations
@@ -43,10 +43,18 @@ MODELS = ("perspective", "fisheye", *_RADIAL)
 """Camera models that are read."""
 
 
+PARTS = ("cameras", "shots", "points", "rig_cameras", "rig_instances", "biases", "reference_lla", "reference")
+"""Parts of a reconstruction that are read, or that say nothing without measured positions."""
+
+CONTROL_POINTS = ("ground_control_points.json", "gcp_list.txt")
+"""Files of control points beside a reconstruction."""
+
+
 class _Observations(NamedTuple):
     images: list[str]
     tracks: list[str]
     pixels: list[tuple[float, float]]
+    unused: dict[str, int]
 
 
 def read_opensfm(path: StrPath, tracks: StrPath | None = None) -> BundleProblem:
@@ -105,6 +113,7 @@ def from_document(document: Record, path: StrPath, tracks: StrPath | None = None
     if not shots or not points:
         document.fail(f"has no {'points' if shots else 'shots'}")
     seen = _read_tracks(_tracks_beside(path) if tracks is None else tracks, shots, set(points))
+    note_unused(path, document.unknown(PARTS) | _unused(document, path) | seen.unused)
     from scipy.spatial.transform import Rotation
 
     rotations = Rotation.from_rotvec(np.array(turns)).as_matrix()
@@ -127,6 +136,18 @@ def from_document(document: Record, path: StrPath, tracks: StrPath | None = None
         camera_index,
         np.array([point_number[track] for track in seen.tracks]),
     )
+
+
+def _unused(document: Record, path: StrPath) -> dict[str, int]:
+    """What OpenSfM optimises with and this package does not: measured positions, priors of cameras, control points."""
+    positions = [shot.value.get("gps_position") for _, shot in document.get("shots").entries("shot")]
+    keys = [camera.value if isinstance(camera.value, dict) else () for _, camera in document.get("cameras").entries("")]
+    beside = [name for name in CONTROL_POINTS if (Path(path).parent / name).is_file()]
+    return {
+        "measured positions": sum(isinstance(one, list) and any(one) for one in positions),
+        "priors of cameras": sum(any(key.endswith("_prior") for key in camera) for camera in keys),
+        **{f"{name} beside it": 1 for name in beside},
+    }
 
 
 def _refuse_rigs(document: Record) -> None:
@@ -187,6 +208,7 @@ def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -
         if version < 0:
             raise ProblemError(f"{name} line 1: version {stated!a} of tracks is not read; 1 and 2 are")
     found: dict[tuple[str, str], tuple[float, float]] = {}
+    scales: set[str] = set()
     for at, line in enumerate(lines[first:], first + 1):
         if not line.strip():
             continue
@@ -197,11 +219,13 @@ def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -
         image, track = words[:2]
         if image not in shots or track not in points:
             continue
+        scales.update(words[5:6] if version else ())
         found[image, track] = (_pixel(words[3], "x", f"{name} line {at}"), _pixel(words[4], "y", f"{name} line {at}"))
     if not found:
         raise ProblemError(f"{name}: no image of the reconstruction sees a point of it")
     images, tracks = zip(*found, strict=True)
-    return _Observations(list(images), list(tracks), list(found.values()))
+    unused = {"scales of key-points": len(found)} if len(scales) > 1 else {}  # OpenSfM divides residuals by them
+    return _Observations(list(images), list(tracks), list(found.values()), unused)
 
 
 def _pixel(word: str, field: str, where: str) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +21,18 @@ LEAST_PIXELS = 16
 def note(path: StrPath, text: str) -> None:
     """Warns about a file; the message begins with its name."""
     report([f"{display_name(path)}: {text}"])
+
+
+def note_unused(path: StrPath, counts: Mapping[str, int]) -> None:
+    """Warns in one line of what a file holds and no reader uses, such as priors.
+
+    Args:
+        path: of the file.
+        counts: how many there are, by what they are called.
+    """
+    there = [f"{what} ({count})" for what, count in counts.items() if count]
+    if there:
+        note(path, f"not used: {', '.join(there)}")
 
 
 def note_center(path: StrPath, what: str, center: tuple[float, float], size: tuple[float, float]) -> None:

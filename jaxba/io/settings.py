@@ -135,7 +135,7 @@ def _value(kind: Any, value: Any, path: str) -> Any:
     if kind is str:
         if isinstance(value, str):
             return value
-        raise SettingsError(f"{path} must be text, is {_show(value)}")
+        raise SettingsError(f"{path} must be text, is {_show(value)}: put it in quotes")
     raise AssertionError(f"{path}: no rule for fields of type {kind}")
 
 

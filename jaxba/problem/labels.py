@@ -36,18 +36,18 @@ class Labels:
         found = [(by_name if isinstance(one, str) else by_id).get(one, -1) for one in wanted]  # type: ignore[call-overload]
         return _positions(list(wanted), found, "image")
 
-    def lenses_at(self, wanted: Iterable[int]) -> Int[np.ndarray, " wanted"]:
+    def lenses_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
         """Positions of lenses by id. Raises as `images_at`."""
         return _positions(list(wanted), _found(self.lenses, wanted), "camera")
 
-    def points_at(self, wanted: Iterable[int]) -> Int[np.ndarray, " wanted"]:
+    def points_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
         """Positions of points by id. Raises as `images_at`."""
         return _positions(list(wanted), _found(self.points, wanted), "point")
 
 
-def _found(ids: Integer[np.ndarray, " n"], wanted: Iterable[int]) -> list[int]:
+def _found(ids: Integer[np.ndarray, " n"], wanted: Iterable[int | str]) -> list[int]:
     by_id = {int(number): at for at, number in enumerate(ids)}
-    return [-1 if isinstance(one, bool) else by_id.get(one, -1) for one in wanted]
+    return [-1 if isinstance(one, bool) else by_id.get(one, -1) for one in wanted]  # type: ignore[call-overload]
 
 
 def _positions(wanted: list, found: list[int], what: str) -> np.ndarray:

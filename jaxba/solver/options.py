@@ -78,7 +78,7 @@ class SolveOptions:
     """Convergence tests."""
 
     max_iterations: int = MAX_ITERATIONS
-    """Limit of linear solves."""
+    """Limit of linear solves; with 0 the cost of the start is computed, and the problem comes back as it is."""
 
     dtype: Dtype = "float64"
     """`float64` or `float32`, the type of all arithmetic; `mixed` is float64 with the reduced camera system in
@@ -114,7 +114,7 @@ class SolveOptions:
         for name, known in _CHOICES.items():
             if getattr(self, name) not in get_args(known):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
-        check_count("max_iterations", self.max_iterations, 1)
+        check_count("max_iterations", self.max_iterations, 0)
         if self.devices is not None:
             check_count("devices", self.devices, 1)
         for name, value in self.tolerances._asdict().items():

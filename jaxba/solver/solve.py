@@ -25,7 +25,7 @@ from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, Stage, compile_and_run, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord, Run, Watch, parts_of, run_stepwise
 from jaxba.solver.diagnosis import cost_of_rounding
-from jaxba.solver.loop import History, history_of, solve_loop
+from jaxba.solver.loop import Carry, History, history_of, solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, Setup, numerics, set_up
 from jaxba.structure.padding import Capacity
@@ -161,6 +161,8 @@ def solve_without(
             run = _run_compiled
         if setup.shards is not None:
             run = functools.partial(_run_sharded, callback=callback, watch=watch)
+        if options.max_iterations == 0:
+            run = _run_nothing
         carry, history, initial_cost, quick_iterations, compile_s, total_s = run(
             setup, options.tolerances, options.max_iterations
         )
@@ -174,7 +176,7 @@ def solve_without(
         if gave_up and final_cost <= cost_of_rounding(problem, setup.dtype):
             termination = Termination.ROUNDING
         return Solution(
-            problem=setup.problem_at(carry.state),
+            problem=setup.problem_at(carry.state) if count else _unchanged(problem),
             initial_cost=initial_cost,
             final_cost=final_cost,
             iterations=count,
@@ -189,6 +191,12 @@ def solve_without(
             quick_iterations=quick_iterations,
             set_aside=setup.away,
         )
+
+
+def _unchanged(problem: BundleProblem) -> BundleProblem:
+    """The problem itself, its parameters as NumPy float64."""
+    cameras, points = (np.asarray(one, np.float64) for one in (problem.cameras, problem.points))
+    return problem.replace(cameras=cameras, points=points)
 
 
 def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
@@ -239,6 +247,23 @@ def _run_sharded(
             history = jax.tree.map(lambda *rows: np.stack(rows), *records)
     total_s = time.perf_counter() - started - clock.seconds
     return Run(carry, history, initial_cost, 0, clock.seconds, total_s)
+
+
+def _run_nothing(setup: Setup, tolerances: Tolerances, max_iterations: int) -> Run:
+    """Runs no iteration: computes the cost of the start."""
+    started = time.perf_counter()
+    with CompileClock() as clock:
+        if setup.shards is None:
+            state = jax.block_until_ready(setup.initial(compile_and_run))
+        else:
+            state = setup.shards.begin(setup.policy, np.asarray(1, np.int32), setup.prices).state
+        setup.check_cost(state)
+    nothing = History(*(np.empty(0, setup.dtype) for _ in History._fields))
+    history = nothing._replace(accepted=np.empty(0, bool), cg_iterations=np.empty(0, np.int32))
+    counts = np.asarray(0, np.int32), np.asarray(Termination.MAX_ITERATIONS, np.int32)
+    carry = Carry(state, None, *jax.device_put((np.asarray(np.nan, setup.dtype), *counts)))
+    total_s = time.perf_counter() - started - clock.seconds
+    return Run(carry, history, float(state.cost), 0, clock.seconds, total_s)
 
 
 def _run_compiled(setup: Setup, tolerances: Tolerances, max_iterations: int) -> Run:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import re
+import socket
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stdout
@@ -32,10 +33,14 @@ WORST = 20
 NOTHING = "none"
 
 
-def start_server(port: int = PORT) -> viser.ViserServer:
-    """A server that only this machine reaches, at this port or the next free one."""
+HOST = "127.0.0.1"
+"""Address under which only this machine reaches the page."""
+
+
+def start_server(port: int = PORT, host: str = HOST) -> viser.ViserServer:
+    """A server at this port or the next free one of an address of this machine."""
     with redirect_stdout(StringIO()):  # it prints a box with its address
-        return viser.ViserServer(host="127.0.0.1", port=port, label="jaxba", verbose=False)
+        return viser.ViserServer(host=host, port=port, label="jaxba", verbose=False)
 
 
 def stop_server(server: viser.ViserServer) -> None:
@@ -47,14 +52,15 @@ def stop_server(server: viser.ViserServer) -> None:
 class Viewer:
     """A page that is served until it is closed."""
 
-    def __init__(self, all_shown: Sequence[Shown], port: int = PORT) -> None:
+    def __init__(self, all_shown: Sequence[Shown], port: int = PORT, host: str = HOST) -> None:
         """Serves a page.
 
         Args:
             all_shown: what stands side by side on it.
             port: first one that is tried.
+            host: address of this machine at which it is reached; `0.0.0.0`: all of them.
         """
-        self.server = start_server(port)
+        self.host, self.server = host, start_server(port, host)
         self._lock = threading.RLock()
         self.stages = stages(self.server, all_shown, self.choose, caption="name" if len(all_shown) > 1 else "")
         self._panel()
@@ -62,7 +68,8 @@ class Viewer:
     @property
     def url(self) -> str:
         """Address of the page."""
-        return f"http://127.0.0.1:{self.server.get_port()}"
+        host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def close(self) -> None:
         """Ends the server."""

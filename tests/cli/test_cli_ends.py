@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from jaxba.cli import common
+from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.solve import run
 from jaxba.cli.streams import tolerant_streams
 
@@ -83,6 +85,37 @@ def test_ctrl_c_while_a_command_imports_is_one_line():
 
 
 @linux
+@pytest.mark.parametrize("command", ["paper", "data", "kitti"])
+def test_sigterm_is_handled_as_ctrl_c_with_its_own_status(command, monkeypatch, capsys):
+    def main(_):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except KeyboardInterrupt:  # where commands say how to go on
+            return common.INTERRUPTED
+
+    monkeypatch.setattr(f"jaxba.cli.{command}._{'build' if command == 'kitti' else command}", main)
+    words = {"paper": [], "data": ["list"], "kitti": ["folder"]}[command]
+    assert importlib.import_module(f"jaxba.cli.{command}").run(words) == 143
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_a_signal_that_is_ignored_stays_ignored():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with common.catch_interrupts() as stopped, Interrupt("iteration", graceful=True) as interrupt:
+            signal.raise_signal(signal.SIGINT)
+            assert not interrupt.requested
+            assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
+            signal.raise_signal(signal.SIGTERM)
+            assert interrupt.requested
+            with pytest.raises(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGTERM)
+            assert stopped() == 143
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@linux
 def test_a_program_that_imports_jaxba_keeps_its_own_handler():
     code = "import signal, jaxba; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -99,9 +132,8 @@ def test_an_interrupt_that_became_another_error_is_an_interrupt(monkeypatch, cap
             raise RuntimeError("a callback failed") from None
         raise AssertionError("no signal came")
 
-    with default_handler():
-        monkeypatch.setattr("jaxba.cli.solve._run", library)
-        assert run([]) == 130
+    monkeypatch.setattr("jaxba.cli.solve._run", library)
+    assert run([]) == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
@@ -117,21 +149,11 @@ def test_an_interrupt_lost_in_a_destructor_is_raised_again(capsys):
         for _ in range(10**9):
             time.monotonic()
 
-    with default_handler(), common.catch_interrupts() as interrupted:
+    with common.catch_interrupts() as stopped:
         with pytest.raises(KeyboardInterrupt):
             drop()
-        assert interrupted()
+        assert stopped() == 130
     assert capsys.readouterr().err == ""
-
-
-class default_handler:
-    """In which Ctrl-C has Python's own handler; a shell's background job ignores it."""
-
-    def __enter__(self) -> None:
-        self.before = signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self.before)
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EFBIG])

@@ -184,7 +184,7 @@ def test_devices_and_processes_that_cannot_be_had_are_one_line(capsys, tmp_path)
 
 
 def test_ctrl_c_saves_the_run_and_prints_how_to_continue(folder, capsys, monkeypatch):
-    before = signal.getsignal(signal.SIGINT)  # a shell's background job ignores the signal
+    before = signal.getsignal(signal.SIGINT)
     interrupt_at(3, monkeypatch)
     assert run(["--out", str(folder), "--resume"]) == 130
     captured = capsys.readouterr()

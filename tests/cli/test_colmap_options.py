@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import support
 
 from jaxba import BundleProblem, hold, read_problem, with_gauge, write_colmap
 from jaxba.cli.colmap_options import translated
+from jaxba.cli.common import UsageError
+from jaxba.cli.constraints import constrained
 from jaxba.cli.solve import run
 
 
@@ -61,8 +65,8 @@ def test_mistakes_in_a_file_of_constraints_are_one_line(model, tmp_path, capsys,
         ("--BundleAdjustment.use_gpu 1", "--BundleAdjustment.use_gpu is not an option here; of COLMAP's are refine_"),
         ("--constant k9", "--constant: no lens has a number 'k9'; there are focal, principal_point"),
         ("--covariance c.npz", "--covariance needs --gauge, constants or priors"),
-        ("--covariance p.txt --gauge two-cameras", "--covariance names the problem's file"),
-        ("--covariance a.txt --output a.txt", "--covariance names the same file as another output"),
+        ("--covariance p.txt --gauge two-cameras", "--covariance p.txt: is a file of the problem"),
+        ("--covariance a.txt --output a.txt", "--output and --covariance name the same file, a.txt"),
         ("--refine-principal-point", "--refine-principal-point is for COLMAP models"),
         ("--constraints none.yaml", "--constraints none.yaml: No such file"),
     ],
@@ -107,6 +111,41 @@ def test_a_file_of_constants_names_images_and_points_of_the_model(model, tmp_pat
         assert (arrays["poses"][1].diagonal() > 0).all()
 
 
+NAMES = ("000010", "1_000", "0x10", "1e3", "yes", "2024-01-01")
+
+
+@pytest.mark.parametrize(
+    ("text", "held"),
+    [
+        ("[000010, 1e3, 2024-01-01]", [0, 3, 5]),  # an octal 8, a number and a date for YAML
+        ("\n- 1_000\n- 0x10\n- yes", [1, 2, 4]),
+        ("1e3", [3]),
+        ("[2]", [1]),  # the id of an image, as there is no such name
+        ("all", [0, 1, 2, 3, 4, 5]),
+        ("", []),
+    ],
+)
+def test_names_that_look_like_numbers_are_names(text, held, model, tmp_path):
+    problem = read_problem(model)
+    problem = problem.replace(labels=replace(problem.labels, names=NAMES))
+    (tmp_path / "c.yaml").write_text(f"constant_poses: {text}\n")
+    found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
+    constant = np.zeros(6, bool) if found.constants is None else found.constants.poses.all(axis=1)
+    assert np.flatnonzero(constant).tolist() == held
+
+
+def test_a_name_goes_before_an_id_and_another_form_of_a_number_is_no_id(model, tmp_path):
+    problem = read_problem(model)
+    problem = problem.replace(labels=replace(problem.labels, names=("3", *problem.labels.names[1:])))
+    (tmp_path / "c.yaml").write_text('constant_poses: [3, "4"]\n')
+    found = constrained(problem, (), None, str(tmp_path / "c.yaml"))
+    assert np.flatnonzero(found.constants.poses.all(axis=1)).tolist() == [0, 3]
+    for key in ("constant_poses", "constant_points", "constant_cameras"):
+        (tmp_path / "c.yaml").write_text(f"{key}: [01]\n")
+        with pytest.raises(UsageError, match=rf"{key}: there is no (image|point|camera) '01'"):
+            constrained(problem, (), None, str(tmp_path / "c.yaml"))
+
+
 def test_priors_of_the_file_pull_images_to_their_positions(model, tmp_path):
     from jaxba.problem import geometry
 
@@ -123,8 +162,6 @@ def test_priors_of_the_file_pull_images_to_their_positions(model, tmp_path):
 
 def test_options_say_the_same_as_the_functions_of_python(model):
     problem = read_problem(model)
-    from jaxba.cli.constraints import constrained
-
     wanted: BundleProblem = with_gauge(hold(problem, rotations="all", numbers=["focal"]), "two-cameras")
     found = constrained(problem, ("rotations", "focal"), "two-cameras", None)
     assert (found.constants.poses == wanted.constants.poses).all()

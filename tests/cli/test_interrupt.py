@@ -1,4 +1,4 @@
-"""Ctrl-C while a long compiled program runs, in which Python handles no signals."""
+"""Ctrl-C or SIGTERM while a long compiled program runs, in which Python handles no signals."""
 
 from __future__ import annotations
 
@@ -21,19 +21,23 @@ with Interrupt("iteration", graceful=True):
 """
 
 
-def test_the_first_prints_a_message_and_the_second_ends_the_process():
+@pytest.mark.parametrize(
+    ("number", "again", "status", "last"),
+    [(signal.SIGINT, "Ctrl-C again", 130, "interrupted"), (signal.SIGTERM, "another signal", 143, "terminated")],
+)
+def test_the_first_prints_a_message_and_the_second_ends_the_process(number, again, status, last):
     child = subprocess.Popen([sys.executable, "-c", BUSY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     with child:
         try:
             assert child.stdout is not None
             assert child.stderr is not None
             assert child.stdout.readline() == "ready\n"
-            child.send_signal(signal.SIGINT)
-            assert child.stderr.readline() == "stopping after this iteration; Ctrl-C again stops at once\n"
+            child.send_signal(number)
+            assert child.stderr.readline() == f"stopping after this iteration; {again} stops at once\n"
             with pytest.raises(subprocess.TimeoutExpired):  # the first one alone does not end it
                 child.wait(1.5 * EXIT_DELAY_S)
-            child.send_signal(signal.SIGINT)
-            assert child.wait(60) == 130
-            assert child.stderr.read() == "interrupted\n"
+            child.send_signal(number)
+            assert child.wait(60) == status
+            assert child.stderr.read() == f"{last}\n"
         finally:
             child.kill()

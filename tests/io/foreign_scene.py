@@ -207,7 +207,7 @@ def write_alicevision(path: Path, scene: Scene, types: list[str], version: tuple
 
 def write_nvm(path: Path, scene: Scene, distortion: list[float], header: str = "NVM_V3") -> Path:
     """VisualSFM's file. Lenses must be pinholes; pixels are measured so that (1 + r |m|^2 / f^2) m is their undistorted
-    pixel, and a second model and comments follow."""
+    pixel, and comments follow."""
     measured = []
     for (i, _), pixel in zip(scene.seen, scene.pixels, strict=True):
         lens = scene.lenses[scene.lens_of[i]]
@@ -225,16 +225,7 @@ def write_nvm(path: Path, scene: Scene, distortion: list[float], header: str = "
         seen = [(i, m.tolist()) for (i, other), m in zip(scene.seen, measured, strict=True) if other == j]
         views = " ".join(f"{i} 7 {x!r} {y!r}" for i, (x, y) in seen)
         lines.append(f"{point[0]!r} {point[1]!r} {point[2]!r} 1 2 3 {len(seen)} {views}")
-    lines += [
-        "",
-        "2",
-        "lost.jpg 100 1 0 0 0 0 0 0 0 0",
-        "lost2.jpg 100 1 0 0 0 0 0 0 0 0",
-        "0",
-        "",
-        "0",
-        "#the last part",
-    ]
+    lines += ["", "0", "#the last part"]
     path.write_text("\n".join(lines) + "\n")
     return path
 

@@ -283,6 +283,12 @@ def test_poses_of_frames_count_and_images_without_one_stay_as_they_are(tmp_path,
     np.testing.assert_allclose(again.cameras, moved.cameras, rtol=1e-12, atol=1e-13)
 
 
+def test_sensors_that_are_no_cameras_are_left_out_and_counted(tmp_path, healthy):
+    problem, notes = noted(framed(tmp_path / "m", [1, 2, 3, 4, 5, 6], "7 2 CAMERA 7 IMU 3 0"))
+    assert notes == ["rigs.txt: 1 sensor left out, no camera (sensor 3 of rig 7)"]
+    assert np.array_equal(problem.cameras, healthy.cameras)
+
+
 RIGS = {
     "absent rig": (("8 1 CAMERA 7", "1 CAMERA 7 {}"), "frames.txt: frame 101: rig 7 is not in "),
     "absent sensor": (("7 1 IMU 7", "1 CAMERA 7 {}"), "frames.txt: frame 101: rig 7 has no sensor 7 of datum 1"),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 import subprocess
 import sys
+import warnings
 
 import foreign_scene
 import numpy as np
@@ -221,6 +223,82 @@ def test_only_the_first_reconstruction_is_read_and_that_is_said(tmp_path):
         assert read_problem(path).num_cameras == 5
 
 
+def changed_json(path, change):
+    contents = json.loads(path.read_text())
+    change(contents)
+    path.write_text(json.dumps(contents))
+    return path
+
+
+def with_priors(contents):
+    for row in contents["views"][:3]:
+        row["value"]["ptr_wrapper"]["data"] |= {"use_pose_center_prior": True, "center": [0, 0, 0]}
+    contents["views"][4]["value"]["ptr_wrapper"]["data"] |= {"use_pose_center_prior": False}
+    contents["control_points"] = [{"key": 0, "value": {"X": [0, 0, 0], "observations": []}}] * 2
+
+
+def with_locks(contents):
+    contents["intrinsics"][0]["scaleLocked"] = "true"
+    contents["constraints2d"] = [{"viewA": 0}] * 4
+    for number, landmark in enumerate(contents["structure"]):
+        for seen in landmark["observations"]:
+            seen["scale"] = str(1.0 + number)
+
+
+def with_positions(contents):
+    shots = list(contents[0]["shots"].values())
+    shots[0]["gps_position"], shots[1]["gps_position"], shots[2]["gps_position"] = [1, 2, 3], [0.0, 0.0, 0.0], None
+    next(iter(contents[0]["cameras"].values()))["focal_prior"] = 0.8
+
+
+def opensfm_with_more(folder):
+    path = changed_json(write_opensfm(folder, scene_of(PINHOLE), ["perspective"]), with_positions)
+    (folder / "gcp_list.txt").write_text("WGS84\n")
+    tracks = folder / "tracks.csv"
+    tracks.write_text(tracks.read_text().replace("0.004", "0.002", 1))
+    return path
+
+
+def openmvg_with_more(folder):
+    return changed_json(write_openmvg(folder / "sfm_data.json", scene_of(PINHOLE), ["pinhole"]), with_priors)
+
+
+def alicevision_with_more(folder):
+    return changed_json(write_alicevision(folder / "a.sfm", scene_of(PINHOLE), ["pinhole"], (1, 2, 1)), with_locks)
+
+
+def nvm_with_more(folder):
+    path = write_nvm(folder / "a.nvm", scene_of(PINHOLE), [0.0] * 5)
+    second = "\n2\nlost.jpg 100 1 0 0 0 0 0 0 0 0\nlost2.jpg 100 1 0 0 0 0 0 0 0 0\n0\n0\n"
+    path.write_text(path.read_text().replace("\n0\n#", f"{second}#"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (openmvg_with_more, "not used: priors of positions (3), control_points (2)"),
+        (alicevision_with_more, "not used: constraints2d (4), scaleLocked (1), scales of key-points ({})"),
+        (
+            opensfm_with_more,
+            "not used: measured positions (1), priors of cameras (1), gcp_list.txt beside it (1), scales of "
+            "key-points ({})",
+        ),
+        (nvm_with_more, "only the first model of the file is read"),
+    ],
+)
+def test_what_a_file_holds_and_nothing_uses_is_one_note_and_refused_if_strict(write, message, tmp_path):
+    path = write(tmp_path)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = read_problem(path)
+    check(found, scene_of(PINHOLE), ROUNDING)
+    wanted = f"{path}: {message.format(len(scene_of(PINHOLE).seen))}"
+    assert [str(one.message) for one in caught] == [wanted]
+    with pytest.raises(ProblemError, match=re.escape(wanted)):
+        read_problem(path, strict=True)
+
+
 def test_compressed_marked_and_windows_files_are_read_too(tmp_path):
     scene = scene_of(PINHOLE)
     nvm = write_nvm(tmp_path / "a.nvm", scene, [0.0] * 5).read_bytes().replace(b"\n", b"\r\n")
@@ -379,7 +457,7 @@ def test_bad_scenes_of_alicevision_are_refused_by_record_and_field(tmp_path, old
         (4, "a.jpg 100 1 0 0 0 0 0 nan 0 0", "line 4: image 0: 'nan' is not a finite number (cz)"),
         (4, "a.jpg 100 0 0 0 0 0 0 0 0 0", "line 4: image 0: qw to qz are no rotation"),
         (4, "a.jpg -100 1 0 0 0 0 0 0 0 0", "image 0 has focal length -100, which must be positive"),
-        (10, "1000000000", "line 43: 'lost.jpg' is not a number (y of point 30)"),
+        (10, "1000000000", "line 43: '#the' is not a number (y of point 30)"),
         (11, "0 0 9 1 2 3 1 5 0 1 1", "line 11: '5' is outside 0..4 (camera index of view 0 of point 0)"),
         (11, "0 0 9 1 2 3 4 x", "line 11: 'x' is not a number (camera index of view 0 of point 0)"),
     ],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import shutil
+import tarfile
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import support
 from foreign_scene import Lens, Scene, write_nvm, write_openmvg
 
 from jaxba.cli.solve import run
-from jaxba.io import check_output, formats, read_problem, write_problem
+from jaxba.io import check_output, formats, read_problem, write_colmap, write_problem
 from jaxba.problem.bundle_problem import ProblemError
 
 WRITTEN = "written are .txt, .bal (BAL), .out (Bundler), .ply (PLY), each also with .gz, .bz2 or .xz"
@@ -93,7 +95,7 @@ def test_a_file_is_recognised_by_its_first_bytes_where_the_name_says_nothing(tmp
 
 
 @pytest.mark.parametrize(
-    "content", [b"PK\x03\x04", b"\x89HDF\r\n", b"ply\nformat ascii 1.0\n", b"<xml/>", b"cameras 3\n"]
+    "content", [b"\x89HDF\r\n", b"ply\nformat ascii 1.0\n", b"<xml/>", b"cameras 3\n", bytes(range(256))]
 )
 def test_what_is_not_read_names_what_is(tmp_path, content):
     path = tmp_path / "a.bin"
@@ -104,6 +106,67 @@ def test_what_is_not_read_names_what_is(tmp_path, content):
     assert formats.formats_read() in str(caught.value)
     for name in ("BAL", "Bundler", "VisualSFM", "OpenSfM", "OpenMVG", "AliceVision", "COLMAP"):
         assert name in str(caught.value)
+
+
+def _zipped(**arrays):
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+def _tar(mode):
+    file = io.BytesIO()
+    with tarfile.open(fileobj=file, mode=mode) as archive:
+        archive.addfile(tarfile.TarInfo("model/images.txt"), io.BytesIO())
+    return file.getvalue()
+
+
+def _png():
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.fromarray(np.zeros((3, 4), np.uint8)).save(file, "png")
+    return file.getvalue()
+
+
+OTHERS = [
+    ("cameras.bin", lambda: bytes(64), "give the folder that holds it, "),
+    ("points3D.txt", lambda: b"# 3D point list with one line of data per point:\n", "give the folder of the model"),
+    ("renamed.txt", lambda: b"# Image list with two lines of data per image:\n1 1 0 0 0 0 0 0 1 a\n", "a COLMAP model"),
+    ("database.db", lambda: b"SQLite format 3\0" + bytes(100), "a COLMAP data base (SQLite)"),
+    ("renamed.out", lambda: b"SQLite format 3\0" + bytes(100), "a COLMAP data base (SQLite)"),
+    ("a.zip", lambda: b"PK\x03\x04" + bytes(40), "an archive: unpack it"),
+    ("a.tar", lambda: _tar("w"), "an archive: unpack it"),
+    ("a.tar.gz", lambda: _tar("w:gz"), "an archive: unpack it"),
+    ("a.tgz", lambda: _tar("w:gz"), "an archive: unpack it"),
+    ("a.npz", lambda: _zipped(state=np.zeros(1), cost=np.zeros(1)), "a recording of a solve, which jaxba-view shows"),
+    ("cov.npz", lambda: _zipped(poses=np.zeros(1)), "a file of NumPy arrays; read are BAL"),
+    ("000000.png", _png, "an image: give the problem"),
+    ("named.txt", _png, "an image: give the problem"),
+    ("poses.txt", lambda: b"1 0 0 0 0 1 0 0 0 0 1 0.5\n" * 200, "jaxba-kitti by --poses"),
+    ("graph.g2o", lambda: b"VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", "a pose graph"),
+    ("problem.txt", lambda: b"\r\n<!DOCTYPE html>\n<html></html>", "an HTML page"),
+    ("transforms.json", lambda: b'{"fl_x": 1, "frames": [{"transform_matrix": []}]}', "nerfstudio's transforms.json"),
+    ("points.xyz", lambda: b"0.5 1 2\n", "files with .xyz are not read; read are BAL"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "message"), OTHERS, ids=[name for name, _, _ in OTHERS])
+def test_a_file_of_another_program_is_named_for_what_it_is(name, content, message, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(content())
+    with pytest.raises(ProblemError) as caught:
+        read_problem(path)
+    assert message in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    assert str(caught.value).isprintable()
+    assert "\\x" not in str(caught.value)
+
+
+def test_a_file_of_a_model_names_the_folder_to_give(tmp_path):
+    write_colmap(support.tiny(), tmp_path / "model")
+    with pytest.raises(ProblemError, match=r"a file of a COLMAP model: give the folder that holds it, .*model$"):
+        read_problem(tmp_path / "model" / "images.bin")
 
 
 def test_a_point_cloud_is_not_read(tmp_path):

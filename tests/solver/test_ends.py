@@ -137,6 +137,20 @@ def behind_glass() -> BundleProblem:
     return problem.replace(cameras=cameras, points=points)
 
 
+@pytest.mark.parametrize("asked", [{}, {"dtype": "float32"}, {"pad": True}, {"devices": 2}])
+def test_without_iterations_the_start_is_measured_and_comes_back(asked):
+    problem = support.tiny()
+    problem = problem.replace(points=np.asarray(problem.points) + np.pi)  # no numbers of float32
+    found = jaxba.solve(problem, options=SolveOptions(max_iterations=0, **asked))
+    assert found.termination == Termination.MAX_ITERATIONS
+    assert (found.iterations, found.accepted, found.converged) == (0, 0, False)
+    assert found.initial_cost == found.final_cost
+    np.testing.assert_allclose(found.final_cost, geometry.cost(problem), rtol=1e-12 if "dtype" not in asked else 1e-4)
+    assert all(len(field) == 0 for field in found.history)
+    assert np.array_equal(found.problem.cameras, problem.cameras)
+    assert np.array_equal(found.problem.points, problem.points)
+
+
 def huge(pixel: float) -> BundleProblem:
     pixels = np.array(support.tiny().observations)
     pixels[17] = pixel

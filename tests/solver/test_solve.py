@@ -441,7 +441,7 @@ def test_the_automatic_choice_of_the_linear_solver_is_told():
     ("change", "message"),
     [
         ({"dtype": "float16"}, "dtype must be one of float64, float32, mixed"),
-        ({"max_iterations": 0}, "max_iterations must be at least 1"),
+        ({"max_iterations": -1}, "max_iterations must be at least 0"),
         ({"max_iterations": 2.5}, "max_iterations must be a whole number"),
         ({"max_iterations": 2**31}, "max_iterations must be at most 2147483647"),
         ({"tolerances": Tolerances(ftol=float("nan"))}, "ftol must not be negative, is nan"),

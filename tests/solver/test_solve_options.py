@@ -157,7 +157,7 @@ def test_a_factorisation_that_does_not_fit_the_memory_is_refused(asked, monkeypa
         ({"loss": "huber"}, "loss must be made with jaxba.Loss, is 'huber'"),
         ({"loss": None}, "loss must be made with jaxba.Loss, is None"),
         ({"tolerances": 1e-6}, "tolerances must be made with jaxba.Tolerances, is 1e-06"),
-        ({"max_iterations": 0}, "max_iterations must be at least 1"),
+        ({"max_iterations": -1}, "max_iterations must be at least 0"),
         ({"tolerances": Tolerances(xtol=-1.0)}, "xtol must not be negative, is -1"),
     ],
 )

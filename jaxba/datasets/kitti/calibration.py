@@ -58,14 +58,18 @@ class Calibration:
         return (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
 
 
+def calibration_files(folder: Path) -> list[Path]:
+    """Where the calibration of a sequence's folder may be, in the order of the search."""
+    return [folder / name for name in FILES] + [folder.absolute().parent / name for name in ABOVE]
+
+
 def find_calibration(folder: Path) -> Path:
     """The file of the calibration of a sequence's folder.
 
     Raises:
         ProblemError: there is none.
     """
-    places = [folder / name for name in FILES] + [folder.absolute().parent / name for name in ABOVE]
-    for place in places:
+    for place in calibration_files(folder):
         if place.is_file():
             return place
     raise ProblemError(

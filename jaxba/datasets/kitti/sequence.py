@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.calibration import Calibration, read_calibration
+from jaxba.datasets.kitti.calibration import Calibration, calibration_files, read_calibration
 from jaxba.datasets.kitti.poses import read_times
 from jaxba.io.files import StrPath, display_name
 from jaxba.problem.bundle_problem import ProblemError
@@ -93,7 +93,7 @@ def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibrati
     if len(chosen) < 2:
         last = max(numbered)
         raise ProblemError(f"{name}: --frames {frames} leaves {len(chosen)} of frames {min(numbered)} to {last}, not 2")
-    times = next((path for path in (root / "times.txt", images.parent / "timestamps.txt") if path.is_file()), None)
+    times = next((path for path in _times_files(root, images) if path.is_file()), None)
     return Sequence(
         images,
         tuple(chosen),
@@ -101,6 +101,20 @@ def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibrati
         read_calibration(root if calibration is None else calibration, camera),
         None if times is None else read_times(times, chosen),
     )
+
+
+def files_of(folder: StrPath, images: Path) -> list[Path]:
+    """Where calibration and times of a sequence may be.
+
+    Args:
+        folder: of the sequence.
+        images: the folder of its images.
+    """
+    return [*calibration_files(Path(folder)), *_times_files(Path(folder), images)]
+
+
+def _times_files(root: Path, images: Path) -> list[Path]:
+    return [root / "times.txt", images.parent / "timestamps.txt"]
 
 
 def _images_folder(root: Path, camera: int) -> Path | None:

@@ -82,6 +82,9 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
     notes += note(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
     images = [image for image, kept in zip(images, sees, strict=True) if kept]
     camera_index, point_index = (np.cumsum(sees) - 1)[views.image], (np.cumsum(observed) - 1)[views.point]
+    other = [(one, rig) for rig in (model.rigs or {}).values() for one in rig.sensors if one.type != CAMERA_SENSOR]
+    sensor = lambda at: f"sensor {other[at][0].id} of rig {other[at][1].id}"
+    notes += note(model.file("rigs"), np.arange(len(other)), "sensor", "left out, no camera", sensor)
     points = table.points["xyz"][observed]
     pixels = table.keys["xy"][views.key]
     problem, cameras = _problem(
