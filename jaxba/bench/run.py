@@ -18,6 +18,7 @@ import jaxba
 from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.damping.registry import SUFFIX
+from jaxba.io.files import visible
 from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.peers import require
@@ -298,7 +299,7 @@ def _digest(path: Path) -> str:
     policy reports that later."""
     total = hashlib.sha256()
     try:
-        for part in sorted(path.iterdir()) if path.is_dir() else [path]:
+        for part in visible(path) if path.is_dir() else [path]:
             if part != path and (part.suffix not in (".bin", ".txt") or not part.is_file()):
                 continue
             with open(part, "rb") as file:

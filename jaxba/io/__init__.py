@@ -9,7 +9,7 @@ from jaxba.io import formats
 from jaxba.io.bal import read_bal, write_bal
 from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap, write_colmap
-from jaxba.io.files import StrPath, display_name
+from jaxba.io.files import StrPath, display_name, visible
 from jaxba.io.ply import write_ply
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 
@@ -81,5 +81,5 @@ def check_output(path: StrPath) -> None:
     """
     if not is_folder(path):
         formats.writer(path)
-    elif os.path.isdir(path) and os.listdir(path) and not is_colmap(path):
+    elif os.path.isdir(path) and visible(path) and not is_colmap(path):
         raise ProblemError(f"cannot write {display_name(path)}: the directory holds other files, and no COLMAP model")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from jaxba.io.encoding import decode
-from jaxba.io.files import display_name, reason
+from jaxba.io.files import display_name, reason, visible
 
 Kind: TypeAlias = Literal["train", "paper", "bench"]
 """Command that reads a configuration, and its folder's name."""
@@ -29,7 +29,7 @@ class SettingsError(ValueError):
 
 def names(kind: Kind) -> list[str]:
     """Names that `find` knows, sorted."""
-    return sorted(path.stem for path in _folder(kind).glob("*.yaml"))
+    return [path.stem for path in visible(_folder(kind)) if path.suffix == ".yaml"]
 
 
 def find(kind: Kind, name: str, folder: Path = Path()) -> Path:

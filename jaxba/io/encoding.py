@@ -32,7 +32,7 @@ def open_text(path: StrPath) -> Iterator[Iterator[bytes]]:
         ProblemError: as `open_input`; the iterator also where the text is not in the encoding of its mark.
     """
     with open_input(path) as blocks:
-        yield _unix_lines(_utf8(blocks, display_name(path)))
+        yield _unix_lines(utf8(blocks, display_name(path)))
 
 
 def read_text(path: StrPath) -> str:
@@ -62,7 +62,13 @@ def decode(data: bytes) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _utf8(blocks: Iterator[bytes], name: str) -> Iterator[bytes]:
+def utf8(blocks: Iterator[bytes], name: str) -> Iterator[bytes]:
+    """The text of the file called `name` without a byte order mark; what begins with the mark of UTF-16 or UTF-32
+    becomes UTF-8, everything else stays as it is.
+
+    Raises:
+        ProblemError: the text is not in the encoding of its mark.
+    """
     head = b""
     while len(head) < _LONGEST_MARK and (block := next(blocks, None)) is not None:
         head += block

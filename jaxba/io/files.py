@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from io import BufferedReader
+from pathlib import Path
 from typing import IO, Any, BinaryIO, TypeAlias
 
 from jaxba.problem.bundle_problem import ProblemError
@@ -51,6 +52,15 @@ def reason(error: BaseException) -> str:
     if isinstance(error, OSError) and error.strerror:
         return _one_line(error.strerror)
     return _one_line(str(error)) or type(error).__name__
+
+
+def visible(folder: StrPath) -> list[Path]:
+    """What lies in a folder, sorted, without names that begin with a dot: systems leave such files beside any other.
+
+    Raises:
+        OSError: it is no folder, or cannot be listed.
+    """
+    return sorted(path for path in Path(folder).iterdir() if not path.name.startswith("."))
 
 
 @contextmanager

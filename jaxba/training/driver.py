@@ -24,8 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.io import settings
+from jaxba.io.files import visible
 from jaxba.runtime import distributed
-from jaxba.runtime.atomic import TEMPORARY, write_text
+from jaxba.runtime.atomic import write_text
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig, load, to_yaml
 from jaxba.training.log import Log, Row
@@ -133,7 +134,7 @@ def prepare_folder(
 
 def _others(folder: Path) -> bool:
     """Whether the folder holds anything but a configuration."""
-    return any(item.name != CONFIG and not item.match(TEMPORARY.format("*")) for item in folder.iterdir())
+    return any(item.name != CONFIG for item in visible(folder))
 
 
 def train(

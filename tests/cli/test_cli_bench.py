@@ -328,7 +328,7 @@ def test_the_final_costs_of_float32_are_computed_in_float64(tmp_path, undrawn, c
     argv = ["--solvers", "ceres@float32,ceres", "--repeats", "1", "--max-iterations", "3"]
     assert bench(tmp_path / "run", str(tmp_path / "tiny.txt"), *argv) == 0
     rough, exact = lines(tmp_path / "run")
-    assert rough["initial_cost"] == pytest.approx(exact["initial_cost"], rel=1e-14)
+    assert rough["initial_cost"] == pytest.approx(exact["initial_cost"], rel=1e-12)
     # the steps differ by rounding only, and by less than the error of a sum in float32
     assert rough["final_cost"] != rough["trace"][-1]["cost"]
     assert rough["final_cost"] == pytest.approx(rough["trace"][-1]["cost"], rel=1e-4)

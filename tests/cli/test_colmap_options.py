@@ -86,7 +86,8 @@ def test_what_cannot_be_is_one_line(words, message, tmp_path, monkeypatch, capsy
 def test_a_file_of_constants_names_images_and_points_of_the_model(model, tmp_path, capsys):
     problem = read_problem(model)
     (tmp_path / "c.yaml").write_text(
-        "constant_poses: [image0001.jpg, 3]\nconstant_points: [2]\nconstant_numbers: [k2]\ngauge: free\n"
+        "constant_poses: [image0001.jpg, 3]\nconstant_points: [2]\nconstant_numbers: [k2]\ngauge: free\n",
+        encoding="utf-16",  # as older editors of Windows save text
     )
     out, spread = str(tmp_path / "out"), tmp_path / "c.npz"
     words = [

@@ -141,6 +141,8 @@ def test_only_an_empty_folder_or_one_of_a_model_is_written(tmp_path):
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes"]
     for _ in range(2):
         (tmp_path / "empty").mkdir(exist_ok=True)
+        for hidden in (".DS_Store", "._cameras.bin", "._images.txt"):  # systems leave such files in any folder
+            (tmp_path / "empty" / hidden).write_text("hidden")
         write_problem(support.tiny(), tmp_path / "empty")
         same_problem(read_problem(tmp_path / "empty"), support.tiny())
 

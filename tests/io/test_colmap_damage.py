@@ -210,13 +210,30 @@ def test_writing_in_place_keeps_what_was_left_out(tmp_path):
     assert np.array_equal(again.points, moved.points)
 
 
+NAMES = ["a b.jpg", "flight A, plan  (2) 1.jpg", '"it\'s".jpg', "\u00e9\u6771 \u00df.jpg", "# 5.jpg", "sub dir/6.JPG"]
+
+
+@pytest.mark.parametrize("binary", [False, True], ids=["text", "binary"])
+def test_names_with_blanks_quotes_and_letters_of_any_alphabet_stay(tmp_path, healthy, binary):
+    model = TextModel()
+    model.heads = [head.replace(f"view{at}.jpg", NAMES[at]) for at, head in enumerate(model.heads)]
+    folder = (model.write_binary if binary else model.write)(tmp_path / "m")
+    assert same(noted(folder)[0], healthy)
+    for out in (tmp_path / "out", folder):
+        write_colmap(healthy, out, like=folder)
+        data = (out / f"images.{'bin' if binary else 'txt'}").read_bytes()
+        places = [data.index(name.encode() + (b"\0" if binary else b"\n")) for name in NAMES]
+        assert places == sorted(places)
+
+
 # Courtesies
 
 
 def test_marks_line_ends_blanks_and_comments_do_not_matter(tmp_path, healthy):
     files = TextModel().files()
     layouts = {
-        "windows": lambda lines: b"\xef\xbb\xbf" + "\r\n".join([*lines, ""]).encode(),
+        "windows": lambda lines: "\r\n".join([*lines, ""]).encode("utf-8-sig"),
+        "16 bits": lambda lines: "\r\n".join([*lines, ""]).encode("utf-16"),
         "blanks": lambda lines: "".join(f"  {line.replace(' ', '  ')} \t\n" for line in lines).encode(),
         "no end": lambda lines: "\n".join(lines).encode(),
         "comments": lambda lines: "".join(f"# {n}\n{line}\n# x y z\n" for n, line in enumerate(lines)).encode(),
@@ -354,6 +371,8 @@ def test_a_benchmark_goes_on_after_models_that_cannot_be_read(tmp_path, capsys):
     assert printed.err.count("\n") == 1
     assert f"note: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n" in printed.out
     assert [record.problem for record in read_records(tmp_path / "runs" / "results.jsonl")] == ["odd", "good"]
+    (good / "._cameras.txt").write_text("of a Mac")  # the model is still the same
+    assert run_bench([str(good), *arguments[3:], "--out", str(tmp_path / "runs")]) == 0
     assert run_bench([str(odd), "--strict", *arguments[3:], "--out", str(tmp_path / "strict")]) == 2
     error = f"error: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n"
     assert capsys.readouterr().err == error

@@ -7,9 +7,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import support
 from colmap_model import TextModel, head_with, noted, refusal, swap
 
-from jaxba import BundleProblem, read_colmap
+from jaxba import BundleProblem, read_colmap, write_colmap
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +48,9 @@ REFUSED = {
         "points3D.txt line 2: point 11: '256' is outside 0..255 (green)",
     ),
     "half a pair": (swap("points3D.txt", " 0.5 ", " 0.5 1 "), "points3D.txt line 2: point 11: the track has "),
-    "16-bit text": (
-        lambda folder: (folder / "images.txt").write_bytes((folder / "images.txt").read_text().encode("utf-16")),
-        "images.txt is a text in UTF-16; save it as UTF-8",
+    "half a 16-bit text": (
+        lambda folder: (folder / "images.txt").write_bytes((folder / "images.txt").read_text().encode("utf-16")[:-1]),
+        "images.txt: is not the text that its byte order mark announces",
     ),
     "missing file": (lambda folder: (folder / "points3D.txt").unlink(), "points3D.txt is missing"),
     "folder for a file": (
@@ -80,6 +81,7 @@ def test_a_quaternion_of_zeros_is_refused_and_one_of_any_other_norm_is_not(tmp_p
             assert refusal(folder) == "images.txt: image 4 (view3.jpg): qvec is zero, which is no rotation"
 
 
+NAN = 0x7FF8 << 48  # the bits of a NaN
 BINARY = {
     "no points at all": ("points3D.bin", 0, b"", "points3D.bin is empty"),
     "half a count": ("points3D.bin", 0, b"\1\0\0", "points3D.bin is cut short in the number of points"),
@@ -90,6 +92,8 @@ BINARY = {
         2**64 - 1,
         f"images.bin is cut short: {2**64 - 1} images do not",
     ),
+    "NaN pose": ("images.bin", 12, NAN, "images.bin: image 1 (view0.jpg): qvec is not finite: nan "),
+    "NaN lens": ("cameras.bin", 32, NAN, "cameras.bin: camera 7 has impossible parameters: nan,"),
     "number of cameras": (
         "cameras.bin",
         0,
@@ -129,8 +133,9 @@ def test_counts_that_do_not_fit_are_refused_in_little_memory(tmp_path, damage):
 
 
 def test_every_cut_of_a_binary_file_is_refused(tmp_path):
-    folder = TextModel().write_binary(tmp_path / "m")
-    for file in ("cameras.bin", "images.bin", "points3D.bin"):
+    folder = tmp_path / "m"
+    write_colmap(support.tiny(), folder)
+    for file in ("cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"):
         data = (folder / file).read_bytes()
         for end in [*range(0, min(200, len(data))), *range(200, len(data), 97)]:
             (folder / file).write_bytes(data[:end])

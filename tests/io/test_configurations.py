@@ -14,6 +14,7 @@ from typing import get_args
 
 import pytest
 
+from jaxba.io import configurations
 from jaxba.io.configurations import Kind, SettingsError, find, names, read
 
 REPOSITORY = Path(__file__).parents[2]
@@ -48,6 +49,14 @@ def test_every_file_of_the_repository_is_found_by_its_name_and_as_a_path(kind):
     for file in files:
         assert find(kind, file.stem).samefile(file)
         assert read(kind, file.stem) == read(kind, str(file)) != {}
+
+
+def test_hidden_files_are_no_configurations(tmp_path, monkeypatch):
+    monkeypatch.setattr(configurations, "_PACKAGE", tmp_path)
+    (tmp_path / "configs" / "train").mkdir(parents=True)
+    for name in ("one.yaml", "._one.yaml", ".yaml"):
+        (tmp_path / "configs" / "train" / name).touch()
+    assert names("train") == ["one"]
 
 
 @pytest.mark.parametrize("kind", KINDS)

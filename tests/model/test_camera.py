@@ -102,14 +102,14 @@ def test_composition_is_that_of_scipy():
     found = np.array(camera.compose_left(jnp.asarray(step.T), jnp.asarray(w.T))).T
     expected = Rotation.from_rotvec(step) * Rotation.from_rotvec(w)
     np.testing.assert_allclose(Rotation.from_rotvec(found).as_matrix(), expected.as_matrix(), atol=1e-14)
-    assert np.linalg.norm(found, axis=1).max() <= np.pi * (1 + 1e-15)
-    np.testing.assert_allclose(found[-len(some) :], 0, atol=1e-15)
+    assert np.linalg.norm(found, axis=1).max() <= np.pi * (1 + 1e-14)
+    np.testing.assert_allclose(found[-len(some) :], 0, atol=1e-14)
 
 
 def test_composition_with_a_tiny_step_loses_no_digit_of_the_step():
     step = 1e-9 * vectors([1.0])
     found = np.asarray(camera.compose_left(jnp.asarray(step.T), jnp.zeros((3, len(step))))).T
-    np.testing.assert_allclose(found, step, rtol=1e-15)
+    np.testing.assert_allclose(found, step, rtol=1e-14)  # a cosine in between would leave 7 digits of 16
 
 
 @settings(max_examples=100, deadline=None)

@@ -172,7 +172,7 @@ def test_lenses_of_their_own_that_are_free_are_as_no_lenses():
     problem = support.tiny()
     own = with_lenses(problem, np.arange(6), np.ones((6, 3), bool))
     plain, same = solve(problem, "learned"), solve(own, "learned")
-    np.testing.assert_allclose(same.history.cost, plain.history.cost, rtol=1e-12)
+    np.testing.assert_allclose(same.history.cost, plain.history.cost, rtol=1e-9)  # two programs
 
 
 @pytest.mark.slow

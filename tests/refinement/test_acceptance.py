@@ -214,8 +214,8 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         after, info = step(layout, before, BOLD, SHORTER_ONLY)
         if once.accepted:  # then nothing is tried again
             assert (info.repairs, info.step_fraction) == (0, 1)
-            # another program, which rounds in another order
-            chex.assert_trees_all_close(after, same, rtol=1e-9, atol=1e-9)
+            # another program, which rounds in another order, and this lambda divides rounding by 1e-8
+            chex.assert_trees_all_close(after, same, rtol=1e-6, atol=1e-6)
             continue
         chex.assert_trees_all_equal(same, before, strict=True)
         if not info.accepted:
@@ -289,15 +289,15 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
     for layout, before in wide():
         plain = step(layout, before, BOLD, PLAIN)[1]
         mended = step(layout, before, BOLD, rounds)[1]
-        np.testing.assert_allclose(mended.predicted, plain.predicted, rtol=1e-9)
-        assert not mended.candidate_cost > plain.candidate_cost * (1 + 1e-12)
+        # two programs under a lambda that divides rounding by 1e-8, though not in directions that cost much
+        np.testing.assert_allclose(mended.predicted, plain.predicted, rtol=1e-8)
+        assert not mended.candidate_cost > plain.candidate_cost * (1 + 1e-6)
         better += bool(mended.candidate_cost < 0.9 * plain.candidate_cost)
         if plain.gain_ratio > GOOD_GAIN or plain.candidate_cost > MAX_COST_RATIO * before.cost:
             trusted += 1  # the model was right, or it is past mending
             assert mended.repairs == 0
-        # rounds, and nothing else, make a candidate better or worse here; two programs round the same cost differently
-        if mended.repairs == 0:
-            np.testing.assert_allclose(mended.candidate_cost, plain.candidate_cost, rtol=1e-12)
+        if mended.repairs == 0:  # rounds, and nothing else, make a candidate better or worse here
+            np.testing.assert_allclose(mended.candidate_cost, plain.candidate_cost, rtol=1e-6)
         assert 0 <= mended.repairs <= 3
     assert better >= 1
     assert trusted >= 5
@@ -341,7 +341,7 @@ def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
         assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_LATER_CANDIDATES)
         assert full.step_fraction >= bare.step_fraction  # what a round brings in need not be shortened further
         if full.step_fraction == bare.step_fraction:
-            assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-12)
+            assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-6)  # two programs, as above
         lower = full.candidate_cost < 0.999 * bare.candidate_cost
         better += bool(full.step_fraction < 1 and (full.step_fraction > bare.step_fraction or lower))
     assert better >= 1

@@ -146,12 +146,20 @@ def wrong(seed: int, size: float) -> tuple[BundleProblem, np.ndarray]:
 
 @pytest.mark.parametrize(("seed", "size"), [(0, 0.3), (1, 0.3), (2, 3.0)])
 def test_from_both_starts_a_point_ends_at_the_cheaper_end_and_from_one_at_that_of_the_likely_one(seed, size):
-    """Against `refine_points` from each of them."""
+    """Against `refine_points` from each of them.
+
+    Two programs round differently. By costs that agree to rounding a minimum is known to the root of it alone: both
+    starts may end there, 1e-8 apart. Other minima are 1e-2 away and more.
+    """
     home, points = wrong(seed, size)
     args = build_layout(home), np.asarray(home.cameras).T, in_layout(home, home.points), in_layout(home, points)
     apart = [np.asarray(_refined(*args[:3], start)) for start in _starts(*args, LOSS)]
     none, one, both = (np.asarray(_from_starts(*args, jnp.asarray(starts))) for starts in range(3))
-    same = functools.partial(np.testing.assert_allclose, rtol=1e-9)  # two programs, which round differently
+
+    def same(found: np.ndarray, expected: np.ndarray) -> None:
+        np.testing.assert_allclose(found[3], expected[3], rtol=1e-9)
+        np.testing.assert_allclose(found[:3], expected[:3], rtol=1e-5, atol=1e-5)
+
     same(none, np.asarray(_refined(*args[:3], args[3])))
     same(one, apart[0])
     second = apart[1][3] < apart[0][3]

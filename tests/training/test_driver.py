@@ -245,6 +245,7 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
 
 def test_a_run_that_never_came_to_anything_is_no_obstacle(tmp_path):
     prepare_folder(tmp_path / "run", CONFIG, False)
+    (tmp_path / "run" / ".DS_Store").touch()
     prepare_folder(tmp_path / "run", dataclasses.replace(CONFIG, seed=1), False)
     assert load(str(tmp_path / "run" / driver.CONFIG)).seed == 1
 

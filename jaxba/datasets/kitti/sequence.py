@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxba.datasets.kitti.calibration import Calibration, calibration_files, read_calibration
 from jaxba.datasets.kitti.poses import read_times
-from jaxba.io.files import StrPath, display_name
+from jaxba.io.files import StrPath, display_name, visible
 from jaxba.problem.bundle_problem import ProblemError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -126,7 +126,7 @@ def _images_folder(root: Path, camera: int) -> Path | None:
 
 def _image_files(folder: Path) -> list[Path]:
     """Images in a folder, without hidden files."""
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+    return [path for path in visible(folder) if path.suffix.lower() in SUFFIXES]
 
 
 def _other_camera(root: Path) -> str:

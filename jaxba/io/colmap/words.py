@@ -6,10 +6,8 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import NoReturn
 
+from jaxba.io.encoding import utf8
 from jaxba.problem.bundle_problem import ProblemError
-
-_MARKS = {b"\xef\xbb\xbf": "", b"\xff\xfe": "UTF-16", b"\xfe\xff": "UTF-16"}
-"""Byte order marks, and encodings that are not read."""
 
 _NUMBER = re.compile(rb"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|(nan)(?:\([^)]*\))?|inf|infinity)", re.IGNORECASE)
 _WINDOWS_NAN = re.compile(rb"[+-]?1\.#(?:q?nan|snan|ind)0*", re.IGNORECASE)
@@ -25,13 +23,9 @@ def lines(data: bytes, name: str, *, empty: bool = False) -> Iterator[Words]:
         empty: whether lines without words come too.
 
     Raises:
-        ProblemError: the file is in UTF-16.
+        ProblemError: the file is not the text that its byte order mark announces.
     """
-    for mark, encoding in _MARKS.items():
-        if data.startswith(mark):
-            if encoding:
-                raise ProblemError(f"{name} is a text in {encoding}; save it as UTF-8")
-            data = data[len(mark) :]
+    data = b"".join(utf8(iter([data]), name))
     start, number = 0, 0
     while start < len(data):
         end = data.find(b"\n", start)
