@@ -17,7 +17,7 @@ from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_siz
 from jaxba.problem.labels import Labels
 from jaxba.problem.priors import Priors, checked_priors
 from jaxba.problem.rigs import Rigs, checked_rigs
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 CAMERA_SIZE = 9
 """Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""
@@ -36,8 +36,8 @@ class ProblemWarning(UserWarning):
 
 
 @register_pytree
-@dataclass(frozen=True)
-class BundleProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class BundleProblem(ArrayRecord):
     """Cameras, points and observations, in the conventions of BAL.
 
     A camera `[w, t, f, k1, k2]` maps a point X to the pixel z:
@@ -152,6 +152,12 @@ class BundleProblem:
         except ValueError as error:
             raise ProblemError(str(error)) from None
         return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
+
+    def __repr__(self) -> str:
+        arrays = ("cameras", "points", "observations")
+        counts = [f"{(*getattr(getattr(self, name), 'shape', ()), '?')[0]} {name}" for name in arrays]
+        parts = ("whitening", "lenses", "constants", "rigs", "priors", "labels")
+        return f"BundleProblem({', '.join([*counts, *(name for name in parts if getattr(self, name) is not None)])})"
 
     @property
     def num_cameras(self) -> int:

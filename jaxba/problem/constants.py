@@ -9,15 +9,15 @@ import numpy as np
 from jaxtyping import Bool
 
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 ROTATION = np.array([True, True, True, False, False, False])
 """The numbers of a pose that are its rotation."""
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Constants:
+@dataclass(frozen=True, eq=False, repr=False)
+class Constants(ArrayRecord):
     """The numbers of poses and the points that are not optimised. They come back bit for bit."""
 
     poses: Bool[AnyArray, "cameras 6"]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxba.problem.camera_models import BAL, CameraModel
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 POSE_SIZE = 6
 """Parameters of a pose: angle-axis (radians) and translation (scene units). Those of the lens follow in a camera."""
@@ -22,8 +22,8 @@ LENS_SIZE = len(BAL)
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Lenses:
+@dataclass(frozen=True, eq=False, repr=False)
+class Lenses(ArrayRecord):
     """The lenses of a problem's cameras."""
 
     index: Int[AnyArray, " cameras"]

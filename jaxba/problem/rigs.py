@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.intrinsics import Lenses
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 EXTRINSICS_SIZE = 6
 """Numbers of the extrinsics of a camera: angle-axis (radians) of M and m (scene units)."""
@@ -29,8 +29,8 @@ LARGEST_DISAGREEMENT = 1e-6
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Rigs:
+@dataclass(frozen=True, eq=False, repr=False)
+class Rigs(ArrayRecord):
     """The frame of each camera of a problem, and its place in the rig.
 
     A solve then adds rotations on the manifold, and makes no camera rounds and pattern moves, which would take cameras
