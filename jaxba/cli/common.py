@@ -115,7 +115,7 @@ def _parse_and_run(
         _end_if_alone(error)
         if missing := missing_platform():
             return print_error(
-                f"JAX_PLATFORMS is {missing!r}, and JAX has no such platform on this machine: unset it, or set it to cpu"
+                f"JAX_PLATFORMS is {missing!r}, but JAX has no such platform on this machine: unset it, or set cpu"
             )
         if isinstance(error, OSError) and error.errno in FULL:
             return print_error(f"{error.filename or 'a file'}: {error.strerror}")

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from jaxba.problem.checks import plain_array
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
@@ -37,7 +38,7 @@ def checked_constants(constants: Constants, cameras: int, points: int) -> Consta
     Raises:
         ValueError: shapes or types differ, or part of a rotation is constant; one line.
     """
-    poses, fixed = np.asarray(constants.poses), np.asarray(constants.points)
+    poses, fixed = plain_array("constant poses", constants.poses), plain_array("constant points", constants.points)
     for name, array, shape in (("poses", poses, (cameras, POSE_SIZE)), ("points", fixed, (points,))):
         if array.dtype != bool or array.shape != shape:
             raise ValueError(f"constant {name} must be bool of shape {shape}, not {array.dtype}{array.shape}")

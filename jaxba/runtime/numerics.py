@@ -14,6 +14,12 @@ from jaxba.runtime.process import refuse_fork, single_blas_thread
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+TRACED = (
+    "JAX traces this call (jit, vmap or grad), which is for NumPy problems outside of traces: in jit and vmap use "
+    "jaxba.solve_loop with what jaxba.prepare returned before, for gradients jaxba.differentiable_solve, not in jit"
+)
+"""What is said where JAX traces a function that needs NumPy arrays."""
+
 
 @contextmanager
 def numerics(dtype: Any, *, single_blas: bool = True) -> Iterator[None]:
@@ -68,10 +74,7 @@ def for_traces(function: Function) -> Function:
 def refuse_traces(values: Any) -> None:
     """Raises a TypeError if JAX traces: one of the values, arrays in a pytree, is a tracer."""
     if any(isinstance(value, jax.core.Tracer) for value in jax.tree.leaves(values)):
-        raise TypeError(
-            "JAX traces this call (jit, vmap or grad), which is for NumPy problems outside of traces: in jit and vmap use "
-            "jaxba.solve_loop with what jaxba.prepare returned before, for gradients jaxba.differentiable_solve, not in jit"
-        )
+        raise TypeError(TRACED)
 
 
 def check_x64(dtype: Any) -> None:
