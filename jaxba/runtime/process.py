@@ -13,11 +13,14 @@ import importlib.util
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import threadpoolctl
 from threadpoolctl import ThreadpoolController
+
+T = TypeVar("T")
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
 """Parameter numbers of glibc's mallopt (malloc.h)."""
@@ -136,7 +139,7 @@ def single_blas_thread() -> Iterator[None]:
         if not _blas_users:
             if "scipy.linalg.cython_lapack" not in sys.modules:  # loads the library whose threads are limited
                 importlib.import_module("scipy.linalg.cython_lapack")
-            _blas_limit = ThreadpoolController().limit(limits=1, user_api="blas")
+            _blas_limit = _as_owner_of_blas(lambda: ThreadpoolController().limit(limits=1, user_api="blas"))
         _blas_users += 1
     try:
         yield
@@ -144,7 +147,17 @@ def single_blas_thread() -> Iterator[None]:
         with _blas_lock:
             _blas_users -= 1
             if not _blas_users:
-                _blas_limit.restore_original_limits()
+                _as_owner_of_blas(_blas_limit.restore_original_limits)
+
+
+def _as_owner_of_blas(change: Callable[[], T]) -> T:
+    """Changes BLAS's threads. Recent versions of threadpoolctl let the first thread that does so own those of OpenBLAS,
+    and ignore all others."""
+    disown = getattr(getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", lambda **_: None)
+    disown(force=True)
+    changed = change()
+    disown(force=True)
+    return changed
 
 
 _forked_from_jax = False

@@ -26,6 +26,7 @@ import numpy as np
 from jaxba.io import settings
 from jaxba.runtime import distributed
 from jaxba.runtime.atomic import TEMPORARY, write_text
+from jaxba.runtime.numerics import for_traces
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig, load, to_yaml
 from jaxba.training.log import Log, Row
@@ -136,6 +137,7 @@ def _others(folder: Path) -> bool:
     return any(item.name != CONFIG and not item.match(TEMPORARY.format("*")) for item in folder.iterdir())
 
 
+@for_traces
 def train(
     config: TrainConfig,
     env: Any,
