@@ -19,9 +19,10 @@ import jax
 import numpy as np
 
 import jaxba
+from jaxba.runtime.numerics import numerics
 from jaxba.solver import sharded
 from jaxba.solver.names import parse_solver
-from jaxba.solver.prepare import Setup, numerics, set_up
+from jaxba.solver.prepare import Setup, set_up
 
 PROBLEMS = (
     "bal/problem-49-7776-pre.txt.bz2",

@@ -31,8 +31,9 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.runtime import process
+from jaxba.runtime.numerics import numerics
 from jaxba.solver.names import parse_solver
-from jaxba.solver.prepare import numerics, prepare
+from jaxba.solver.prepare import prepare
 from jaxba.solver.solve import solve
 
 POINTS = 3

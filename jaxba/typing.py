@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 import numpy as np
@@ -16,6 +16,48 @@ LARGEST_COUNT = 2**31 - 1
 """Largest count that an option may have: programs count in 32 bits."""
 
 T = TypeVar("T")
+
+SHOWN = 8
+"""Most items of a tuple that `outline` shows."""
+
+
+class ArrayRecord:
+    """Base of dataclasses of arrays, which are made with `eq=False, repr=False`. Two are equal if they are of one class
+    and all their arrays and other values are equal, with NaN equal to NaN. Shown with types and shapes, in one line."""
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return all(same(getattr(self, x.name), getattr(other, x.name)) for x in fields(cast(Any, self)))
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]  # arrays can be written to
+
+    def __repr__(self) -> str:
+        values = {field.name: getattr(self, field.name) for field in fields(cast(Any, self))}
+        shown = ", ".join(f"{name}={outline(value)}" for name, value in values.items() if value is not None)
+        return f"{type(self).__name__}({shown})"
+
+
+def same(one: Any, other: Any) -> bool:
+    """Whether two values are equal: arrays if their shapes and all entries are, and tuples if all items are."""
+    if isinstance(one, AnyArray) or isinstance(other, AnyArray):
+        one, other = np.asarray(one), np.asarray(other)
+        return one.shape == other.shape and bool(np.all((one == other) | ((one != one) & (other != other))))
+    if isinstance(one, tuple) and isinstance(other, tuple):
+        return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
+    return bool(one == other)
+
+
+def outline(value: Any) -> str:
+    """A value in one short line: arrays by type and shape."""
+    if isinstance(value, AnyArray) and value.ndim:
+        return f"{value.dtype}[{', '.join(map(str, value.shape))}]"
+    if isinstance(value, tuple):
+        names = getattr(value, "_fields", ("",) * len(value))
+        items = [f"{name}={outline(x)}" if name else outline(x) for name, x in zip(names, value, strict=True)]
+        kind = type(value).__name__ if any(names) else ""
+        return f"{kind}({', '.join(items[:SHOWN])}{', ...' if len(items) > SHOWN else ''})"
+    return repr(value)
 
 
 def register_pytree(kind: type[T]) -> type[T]:

@@ -115,11 +115,15 @@ def _parse_and_run(
     except (ProblemError, UsageError, PolicyFileError, *names) as error:
         return print_error(str(error))
     except Exception as error:
-        from jaxba.runtime.process import out_of_memory
+        from jaxba.runtime.process import missing_platform, out_of_memory
 
         if out_of_memory(error):
             return print_error("not enough memory")
         _end_if_alone(error)
+        if missing := missing_platform():
+            return print_error(
+                f"JAX_PLATFORMS is {missing!r}, but JAX has no such platform on this machine: unset it, or set cpu"
+            )
         if isinstance(error, OSError) and error.errno in FULL:
             return print_error(f"{error.filename or 'a file'}: {error.strerror}")
         raise

@@ -18,7 +18,7 @@ from jaxba.damping.policy import ProblemInfo
 from jaxba.linear.step import Effort
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 
 class Guarded(NamedTuple):
@@ -136,8 +136,8 @@ class Layer(NamedTuple):
 
 
 @register_pytree
-@dataclass(frozen=True)
-class LearnedPolicy(AgentPolicy):
+@dataclass(frozen=True, eq=False, repr=False)
+class LearnedPolicy(ArrayRecord, AgentPolicy):
     """The mean action of a trained actor, limited by the guard.
 
     The weights are traced: another policy of the same shape never recompiles.

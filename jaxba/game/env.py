@@ -39,6 +39,7 @@ from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, state_at
 from jaxba.problem.options import StepOptions
+from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.typing import register_pytree
 
 Reward = Literal["duration", "constant", "reduction", "reversed", "price", "clock"]
@@ -161,8 +162,10 @@ class Game:
         """Numbers of an action."""
         return self.config.agent.action_size
 
+    @for_traces
     def reset(self, key: Array) -> tuple[GameState, Float[Array, "envs features"]]:
         """New episodes everywhere."""
+        check_x64(self.banks[0].initial_cost.dtype)
         key, *keys = jax.random.split(key, 1 + len(self.kinds))
         episodes = tuple(
             jax.vmap(lambda k, bank=bank: self._fresh(bank, k))(own_rows(jax.random.split(k, count), self.devices))
@@ -218,8 +221,10 @@ class Game:
         memory = record(agent, episode.memory._replace(effort=effort), step)
         return Episode(episode.scene, state, memory), step
 
+    @for_traces
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
         """Plays one action everywhere."""
+        check_x64(self.banks[0].initial_cost.dtype)
         key, *keys = jax.random.split(state.key, 1 + len(self.kinds))
         parts, after, start = [], [], 0
         for kind, bank, episodes, k, count in zip(self.kinds, self.banks, state.episodes, keys, self.envs, strict=True):
@@ -273,6 +278,7 @@ class Game:
             reward = bonus - jnp.log10(step.cost / best)
         return rules.scale * reward
 
+    @for_traces
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
         """Uniform actions in half of the environments, Ceres' rule in a quarter, and a hundredth of its lambda in the
         last quarter. Numbers of an action other than lambda are uniform in all of them."""

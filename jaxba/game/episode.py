@@ -22,6 +22,7 @@ from jaxba.lm.termination import converged_in_cost
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import check_x64, for_traces
 
 TRIES = 64
 """Scenes of which `draw` takes the first that is worth solving; 85% of the default class are."""
@@ -64,6 +65,7 @@ class Episode(NamedTuple):
     """Whether the convergence test ended it, and not the limit."""
 
 
+@for_traces
 def replay(
     kind: SceneClass,
     bank: Bank,
@@ -89,11 +91,13 @@ def replay(
     """
     if not 0 <= scene < len(bank.initial_cost):
         raise IndexError(f"there is no scene {scene} among {len(bank.initial_cost)}")
+    check_x64(bank.initial_cost.dtype)
     one = jax.tree.map(lambda x: x[scene], bank)
     arguments = one.scenes, one.info, one.initial_cost, policy, options, limit
     return _episode(kind, one.scenes, one.info, _played(kind, *arguments, jnp.asarray(ftol, one.initial_cost.dtype)))
 
 
+@for_traces
 def draw(kind: SceneClass, key: Array, scene: int, policy: DampingPolicy, options: StepOptions, limit: int) -> Episode:
     """The same on a random scene: the one with this number, for this key. Other arguments as for `replay`; for a class
     of windows of real problems the scene is one of the family `wide`.

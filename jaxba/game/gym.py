@@ -17,7 +17,7 @@ from jaxba.damping.features import FEATURE_LIMIT
 from jaxba.game.env import Game, GameState
 from jaxba.game.protocol import Step
 from jaxba.runtime.jit import jit
-from jaxba.runtime.process import forked_from_jax
+from jaxba.runtime.numerics import numerics
 
 try:
     import gymnasium
@@ -40,26 +40,17 @@ def action_space(game: Game) -> spaces.Box:
     return spaces.Box(-1.0, 1.0, (game.action_size,), np.float32)
 
 
-FORKED = (
-    "this process was forked from one in which JAX had started, and would wait for its threads for ever: "
-    'use gymnasium.vector.AsyncVectorEnv(..., context="spawn"), which begins processes anew, or GymVectorGame'
-)
-"""What is said where JAX cannot run."""
-
-
 class _Compiled:
     """`reset` and `step` of a game with NumPy arrays. The game is an argument of the compiled functions, so that its
     banks are not constants in them."""
 
     def __init__(self, game: Game) -> None:
         self.game = game
-        self.x64 = game.banks[0].initial_cost.dtype == np.float64
+        self.dtype = game.banks[0].initial_cost.dtype
 
     def reset(self, random: np.random.Generator, mask: np.ndarray | None = None) -> np.ndarray:
         """New episodes, where the mask is true if one is given: the first observations of all that are under way."""
-        if forked_from_jax():
-            raise RuntimeError(FORKED)
-        with jax.enable_x64(self.x64):
+        with numerics(self.dtype, single_blas=False):
             key = jax.random.key(int(random.integers(2**31)))
             if mask is None:
                 self.state, observation = _reset(self.game, key)
@@ -69,9 +60,7 @@ class _Compiled:
 
     def step(self, action: np.ndarray, waiting: np.ndarray | None = None) -> Any:
         """One iteration of every scene that is not waiting: a `Step` of NumPy arrays."""
-        if forked_from_jax():
-            raise RuntimeError(FORKED)
-        with jax.enable_x64(self.x64):
+        with numerics(self.dtype, single_blas=False):
             given = jnp.asarray(action, jnp.float32)
             if waiting is None:
                 self.state, step = _step(self.game, self.state, given)

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.model import camera
 from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.density import DENSE_UNKNOWNS
 from jaxba.structure.track_buckets import TILED_POINTS
 
@@ -98,6 +99,7 @@ class _Rig(NamedTuple):
     intrinsics: Float[Array, "3 cameras"]  # f, k1, k2
 
 
+@for_traces
 @functools.partial(jit, static_argnames=("kind", "count", "dtype"))
 def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64") -> Scenes:
     """Random scenes, the unusable ones included; see `scene_bank.solve_scenes`. Not of the family `windows`.
@@ -108,6 +110,7 @@ def make_scenes(kind: SceneClass, key: Array, count: int, dtype: str = "float64"
         count: number of scenes.
         dtype: of all numbers.
     """
+    check_x64(dtype)
     one = _paper_scene if kind.family == "paper" else _wide_scene
     scenes = lax.map(lambda k: one(kind, k), jax.random.split(key, count), batch_size=256)
     return jax.tree.map(lambda x: x if x.dtype == bool else x.astype(dtype), scenes)

@@ -24,6 +24,7 @@ from jaxba.lm.step import lm_step, state_at
 from jaxba.lm.termination import converged_in_cost
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import check_x64, for_traces
 
 T = TypeVar("T")
 
@@ -118,6 +119,7 @@ class _Loop(NamedTuple):
     paid: Array
 
 
+@for_traces
 def play(
     kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: float = 1e-6
 ) -> Trajectories:
@@ -131,6 +133,7 @@ def play(
         limit: largest number of linear solves per scene.
         ftol: relative decrease of an accepted step below which a scene has converged (`converged_in_cost`).
     """
+    check_x64(bank.initial_cost.dtype)
     loop = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
     found = jax.tree.map(np.asarray, (loop.costs, loop.dampings, loop.iterations, loop.converged, loop.paid))
     costs, dampings, iterations, converged, prices = found

@@ -29,6 +29,7 @@ from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, Refinement, StepOptions, check_count
 from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import for_traces
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose lowest cost is the best known one, each with point iterations."""
@@ -174,6 +175,7 @@ class Draft(NamedTuple):
     usable: np.ndarray
 
 
+@for_traces
 def solve_scenes(
     kind: SceneClass,
     key: Array,
@@ -232,6 +234,7 @@ class Split(NamedTuple):
     held_out: Bank
 
 
+@for_traces
 def make_banks(
     config: BankConfig,
     key: Array,
@@ -307,6 +310,7 @@ def reach(
     return np.where(reached.any(axis=1), reached.argmax(axis=1), np.inf)
 
 
+@for_traces
 def select(bank: Bank, rows: Int[np.ndarray, " kept"] | Bool[np.ndarray, " scenes"]) -> Bank:
     """The scenes of these rows."""
     return jax.tree.map(lambda x: x[jnp.asarray(rows)], bank)

@@ -34,6 +34,7 @@ from jaxba.problem.safe_math import safe_divide, safe_sqrt
 from jaxba.refinement.acceptance import Candidate
 from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.subproblems import Whole
+from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.conventions import components_first
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
@@ -47,6 +48,7 @@ class Proposal(NamedTuple):
     weightless: Bool[Array, ""] | None = None  # see `StepInfo`; None: no
 
 
+@for_traces
 def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, dtype=None) -> LMState:
     """The problem's parameters in layout order, with their cost.
 
@@ -56,6 +58,7 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
         options: the loss, and the number of previous steps to keep.
         dtype: floating point type of the solve; that of the problem's arrays if None.
     """
+    check_x64(problem.cameras.dtype if dtype is None else dtype)
     unknowns = layout.unknowns
     if unknowns is not None and unknowns.in_rigs and problem.cameras.shape[1] != POSE_SIZE + unknowns.size:
         raise ValueError("a problem with rigs must be in_frames (jaxba.problem.frames); jaxba.prepare does it")
@@ -78,6 +81,7 @@ def state_at(
     return LMState(cameras, points, cost, jnp.zeros((options.kept_steps, *cameras.shape), cameras.dtype))
 
 
+@for_traces
 def lm_step(
     layout: Layout,
     state: LMState,
@@ -106,8 +110,10 @@ def lm_step(
         The next state (unchanged after a rejection) and the record of the iteration.
 
     Raises:
-        ValueError: cameras share lenses, and the options have another method than plain LM.
+        ValueError: cameras share lenses, and the options have another method than plain LM; or the state is float64,
+            and 64 bits are not enabled in JAX.
     """
+    check_x64(state.cost.dtype)
     if not options.single_solve:
         return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, iteration)
     proposal = propose(layout, state, damping, options, iteration)

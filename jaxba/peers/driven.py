@@ -25,9 +25,9 @@ from jaxba.peers.colmap import pyceres
 from jaxba.peers.model import Observations, observations_of, step_metrics
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import numerics
 from jaxba.solver.loop import after_step
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution
@@ -107,7 +107,7 @@ def drive_ceres(
     recorder = _SummaryRecorder()
     options.callbacks = [recorder]
     options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
-    with jax.enable_x64(True), process.single_blas_thread(), CompileClock() as clock:
+    with numerics(np.float64), CompileClock() as clock:
         started = time.perf_counter()
         state, damping = _init(policy, _problem_info(problem, run.initial_cost, max_iterations))
         # everything is compiled before the clock starts

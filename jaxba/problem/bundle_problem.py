@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxba.problem.checks import plain_array, real_numbers
 from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
 from jaxba.problem.priors import Priors, checked_priors
 from jaxba.problem.rigs import Rigs, checked_rigs
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 CAMERA_SIZE = 9
 """Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""
@@ -36,8 +37,8 @@ class ProblemWarning(UserWarning):
 
 
 @register_pytree
-@dataclass(frozen=True)
-class BundleProblem:
+@dataclass(frozen=True, eq=False, repr=False)
+class BundleProblem(ArrayRecord):
     """Cameras, points and observations, in the conventions of BAL.
 
     A camera `[w, t, f, k1, k2]` maps a point X to the pixel z:
@@ -125,20 +126,29 @@ class BundleProblem:
         """
         if covariance is not None and weight is not None:
             raise ProblemError("give a covariance or a weight per observation, not both")
-        problem = cls(
-            cameras=_floats("cameras", cameras, POSE_SIZE + lens_size(lenses)),
-            points=_floats("points", points, POINT_SIZE),
-            observations=_floats("observations", observations, 2),
-            camera_index=_indices("camera_index", camera_index, len(cameras)),
-            point_index=_indices("point_index", point_index, len(points)),
-        )
-        count = problem.num_observations
+        parts = {"lenses": (lenses, Lenses), "constants": (constants, Constants), "rigs": (rigs, Rigs)}
+        for name, (part, kind) in {**parts, "priors": (priors, Priors)}.items():
+            if part is not None and not isinstance(part, kind):
+                raise ProblemError(f"{name} must be a {kind.__name__}, not of type {type(part).__name__}")
+        try:
+            cameras = _floats("cameras", cameras, POSE_SIZE + lens_size(lenses))
+            points = _floats("points", points, POINT_SIZE)
+            problem = cls(
+                cameras=cameras,
+                points=points,
+                observations=_floats("observations", observations, 2),
+                camera_index=_indices("camera_index", camera_index, len(cameras)),
+                point_index=_indices("point_index", point_index, len(points)),
+            )
+            count = problem.num_observations
+            whitening = _whitening(covariance, weight, count)
+        except ValueError as error:
+            raise error if isinstance(error, ProblemError) else ProblemError(str(error)) from None
         if count == 0:
             raise ProblemError("the problem has no observations")
         for name in ("camera_index", "point_index"):
             if len(getattr(problem, name)) != count:
                 raise ProblemError(f"{name} has {len(getattr(problem, name))} entries for {count} observations")
-        whitening = _whitening(covariance, weight, count)
         try:
             if lenses is not None:
                 lenses = checked_lenses(lenses, np.asarray(problem.cameras))
@@ -152,6 +162,12 @@ class BundleProblem:
         except ValueError as error:
             raise ProblemError(str(error)) from None
         return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
+
+    def __repr__(self) -> str:
+        arrays = ("cameras", "points", "observations")
+        counts = [f"{(*getattr(getattr(self, name), 'shape', ()), '?')[0]} {name}" for name in arrays]
+        parts = ("whitening", "lenses", "constants", "rigs", "priors", "labels")
+        return f"BundleProblem({', '.join([*counts, *(name for name in parts if getattr(self, name) is not None)])})"
 
     @property
     def num_cameras(self) -> int:
@@ -175,7 +191,7 @@ class BundleProblem:
 
 def _floats(name: str, values: Any, width: int) -> np.ndarray:
     """A float64 array of shape (n, width), checked to be finite."""
-    array = np.ascontiguousarray(np.asarray(values, dtype=np.float64))
+    array = real_numbers(name, values)
     if array.ndim != 2 or array.shape[1] != width:
         raise ProblemError(f"{name} must have shape (n, {width}), not {array.shape}")
     bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
@@ -186,7 +202,7 @@ def _floats(name: str, values: Any, width: int) -> np.ndarray:
 
 def _indices(name: str, values: Any, bound: int) -> np.ndarray:
     """An int32 vector, checked to be in [0, bound)."""
-    array = np.asarray(values)
+    array = plain_array(name, values)
     if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
         raise ProblemError(f"{name} must be a vector of integers, not {array.dtype} of shape {array.shape}")
     bad = np.flatnonzero((array < 0) | (array >= bound))
@@ -198,7 +214,7 @@ def _indices(name: str, values: Any, bound: int) -> np.ndarray:
 def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:
     """`Sigma^(-1/2)` of each observation, shape (count, 2, 2), from covariances or weights."""
     if weight is not None:
-        weight = np.asarray(weight, dtype=np.float64)
+        weight = real_numbers("weight", weight)
         if weight.shape != (count,) or not np.isfinite(weight).all() or (weight < 0).any():
             raise ProblemError(f"weight must be {count} finite numbers that are not negative")
         if not weight.any():
@@ -206,7 +222,7 @@ def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:
         return np.sqrt(weight)[:, None, None] * np.eye(2)
     if covariance is None:
         return None
-    covariance = np.asarray(covariance, dtype=np.float64)
+    covariance = real_numbers("covariance", covariance)
     if covariance.shape != (count, 2, 2) or not np.isfinite(covariance).all():
         raise ProblemError(f"covariance must be finite, of shape ({count}, 2, 2), not {covariance.shape}")
     values, vectors = np.linalg.eigh(covariance)

@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from jaxba.problem.checks import plain_array
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 ROTATION = np.array([True, True, True, False, False, False])
 """The numbers of a pose that are its rotation."""
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Constants:
+@dataclass(frozen=True, eq=False, repr=False)
+class Constants(ArrayRecord):
     """The numbers of poses and the points that are not optimised. They come back bit for bit."""
 
     poses: Bool[AnyArray, "cameras 6"]
@@ -37,7 +38,7 @@ def checked_constants(constants: Constants, cameras: int, points: int) -> Consta
     Raises:
         ValueError: shapes or types differ, or part of a rotation is constant; one line.
     """
-    poses, fixed = np.asarray(constants.poses), np.asarray(constants.points)
+    poses, fixed = plain_array("constant poses", constants.poses), plain_array("constant points", constants.points)
     for name, array, shape in (("poses", poses, (cameras, POSE_SIZE)), ("points", fixed, (points,))):
         if array.dtype != bool or array.shape != shape:
             raise ValueError(f"constant {name} must be bool of shape {shape}, not {array.dtype}{array.shape}")

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxba.problem.camera_models import BAL, CameraModel
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.problem.checks import plain_array
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 POSE_SIZE = 6
 """Parameters of a pose: angle-axis (radians) and translation (scene units). Those of the lens follow in a camera."""
@@ -22,8 +23,8 @@ LENS_SIZE = len(BAL)
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Lenses:
+@dataclass(frozen=True, eq=False, repr=False)
+class Lenses(ArrayRecord):
     """The lenses of a problem's cameras."""
 
     index: Int[AnyArray, " cameras"]
@@ -73,7 +74,7 @@ def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
         ValueError: shapes differ, an index is out of range, or cameras with the same lens differ in their intrinsics.
             The message is one line.
     """
-    index, free = np.asarray(lenses.index), np.asarray(lenses.free)
+    index, free = plain_array("index of lenses", lenses.index), plain_array("free of lenses", lenses.free)
     if index.shape != (len(cameras),) or index.dtype.kind not in "iu":
         raise ValueError(f"lenses must name a lens for each of {len(cameras)} cameras, not {index.dtype}{index.shape}")
     size = lens_size(lenses)
@@ -83,7 +84,7 @@ def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
     bad = np.flatnonzero((index < 0) | (index >= len(free)))
     if bad.size:
         raise ValueError(f"camera {bad[0]} has lens {index[bad[0]]}, outside 0..{len(free) - 1}")
-    model = np.zeros(len(free), int) if lenses.model is None else np.asarray(lenses.model)
+    model = np.zeros(len(free), int) if lenses.model is None else plain_array("model of lenses", lenses.model)
     if model.shape != (len(free),) or model.dtype.kind not in "iu":
         raise ValueError(f"lenses must name a model for each of {len(free)} lenses, not {model.dtype}{model.shape}")
     bad = np.flatnonzero((model < 0) | (model >= len(lenses.models)))

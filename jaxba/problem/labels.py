@@ -8,9 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int, Integer
 
+from jaxba.typing import ArrayRecord
 
-@dataclass(frozen=True)
-class Labels:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Labels(ArrayRecord):
     """Names and ids of the parts of a problem, in its order."""
 
     names: tuple[str, ...]

@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.problem.losses import Loss
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Priors:
+@dataclass(frozen=True, eq=False, repr=False)
+class Priors(ArrayRecord):
     """Priors of a problem, in the order of its cameras and lenses. Zero weights are for what nothing is known of."""
 
     positions: Float[AnyArray, "cameras 3"]

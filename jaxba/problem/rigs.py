@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxba.problem.checks import plain_array, real_numbers
 from jaxba.problem.intrinsics import Lenses
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 EXTRINSICS_SIZE = 6
 """Numbers of the extrinsics of a camera: angle-axis (radians) of M and m (scene units)."""
@@ -29,8 +30,8 @@ LARGEST_DISAGREEMENT = 1e-6
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Rigs:
+@dataclass(frozen=True, eq=False, repr=False)
+class Rigs(ArrayRecord):
     """The frame of each camera of a problem, and its place in the rig.
 
     A solve then adds rotations on the manifold, and makes no camera rounds and pattern moves, which would take cameras
@@ -81,8 +82,9 @@ def checked_rigs(rigs: Rigs, cameras: np.ndarray, lenses: Lenses | None) -> Rigs
     """
     from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
 
-    frame = np.asarray(rigs.frame)
-    rotation, translation = np.asarray(rigs.rotation, np.float64), np.asarray(rigs.translation, np.float64)
+    frame = plain_array("frames of rigs", rigs.frame)
+    rotation = real_numbers("rotations of rigs", rigs.rotation)
+    translation = real_numbers("translations of rigs", rigs.translation)
     count = len(cameras)
     if (frame.shape, rotation.shape, translation.shape) != ((count,), (count, 3, 3), (count, 3)):
         raise ValueError(f"rigs must say of each of {count} cameras its frame and its place in the rig")
@@ -111,9 +113,11 @@ def checked_rigs(rigs: Rigs, cameras: np.ndarray, lenses: Lenses | None) -> Rigs
 def _checked_free(
     rigs: Rigs, rotation: np.ndarray, translation: np.ndarray, lenses: Lenses | None
 ) -> Bool[np.ndarray, " cameras"] | None:
-    if rigs.free is None or not np.asarray(rigs.free).any():
+    if rigs.free is None:
         return None
-    free = np.asarray(rigs.free)
+    free = plain_array("free extrinsics of rigs", rigs.free)
+    if not free.any():
+        return None
     if free.dtype != bool or free.shape != (len(rotation),):
         raise ValueError(f"rigs must say of each of {len(rotation)} cameras whether its extrinsics are free")
     if lenses is None:

@@ -163,19 +163,34 @@ def use_devices(count: int | None) -> list[jax.Device]:
         if count < 1:
             raise DistributedError(f"at least one device is needed, not {count}")
         if count > 1:
-            # devices share XLA's threads, and batched factorisations of several at a time wait for each other for ever
-            # where there are few
-            os.environ.setdefault("NPROC", str(THREADS * count))
             with contextlib.suppress(RuntimeError):  # JAX has started
                 jax.config.update("jax_num_cpu_devices", count)
-    if count is None and jax.process_count() == 1:
-        count = 1
-    found = jax.local_devices()
+    with _threads(THREADS * (count or 1)):
+        if count is None and jax.process_count() == 1:
+            count = 1
+        found = jax.local_devices()
     if count is not None and len(found) < count:
         kind = found[0].platform.upper()
         raise DistributedError(f"{count} devices asked for, {len(found)} of kind {kind} found")
     own = lambda process: [x for x in jax.devices() if x.process_index == process][:count]
     return [device for process in range(jax.process_count()) for device in own(process)]
+
+
+@contextlib.contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """In which JAX starts with so many of XLA's threads for virtual devices, unless it has started or NPROC is set.
+
+    Devices share the threads, and batched factorisations of several at a time wait for each other for ever where there
+    are few.
+    """
+    if count <= THREADS or "NPROC" in os.environ:
+        yield
+        return
+    os.environ["NPROC"] = str(count)
+    try:
+        yield
+    finally:
+        del os.environ["NPROC"]
 
 
 def together(work: Callable[[], T]) -> T:

@@ -12,10 +12,15 @@ import gc
 import importlib.util
 import os
 import sys
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, TypeVar
 
+import threadpoolctl
 from threadpoolctl import ThreadpoolController
+
+T = TypeVar("T")
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_MAX = -1, -2, -4
 """Parameter numbers of glibc's mallopt (malloc.h)."""
@@ -68,6 +73,17 @@ def out_of_memory(error: Exception) -> bool:
     )
 
 
+def missing_platform() -> str | None:
+    """The platforms that JAX was told to use, as by JAX_PLATFORMS, if it cannot start them; else None."""
+    import jax
+
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError):  # the second, without a word, for cuda where JAX was installed without it
+        return jax.config.values.get("jax_platforms")
+    return None
+
+
 def release_programs(share: float | None = None) -> bool:
     """Drops JAX's compiled programs if the process comes near Linux's limit of memory mappings.
 
@@ -104,27 +120,59 @@ def _mappings() -> int:
         return sum(1 for _ in file)
 
 
+_blas_lock = threading.Lock()
+_blas_users = 0
+"""Contexts of `single_blas_thread` that are open, in all threads."""
+_blas_limit: Any = None
+"""What the first of them has set, which the last takes back."""
+
+
 @contextlib.contextmanager
 def single_blas_thread() -> Iterator[None]:
-    """A context in which BLAS uses one thread.
+    """A context in which BLAS uses one thread. Contexts of several threads may overlap.
 
     XLA on a CPU factors matrices with SciPy's OpenBLAS, whose threads keep spinning after each call and take the
     processor from XLA's own threads; beside another busy process an iteration became ten times slower.
     """
-    if "scipy.linalg.cython_lapack" not in sys.modules:  # loads the library whose threads are limited
-        importlib.import_module("scipy.linalg.cython_lapack")
-    with ThreadpoolController().limit(limits=1, user_api="blas"):
+    global _blas_users, _blas_limit
+    with _blas_lock:
+        if not _blas_users:
+            if "scipy.linalg.cython_lapack" not in sys.modules:  # loads the library whose threads are limited
+                importlib.import_module("scipy.linalg.cython_lapack")
+            _blas_limit = _as_owner_of_blas(lambda: ThreadpoolController().limit(limits=1, user_api="blas"))
+        _blas_users += 1
+    try:
         yield
+    finally:
+        with _blas_lock:
+            _blas_users -= 1
+            if not _blas_users:
+                _as_owner_of_blas(_blas_limit.restore_original_limits)
+
+
+def _as_owner_of_blas(change: Callable[[], T]) -> T:
+    """Changes BLAS's threads. Recent versions of threadpoolctl let the first thread that does so own those of OpenBLAS,
+    and ignore all others."""
+    disown = getattr(getattr(threadpoolctl, "OpenBLASController", None), "clear_controlling_thread", lambda **_: None)
+    disown(force=True)
+    changed = change()
+    disown(force=True)
+    return changed
 
 
 _forked_from_jax = False
 """Whether this process is the fork of one in which JAX had started."""
 
 
-def forked_from_jax() -> bool:
-    """Whether this process is the fork of one in which JAX had started, so that it would wait for threads that only
-    that one has. Known of forks after the import of this module."""
-    return _forked_from_jax
+def refuse_fork() -> None:
+    """Raises a RuntimeError if this process is the fork of one in which JAX had started: it would wait for threads that
+    only that one has. Known of forks after the import of this module."""
+    if _forked_from_jax:
+        raise RuntimeError(
+            "this process was forked from one in which JAX had started, and would wait for its threads for ever: begin "
+            'it anew, with multiprocessing.get_context("spawn") or gymnasium.vector.AsyncVectorEnv(..., '
+            'context="spawn")'
+        )
 
 
 def _after_fork() -> None:

@@ -8,13 +8,17 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells define it."""
 
 
+COMMANDS = tuple(f"jaxba-{name}" for name in ("bench", "data", "kitti", "paper", "solve", "train", "view"))
+"""Names of the commands."""
+
+
 def quiet_interrupt() -> None:
     """If this process is one of the commands: until `jaxba.cli.common.run_command` begins, Ctrl-C ends it at once.
 
     Nothing has been begun by then. Processes that import jaxba for themselves are left alone.
     """
     name = os.path.basename(sys.argv[0]) if sys.argv else ""
-    if name.startswith("jaxba-") and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    if name.removesuffix(".exe") in COMMANDS and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, on_early_interrupt)
 
 

@@ -31,8 +31,10 @@ from jaxba.problem.options import Coordinates, StepOptions
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
-from jaxba.solver.prepare import numerics
+from jaxba.runtime.numerics import numerics
+from jaxba.solver.prepare import check_problem
 from jaxba.structure.layout import Layout, layout_for
+from jaxba.typing import ArrayRecord
 
 SINGULAR = 1e-12
 """Smallest eigenvalue of the reduced camera system, scaled to a unit diagonal, that is not taken for a free gauge. On
@@ -42,8 +44,8 @@ CHUNK = 4096
 """Points whose covariances are computed at once."""
 
 
-@dataclass(frozen=True)
-class Covariance:
+@dataclass(frozen=True, eq=False, repr=False)
+class Covariance(ArrayRecord):
     """Covariances. Rows and columns of what is constant are zero; those of what nothing observes are NaN."""
 
     poses: Float[np.ndarray, "cameras 6 6"]
@@ -97,6 +99,7 @@ class Covariance:
         return jacobian @ self.between(first, second) @ jacobian.T
 
 
+@numerics(np.float64, single_blas=False)
 def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covariance:
     """The covariance of the numbers of a problem at its minimum.
 
@@ -110,6 +113,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
         ProblemError: the position, orientation and scale of the scene are free (`with_gauge`, constants or priors fix
             them), or something that is not constant is not determined by what is observed.
     """
+    check_problem(problem)
     options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
     given, problem = problem, without_views_of(problem, facing_away(problem))
     offset = far_middle(problem)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import numpy as np
 from jax import Array
 
@@ -17,6 +16,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import COST_ROUNDING
 from jaxba.runtime.compilation import compile_and_run, program
+from jaxba.runtime.numerics import numerics
 from jaxba.structure.layout import Layout, build_layout
 
 
@@ -34,7 +34,7 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
     loss = loss or Loss()
     problem = in_frames(problem)
     layout = build_layout(problem, pairs=False, grid=False)
-    with jax.enable_x64(dtype != np.float32):
+    with numerics(dtype):
         found = compile_and_run(program(_start_terms, "loss", "dtype", level="quick"), layout, problem, loss, dtype)
         costs, inverse_depth = (np.asarray(x) for x in found)
     slots = np.flatnonzero(np.asarray(layout.slot_mask) & ~np.isfinite(costs))

@@ -47,11 +47,12 @@ from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import check_x64, numerics, refuse_traces
 from jaxba.solver.options import SolveOptions, checked_options
-from jaxba.solver.prepare import DEFAULT_POLICY, numerics, set_up
+from jaxba.solver.prepare import DEFAULT_POLICY, check_problem, set_up
 from jaxba.solver.solve import solve
 from jaxba.structure.layout import Layout
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, outline, same
 
 DAMPING = 1e-10
 """lambda of the Gauss-Newton system in the preconditioner: enough that a free gauge leaves it positive definite."""
@@ -78,6 +79,8 @@ class SolveInputs(NamedTuple):
     positions: Float[AnyArray, "cameras 3"] | None = None
     """Measured positions, if the problem has priors."""
 
+    __eq__, __repr__, __hash__ = same, outline, None  # pyright: ignore[reportAssignmentType]
+
 
 def inputs_of(problem: BundleProblem) -> SolveInputs:
     """The numbers of a problem that `differentiable_solve` takes."""
@@ -102,6 +105,7 @@ def differentiable_solve(
         A function; its derivatives raise a ProblemError if conjugate gradients do not solve with the Hessian, as where
         the solution is not determined. With a free gauge only what does not depend on the gauge has derivatives.
     """
+    check_problem(problem)
     options = checked_options(options)
 
     @jax.custom_vjp
@@ -109,12 +113,16 @@ def differentiable_solve(
         return forward(inputs)[0]
 
     def forward(inputs: SolveInputs) -> tuple[tuple[Array, Array], tuple[SolveInputs, BundleProblem]]:
-        solved = solve(_with_inputs(problem, inputs), policy, options).problem
-        return (jnp.asarray(solved.cameras), jnp.asarray(solved.points)), (inputs, solved)
+        refuse_traces(inputs)
+        check_x64(np.float64)
+        with numerics(np.float64):
+            solved = solve(_with_inputs(problem, inputs), policy, options).problem
+            return (jnp.asarray(solved.cameras), jnp.asarray(solved.points)), (inputs, solved)
 
     def backward(saved: tuple[SolveInputs, BundleProblem], cotangents: tuple[Array, Array]) -> tuple[SolveInputs]:
         inputs, solved = saved
-        return (_transposed(solved, policy, options, inputs, cotangents),)
+        with numerics(np.float64):
+            return (_transposed(solved, policy, options, inputs, cotangents),)
 
     find.defvjp(forward, backward)
     return find

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array, lax
 from jaxtyping import Float, Int
 
@@ -22,10 +21,11 @@ from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, only_free
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
+from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout, num_partitions
 from jaxba.structure.segment_sums import point_sum
-from jaxba.typing import AnyArray
+from jaxba.typing import AnyArray, outline, same
 
 
 class History(NamedTuple):
@@ -54,6 +54,8 @@ class History(NamedTuple):
 
     step_norm: AnyArray
     """Norm of the candidate's step."""
+
+    __eq__, __repr__, __hash__ = same, outline, None  # pyright: ignore[reportAssignmentType]
 
 
 class Carry(NamedTuple):
@@ -168,6 +170,7 @@ def history_of(step: StepInfo) -> History:
     )
 
 
+@for_traces
 @functools.partial(jit, static_argnames=("options", "max_iterations"))
 def solve_loop(
     layout: Layout,
@@ -197,8 +200,7 @@ def solve_loop(
     Raises:
         ValueError: the state is float64, and 64 bits are not enabled in JAX.
     """
-    if state.cost.dtype == np.float64 and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise ValueError('the state is float64: call jax.config.update("jax_enable_x64", True) first')
+    check_x64(state.cost.dtype)
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
     carry = begin(problem_info(layout, state, options, iteration_limit, prices), policy, state)
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,6 +25,7 @@ from jaxba.problem.preprocess import far_middle, shift
 from jaxba.problem.rigs import with_unseen_of_frames
 from jaxba.runtime import distributed, process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
+from jaxba.runtime.numerics import numerics, refuse_traces
 from jaxba.solver.cost_model import choose_linear_solver, prices
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
@@ -35,6 +35,7 @@ from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.padding import Capacity, capacity_of, padded_parameters, with_padded_solver
+from jaxba.typing import ArrayRecord
 
 DEFAULT_POLICY = GUARDED
 """Name of the default damping policy."""
@@ -47,8 +48,8 @@ POLICY_PARTS = ("min_gain", "init", "propose")
 """What every damping policy has (`DampingPolicy`)."""
 
 
-@dataclass(frozen=True)
-class Setup:
+@dataclass(frozen=True, eq=False, repr=False)
+class Setup(ArrayRecord):
     """A solve before its initial state is computed."""
 
     problem: BundleProblem
@@ -118,7 +119,7 @@ class Setup:
         return found.replace(**_exact(self.counted, found))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Prepared(Setup):
     """Arguments of `jaxba.solve_loop` and `jaxba.lm_step` for a problem."""
 
@@ -154,13 +155,6 @@ def prepare(
     return Prepared(**vars(setup), state=state, compile_s=clock.seconds)
 
 
-@contextmanager
-def numerics(dtype: np.dtype[Any]) -> Iterator[None]:
-    """In which the programs of a solve are compiled and run: 64 bits unless for float32, one thread for LAPACK."""
-    with jax.enable_x64(dtype != np.float32), process.single_blas_thread():
-        yield
-
-
 def set_up(
     problem: BundleProblem,
     policy: str | DampingPolicy = DEFAULT_POLICY,
@@ -169,9 +163,8 @@ def set_up(
 ) -> Setup:
     """`prepare` without the initial state. Arguments and errors as there; `away`: whose views are left out, if that is
     decided."""
+    check_problem(problem)
     options = checked_options(options)
-    if not isinstance(problem, BundleProblem):
-        raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
     if isinstance(policy, str):
         policy, options = resolve_policy(policy, options)
     _check_policy(policy)
@@ -202,6 +195,20 @@ def set_up(
         known = jax.tree.map(lambda x: np.asarray(x, dtype), known)
         setup_s = time.perf_counter() - started
     return Setup(given, problem, away, layout, step, policy, capacity, offset, start, dtype, known, setup_s, shards)
+
+
+def check_problem(problem: BundleProblem) -> None:
+    """First of all in every public function of a problem that computes with JAX.
+
+    Raises:
+        ValueError: it is no problem.
+        TypeError: JAX traces it.
+        RuntimeError: the process was forked from one in which JAX had started.
+    """
+    if not isinstance(problem, BundleProblem):
+        raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
+    refuse_traces(problem)
+    process.refuse_fork()
 
 
 def _pads(problem: BundleProblem, options: SolveOptions) -> bool:

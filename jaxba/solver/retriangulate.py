@@ -33,9 +33,12 @@ from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
 from jaxba.runtime.compilation import compile_and_run, level_after, program, stages
+from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import explain_start
+from jaxba.solver.prepare import check_problem
 from jaxba.structure.conventions import components_first, items_first
 from jaxba.structure.layout import Layout, build_layout
+from jaxba.typing import ArrayRecord
 
 START_DISTANCES = (1.0, 1 / 16, 1 / 4, 1 / 2, 2.0, 16.0, -1.0)
 """Starts besides the midpoint of the rays: multiples of the distance of a point from the first camera that sees it. The
@@ -56,8 +59,8 @@ MIN_GAIN = 1e-6
 """Smallest decrease for which a point is moved, relative to the mean cost of a point after the search."""
 
 
-@dataclass(frozen=True)
-class Retriangulation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Retriangulation(ArrayRecord):
     """Result of `retriangulate`."""
 
     problem: BundleProblem
@@ -102,6 +105,7 @@ def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangu
     Raises:
         ProblemError: the cost is not finite.
     """
+    check_problem(problem)
     return retriangulate_without(facing_away(problem), problem, loss)
 
 
@@ -110,7 +114,7 @@ def retriangulate_without(
 ) -> Retriangulation:
     """`retriangulate` where it is known which images face away."""
     given, problem = problem, without_views_of(problem, away)
-    with jax.enable_x64(True), process.single_blas_thread():
+    with numerics(np.float64):
         here = in_frames(problem)
         layout = build_layout(here, pairs=False, grid=False)
         order = np.concatenate([np.asarray(members) for members in layout.bucket_points])

@@ -23,12 +23,14 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
 from jaxba.runtime.compilation import CompileClock, Stage, compile_and_run, compiler_options, stages
+from jaxba.runtime.numerics import numerics
 from jaxba.solver.callback_loop import IterationRecord, Run, Watch, parts_of, run_stepwise
 from jaxba.solver.diagnosis import cost_of_rounding
 from jaxba.solver.loop import Carry, History, history_of, solve_loop
 from jaxba.solver.options import SolveOptions, checked_options
-from jaxba.solver.prepare import DEFAULT_POLICY, Setup, numerics, set_up
+from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
 from jaxba.structure.padding import Capacity
+from jaxba.typing import ArrayRecord
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,8 +40,8 @@ MIN_HISTORY = 128
 rounded up to a power of two."""
 
 
-@dataclass(frozen=True)
-class Solution:
+@dataclass(frozen=True, eq=False, repr=False)
+class Solution(ArrayRecord):
     """Result of `solve`."""
 
     problem: BundleProblem

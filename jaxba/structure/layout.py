@@ -39,15 +39,15 @@ from jaxba.structure.random_partitions import Partition, partition_layout
 from jaxba.structure.sum_trees import sorted_by, sum_tree, with_spare_row
 from jaxba.structure.track_buckets import Bucket, bucket_slots, padded_slots
 from jaxba.structure.unknowns import Unknowns, unknowns_of
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 CAMERA_CHUNK = 8
 """Observations per chunk of a camera. Their products are unrolled, so this number decides the size of the program."""
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Layout:
+@dataclass(frozen=True, eq=False, repr=False)
+class Layout(ArrayRecord):
     """A problem's observations in slot order, with the index arrays of their sums. Its points are in *layout order*."""
 
     slot_camera: Int[AnyArray, " slots"]

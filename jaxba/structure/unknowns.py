@@ -31,12 +31,12 @@ from jaxba.problem.intrinsics import POSE_SIZE, lens_size
 from jaxba.problem.priors import Priors
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.agreement import Agreement, size_of
-from jaxba.typing import AnyArray, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 
 @register_pytree
-@dataclass(frozen=True)
-class Unknowns:
+@dataclass(frozen=True, eq=False, repr=False)
+class Unknowns(ArrayRecord):
     """The unknowns of a problem, where they are not just all numbers of all BAL cameras and points."""
 
     members: Bool[AnyArray, "cameras lenses"] | None

@@ -27,6 +27,7 @@ from jaxba.io import settings
 from jaxba.io.files import visible
 from jaxba.runtime import distributed
 from jaxba.runtime.atomic import write_text
+from jaxba.runtime.numerics import for_traces
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig, load, to_yaml
 from jaxba.training.log import Log, Row
@@ -137,6 +138,7 @@ def _others(folder: Path) -> bool:
     return any(item.name != CONFIG for item in visible(folder))
 
 
+@for_traces
 def train(
     config: TrainConfig,
     env: Any,

@@ -352,10 +352,10 @@ def scene(seed: int):
 
 def test_another_policy_of_the_same_shape_compiles_nothing():
     solve(scene(0), random_policy(1), max_iterations=40)
-    programs = solve_loop._cache_size()
+    programs = solve_loop.__wrapped__._cache_size()
     first = solve(scene(0), random_policy(1), max_iterations=40)
     second = solve(scene(0), random_policy(2), max_iterations=40)
-    assert solve_loop._cache_size() == programs
+    assert solve_loop.__wrapped__._cache_size() == programs
     assert not np.array_equal(first.history.damping[:1], second.history.damping[:1])
 
 

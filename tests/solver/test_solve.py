@@ -147,13 +147,13 @@ def test_the_step_becomes_short():
 @pytest.mark.xla
 def test_another_limit_compiles_nothing_and_is_kept_to():
     whole = solve(support.tiny(), "ceres")
-    programs = solve_loop._cache_size()
+    programs = solve_loop.__wrapped__._cache_size()
     for limit in (1, 3, 128):
         found = solve(support.tiny(), "ceres", max_iterations=limit)
         assert found.iterations == len(found.history.cost) == min(limit, whole.iterations)
         np.testing.assert_array_equal(found.history.cost, whole.history.cost[:limit])
         assert (found.termination == Termination.MAX_ITERATIONS) == (limit < whole.iterations)
-    assert solve_loop._cache_size() == programs
+    assert solve_loop.__wrapped__._cache_size() == programs
 
 
 def test_the_gradient_vanishes_at_an_exact_optimum():
