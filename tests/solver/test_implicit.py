@@ -169,10 +169,11 @@ def test_what_determines_a_point_are_rays_that_are_not_parallel():
 
 def invariants(cameras: jax.Array, points: jax.Array) -> jax.Array:
     """Numbers that no similarity changes: ratios of distances of points and of cameras, an angle, focal lengths."""
-    center = lambda at: -camera.rotation_matrix(cameras[at, :3]).T @ cameras[at, 3:6]
+    rotation = jnp.moveaxis(camera.rotation_matrix(cameras[:, :3].T), 2, 0)
+    center = lambda at: -rotation[at].T @ cameras[at, 3:6]
     length = lambda x: jnp.sqrt(jnp.sum(x * x))
     base = length(points[0] - points[11])
-    turn = camera.rotation_matrix(cameras[0, :3]) @ camera.rotation_matrix(cameras[3, :3]).T
+    turn = rotation[0] @ rotation[3].T
     ratios = length(points[2] - points[5]) / base, length(center(1) - points[4]) / base
     return jnp.stack([*ratios, length(center(0) - center(3)) / base, turn[0, 1], cameras[4, 6] / 600])
 
