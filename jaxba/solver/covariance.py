@@ -164,7 +164,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     return Covariance(poses, lenses, marginal, given_cameras, index, of_cameras, changes, rotations, cameras[:, 3:6])
 
 
-def _warn(labels: Labels | None, **undetermined: Int[np.ndarray, " n"]) -> None:
+def _warn(labels: Labels | None, **undetermined: np.ndarray) -> None:
     parts = [part_names(labels, kind, which) for kind, which in undetermined.items() if len(which)]
     if parts:
         note = f"not determined by what is observed, so with NaN for a covariance: {', '.join(parts)}"
