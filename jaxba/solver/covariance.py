@@ -150,7 +150,8 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     cameras = np.asarray(given.cameras)
     rotations = geometry.rotation_matrices(cameras[:, :3])
     changes = _changes(problem, layout, rotations, offset)
-    poses = np.array([_through(change, _submatrix(of_cameras, row)) for change, row in zip(changes, index, strict=True)])
+    pairs = zip(changes, index, strict=True)
+    poses = np.array([_through(change, _submatrix(of_cameras, row)) for change, row in pairs])
     poses[~seen] = np.nan
     lenses = _of_lenses(problem, layout, index, of_cameras)
     unseen = np.setdiff1d(np.arange(len(lenses)), _lens_of(problem)[seen])
