@@ -29,7 +29,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, lens_size
-from jaxba.problem.labels import Labels, part_names
+from jaxba.problem.labels import Part, part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Coordinates, StepOptions
 from jaxba.problem.preprocess import far_middle, shift
@@ -156,20 +156,16 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     lenses = _of_lenses(problem, layout, index, of_cameras)
     unseen = np.setdiff1d(np.arange(len(lenses)), _lens_of(problem)[seen])
     has = lambda x: np.isnan(x).any(axis=(1, 2))
-    _warn(
-        problem.labels,
-        image=np.flatnonzero(has(poses) & seen),
-        lens=np.setdiff1d(np.flatnonzero(has(lenses)), unseen),
-        point=np.flatnonzero(has(marginal) & system.seen),
-    )
-    return Covariance(poses, lenses, marginal, given_cameras, index, of_cameras, changes, rotations, cameras[:, 3:6])
-
-
-def _warn(labels: Labels | None, **undetermined: np.ndarray) -> None:
-    parts = [part_names(labels, kind, which) for kind, which in undetermined.items() if len(which)]
+    undetermined: dict[Part, np.ndarray] = {
+        "image": np.flatnonzero(has(poses) & seen),
+        "lens": np.setdiff1d(np.flatnonzero(has(lenses)), unseen),
+        "point": np.flatnonzero(has(marginal) & system.seen),
+    }
+    parts = [part_names(problem.labels, kind, which) for kind, which in undetermined.items() if len(which)]
     if parts:
         note = f"not determined by what is observed, so with NaN for a covariance: {', '.join(parts)}"
-        warnings.warn(note, ProblemWarning, stacklevel=3)
+        warnings.warn(note, ProblemWarning, stacklevel=2)
+    return Covariance(poses, lenses, marginal, given_cameras, index, of_cameras, changes, rotations, cameras[:, 3:6])
 
 
 def _changes(
@@ -278,13 +274,13 @@ def _system(
     place = np.repeat(index[camera], 2, axis=0).ravel()
     used = place >= 0
     at = np.repeat(rows, index.shape[1])
-    jacobian = csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))
+    parts, height = [csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))], len(rows)
     if linear.priors is not None:
-        jacobian = vstack([jacobian, _prior_rows(index, count, np.asarray(linear.priors.blocks))], format="csr")
+        parts, height = [*parts, _prior_rows(index, count, np.asarray(linear.priors.blocks))], height + index.size
     place = np.repeat(3 * point[:, None] + np.arange(3), 2, axis=0).ravel()
     seen, starts = np.bincount(point, minlength=points) > 0, np.searchsorted(point, np.arange(points + 1))
-    by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (jacobian.shape[0], 3 * points))
-    return _System(jacobian, by_points, inverse, turn, lost, seen, starts)
+    by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (height, 3 * points))
+    return _System(vstack(parts, format="csr"), by_points, inverse, turn, lost, seen, starts)
 
 
 def _prior_rows(index: Int[np.ndarray, "cameras width"], count: int, blocks: Float[np.ndarray, "cameras width width"]):

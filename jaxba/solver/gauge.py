@@ -118,11 +118,11 @@ def determined_directions(problem: BundleProblem) -> Float[np.ndarray, "points 3
     rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(float).tiny)
     across = np.eye(3) - rays[:, :, None] * rays[:, None]
     if problem.whitening is not None:
-        across = across * np.any(np.asarray(problem.whitening) != 0, axis=(1, 2))[:, None, None]
+        across = across * np.asarray(problem.whitening).any(axis=(1, 2), keepdims=True)
     total = np.zeros((problem.num_points, 3, 3))
     np.add.at(total, problem.point_index, across)
     values, vectors = np.linalg.eigh(total)
-    kept = values > PARALLEL * np.maximum(values[:, 2:], np.finfo(float).tiny)
+    kept = np.greater(values, PARALLEL * np.maximum(values[:, 2:], np.finfo(float).tiny))
     if problem.constants is not None:
         kept &= ~np.asarray(problem.constants.points)[:, None]
     return np.where(kept.all(axis=1)[:, None, None], np.eye(3), (vectors * kept[:, None]) @ vectors.transpose(0, 2, 1))

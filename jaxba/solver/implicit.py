@@ -164,7 +164,6 @@ def _transposed(
         still = _symmetries(solved, here, setup.layout, order)
         arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, still, inputs, cotangents)
         found, residual = jax.jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
-    print("RESIDUAL", float(residual), flush=True)
     if not float(residual) < 1e-4:
         raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
     return found
