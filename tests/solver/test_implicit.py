@@ -178,26 +178,31 @@ def invariants(cameras: jax.Array, points: jax.Array) -> jax.Array:
     return jnp.stack([*ratios, length(center(0) - center(3)) / base, turn[0, 1], cameras[4, 6] / 600])
 
 
-FAST = ("lenses held", "shared lens")
+PAIRS = [
+    pytest.param(name, loss, marks=() if (name, loss) == ("shared lens", "squared") else pytest.mark.slow)
+    for name in SETTINGS
+    for loss in ("squared", "cauchy")
+]
 
 
-@pytest.mark.parametrize("loss", ["squared", "cauchy"])
-@pytest.mark.parametrize("name", [pytest.param(n, marks=() if n in FAST else pytest.mark.slow) for n in SETTINGS])
+@pytest.mark.parametrize(("name", "loss"), PAIRS)
 def test_derivatives_of_invariants_are_those_of_differences_in_every_setting(name, loss):
-    options = dataclasses.replace(TIGHT, loss=jaxba.Loss(loss, 1.0))
-    problem = jaxba.solve(SETTINGS[name][0](small()), "ceres", options).problem
+    options = dataclasses.replace(TIGHT, loss=jaxba.Loss(loss, 3.0))
+    solution = jaxba.solve(SETTINGS[name][0](small()), "ceres", options)
+    problem = solution.problem
     find = differentiable_solve(problem, "ceres", options)
     inputs = jax.tree.map(jnp.asarray, inputs_of(problem))
-    weights, step = np.array([1.0, -0.7, 0.5, 0.3, 0.8]), 0.02
+    weights, step = np.array([1.0, -0.7, 0.5, 0.3, 0.8]), 0.04
     value = lambda inputs: jnp.sum(weights * invariants(*find(inputs)))
     found = jax.grad(value)(inputs)
     change = np.random.default_rng(2).normal(size=inputs.observations.shape)
-    assert np.isfinite(found.observations).all()
     # central differences of fourth order
     at = lambda scale: float(value(inputs._replace(observations=inputs.observations + scale * step * change)))
     wanted = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
-    size = np.linalg.norm(found.observations) * np.linalg.norm(change) / np.sqrt(change.size)
-    np.testing.assert_allclose(jnp.sum(found.observations * change), wanted, rtol=0, atol=1e-6 * size)
+    # a solve ends some sqrt(2 ftol cost) pixels from its minimum
+    away = 3 * np.sqrt(2 * TIGHT.tolerances.ftol * solution.final_cost) / step + 1e-7
+    atol = away * np.linalg.norm(found.observations)
+    np.testing.assert_allclose(jnp.sum(found.observations * change), wanted, rtol=0, atol=atol)
 
 
 @pytest.mark.slow
