@@ -14,6 +14,7 @@ from jaxba.io.configurations import SettingsError, read_file
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.constraints import Gauge, hold, with_gauge
+from jaxba.problem.labels import part_name
 from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_position_priors
 
@@ -76,7 +77,8 @@ def _with_known_places(problem: BundleProblem) -> np.ndarray:
     lost = np.setdiff1d(rigs.frame, np.asarray(rigs.frame)[known])
     if len(lost):
         first = int(np.flatnonzero(np.asarray(rigs.frame) == lost[0])[0])
-        raise ValueError(f"the frame of image {first} has no image of a camera with a constant place in its rig")
+        name = part_name(problem.labels, "image", first)
+        raise ValueError(f"the frame of {name} has no image of a camera with a constant place in its rig")
     return known
 
 

@@ -393,7 +393,8 @@ def _read(args: Arguments, path: str) -> BundleProblem:
 
 
 def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
-    found = covariance(problem, loss=loss)
+    with common.notes_printed():
+        found = covariance(problem, loss=loss)
     with open_output(path) as file:
         arrays = ("poses", "lenses", "points", "points_given_cameras")
         np.savez_compressed(file, **{name: getattr(found, name) for name in arrays})

@@ -19,6 +19,7 @@ from jaxba.io.text import LineReader, NumberReader
 from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import angle_axis, are_rotations, rotation_matrices
+from jaxba.problem.labels import part_name
 from jaxba.typing import LARGEST_COUNT
 
 HEADER = b"# Bundle file v0.3"
@@ -73,7 +74,8 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
     cameras, camera_index = np.asarray(valid.cameras), np.asarray(valid.camera_index)
     lost = np.flatnonzero((cameras[:, 6] == 0) & (np.bincount(camera_index, minlength=len(cameras)) > 0))
     if lost.size:
-        raise ProblemError(f"cannot write {display_name(path)}: camera {lost[0]} has focal length 0")
+        name = part_name(problem.labels, "image", lost[0])
+        raise ProblemError(f"cannot write {display_name(path)}: {name} has focal length 0")
     order = np.argsort(valid.point_index, kind="stable")
     views = np.bincount(np.asarray(valid.point_index), minlength=valid.num_points).tolist()
     keys, pixels = _keys(camera_index)[order].tolist(), valid.observations[order].tolist()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Int, Integer
@@ -45,6 +46,24 @@ class Labels(ArrayRecord):
     def points_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
         """Positions of points by id. Raises as `images_at`."""
         return _positions(list(wanted), _found(self.points, wanted), "point")
+
+
+Part = Literal["image", "lens", "point"]
+
+
+def part_name(labels: Labels | None, kind: Part, at: int) -> str:
+    """What a message calls a part of a problem: by its name and id, or by its position where nothing has labels."""
+    if labels is None:
+        return f"{'camera' if kind == 'image' else kind} {at}"
+    if kind == "image":
+        return f"image {labels.images[at]} ({labels.names[at]})"
+    return f"camera {labels.lenses[at]}" if kind == "lens" else f"point {labels.points[at]}"
+
+
+def part_names(labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"]) -> str:
+    """The same for some parts of a kind; of many the first."""
+    more = f" and {len(which) - 1} more" if len(which) > 1 else ""
+    return part_name(labels, kind, int(which[0])) + more
 
 
 def _found(ids: Integer[np.ndarray, " n"], wanted: Iterable[int | str]) -> list[int]:

@@ -5,6 +5,8 @@ With `J^T J = [[B, E], [E^T, C]]` of the unknown numbers of cameras and points a
     cov(cameras) = S^-1,    S = B - E C^-1 E^T,
     cov(points)  = C^-1 + C^-1 E^T S^-1 E C^-1,    of given cameras: C^-1.
 
+Directions that nothing determines are left out of both inverses. A number has a covariance if none of them moves it.
+
 It is that of the parameters if residuals are independent with unit variance: whitened, or pixels with a noise of one
 pixel (else multiply by the variance). Robust losses weigh it as they weigh the cost.
 
@@ -13,32 +15,43 @@ Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", section 9;
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.lm.step import initial_state
 from jaxba.model.linearize import Linearization, linearize, only_free
 from jaxba.problem import geometry
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.facing import facing_away, without_views_of
 from jaxba.problem.frames import in_frames
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, lens_size
+from jaxba.problem.labels import Part, part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Coordinates, StepOptions
 from jaxba.problem.preprocess import far_middle, shift
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.prepare import check_problem
+from jaxba.solver.gauge import free_gauge
+from jaxba.solver.prepare import check_problem, layout_order
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.typing import ArrayRecord
 
-SINGULAR = 1e-12
-"""Smallest eigenvalue of the reduced camera system, scaled to a unit diagonal, that is not taken for a free gauge. On
-scenes with a gauge it is above 1e-9, and without one at the rounding error."""
+UNDETERMINED = 1e-9
+"""A direction is not determined where residuals change by less than this share of what each number by itself changes
+them by: sums of Jacobian columns that cancel are known to some 1e-12 of them."""
+
+WEAK = 1e-6
+"""Eigenvalues of the camera system, scaled to a unit diagonal of B, below which they are computed anew from the
+Jacobian: differences of squares know them to some 1e-16."""
+
+COMPONENT = 1e-7
+"""Part of a number in a direction that is not determined from which the number is not determined either."""
 
 CHUNK = 4096
 """Points whose covariances are computed at once."""
@@ -46,7 +59,7 @@ CHUNK = 4096
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Covariance(ArrayRecord):
-    """Covariances. Rows and columns of what is constant are zero; those of what nothing observes are NaN."""
+    """Covariances. Rows and columns of what is constant are zero; those of what is not determined are NaN."""
 
     poses: Float[np.ndarray, "cameras 6 6"]
     """Of the pose of each camera: rotation (left perturbation `exp(d) R`, radians), then translation (scene units)."""
@@ -82,7 +95,7 @@ class Covariance(ArrayRecord):
         width = len(rows) // 2
         change = np.zeros((12, 2 * width))
         change[:6, :width], change[6:, width:] = self.changes[first], self.changes[second]
-        return change @ _submatrix(self.cameras, rows) @ change.T
+        return _through(change, _submatrix(self.cameras, rows))
 
     def relative_pose(self, first: int, second: int) -> Float[np.ndarray, "6 6"]:
         """Covariance of a camera's pose in the frame of another, `P_2 = R P_1 + t`: left perturbation of R, and t.
@@ -96,22 +109,23 @@ class Covariance(ArrayRecord):
         # R <- exp(d_2) R exp(-d_1): t_2 - R t_1 changes by d_2's and d_1's turn of R t_1
         jacobian[3:, 6:9], jacobian[3:, :3] = _cross(moved), -_cross(moved) @ relative
         jacobian[3:, 3:6], jacobian[3:, 9:] = -relative, np.eye(3)
-        return jacobian @ self.between(first, second) @ jacobian.T
+        return _through(jacobian, self.between(first, second))
 
 
 @numerics(np.float64, single_blas=False)
 def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covariance:
     """The covariance of the numbers of a problem at its minimum.
 
-    Memory grows with the square of the unknown numbers of cameras, and time with their cube.
+    Memory grows with the square of the unknown numbers of cameras, and time with their cube. What is not determined by
+    what is observed, as a point that is seen once, has NaN, and a ProblemWarning names it.
 
     Args:
         problem: a solved problem, with the constants, gauge and priors that were used.
         loss: robust loss of the solve; None: squared.
 
     Raises:
-        ProblemError: the position, orientation and scale of the scene are free (`with_gauge`, constants or priors fix
-            them), or something that is not constant is not determined by what is observed.
+        ProblemError: the position, orientation or scale of the scene is free; `with_gauge`, constants or priors fix
+            them.
     """
     check_problem(problem)
     options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
@@ -121,32 +135,44 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     with numerics(np.dtype("float64")):
         layout = layout_for(problem, options)
         linear = jax.device_get(jit(_linear, static_argnames="options")(layout, problem, options))
+    free = len(free_gauge(problem, layout)[0])
+    if free:
+        which = "7 directions of the cameras are" if free == 7 else f"{free} of 7 directions of the scene are"
+        hint = "fix them with a gauge, constants or priors"
+        raise ProblemError(f"{which} not determined by what is observed; {hint}")
     index, count = _unknown_index(problem, layout)
-    members = np.concatenate([np.asarray(points) for points in layout.bucket_points])
-    mask = np.asarray(layout.slot_mask)
-    camera, point = np.asarray(layout.slot_camera)[mask], members[np.asarray(layout.slot_point)[mask]]
-    by_camera = np.moveaxis(np.array([[row[mask] for row in pair] for pair in linear.camera_jacobian]), 2, 0)
-    by_point = np.moveaxis(np.array([[row[mask] for row in pair] for pair in linear.point_jacobian]), 2, 0)
-
     free_points = np.ones(problem.num_points, bool)
     if problem.constants is not None:
         free_points &= ~np.asarray(problem.constants.points)
-    seen_points = np.bincount(point, minlength=problem.num_points) > 0
-    system, inverse, coupling, rows = _reduced(index, count, camera, point, by_camera, by_point, free_points, linear)
-    of_cameras = _inverse(system)
-    of_points = np.where(free_points[:, None, None], inverse, 0.0)
-    marginal = of_points + _of_cameras(of_cameras, of_points, coupling, rows, point)
-    for matrices in (of_points, marginal):
-        matrices[~seen_points & free_points] = np.nan
+    system = _system(layout, linear, index, count, free_points)
+    inverse, null = _inverse(system)
+    marginal, lost_by_cameras = _marginal(system, inverse, null)
+    given_cameras = system.turn @ system.inverse @ system.turn.transpose(0, 2, 1)
+    lost_by_points = system.lost | (~system.seen & free_points)[:, None]
+    for matrices, lost in ((marginal, lost_by_points | lost_by_cameras), (given_cameras, lost_by_points)):
+        matrices[lost[:, :, None] | lost[:, None]] = np.nan
+    lost = np.linalg.norm(null, axis=1) > COMPONENT
+    of_cameras = np.where(lost[:, None] | lost, np.nan, inverse)
     seen = np.asarray(layout.camera_seen)
     cameras = np.asarray(given.cameras)
     rotations = geometry.rotation_matrices(cameras[:, :3])
     changes = _changes(problem, layout, rotations, offset)
-    poses = np.array([_submatrix(of_cameras, row) for row in index])
-    poses = changes @ poses @ changes.transpose(0, 2, 1)
+    pairs = zip(changes, index, strict=True)
+    poses = np.array([_through(change, _submatrix(of_cameras, row)) for change, row in pairs])
     poses[~seen] = np.nan
     lenses = _of_lenses(problem, layout, index, of_cameras)
-    return Covariance(poses, lenses, marginal, of_points, index, of_cameras, changes, rotations, cameras[:, 3:6])
+    unseen = np.setdiff1d(np.arange(len(lenses)), _lens_of(problem)[seen])
+    has = lambda x: np.isnan(x).any(axis=(1, 2))
+    undetermined: dict[Part, np.ndarray] = {
+        "image": np.flatnonzero(has(poses) & seen),
+        "lens": np.setdiff1d(np.flatnonzero(has(lenses)), unseen),
+        "point": np.flatnonzero(has(marginal) & system.seen),
+    }
+    parts = [part_names(problem.labels, kind, which) for kind, which in undetermined.items() if len(which)]
+    if parts:
+        note = f"not determined by what is observed, so with NaN for a covariance: {', '.join(parts)}"
+        warnings.warn(note, ProblemWarning, stacklevel=2)
+    return Covariance(poses, lenses, marginal, given_cameras, index, of_cameras, changes, rotations, cameras[:, 3:6])
 
 
 def _changes(
@@ -197,46 +223,85 @@ def _unknown_index(problem: BundleProblem, layout: Layout) -> tuple[np.ndarray, 
     return found, len(used)
 
 
-def _reduced(
-    index: np.ndarray,
-    count: int,
-    camera: np.ndarray,
-    point: np.ndarray,
-    by_camera: np.ndarray,
-    by_point: np.ndarray,
-    free_points: np.ndarray,
+class _System(NamedTuple):
+    """The linear system in observations, sorted by point. Steps of points are `turn u`, with columns of the Jacobian by
+    u that are nearly orthogonal and of unit length, or zero where a point is not determined."""
+
+    jacobian: Any
+    """Sparse, of two rows for each observation, and then of the priors, by the unknowns of cameras."""
+
+    by_point: Any
+    """Sparse, of two rows for each observation by u."""
+
+    inverse: Float[np.ndarray, "points 3 3"]
+    """C^-1 of each point, in u."""
+
+    turn: Float[np.ndarray, "points 3 3"]
+    lost: Bool[np.ndarray, "points 3"]
+    """Coordinates of points that their observations do not determine, whatever the cameras."""
+
+    seen: Bool[np.ndarray, " points"]
+    starts: Int[np.ndarray, " points_and_one"]
+    """First observation of each point."""
+
+
+def _system(
+    layout: Layout,
     linear: Linearization,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """S, the inverses of C, and for each observation its part of E with the unknowns of its rows."""
+    index: Int[np.ndarray, "cameras width"],
+    count: int,
+    free_points: Bool[np.ndarray, " points"],
+) -> _System:
+    from scipy.sparse import csr_matrix, vstack
+
+    mask, points = np.asarray(layout.slot_mask), len(free_points)
+    point = layout_order(layout)[np.asarray(layout.slot_point)[mask]]
+    order = np.argsort(point, kind="stable")
+    camera, point = np.asarray(layout.slot_camera)[mask][order], point[order]
+    columns = lambda rows: np.moveaxis(np.array([[row[mask] for row in pair] for pair in rows]), 2, 0)[order]
+    by_camera = columns(linear.camera_jacobian)
+    by_point = columns(linear.point_jacobian) * free_points[point][:, None, None]
+
+    def squares(rows: np.ndarray) -> np.ndarray:
+        found = np.zeros((points, 3, 3))
+        np.add.at(found, point, np.einsum("nki,nkj->nij", rows, rows))
+        return found
+
+    # squares know a weak direction badly, columns that are turned to it do not
+    _, turn = np.linalg.eigh(squares(by_point))
+    by_point = by_point @ turn[point]
+    size = np.sqrt(np.diagonal(squares(by_point), axis1=1, axis2=2))
+    known = size > UNDETERMINED * size.max(axis=1, keepdims=True)
+    lost = (np.abs(turn) * ~known[:, None] > COMPONENT).any(axis=2) & free_points[:, None]
+    turn = turn * np.where(known, 1 / np.where(known, size, 1.0), 0.0)[:, None]
+    by_point = by_point * np.where(known, 1 / np.where(known, size, 1.0), 0.0)[point][:, None]
+    inverse = np.linalg.inv(squares(by_point) + np.eye(3) * ~known[:, None]) * (known[:, None] & known[:, :, None])
+
+    rows = np.arange(2 * len(point))
+    place = np.repeat(index[camera], 2, axis=0).ravel()
+    used = place >= 0
+    at = np.repeat(rows, index.shape[1])
+    parts, height = [csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))], len(rows)
+    if linear.priors is not None:
+        parts, height = [*parts, _prior_rows(index, count, np.asarray(linear.priors.blocks))], height + index.size
+    place = np.repeat(3 * point[:, None] + np.arange(3), 2, axis=0).ravel()
+    seen, starts = np.bincount(point, minlength=points) > 0, np.searchsorted(point, np.arange(points + 1))
+    by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (height, 3 * points))
+    return _System(vstack(parts, format="csr"), by_points, inverse, turn, lost, seen, starts)
+
+
+def _prior_rows(index: Int[np.ndarray, "cameras width"], count: int, blocks: Float[np.ndarray, "cameras width width"]):
+    """Roots of the blocks of priors, as rows of the Jacobian."""
     from scipy.sparse import csr_matrix
 
-    points = np.zeros((len(free_points), 3, 3))
-    np.add.at(points, point, np.einsum("nki,nkj->nij", by_point, by_point))
-    constant = ~free_points | (np.bincount(point, minlength=len(free_points)) == 0)
-    points[constant] = np.eye(3)
-    if np.linalg.cond(points).max(initial=0.0) > 1 / np.finfo(float).eps:
-        bad = int(np.linalg.cond(points).argmax())
-        raise ProblemError(f"point {bad} is not determined by what is observed: no covariance")
-    inverse = np.linalg.inv(points)
-    inverse[constant] = 0.0
-    rows = index[camera]
-    coupling = np.einsum("nka,nkj->naj", by_camera, by_point) * (rows >= 0)[:, :, None]
-    # B - E C^-1 E^T as sparse products
-    columns = np.repeat(rows[:, None], 2, axis=1).ravel()
-    used = columns >= 0
-    at = np.repeat(np.arange(2 * len(camera)), rows.shape[1])
-    jacobian = csr_matrix((by_camera.ravel()[used], (at[used], columns[used])), (2 * len(camera), count))
-    place = (3 * point[:, None, None] + np.arange(3)[None, None] + np.zeros_like(rows)[:, :, None]).ravel()
-    of_row = np.repeat(rows[:, :, None], 3, axis=2).ravel()
-    used = of_row >= 0
-    cross = csr_matrix((coupling.ravel()[used], (of_row[used], place[used])), (count, 3 * len(free_points)))
-    blocks = _block_diagonal(inverse)
-    system = (jacobian.T @ jacobian).toarray() - (cross @ blocks @ cross.T).toarray()
-    if linear.priors is not None:
-        for row, block in zip(index, np.asarray(linear.priors.blocks), strict=True):
-            own = row >= 0
-            np.add.at(system, np.ix_(row[own], row[own]), block[np.ix_(own, own)])
-    return system, inverse, coupling, rows
+    size = np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
+    unit = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(blocks / (unit[:, :, None] * unit[:, None]))
+    values = np.where(values > 1e-14, values, 0.0)
+    roots = np.sqrt(values)[:, :, None] * vectors.transpose(0, 2, 1) * unit[:, None]
+    rows, place = np.indices((index.size, index.shape[1]))[0], np.repeat(index, index.shape[1], axis=0)
+    used = place >= 0
+    return csr_matrix((roots.reshape(place.shape)[used], (rows[used], place[used])), (index.size, count))
 
 
 def _block_diagonal(blocks: Float[np.ndarray, "n 3 3"]):
@@ -246,40 +311,63 @@ def _block_diagonal(blocks: Float[np.ndarray, "n 3 3"]):
     return bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), (3 * count, 3 * count)).tocsr()
 
 
-def _inverse(system: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    if not len(system):
-        return system
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(system), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(system * scale[:, None] * scale)
-    if values[0] < SINGULAR:
-        null = int(np.sum(values < SINGULAR))
-        hint = "; fix them with a gauge, constants or priors" if null <= 7 else ""
-        raise ProblemError(f"{null} directions of the cameras are not determined by what is observed{hint}")
-    return (vectors / values) @ vectors.T * scale[:, None] * scale
+def _inverse(system: _System) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n directions"]]:
+    """The inverse of S without the directions that are not determined, and an orthonormal basis of these, in which each
+    number is divided by its deviation if all others are known."""
+    whole = (system.jacobian.T @ system.jacobian).toarray()
+    if not len(whole):
+        return whole, whole
+    cross = (system.jacobian.T @ system.by_point).tocsr()
+    eliminated = _block_diagonal(system.inverse) @ cross.T
+    own = np.sqrt(np.diagonal(whole))
+    scale = 1 / np.where(own > 0, own, 1.0)
+    values, vectors = np.linalg.eigh((whole - (cross @ eliminated).toarray()) * scale[:, None] * scale)
+    weak = values < WEAK
+    strong = vectors[:, ~weak]
+    inverse, null = (strong / values[~weak]) @ strong.T, np.zeros((len(whole), 0))
+    if weak.any():
+        candidates = vectors[:, weak]
+        values, turn = np.linalg.eigh(_squares(system, eliminated, scale[:, None] * candidates))
+        lost = values < UNDETERMINED**2
+        candidates, null = candidates @ turn[:, ~lost], candidates @ turn[:, lost]
+        inverse = inverse + (candidates / values[~lost]) @ candidates.T
+    return inverse * scale[:, None] * scale, null
 
 
-def _of_cameras(
-    of_cameras: np.ndarray, given: np.ndarray, coupling: np.ndarray, rows: np.ndarray, point: np.ndarray
-) -> Float[np.ndarray, "points 3 3"]:
-    """`C^-1 E^T S^-1 E C^-1` of each point."""
-    from scipy.sparse import csr_matrix
-
-    count = len(given)
-    if not len(of_cameras):
-        return np.zeros((count, 3, 3))
-    place = (3 * point[:, None, None] + np.arange(3)[None, None] + np.zeros_like(rows)[:, :, None]).ravel()
-    of_row = np.repeat(rows[:, :, None], 3, axis=2).ravel()
-    used = of_row >= 0
-    cross = csr_matrix((coupling.ravel()[used], (place[used], of_row[used])), (3 * count, len(of_cameras)))
-    found = np.zeros((count, 3, 3))
-    for start in range(0, count, CHUNK):
-        part = slice(start, start + CHUNK)
-        of_part = cross[3 * start : 3 * (start + CHUNK)]
-        product = np.asarray(of_part @ of_cameras)  # (3 points, unknowns)
-        own = of_part.toarray().reshape(-1, 3, len(of_cameras))
-        middle = np.einsum("piu,pju->pij", own, product.reshape(own.shape))
-        found[part] = given[part] @ middle @ given[part]
+def _squares(system: _System, eliminated: Any, steps: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "k k"]:
+    """Products of the changes of all residuals with steps of cameras, where points follow."""
+    observations = int(system.starts[-1])
+    change = system.jacobian[2 * observations :] @ steps
+    found = change.T @ change
+    for first in range(0, len(system.seen), CHUNK):
+        last = min(first + CHUNK, len(system.seen))
+        rows, columns = slice(2 * system.starts[first], 2 * system.starts[last]), slice(3 * first, 3 * last)
+        follow = eliminated[columns] @ steps
+        change = system.jacobian[rows] @ steps - system.by_point[rows, columns] @ follow
+        found += change.T @ change
     return found
+
+
+def _marginal(
+    system: _System, of_cameras: Float[np.ndarray, "n n"], null: Float[np.ndarray, "n directions"]
+) -> tuple[Float[np.ndarray, "points 3 3"], Bool[np.ndarray, "points 3"]]:
+    """`C^-1 + C^-1 E^T S^-1 E C^-1` of each point, and the coordinates of points that cameras leave undetermined."""
+    count, unknowns = len(system.seen), len(of_cameras)
+    cross = (system.by_point.T @ system.jacobian).tocsr()
+    own = np.sqrt(np.asarray(system.jacobian.multiply(system.jacobian).sum(axis=0)).ravel())
+    null = null / np.where(own > 0, own, 1.0)[:, None]
+    found, lost = system.inverse.copy(), np.zeros((count, 3), bool)
+    for start in range(0, count if unknowns else 0, CHUNK):
+        part = slice(start, start + CHUNK)
+        of_part, given = cross[3 * start : 3 * (start + CHUNK)], system.inverse[part]
+        product = np.asarray(of_part @ of_cameras)  # (3 points, unknowns)
+        columns = of_part.toarray().reshape(*given.shape[:2], unknowns)
+        middle = np.einsum("piu,pju->pij", columns, product.reshape(columns.shape))
+        found[part] += given @ middle @ given
+        follow = system.turn[part] @ given @ np.asarray(of_part @ null).reshape(*given.shape[:2], null.shape[1])
+        deviation = np.sqrt(np.einsum("pij,pjk,pik->pi", system.turn[part], given, system.turn[part]))
+        lost[part] = np.linalg.norm(follow, axis=2) > COMPONENT * deviation
+    return system.turn @ found @ system.turn.transpose(0, 2, 1), lost
 
 
 def _of_lenses(
@@ -290,7 +378,7 @@ def _of_lenses(
     size = lens_size(lenses)
     columns = range(size) if unknowns is None else unknowns.columns
     place = [(k, column) for k, column in enumerate(columns) if column < size]
-    of_camera = np.arange(problem.num_cameras) if lenses is None else np.asarray(lenses.index)
+    of_camera = _lens_of(problem)
     count = problem.num_cameras if lenses is None else len(lenses.free)
     found = np.full((count, size, size), np.nan)
     for camera in np.flatnonzero(layout.camera_seen):
@@ -298,6 +386,19 @@ def _of_lenses(
         for k, column in place:
             rows[column] = index[camera, POSE_SIZE + k]
         found[of_camera[camera]] = _submatrix(of_cameras, rows)
+    return found
+
+
+def _lens_of(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
+    return np.arange(problem.num_cameras) if problem.lenses is None else np.asarray(problem.lenses.index)
+
+
+def _through(change: Float[np.ndarray, "m n"], matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"]:
+    """`change matrix change^T`, NaN where it depends on a number that is NaN."""
+    lost = np.isnan(np.diagonal(matrix))
+    found = change @ np.where(lost[:, None] | lost, 0.0, matrix) @ change.T
+    depends = (change[:, lost] != 0).any(axis=1)
+    found[depends], found[:, depends] = np.nan, np.nan
     return found
 
 

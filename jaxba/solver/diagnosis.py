@@ -12,6 +12,7 @@ from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, view_terms
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.frames import in_frames
+from jaxba.problem.labels import part_name
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import COST_ROUNDING
@@ -48,9 +49,13 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
     number, (camera, point) = next((n, pair) for n, pair in enumerate(pairs) if pair in bad)
     here = (cameras == camera) & (order[points] == point)
     on_plane = not np.isfinite(inverse_depth[slots[here]]).all()
-    why = f"lies on the plane of camera {camera}" if on_plane else f"has a residual in camera {camera} that overflows"
+    name = lambda kind, at: part_name(problem.labels, kind, at)
+    view = name("image", camera)
+    why = f"lies on the plane of {view}" if on_plane else f"has a residual in {view} that overflows"
     others = f" (and {slots.size - 1} more)" if slots.size > 1 else ""
-    return f"the cost at the start is not finite: observation {number}{others}, point {point} {why}{narrow}"
+    where = f"observation {number}{others}, " if problem.labels is None else ""
+    more = "" if problem.labels is None else others
+    return f"the cost at the start is not finite: {where}{name('point', point)}{more} {why}{narrow}"
 
 
 def cost_of_rounding(problem: BundleProblem, dtype: Any) -> float:

@@ -7,7 +7,8 @@ measured positions and what is constant. So
 
 with the exact Hessian H, not its Gauss-Newton approximation. Reverse mode takes one solve with H: conjugate gradients
 with products by forward over reverse mode, preconditioned by the Schur complement of the Gauss-Newton system, that is,
-by the linear solver of the solve itself. Nothing is differentiated through iterations.
+by the linear solver of the solve itself. Nothing is differentiated through iterations. Where symmetries leave an orbit
+of minima (solver/gauge.py), H is singular along it: y moves orthogonally to the orbit, by the pseudo-inverse.
 
 Source: Griewank and Walther 2008, "Evaluating Derivatives", chapter 15; Blondel et al. 2022, "Efficient and Modular
 Implicit Differentiation".
@@ -15,6 +16,7 @@ Implicit Differentiation".
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -48,6 +50,7 @@ from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, numerics, refuse_traces
+from jaxba.solver.gauge import BROKEN, SIMILARITY, determined_directions, free_gauge
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, check_problem, set_up
 from jaxba.solver.solve import solve
@@ -96,6 +99,11 @@ def differentiable_solve(
     Reverse mode (`jax.grad`, `jax.vjp`) works, and not inside `jax.jit`, since the solve runs from Python. 64 bits must
     be enabled in JAX. The start is that of the inputs, and the minimum that it leads to counts as a function of them.
 
+    A free gauge leaves an orbit of minima, and a point that is seen once a ray of them. The derivative is that of the
+    minimum that moves at right angles to these (in radians and scene units). What is the same on all of an orbit, as
+    lenses, angles, ratios of distances, and aligned cameras, has no other derivative; the rest of what a solve finds
+    also depends on its way there, which differences see and derivatives do not.
+
     Args:
         problem: says everything that the inputs do not: who sees what, lenses, constants, priors, rigs.
         policy: as for `solve`.
@@ -103,7 +111,7 @@ def differentiable_solve(
 
     Returns:
         A function; its derivatives raise a ProblemError if conjugate gradients do not solve with the Hessian, as where
-        the solution is not determined. With a free gauge only what does not depend on the gauge has derivatives.
+        more than gauge and depths of points is not determined.
     """
     check_problem(problem)
     options = checked_options(options)
@@ -163,11 +171,42 @@ def _transposed(
         slots = set_up(solved.replace(observations=numbered), policy, options, away).layout.pixels[0]
         order = np.concatenate([np.asarray(members) for members in setup.layout.bucket_points])
         here = in_frames(setup.counted)
-        arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, inputs, cotangents)
+        still = _symmetries(setup.counted, here, setup.layout, order)
+        arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, still, inputs, cotangents)
         found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
     if not float(residual) < 1e-4:
         raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
     return found
+
+
+class Symmetries(NamedTuple):
+    """What leaves the cost as it is: an orthonormal basis of seven directions of the gauge, zero for those that are not
+    free, and the directions in which rays determine points, in layout order."""
+
+    gauge_cameras: Float[AnyArray, "7 cameras width"]
+    gauge_points: Float[AnyArray, "7 3 points"]
+    points: Float[AnyArray, "points 3 3"]
+
+
+def _symmetries(solved: BundleProblem, in_frames: BundleProblem, layout: Layout, order: np.ndarray) -> Symmetries:
+    determined = determined_directions(solved)
+    cameras, points = free_gauge(in_frames, layout)
+    # only what of it is not already a motion of points along their rays
+    points = np.einsum("pij,kpj->kpi", determined, points)
+    real = order < solved.num_points
+    at = np.minimum(order, solved.num_points - 1)
+    points = np.where(real[:, None], points[:, at], 0.0).transpose(0, 2, 1)
+    whole = np.hstack([x.reshape(len(x), math.prod(x.shape[1:])) for x in (cameras, points)])
+    _, sizes, rows = np.linalg.svd(whole, full_matrices=False)
+    basis = np.zeros((SIMILARITY, whole.shape[1]))
+    basis[: len(whole)] = np.where((sizes > BROKEN * sizes.max(initial=0.0))[:, None], rows, 0.0)
+    split = math.prod(cameras.shape[1:])
+    of_cameras, of_points = basis[:, :split], basis[:, split:]
+    return Symmetries(
+        of_cameras.reshape(SIMILARITY, *cameras.shape[1:]),
+        of_points.reshape(SIMILARITY, *points.shape[1:]),
+        np.where(real[:, None, None], determined[at], 0.0),
+    )
 
 
 def _solve_transposed(
@@ -175,6 +214,7 @@ def _solve_transposed(
     order: Array,
     slots: Array,
     solved: BundleProblem,
+    still: Symmetries,
     inputs: SolveInputs,
     cotangents: tuple[Array, Array],
     *,
@@ -185,18 +225,23 @@ def _solve_transposed(
     width = POSE_SIZE + LENS_SIZE if unknowns is None else unknowns.width
     count = state.cameras.shape[1]
     seen = jnp.asarray(layout.camera_seen)[:, None]
-    real = (order < solved.num_points) & jnp.ones(order.shape, bool)
-    if unknowns is not None and unknowns.free_points is not None:
-        real = real & jnp.asarray(unknowns.free_points)
 
     def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
+        """On the unknowns that a minimum determines, orthogonally."""
         cameras = jnp.where(seen, y[0], 0)
-        return cameras if unknowns is None else unknowns.project(cameras), jnp.where(real, y[1], 0)
+        cameras = cameras if unknowns is None else unknowns.project(cameras)
+        points = jnp.einsum("pij,jp->ip", still.points, y[1], precision="highest")
+        along = jnp.einsum("kcw,cw->k", still.gauge_cameras, cameras, precision="highest")
+        along = along + jnp.einsum("kip,ip->k", still.gauge_points, points, precision="highest")
+        return (
+            cameras - jnp.einsum("k,kcw->cw", along, still.gauge_cameras, precision="highest"),
+            points - jnp.einsum("k,kip->ip", along, still.gauge_points, precision="highest"),
+        )
 
     def moved(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
         """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
         cameras = state.cameras + _start_of_constants(layout, of_frames(theta.cameras))
-        points = state.points + _start_of_points(layout, solved, jnp.asarray(theta.points), order)
+        points = state.points + _start_of_points(solved, still, jnp.asarray(theta.points), order)
         rows = y[0].T if unknowns is None else unknowns.expanded(y[0].T)
         return camera.moved(cameras, rows, unknowns), points + y[1]
 
@@ -263,13 +308,10 @@ def _start_of_constants(layout: Layout, cameras: Array) -> Array:
     return (kept - jax.lax.stop_gradient(kept)).T
 
 
-def _start_of_points(layout: Layout, solved: BundleProblem, points: Array, order: Array) -> Array:
-    """The same for points, in layout order."""
-    unknowns = layout.unknowns
-    if unknowns is None or unknowns.free_points is None:
-        return jnp.zeros((3, len(order)))
+def _start_of_points(solved: BundleProblem, still: Symmetries, points: Array, order: Array) -> Array:
+    """The same for points that are constant or that nothing sees, in layout order."""
     own = points.T[:, jnp.minimum(order, solved.num_points - 1)]
-    kept = jnp.where(jnp.asarray(unknowns.free_points), 0, own)
+    kept = jnp.where(jnp.any(still.points != 0, axis=(1, 2)), 0, own)
     return kept - jax.lax.stop_gradient(kept)
 
 

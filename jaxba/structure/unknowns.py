@@ -28,6 +28,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CameraModel
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
+from jaxba.problem.labels import part_name
 from jaxba.problem.priors import Priors
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.agreement import Agreement, size_of
@@ -231,7 +232,8 @@ def _frames(
     part = ~pose_free[:, 3:].all(axis=1) & pose_free[:, 3:].any(axis=1)
     bad = np.flatnonzero(part & problem.rigs.turned)
     if bad.size:
-        raise ProblemError(f"part of the translation of camera {bad[0]} is constant, which is turned in its rig")
+        name = part_name(problem.labels, "image", bad[0])
+        raise ProblemError(f"part of the translation of {name} is constant, which is turned in its rig")
     constant = np.zeros(pose_free.shape, bool)
     np.logical_or.at(constant, own, ~pose_free)  # also of cameras that nothing sees
     return frame.astype(np.int32), ~constant[own]

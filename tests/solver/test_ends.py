@@ -16,6 +16,7 @@ from jaxba import BundleProblem, Loss, ProblemError, SolveOptions, StepOptions, 
 from jaxba.cli.solve import run
 from jaxba.damping.registry import POLICIES
 from jaxba.problem import geometry
+from jaxba.problem.labels import Labels
 from jaxba.solver.diagnosis import explain_start
 
 # Losses without a weight
@@ -183,3 +184,12 @@ def test_a_sum_that_overflows_names_no_observation():
 def test_the_explanation_is_that_of_the_loss():
     """A residual whose square overflows has a finite cost under no loss that looks at the square."""
     assert "observation 17" in explain_start(huge(1e200), Loss("cauchy"))
+
+
+def test_messages_call_images_and_points_what_the_model_calls_them():
+    problem = huge(1e200)
+    camera, point = problem.camera_index[17], problem.point_index[17]
+    names, count = tuple(f"{k}.jpg" for k in range(problem.num_cameras)), problem.num_cameras
+    labels = Labels(names, 70 + np.arange(count), np.arange(count), 7000 + np.arange(problem.num_points))
+    words = f"point {7000 + point} has a residual in image {70 + camera} ({camera}.jpg) that overflows"
+    assert words in explain_start(problem.replace(labels=labels), Loss("cauchy"))

@@ -10,6 +10,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, colmap_quaternions
 from jaxba.problem.intrinsics import LENS_SIZE
+from jaxba.problem.labels import part_name
 
 _NAME_DIGITS = 4  # at least, so that the names of images sort as their ids do
 _LARGEST_HALF = 2**30  # pixels; COLMAP's sizes are whole numbers, and no image is larger
@@ -33,7 +34,7 @@ def create_model(problem: BundleProblem, target: str) -> Model:
     general = valid.lenses is not None and not valid.lenses.all_bal
     wrong = np.flatnonzero(~(cameras[:, 6] > 0))
     if wrong.size:
-        at = f"f of camera {wrong[0]} is {cameras[wrong[0], 6]:g}"
+        at = f"f of {part_name(problem.labels, 'image', wrong[0])} is {cameras[wrong[0], 6]:g}"
         raise ProblemError(f"cannot write {target}: {at}, and COLMAP's focal lengths are positive")
     lens = np.arange(len(cameras)) if valid.lenses is None else np.asarray(valid.lenses.index)
     _, first, lens = np.unique(lens, return_index=True, return_inverse=True)
