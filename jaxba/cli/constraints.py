@@ -7,11 +7,12 @@ from typing import Any, get_args
 
 import numpy as np
 
-from jaxba.cli.common import UsageError
+from jaxba.cli.common import UsageError, counted
+from jaxba.cli.constraint_values import PositionPriors, names_of, parse_items, parse_position_priors
 from jaxba.io.configurations import SettingsError, read_file
+from jaxba.io.notes import report
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.constraints import Gauge, hold, with_gauge
-from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_position_priors
 
 PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
@@ -24,16 +25,28 @@ KEYS = {
     "constant_cameras": "ids of cameras, which images share",
     "constant_extrinsics": "ids of cameras, whose places in their rigs do not move",
     "constant_numbers": "focal, principal_point, distortion or names such as k2",
-    "position_priors": "positions: {name or id: [x, y, z]}, stddev, loss and loss_scale",
+    "position_priors": "positions: {name or id: [x, y, z]}, stddev, loss, loss_scale and align",
     "gauge": "free, two-cameras or three-points",
 }
 """Keys of the file, and what they hold."""
 
 
 def constrained(
-    problem: BundleProblem, constant: tuple[str, ...], gauge: Gauge | None, file: str | None
+    problem: BundleProblem,
+    constant: tuple[str, ...],
+    gauge: Gauge | None,
+    file: str | None,
+    *,
+    strict: bool = False,
 ) -> BundleProblem:
     """The problem with what the options and the file say.
+
+    Args:
+        problem: any problem.
+        constant: what `--constant` names.
+        gauge: what `--gauge` names.
+        file: YAML file of constants and priors.
+        strict: refuse positions of images that are not in the problem, instead of leaving them out with a note.
 
     Raises:
         UsageError: something is not in the problem; one line that names the option or the key.
@@ -42,7 +55,7 @@ def constrained(
     settings = {} if file is None else _read(file)
     first = [key for key in settings if key == "position_priors"]  # the scene is aligned before anything is constant
     for key in first:
-        problem = _applied(problem, file, key, settings.pop(key))
+        problem = _applied(problem, file, key, settings.pop(key), strict)
     try:
         numbers = [one.replace("-", "_") for one in constant if one not in PARTS]
         parts: dict[str, Any] = {part: "all" for part in PARTS[:4] if part in constant}
@@ -56,7 +69,7 @@ def constrained(
     if in_file not in get_args(Gauge):
         raise UsageError(f"--constraints {file}: gauge: must be one of {', '.join(get_args(Gauge))}, not {in_file!r}")
     for key, value in settings.items():
-        problem = _applied(problem, file, key, value)
+        problem = _applied(problem, file, key, value, strict)
     return with_gauge(problem, gauge or in_file)
 
 
@@ -77,12 +90,11 @@ def _with_known_places(problem: BundleProblem) -> np.ndarray:
     return known
 
 
-def _applied(problem: BundleProblem, file: str | None, key: str, value: Any) -> BundleProblem:
+def _applied(problem: BundleProblem, file: str | None, key: str, value: Any, strict: bool) -> BundleProblem:
     try:
-        return _apply(problem, key, value)
-    except (ValueError, TypeError, AttributeError, LookupError, OverflowError) as error:
-        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise UsageError(f"--constraints {file}: {key}: {what}") from None
+        return _apply(problem, f"{file}: {key}", key, value, strict)
+    except ValueError as error:
+        raise UsageError(f"--constraints {file}: {key}: {error}") from None
 
 
 def _read(file: str) -> dict[str, Any]:
@@ -96,28 +108,42 @@ def _read(file: str) -> dict[str, Any]:
     return settings
 
 
-def _apply(problem: BundleProblem, key: str, value: Any) -> BundleProblem:
+def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: bool) -> BundleProblem:
     labels = problem.labels
-    images = lambda wanted: wanted if labels is None else labels.images_at(wanted)
-    if key == "constant_poses":
-        return hold(problem, poses=images(value))
-    if key == "constant_rotations":
-        return hold(problem, rotations=images(value))
-    if key == "constant_points":
-        return hold(problem, points=value if labels is None else labels.points_at(value))
-    if key == "constant_cameras":
-        return hold(problem, lenses=value if labels is None else labels.lenses_at(value))
-    if key == "constant_extrinsics":
-        return hold(problem, extrinsics=value if labels is None else labels.lenses_at(value))
-    if key == "constant_numbers":
-        return hold(problem, numbers=value)
     if key == "position_priors":
-        unknown = [one for one in value if one not in ("positions", "stddev", "loss", "loss_scale")]
-        if unknown:
-            raise ValueError(f"unknown key {unknown[0]!r}; there are positions, stddev, loss and loss_scale")
-        positions = value["positions"]
-        spread = np.broadcast_to(np.asarray(value.get("stddev", 1.0), np.float64), 3)
-        loss = Loss(value.get("loss", "squared"), float(value.get("loss_scale", 1.0)))
-        at = np.asarray(images(list(positions))).tolist()
-        return with_position_priors(problem, list(positions.values()), np.diag(spread**2), images=at, loss=loss)
-    raise ValueError("unknown key")
+        return _with_positions(problem, where, parse_position_priors(value), strict)
+    if key == "constant_numbers":
+        return hold(problem, numbers=parse_items(value, "names of numbers of a lens"))
+    wanted: Any = value if value == "all" else parse_items(value, KEYS[key])
+    if labels is not None and wanted != "all":
+        found = {"constant_points": labels.points_at, "constant_cameras": labels.lenses_at}
+        found["constant_extrinsics"] = labels.lenses_at
+        wanted = found.get(key, labels.images_at)(wanted)
+    arguments = {"constant_cameras": "lenses"}
+    return hold(problem, **{arguments.get(key, key.removeprefix("constant_")): wanted})
+
+
+def _with_positions(problem: BundleProblem, where: str, given: PositionPriors, strict: bool) -> BundleProblem:
+    """The problem with the positions of its own images; a note says which others there are."""
+    labels = problem.labels
+    if labels is None:
+        known = {*range(problem.num_cameras)}
+    else:
+        known = {*labels.names, *labels.images.tolist(), *map(str, labels.images.tolist())}
+    ours = [at for at, image in enumerate(given.images) if image in known]
+    others = [str(image) for image in given.images if image not in known]
+    if not ours:
+        raise ValueError(f"none of the images is in the problem: {names_of(others) or 'no positions'}")
+    if others:
+        verb = "is" if len(others) == 1 else "are"
+        note = f"{where}: {counted(len(others), 'image')} {verb} not in the problem, left out: {names_of(others)}"
+        report([note], strict=strict)
+    images: Any = [given.images[at] for at in ours]
+    return with_position_priors(
+        problem,
+        given.positions[ours],
+        stddev=given.stddev[ours],
+        images=images if labels is None else labels.images_at(images).tolist(),
+        loss=given.loss,
+        align=given.align,
+    )

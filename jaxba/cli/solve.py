@@ -162,7 +162,8 @@ class Arguments:
     name does, unless it ends in .txt, .bal, .out, .ply, .bz2, .gz or .xz."""
 
     strict: bool = False
-    """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point."""
+    """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point; and
+    positions in --constraints of images that are not in the problem."""
 
     covariance: str | None = None
     """Output file (.npz) of covariances: poses, lenses, points, points_given_cameras. It needs a gauge, constants or
@@ -357,7 +358,7 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
         view.check_extra()
     with common.notes_printed():
         problem = _default_scene() if path is None else _read(args, path)
-        problem = constrained(problem, args.constant, args.gauge, args.constraints)
+        problem = constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)
     check_storable(args.output, problem, path)
     if args.covariance and problem.constants is None and problem.priors is None:
         raise common.UsageError("--covariance needs --gauge, constants or priors: position and scale are free")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -17,6 +17,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constants import ROTATION, Constants, constants_of
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.values import shown
 
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
 """Positions, names of images, a mask, or all of them."""
@@ -186,31 +187,51 @@ def _mask(problem: BundleProblem, which: Which, count: int, what: str) -> Bool[n
             raise ValueError(f"which {what} must be 'all' or a list, not {which!r}")
         return np.ones(count, bool)
     mask = np.zeros(count, bool)
-    chosen = np.asarray(which if isinstance(which, np.ndarray | jax.Array) else list(which))
+    chosen = _listed(which, what)
     if chosen.dtype == bool:
         if chosen.shape != mask.shape:
             raise ValueError(f"a mask for every {what} has shape {mask.shape}, not {chosen.shape}")
         return chosen
-    at = positions_of(problem, chosen, what)
-    bad = at[(at < 0) | (at >= count)]
-    if len(bad):
-        raise ValueError(f"there is no {what} {bad[0]}: there are {count}")
-    mask[at] = True
+    mask[positions_of(problem, chosen, what, count)] = True
     return mask
 
 
-def positions_of(problem: BundleProblem, chosen: np.ndarray, what: str) -> Int[np.ndarray, " n"]:
+def _listed(which: Any, what: str) -> np.ndarray:
+    """A list of positions, names or truth values as an array."""
+    try:
+        chosen = np.asarray(which if isinstance(which, np.ndarray | jax.Array) else list(which))
+    except (TypeError, ValueError):  # no list, or a list of lists
+        chosen = np.asarray(None)
+    if chosen.ndim != 1:
+        raise ValueError(f"which {what} must be a list of positions or names, not {shown(which)}")
+    return chosen
+
+
+def positions_of(
+    problem: BundleProblem, which: Iterable[int] | Iterable[str] | np.ndarray, what: str, count: int | None = None
+) -> Int[np.ndarray, " n"]:
     """Positions, of images perhaps from names.
 
+    Args:
+        problem: any problem.
+        which: positions or names.
+        what: `image`, `point` or `lens`.
+        count: how many there are; None: as images.
+
     Raises:
-        ValueError: neither positions nor names; one line.
+        ValueError: neither positions nor names, or there are fewer; one line.
     """
+    chosen = _listed(which, what)
+    count = problem.num_cameras if count is None else count
     if chosen.dtype.kind in "US":
         if problem.labels is None or what != "image":
             raise ValueError(f"this problem has no names for a {what}: give positions")
         return problem.labels.images_at(chosen.tolist())
     if chosen.size and chosen.dtype.kind not in "iu":
-        raise ValueError(f"each {what} is given by its position, not by {chosen.ravel()[0].item()!r}")
+        raise ValueError(f"each {what} is given by its position, not by {shown(chosen.tolist()[0])}")
+    bad = chosen[(chosen < 0) | (chosen >= count)]
+    if len(bad):
+        raise ValueError(f"there is no {what} {bad[0]}: there are {count}")
     return chosen.astype(np.int64)
 
 
@@ -222,6 +243,8 @@ def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "
     """
     free = np.asarray(lenses.free)
     meant = np.zeros(free.shape, bool)
+    if not isinstance(numbers, Iterable):
+        raise ValueError(f"numbers of a lens are given by a list of names, not {shown(numbers)}")
     for name in (numbers,) if isinstance(numbers, str) else numbers:
         of_models = [
             getattr(model, name)
@@ -231,7 +254,7 @@ def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "
         ]
         if name not in GROUPS and not any(of_models):
             known = dict.fromkeys(parameter for model in lenses.models for parameter in model.parameters)
-            raise ValueError(f"no lens has a number {name!r}; there are {', '.join([*GROUPS, *known])}")
+            raise ValueError(f"no lens has a number {shown(name)}; there are {', '.join([*GROUPS, *known])}")
         for lens in range(len(free)):
             meant[lens, list(of_models[0 if lenses.model is None else int(lenses.model[lens])])] = True
     return meant

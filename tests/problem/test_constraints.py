@@ -167,7 +167,7 @@ def test_priors_that_do_not_fit_are_refused_in_one_line():
     fewer = replace(priors, **{name: getattr(priors, name)[:5] for name in names})
     with pytest.raises(ProblemError, match=r"positions of priors must have shape \(6, 3\), not \(5, 3\)"):
         BundleProblem.create(*parts, priors=fewer)
-    with pytest.raises(ProblemError, match="lens_weight of priors are not finite"):
+    with pytest.raises(ProblemError, match="lens_weight of priors must be finite"):
         BundleProblem.create(*parts, priors=replace(priors, lens_weight=priors.lens_weight * np.nan))
 
 
@@ -200,9 +200,7 @@ def test_a_scene_is_aligned_with_measured_positions_of_which_some_are_wrong():
     np.testing.assert_allclose(geometry.cost(aligned), geometry.cost(problem), rtol=1e-9)
     with pytest.raises(ProblemError, match="an alignment would move what is constant or measured"):
         with_position_priors(hold(problem, poses=[0]), measured, np.eye(3))
-    with pytest.raises(ProblemError, match="an alignment needs 3 poses, not 2"):
-        with_position_priors(problem, measured[:2], np.eye(3), images=[0, 1])
-    with pytest.raises(ProblemError, match="covariance of position 0 is not symmetric positive definite"):
+    with pytest.raises(ProblemError, match="covariance of the position of image 0 is not symmetric positive definite"):
         with_position_priors(problem, measured, -np.eye(3))
 
 
