@@ -14,6 +14,7 @@ from jaxba.io.notes import report
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.constraints import Gauge, hold, with_gauge
 from jaxba.problem.measured import with_position_priors
+from jaxba.problem.values import shown
 
 PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
 """What `--constant` names besides numbers of lenses."""
@@ -67,7 +68,9 @@ def constrained(
         raise UsageError(f"--constant: {error}") from None
     in_file = settings.pop("gauge", "free")
     if in_file not in get_args(Gauge):
-        raise UsageError(f"--constraints {file}: gauge: must be one of {', '.join(get_args(Gauge))}, not {in_file!r}")
+        raise UsageError(
+            f"--constraints {file}: gauge: must be one of {', '.join(get_args(Gauge))}, not {shown(in_file)}"
+        )
     for key, value in settings.items():
         problem = _applied(problem, file, key, value, strict)
     return with_gauge(problem, gauge or in_file)
@@ -104,7 +107,7 @@ def _read(file: str) -> dict[str, Any]:
         raise UsageError(f"--constraints {error}") from None
     unknown = [key for key in settings if key not in KEYS]
     if unknown:
-        raise UsageError(f"--constraints {file}: unknown key {unknown[0]!r}; there are {', '.join(KEYS)}")
+        raise UsageError(f"--constraints {file}: unknown key {shown(unknown[0])}; there are {', '.join(KEYS)}")
     return settings
 
 
@@ -113,14 +116,21 @@ def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: boo
     if key == "position_priors":
         return _with_positions(problem, where, parse_position_priors(value), strict)
     if key == "constant_numbers":
-        return hold(problem, numbers=parse_items(value, "names of numbers of a lens"))
+        return hold(problem, numbers=[str(name) for name in parse_items(value, KEYS[key])])
     wanted: Any = value if value == "all" else parse_items(value, KEYS[key])
     if labels is not None and wanted != "all":
         found = {"constant_points": labels.points_at, "constant_cameras": labels.lenses_at}
         found["constant_extrinsics"] = labels.lenses_at
         wanted = found.get(key, labels.images_at)(wanted)
+    elif wanted != "all":
+        wanted = _numbered(wanted)
     arguments = {"constant_cameras": "lenses"}
     return hold(problem, **{arguments.get(key, key.removeprefix("constant_")): wanted})
+
+
+def _numbered(items: list[str | int]) -> list[str | int]:
+    """Positions in a problem without names, also those written as text."""
+    return [int(item) if str(item).isdecimal() else item for item in items]
 
 
 def _with_positions(problem: BundleProblem, where: str, given: PositionPriors, strict: bool) -> BundleProblem:
@@ -130,15 +140,17 @@ def _with_positions(problem: BundleProblem, where: str, given: PositionPriors, s
         known = {*range(problem.num_cameras)}
     else:
         known = {*labels.names, *labels.images.tolist(), *map(str, labels.images.tolist())}
-    ours = [at for at, image in enumerate(given.images) if image in known]
-    others = [str(image) for image in given.images if image not in known]
+    wanted = given.images if labels is not None else _numbered(given.images)
+    ours = [at for at, image in enumerate(wanted) if image in known]
+    others = [str(image) for image in wanted if image not in known]
     if not ours:
         raise ValueError(f"none of the images is in the problem: {names_of(others) or 'no positions'}")
     if others:
-        verb = "is" if len(others) == 1 else "are"
-        note = f"{where}: {counted(len(others), 'image')} {verb} not in the problem, left out: {names_of(others)}"
-        report([note], strict=strict)
-    images: Any = [given.images[at] for at in ours]
+        text = f"positions of {counted(len(others), 'image')} that the problem does not have: {names_of(others)}"
+        if strict:
+            raise ValueError(text)
+        report([f"{where}: left out {text}"])
+    images: Any = [wanted[at] for at in ours]
     return with_position_priors(
         problem,
         given.positions[ours],

@@ -14,6 +14,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
+from jaxba.problem.preprocess import MIN_TRACK
 from jaxba.runtime.compilation import Part, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import split_refinement
@@ -113,8 +114,10 @@ def retriangulated(found: Retriangulation, ftol: float) -> str:
 def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None) -> str:
     """The result of a solve in a few lines. `loss` is that of the solve; None: squared residuals."""
     state = "converged" if solution.converged else "not converged"
-    # from the residuals, since the cost may be that of a robust loss
-    rms = [np.sqrt(2 * geometry.cost(p) / p.num_observations) for p in (problem, solution.problem)]
+    costs = [solution.initial_cost, solution.final_cost]
+    if problem.priors is not None or not (loss or Loss()).trivial:  # else the residuals' own, in the solve's arithmetic
+        costs = [geometry.cost(p) for p in (problem, solution.problem)]
+    rms = [np.sqrt(2 * cost / problem.num_observations) for cost in costs]
     # COLMAP prints the root of the cost over the number of residuals
     colmaps = [np.sqrt(cost / (2 * problem.num_observations)) for cost in (solution.initial_cost, solution.final_cost)]
     as_colmap = f"; COLMAP's measure: {colmaps[0]:.6f} -> {colmaps[1]:.6f} px" if problem.labels is not None else ""
@@ -195,6 +198,9 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     cameras = np.bincount(np.asarray(problem.camera_index), minlength=problem.num_cameras)
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
     alone = cameras == 0
+    if problem.constants is not None:  # no surprise that these stay
+        alone &= ~np.asarray(problem.constants.poses).all(axis=1)
+        points = np.where(problem.constants.points, MIN_TRACK, points)
     if problem.rigs is not None:  # others move with their frame
         frame = np.asarray(problem.rigs.frame)
         alone = alone & ~np.isin(frame, frame[cameras > 0])

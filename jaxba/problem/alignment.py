@@ -18,8 +18,12 @@ SIGNIFICANT = 3.0
 """Standard deviations by which positions must spread in a direction before they say anything about scale or rotation:
 three images on a line with this spread across it determine the roll about it to some 0.2 radians, 30 to 0.06."""
 
-MISFIT = 5.0
-"""Root of chi-square per degree of freedom from which positions and scene do not fit each other."""
+MOST = 0.75
+"""Share of the images that must fit: it is noted if fewer do."""
+
+DOUBTFUL, MISFIT = 2.0, 5.0
+"""Distance of this share, in terms of that of noise alone, from which other axes or units are tried, and from which the
+scene does not fit its positions."""
 
 BETTER = 0.3
 """Share of the misfit that other axes or units leave before they are taken for the true ones."""
@@ -30,8 +34,11 @@ EXPLAINED = 0.1
 LEAST_IMAGES = 5
 """Fewest images by which other axes or units are recognised: four fit too well by chance."""
 
-MEDIAN, NEARLY_ALL = 1.538, 3.37
-"""Norm of three standard normal numbers: its median, and its 99 percent quantile."""
+MEDIAN, UPPER_QUARTER, NEARLY_ALL = 1.538, 2.027, 3.37
+"""Norm of three standard normal numbers: its quantiles at 50, 75 and 99 percent."""
+
+LARGEST_AREA = 1.0
+"""Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent."""
 
 EARTH = 6.371e6
 """Radius, metres."""
@@ -67,17 +74,17 @@ def aligned(
             raise ProblemError("the scene cannot be aligned: positions are too far apart to be squared")
     best, rank = _robust_fit(centers, positions, covariances)
     left_over = 3 * len(images) - (3, 6, 7)[rank]
-    chi = np.median(_distances(best, centers, positions, covariances)) / MEDIAN
+    chi = float(np.quantile(_distances(best, centers, positions, covariances), MOST)) / UPPER_QUARTER
     chi = chi * np.sqrt(3 * len(images) / left_over) if left_over else 0.0
-    if chi > MISFIT or _rank(positions[:, :2], covariances[:, :2, :2]) == 0:
+    if chi > DOUBTFUL or _rank(positions[:, :2], covariances[:, :2, :2]) == 0:
         _refuse_other_axes(centers, positions)
     if rank < 2:
         _note(NOT_DETERMINED[rank])
     if chi > MISFIT:
-        away = np.median(np.linalg.norm(best.points(centers) - positions, axis=1))
+        away = np.quantile(np.linalg.norm(best.points(centers) - positions, axis=1), MOST)
         _note(
-            f"half of the images of the aligned scene are {away:.3g} or more from their positions, {chi:.3g} times "
-            "what the standard deviations explain"
+            f"a quarter of the images of the aligned scene are {away:.3g} or more from their positions, {chi:.3g} "
+            "times what the standard deviations explain"
         )
     scale, rotation, shift = best
     cameras = np.array(problem.cameras, np.float64)
@@ -162,14 +169,15 @@ def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
     others = [(positions * [-1, 1, 1], "mirrored: are two axes swapped, or is one reversed?")]
     for latitude, longitude in ((0, 1), (1, 0)):
         middle = np.median(positions, axis=0)
-        if np.abs(positions[:, latitude]).max() <= 90 and np.abs(positions[:, longitude]).max() <= 180:
+        near = np.median(np.abs(positions - middle)[:, :2].max(axis=1)) < LARGEST_AREA
+        if near and np.abs(positions[:, latitude]).max() <= 90 and np.abs(positions[:, longitude]).max() <= 180:
             east, north = (np.radians(positions - middle)[:, at] * EARTH for at in (longitude, latitude))
             metres = np.stack([east * np.cos(np.radians(middle[latitude])), north, positions[:, 2]], axis=1)
             others.append((metres, "latitude and longitude in degrees: give metres, such as UTM's or east, north, up"))
     misfit = _misfit(centers, positions)
     for other, what in others:
         if _misfit(centers, other) < min(BETTER * misfit, EXPLAINED):
-            raise ProblemError(f"the positions seem to be {what} (without an alignment they are taken as they are)")
+            raise ProblemError(f"the positions seem to be {what} (align: false takes them as they are)")
 
 
 def _misfit(centers: np.ndarray, positions: np.ndarray) -> float:

@@ -5,6 +5,7 @@ What is constant comes back bit for bit.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any, Literal, get_args
@@ -14,8 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxba.problem import geometry
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.constants import ROTATION, Constants, constants_of
+from jaxba.problem.freedoms import fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
 from jaxba.problem.values import shown
 
@@ -85,7 +87,8 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     the observed camera that is nearest to the middle of all, and one number of the translation of the one that is
     farthest from it, are constant: the seven degrees of freedom of a similarity, and nothing else; where rigs give the
     scene its scale, the first pose alone. `three-points`: three points that many images see and that are far apart are
-    constant. `free`: no more than is. Source: COLMAP, `BundleAdjustmentGauge`.
+    constant. `free`: no more than is. Nothing becomes constant, with a `ProblemWarning`, where constants and priors fix
+    the seven already. Source: COLMAP, `BundleAdjustmentGauge`.
 
     In a scene far from the origin (`preprocess.FAR`) the number of a translation is that of the scene shifted to it.
 
@@ -98,7 +101,12 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     if gauge == "free":
         return problem
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
-    if problem.rigs is not None and _has_baseline(problem):
+    scaled = problem.rigs is not None and _has_baseline(problem)
+    if fixed_freedoms(problem, scale_known=scaled) == 7:
+        note = f"the gauge {gauge} is not needed: constants and priors fix position, orientation and scale already"
+        warnings.warn(note, ProblemWarning, stacklevel=2)
+        return problem
+    if scaled:
         if gauge == "three-points":
             raise ProblemError("the rigs give the scene its scale: use the gauge of two cameras, which then holds one")
         constants.poses[_middle_camera(problem)] = True
@@ -142,7 +150,9 @@ def _fix_two_cameras(problem: BundleProblem, constants: Constants) -> None:
     if len(seen) < 2:
         raise ProblemError("a gauge of two cameras needs two that see points")
     centers = geometry.camera_centers(problem.cameras)[seen]
-    first = int(np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
+    whole = constants.poses[seen].all(axis=1)  # a constant pose is the first, if there is one
+    from_middle = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    first = int(np.argmin(np.where(whole | ~whole.any(), from_middle, np.inf)))
     second = int(np.argmax(np.linalg.norm(centers - centers[first], axis=1)))
     constants.poses[seen[first]] = True
     # its distance from the first camera along the axis of its own on which that is largest

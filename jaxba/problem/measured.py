@@ -19,6 +19,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.priors import Priors
 from jaxba.problem.values import finite, shown
 
+
 def with_position_priors(
     problem: BundleProblem,
     positions: Any,
@@ -135,7 +136,7 @@ def _images_at(problem: BundleProblem, images: Iterable[int] | Iterable[str] | N
     at = positions_of(problem, images, "image")
     values, counts = np.unique(at, return_counts=True)
     if (counts > 1).any():
-        raise ValueError(f"{_name(problem, values[counts > 1][0])} has more than one measurement")
+        raise ValueError(f"{_name(problem, int(values[counts > 1][0]))} has more than one measurement")
     return at
 
 
@@ -166,7 +167,7 @@ def _covariances(problem: BundleProblem, what: str, covariance: Any, at: np.ndar
     symmetric = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-9 * np.abs(values).max(axis=1)
     bad = np.flatnonzero(~((values[:, 0] > 0) & symmetric))
     if len(bad):
-        where = _name(problem, at[bad[0]])
+        where = _name(problem, int(at[bad[0]]))
         raise ProblemError(f"the covariance of the {what} of {where} is not symmetric positive definite")
     return matrices
 
