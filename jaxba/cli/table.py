@@ -118,13 +118,14 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     if problem.priors is not None or not (loss or Loss()).trivial:  # else the residuals' own, in the solve's arithmetic
         costs = [geometry.cost(p) for p in (problem, solution.problem)]
     rms = [np.sqrt(2 * cost / problem.num_observations) for cost in costs]
+    # a robust loss may bear a residual that overflows
+    shown = f" (rms {rms[0]:.4g} -> {rms[1]:.4g} px)" if np.isfinite(rms).all() else ""
     # COLMAP prints the root of the cost over the number of residuals
     colmaps = [np.sqrt(cost / (2 * problem.num_observations)) for cost in (solution.initial_cost, solution.final_cost)]
     as_colmap = f"; COLMAP's measure: {colmaps[0]:.6f} -> {colmaps[1]:.6f} px" if problem.labels is not None else ""
     lines = [
         f"{state}: {solution.termination.reason}",
-        f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e} "
-        f"(rms {rms[0]:.4g} -> {rms[1]:.4g} px){as_colmap}",
+        f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e}{shown}{as_colmap}",
         f"{counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
         f"linear solver {solution.linear_solver}",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "

@@ -71,7 +71,7 @@ def test_a_line_is_mapped_to_a_line_by_the_smallest_rotation():
     for angle in (0.0, 0.7, np.pi - 1e-5, np.pi):
         axis = np.cross([1.0, 2.0, 0.5], rng.normal(size=3))
         turn = Rotation.from_rotvec(angle * axis / np.linalg.norm(axis))
-        source = np.outer(rng.normal(size=6), [1.0, 2.0, 0.5]) + [1, 2, 3]
+        source = np.array([1.0, 2.0, 3.0]) + np.outer(rng.normal(size=6), [1.0, 2.0, 0.5])
         target = turn.apply(3.0 * source) + 5
         found = along_line(source, target, np.ones(6))
         np.testing.assert_allclose(found.points(source), target, atol=1e-9)
