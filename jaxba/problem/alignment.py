@@ -44,8 +44,8 @@ EARTH = 6.371e6
 """Radius, metres."""
 
 NOT_DETERMINED = (
-    "the positions are at one place within their standard deviations: the alignment only moves the scene",
-    "the positions lie on a line within their standard deviations: the alignment does not turn the scene about it",
+    "the positions are at one place within their noise: the alignment only moves the scene",
+    "the positions lie on a line within their noise: the alignment does not turn the scene about it",
 )
 """Notes, by the number of directions in which the positions spread."""
 
@@ -112,8 +112,9 @@ def _robust_fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndar
         if best is None or distance.sum() < least:  # of all: half of the images may lie on a line, and others not
             best, least = distance, distance.sum()
     assert best is not None
-    near = best <= NEARLY_ALL * max(1.0, np.median(best) / MEDIAN)
-    return _fit(centers[near], positions[near], covariances[near])
+    error = max(1.0, float(np.median(best)) / MEDIAN)  # in standard deviations: the scene has its own
+    near = best <= NEARLY_ALL * error
+    return _fit(centers[near], positions[near], max(1.0, error / SIGNIFICANT) ** 2 * covariances[near])
 
 
 def _fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray) -> tuple[Similarity, int]:
@@ -139,8 +140,9 @@ def _fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray) ->
 def _rank(positions: np.ndarray, covariances: np.ndarray) -> int:
     """In how many directions positions spread beyond their noise."""
     weights = _weights(covariances)
-    root = np.linalg.cholesky(np.einsum("n,nij->ij", weights, covariances))
-    white = np.linalg.solve(root, (positions - weights @ positions).T) * np.sqrt(weights)
+    values, vectors = np.linalg.eigh(np.einsum("n,nij->ij", weights, covariances))
+    white = (positions - weights @ positions) @ vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    white *= np.sqrt(weights)[:, None]
     return int(np.sum(np.linalg.svd(white, compute_uv=False) > SIGNIFICANT))
 
 

@@ -19,6 +19,9 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.priors import Priors
 from jaxba.problem.values import finite, shown
 
+LEAST_VARIANCE = 1e-200
+"""Smallest eigenvalue of a covariance whose inverse can be computed with."""
+
 
 def with_position_priors(
     problem: BundleProblem,
@@ -165,7 +168,7 @@ def _covariances(problem: BundleProblem, what: str, covariance: Any, at: np.ndar
     matrices = np.broadcast_to(given, (len(at), 3, 3))
     values = np.linalg.eigvalsh(matrices)
     symmetric = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-9 * np.abs(values).max(axis=1)
-    bad = np.flatnonzero(~((values[:, 0] > 0) & symmetric))
+    bad = np.flatnonzero(~((values[:, 0] > LEAST_VARIANCE) & symmetric))
     if len(bad):
         where = _name(problem, int(at[bad[0]]))
         raise ProblemError(f"the covariance of the {what} of {where} is not symmetric positive definite")
