@@ -9,14 +9,15 @@ from typing import Any, get_args
 
 import numpy as np
 
-from jaxba.cli.common import UsageError
+from jaxba.cli.common import UsageError, counted
+from jaxba.cli.constraint_values import PositionPriors, names_of, parse_items, parse_position_priors
 from jaxba.io.configurations import SettingsError, read_file
-from jaxba.io.text import number
+from jaxba.io.notes import report
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.constraints import Gauge, hold, with_gauge
 from jaxba.problem.labels import part_name
-from jaxba.problem.losses import Loss
 from jaxba.problem.measured import with_position_priors
+from jaxba.problem.values import shown
 
 PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
 """What `--constant` names besides numbers of lenses."""
@@ -28,16 +29,28 @@ KEYS = {
     "constant_cameras": "ids of cameras, which images share",
     "constant_extrinsics": "ids of cameras, whose places in their rigs do not move",
     "constant_numbers": "focal, principal_point, distortion or names such as k2",
-    "position_priors": "positions: {name or id: [x, y, z]}, stddev, loss and loss_scale",
+    "position_priors": "positions: {name or id: [x, y, z]}, stddev, loss, loss_scale and align",
     "gauge": "free, two-cameras or three-points",
 }
 """Keys of the file, and what they hold."""
 
 
 def constrained(
-    problem: BundleProblem, constant: tuple[str, ...], gauge: Gauge | None, file: str | None
+    problem: BundleProblem,
+    constant: tuple[str, ...],
+    gauge: Gauge | None,
+    file: str | None,
+    *,
+    strict: bool = False,
 ) -> BundleProblem:
     """The problem with what the options and the file say.
+
+    Args:
+        problem: any problem.
+        constant: what `--constant` names.
+        gauge: what `--gauge` names.
+        file: YAML file of constants and priors.
+        strict: refuse positions of images that are not in the problem, instead of leaving them out with a note.
 
     Raises:
         UsageError: something is not in the problem; one line that names the option or the key.
@@ -46,7 +59,7 @@ def constrained(
     settings = {} if file is None else _read(file)
     first = [key for key in settings if key == "position_priors"]  # the scene is aligned before anything is constant
     for key in first:
-        problem = _applied(problem, file, key, settings.pop(key))
+        problem = _applied(problem, file, key, settings.pop(key), strict)
     try:
         numbers = [one.replace("-", "_") for one in constant if one not in PARTS]
         parts: dict[str, Any] = {part: "all" for part in PARTS[:4] if part in constant}
@@ -58,9 +71,11 @@ def constrained(
         raise UsageError(f"--constant: {error}") from None
     in_file = settings.pop("gauge", "free")
     if in_file not in get_args(Gauge):
-        raise UsageError(f"--constraints {file}: gauge: must be one of {', '.join(get_args(Gauge))}, not {in_file!r}")
+        raise UsageError(
+            f"--constraints {file}: gauge: must be one of {', '.join(get_args(Gauge))}, not {shown(in_file)}"
+        )
     for key, value in settings.items():
-        problem = _applied(problem, file, key, value)
+        problem = _applied(problem, file, key, value, strict)
     return with_gauge(problem, gauge or in_file)
 
 
@@ -82,12 +97,11 @@ def _with_known_places(problem: BundleProblem) -> np.ndarray:
     return known
 
 
-def _applied(problem: BundleProblem, file: str | None, key: str, value: Any) -> BundleProblem:
+def _applied(problem: BundleProblem, file: str | None, key: str, value: Any, strict: bool) -> BundleProblem:
     try:
-        return _apply(problem, key, value)
-    except (ValueError, TypeError, AttributeError, LookupError, OverflowError) as error:
-        what = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-        raise UsageError(f"--constraints {file}: {key}: {what}") from None
+        return _apply(problem, f"{file}: {key}", key, value, strict)
+    except ValueError as error:
+        raise UsageError(f"--constraints {file}: {key}: {error}") from None
 
 
 def _read(file: str) -> dict[str, Any]:
@@ -97,58 +111,60 @@ def _read(file: str) -> dict[str, Any]:
         raise UsageError(f"--constraints {error}") from None
     unknown = [key for key in settings if key not in KEYS]
     if unknown:
-        raise UsageError(f"--constraints {file}: unknown key {unknown[0]!r}; there are {', '.join(KEYS)}")
+        raise UsageError(f"--constraints {file}: unknown key {shown(unknown[0])}; there are {', '.join(KEYS)}")
     return settings
 
 
-def _named(wanted: Any, names: Container[str] = ()) -> Any:
-    """What a list of the file means: of each text a name if there is such a one, else an id or a position.
+def _meant(items: list[str], names: Container[str] = ()) -> list[Any]:
+    """What items of the file mean: of each text a name if there is such a one, else an id or a position.
 
-    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules. The word `all`
-    alone is all; another word alone is a list of it.
+    Only the plain form of a number is one: `000010` and `0x10` are not, in contrast to YAML's rules.
     """
-    if isinstance(wanted, str):
-        return wanted if wanted == "all" else _named([wanted] if wanted else [], names)
-    plain = lambda one: isinstance(one, str) and one not in names and re.fullmatch(r"0|[1-9]\d*", one, re.ASCII)
-    return [int(one) if plain(one) else one for one in wanted]
+    plain = lambda one: one not in names and re.fullmatch(r"0|[1-9]\d*", one, re.ASCII)
+    return [int(one) if plain(one) else one for one in items]
 
 
-def _numbers(value: Any) -> Any:
-    """Numbers for the texts of a value. Raises ValueError."""
-    return number(value) if isinstance(value, str) else [_numbers(one) for one in value]
-
-
-def _apply(problem: BundleProblem, key: str, value: Any) -> BundleProblem:
+def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: bool) -> BundleProblem:
     labels = problem.labels
-
-    def images(wanted: Any) -> Any:
-        found = _named(wanted, () if labels is None else frozenset(labels.names))
-        return found if labels is None or found == "all" else labels.images_at(found)
-
-    def ids(wanted: Any, at: str) -> Any:
-        found = _named(wanted)
-        return found if labels is None or found == "all" else getattr(labels, at)(found)
-
-    if key == "constant_poses":
-        return hold(problem, poses=images(value))
-    if key == "constant_rotations":
-        return hold(problem, rotations=images(value))
-    if key == "constant_points":
-        return hold(problem, points=ids(value, "points_at"))
-    if key == "constant_cameras":
-        return hold(problem, lenses=ids(value, "lenses_at"))
-    if key == "constant_extrinsics":
-        return hold(problem, extrinsics=ids(value, "lenses_at"))
-    if key == "constant_numbers":
-        return hold(problem, numbers=value)
+    names = frozenset() if labels is None else frozenset(labels.names)
     if key == "position_priors":
-        unknown = [one for one in value if one not in ("positions", "stddev", "loss", "loss_scale")]
-        if unknown:
-            raise ValueError(f"unknown key {unknown[0]!r}; there are positions, stddev, loss and loss_scale")
-        positions = value["positions"]
-        spread = np.broadcast_to(np.asarray(_numbers(value.get("stddev", "1")), np.float64), 3)
-        loss = Loss(value.get("loss", "squared"), _numbers(value.get("loss_scale", "1")))
-        at = np.asarray(images(list(positions))).tolist()
-        measured = [_numbers(one) for one in positions.values()]
-        return with_position_priors(problem, measured, np.diag(spread**2), images=at, loss=loss)
-    raise ValueError("unknown key")
+        return _with_positions(problem, where, parse_position_priors(value), names, strict)
+    items = parse_items(value, KEYS[key])
+    if key == "constant_numbers":
+        return hold(problem, numbers=items)
+    of_images = key in ("constant_poses", "constant_rotations")
+    wanted: Any = "all" if value == "all" else _meant(items, names if of_images else ())
+    if labels is not None and wanted != "all":
+        at = labels.points_at if key == "constant_points" else labels.lenses_at
+        wanted = labels.images_at(wanted) if of_images else at(wanted)
+    part = key.removeprefix("constant_")
+    return hold(problem, **{"lenses" if part == "cameras" else part: wanted})
+
+
+def _with_positions(
+    problem: BundleProblem, where: str, given: PositionPriors, names: Container[str], strict: bool
+) -> BundleProblem:
+    """The problem with the positions of its own images; a note says which others there are."""
+    labels = problem.labels
+    ids = range(problem.num_cameras) if labels is None else set(labels.images.tolist())
+    wanted = _meant(given.images, names)
+    ours = [at for at, image in enumerate(wanted) if image in names or image in ids]
+    others = [
+        image for image, meant in zip(given.images, wanted, strict=True) if meant not in names and meant not in ids
+    ]
+    if not len(ours):
+        raise ValueError(f"none of the images is in the problem: {names_of(others) or 'no positions'}")
+    if others:
+        text = f"positions of {counted(len(others), 'image')} that the problem does not have: {names_of(others)}"
+        if strict:
+            raise ValueError(text)
+        report([f"{where}: left out {text}"])
+    images: Any = [wanted[at] for at in ours]
+    return with_position_priors(
+        problem,
+        given.positions[ours],
+        stddev=given.stddev[ours],
+        images=images if labels is None else labels.images_at(images).tolist(),
+        loss=given.loss,
+        align=given.align,
+    )

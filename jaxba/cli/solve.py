@@ -168,7 +168,8 @@ class Arguments:
     every name does, unless it ends in .txt, .bal, .out, .ply, .bz2, .gz or .xz."""
 
     strict: bool = False
-    """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point."""
+    """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point; and
+    positions in --constraints of images that are not in the problem."""
 
     covariance: str | None = None
     """Output file (.npz) of covariances: poses, lenses, points, points_given_cameras. It needs a gauge, constants or
@@ -365,7 +366,7 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
         view.check_extra()
     with common.notes_printed():
         problem = _default_scene() if path is None else _read(args, path)
-        problem = constrained(problem, args.constant, args.gauge, args.constraints)
+        problem = constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
     check_storable(args.output, problem, path)

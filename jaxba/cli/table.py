@@ -16,6 +16,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.facing import image_names, views_behind, without_views_of
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
+from jaxba.problem.preprocess import MIN_TRACK
 from jaxba.runtime.compilation import Part, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import split_refinement
@@ -117,15 +118,18 @@ def summary(problem: BundleProblem, solution: Solution, loss: Loss | None = None
     state = "converged" if solution.converged else "not converged"
     problem, end = (without_views_of(p, solution.set_aside) for p in (problem, solution.problem))
     solution = replace(solution, problem=end)
-    # from the residuals, since the cost may be that of a robust loss
-    rms = [np.sqrt(2 * geometry.cost(p) / p.num_observations) for p in (problem, solution.problem)]
+    costs = [solution.initial_cost, solution.final_cost]
+    if problem.priors is not None or not (loss or Loss()).trivial:  # else the residuals' own, in the solve's arithmetic
+        costs = [geometry.cost(p) for p in (problem, solution.problem)]
+    rms = [np.sqrt(2 * cost / problem.num_observations) for cost in costs]
+    # a robust loss may bear a residual that overflows
+    shown = f" (rms {rms[0]:.4g} -> {rms[1]:.4g} px)" if np.isfinite(rms).all() else ""
     # COLMAP prints the root of the cost over the number of residuals
     colmaps = [np.sqrt(cost / (2 * problem.num_observations)) for cost in (solution.initial_cost, solution.final_cost)]
     as_colmap = f"; COLMAP's measure: {colmaps[0]:.6f} -> {colmaps[1]:.6f} px" if problem.labels is not None else ""
     lines = [
         f"{state}: {solution.termination.reason}",
-        f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e} "
-        f"(rms {rms[0]:.4g} -> {rms[1]:.4g} px){as_colmap}",
+        f"cost {solution.initial_cost:.6e} -> {solution.final_cost:.6e}{shown}{as_colmap}",
         f"{counted(solution.iterations, 'iteration')}, {solution.accepted} accepted; "
         f"linear solver {solution.linear_solver}",
         f"time: set-up {solution.setup_s:.2f} s, compilation {solution.compile_s:.2f} s, "
@@ -200,6 +204,9 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
     points = np.bincount(np.asarray(problem.point_index), minlength=problem.num_points)
     alone = cameras == 0
     alone[solution.set_aside] = False
+    if problem.constants is not None:  # no surprise that these stay
+        alone &= ~np.asarray(problem.constants.poses).all(axis=1)
+        points = np.where(problem.constants.points, MIN_TRACK, points)
     if problem.rigs is not None:  # others move with their frame
         frame = np.asarray(problem.rigs.frame)
         alone = alone & ~np.isin(frame, frame[cameras > 0])

@@ -5,18 +5,21 @@ What is constant comes back bit for bit.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxba.problem import geometry
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.constants import ROTATION, Constants, constants_of
+from jaxba.problem.freedoms import fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.values import shown
 
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
 """Positions, names of images, a mask, or all of them."""
@@ -84,7 +87,8 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     the observed camera that is nearest to the middle of all, and one number of the translation of the one that is
     farthest from it, are constant: the seven degrees of freedom of a similarity, and nothing else; where rigs give the
     scene its scale, the first pose alone. `three-points`: three points that many images see and that are far apart are
-    constant. `free`: no more than is. Source: COLMAP, `BundleAdjustmentGauge`.
+    constant. `free`: no more than is. Nothing becomes constant, with a `ProblemWarning`, where constants and priors fix
+    the seven already. Source: COLMAP, `BundleAdjustmentGauge`.
 
     In a scene far from the origin (`preprocess.FAR`) the number of a translation is that of the scene shifted to it.
 
@@ -97,7 +101,12 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     if gauge == "free":
         return problem
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
-    if problem.rigs is not None and _has_baseline(problem):
+    scaled = problem.rigs is not None and _has_baseline(problem)
+    if fixed_freedoms(problem, scale_known=scaled) == 7:
+        note = f"the gauge {gauge} is not needed: constants and priors fix position, orientation and scale already"
+        warnings.warn(note, ProblemWarning, stacklevel=2)
+        return problem
+    if scaled:
         if gauge == "three-points":
             raise ProblemError("the rigs give the scene its scale: use the gauge of two cameras, which then holds one")
         constants.poses[_middle_camera(problem)] = True
@@ -141,7 +150,9 @@ def _fix_two_cameras(problem: BundleProblem, constants: Constants) -> None:
     if len(seen) < 2:
         raise ProblemError("a gauge of two cameras needs two that see points")
     centers = geometry.camera_centers(problem.cameras)[seen]
-    first = int(np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1)))
+    whole = constants.poses[seen].all(axis=1)  # a constant pose is the first, if there is one
+    from_middle = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    first = int(np.argmin(np.where(whole | ~whole.any(), from_middle, np.inf)))
     second = int(np.argmax(np.linalg.norm(centers - centers[first], axis=1)))
     constants.poses[seen[first]] = True
     # its distance from the first camera along the axis of its own on which that is largest
@@ -186,31 +197,51 @@ def _mask(problem: BundleProblem, which: Which, count: int, what: str) -> Bool[n
             raise ValueError(f"which {what} must be 'all' or a list, not {which!r}")
         return np.ones(count, bool)
     mask = np.zeros(count, bool)
-    chosen = np.asarray(which if isinstance(which, np.ndarray | jax.Array) else list(which))
+    chosen = _listed(which, what)
     if chosen.dtype == bool:
         if chosen.shape != mask.shape:
             raise ValueError(f"a mask for every {what} has shape {mask.shape}, not {chosen.shape}")
         return chosen
-    at = positions_of(problem, chosen, what)
-    bad = at[(at < 0) | (at >= count)]
-    if len(bad):
-        raise ValueError(f"there is no {what} {bad[0]}: there are {count}")
-    mask[at] = True
+    mask[positions_of(problem, chosen, what, count)] = True
     return mask
 
 
-def positions_of(problem: BundleProblem, chosen: np.ndarray, what: str) -> Int[np.ndarray, " n"]:
+def _listed(which: Any, what: str) -> np.ndarray:
+    """A list of positions, names or truth values as an array."""
+    try:
+        chosen = np.asarray(which if isinstance(which, np.ndarray | jax.Array) else list(which))
+    except (TypeError, ValueError):  # no list, or a list of lists
+        chosen = np.asarray(None)
+    if chosen.ndim != 1:
+        raise ValueError(f"which {what} must be a list of positions or names, not {shown(which)}")
+    return chosen
+
+
+def positions_of(
+    problem: BundleProblem, which: Iterable[int] | Iterable[str] | np.ndarray, what: str, count: int | None = None
+) -> Int[np.ndarray, " n"]:
     """Positions, of images perhaps from names.
 
+    Args:
+        problem: any problem.
+        which: positions or names.
+        what: `image`, `point` or `lens`.
+        count: how many there are; None: as images.
+
     Raises:
-        ValueError: neither positions nor names; one line.
+        ValueError: neither positions nor names, or there are fewer; one line.
     """
+    chosen = _listed(which, what)
+    count = problem.num_cameras if count is None else count
     if chosen.dtype.kind in "US":
         if problem.labels is None or what != "image":
             raise ValueError(f"this problem has no names for a {what}: give positions")
         return problem.labels.images_at(chosen.tolist())
     if chosen.size and chosen.dtype.kind not in "iu":
-        raise ValueError(f"each {what} is given by its position, not by {chosen.ravel()[0].item()!r}")
+        raise ValueError(f"each {what} is given by its position, not by {shown(chosen.tolist()[0])}")
+    bad = chosen[(chosen < 0) | (chosen >= count)]
+    if len(bad):
+        raise ValueError(f"there is no {what} {bad[0]}: there are {count}")
     return chosen.astype(np.int64)
 
 
@@ -222,6 +253,8 @@ def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "
     """
     free = np.asarray(lenses.free)
     meant = np.zeros(free.shape, bool)
+    if not isinstance(numbers, Iterable):
+        raise ValueError(f"numbers of a lens are given by a list of names, not {shown(numbers)}")
     for name in (numbers,) if isinstance(numbers, str) else numbers:
         of_models = [
             getattr(model, name)
@@ -231,7 +264,7 @@ def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "
         ]
         if name not in GROUPS and not any(of_models):
             known = dict.fromkeys(parameter for model in lenses.models for parameter in model.parameters)
-            raise ValueError(f"no lens has a number {name!r}; there are {', '.join([*GROUPS, *known])}")
+            raise ValueError(f"no lens has a number {shown(name)}; there are {', '.join([*GROUPS, *known])}")
         for lens in range(len(free)):
             meant[lens, list(of_models[0 if lenses.model is None else int(lenses.model[lens])])] = True
     return meant

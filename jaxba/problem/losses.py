@@ -18,6 +18,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from jaxba.problem.values import finite, shown
+
 
 def _squared(s: Array) -> tuple[Array, Array]:
     return s, jnp.ones_like(s)
@@ -72,9 +74,10 @@ class Loss:
     """Residual norm in pixels at which the loss starts to flatten; no effect for `squared`."""
 
     def __post_init__(self) -> None:
-        if not callable(self.rho) and self.rho not in _SHAPES:
-            raise ValueError(f"unknown loss {self.rho!r}; known: {', '.join(NAMES)}")
-        if not (self.scale > 0 and 0 < self.scale * self.scale < float("inf")):
+        if not callable(self.rho) and not (isinstance(self.rho, str) and self.rho in _SHAPES):
+            raise ValueError(f"unknown loss {shown(self.rho)}; known: {', '.join(NAMES)}")
+        scale = float(finite("scale", self.scale, ()))
+        if not (scale > 0 and 0 < scale * scale < float("inf")):
             raise ValueError(f"scale must be positive, and its square a finite number, is {self.scale}")
 
     @property

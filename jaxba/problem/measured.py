@@ -12,22 +12,23 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.problem import geometry
+from jaxba.problem.alignment import aligned
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constraints import every_lens, number_columns, positions_of
 from jaxba.problem.losses import Loss
 from jaxba.problem.priors import Priors
-from jaxba.problem.similarity import umeyama
+from jaxba.problem.values import finite, shown
 
-ROUNDS, KEPT = 10, 0.5
-"""Rounds of a robust alignment, and the share of the images that each keeps: it stands half of the positions wrong."""
+LEAST_VARIANCE = 1e-200
+"""Smallest eigenvalue of a covariance whose inverse can be computed with."""
 
 
 def with_position_priors(
     problem: BundleProblem,
     positions: Any,
-    covariance: Any,
+    covariance: Any = None,
     *,
+    stddev: Any = None,
     images: Iterable[int] | Iterable[str] | None = None,
     loss: Loss | None = None,
     align: bool = True,
@@ -38,28 +39,35 @@ def with_position_priors(
         problem: any problem.
         positions: measured centres, shape (n, 3), in the units of `covariance`.
         covariance: shape (3, 3) for all, or (n, 3, 3).
+        stddev: standard deviations instead: one number, three along x, y and z, or one or three for each image, shape
+            (n, 1), (n, 3), or (n,) where n is not 3.
         images: positions or names of the images; None: all, in order.
         loss: robust loss of the squared whitened distance; None: squared.
         align: whether the scene is first moved, turned and scaled to the measured positions, robustly, as COLMAP does.
+            What they do not determine, such as the rotation about a line, stays as it is, with a `ProblemWarning`.
             Without it the scene must be in their frame already.
 
     Raises:
         ValueError: shapes, or no such image; one line.
-        ProblemError: a covariance is not positive definite; or an alignment has too few positions, or would move what
-            is constant or has priors.
+        ProblemError: a covariance is not positive definite; or an alignment would move what is constant or has priors,
+            or the positions are latitude and longitude, or mirrored.
     """
-    at = np.arange(problem.num_cameras) if images is None else _images_at(problem, images)
-    measured = np.asarray(positions, np.float64)
-    if measured.shape != (len(at), 3) or not np.isfinite(measured).all():
-        raise ValueError(f"positions must be finite, of shape ({len(at)}, 3), not {measured.shape}")
-    whitening = _inverse_roots("position", covariance, len(at))
+    at = _images_at(problem, images)
+    measured = finite("positions", positions, (len(at), 3))
+    if (covariance is None) == (stddev is None):
+        raise ValueError("positions need either a covariance or a stddev")
+    if stddev is not None:
+        covariance = _variances(stddev, len(at))
+    covariances = _covariances(problem, "position", covariance, at)
+    if not isinstance(loss, Loss | None):
+        raise ValueError(f"loss must be a jaxba.Loss, not {shown(loss)}")
     if align:
         if problem.constants is not None or problem.priors is not None:
             raise ProblemError("an alignment would move what is constant or measured: align first, or align=False")
-        problem = aligned(problem, measured, at)
+        problem = aligned(problem, measured, covariances, at)
     priors = priors_of(problem)
     places, weights = np.array(priors.positions), np.array(priors.position_whitening)
-    places[at], weights[at] = measured, whitening
+    places[at], weights[at] = measured, _inverse_roots(covariances)
     return problem.replace(
         priors=replace(priors, positions=places, position_whitening=weights, position_loss=loss or Loss())
     )
@@ -79,13 +87,11 @@ def with_rotation_priors(
     Raises:
         ValueError, ProblemError: as `with_position_priors`.
     """
-    at = np.arange(problem.num_cameras) if images is None else _images_at(problem, images)
-    measured = np.asarray(rotations, np.float64)
-    if measured.shape != (len(at), 3) or not np.isfinite(measured).all():
-        raise ValueError(f"rotations must be finite, of shape ({len(at)}, 3), not {measured.shape}")
+    at = _images_at(problem, images)
+    measured = finite("rotations", rotations, (len(at), 3))
     priors = priors_of(problem)
     known, weights = np.array(priors.rotations), np.array(priors.rotation_whitening)
-    known[at], weights[at] = measured, _inverse_roots("rotation", covariance, len(at))
+    known[at], weights[at] = measured, _inverse_roots(_covariances(problem, "rotation", covariance, at))
     return problem.replace(priors=replace(priors, rotations=known, rotation_whitening=weights))
 
 
@@ -106,8 +112,11 @@ def with_lens_priors(problem: BundleProblem, numbers: dict[str, float]) -> Bundl
     _, first = np.unique(lenses.index, return_index=True)
     used = np.asarray(lenses.index)[first]
     mean[used] = cameras[first, 6:]
-    for name, deviation in numbers.items():
-        if not 0 < deviation < np.inf:
+    if not isinstance(numbers, dict):
+        raise ValueError(f"standard deviations are a dict by the names of numbers, not {shown(numbers)}")
+    for name, value in numbers.items():
+        deviation = float(finite(f"the standard deviation of {name}", value, ()))
+        if deviation <= 0:
             raise ValueError(f"the standard deviation of {name} must be positive, is {deviation}")
         weight[number_columns(lenses, [name])] = 1 / deviation
     return problem.replace(lenses=lenses, priors=replace(priors, lenses=mean, lens_weight=weight))
@@ -123,51 +132,49 @@ def priors_of(problem: BundleProblem) -> Priors:
     return Priors(np.zeros((count, 3)), none, np.array(problem.cameras)[:, :3], none, numbers, numbers)
 
 
-def aligned(problem: BundleProblem, positions: Float[np.ndarray, "n 3"], images: np.ndarray) -> BundleProblem:
-    """The problem moved, turned and scaled so that the centres of images are near the given positions.
-
-    Source: `umeyama` in rounds that each keep the nearer half of the images (least trimmed squares; Rousseeuw 1984).
-
-    Raises:
-        ProblemError: fewer than three images, or their centres or positions lie on a line.
-    """
-    centers = geometry.camera_centers(problem.cameras)[images]
-    best, error = umeyama(centers, positions), np.inf
-    rng = np.random.default_rng(0)
-    for start in range(ROUNDS):
-        kept = np.arange(len(images)) if start == 0 else rng.choice(len(images), 3, replace=False)
-        try:
-            for _ in range(ROUNDS):
-                fit = umeyama(centers[kept], positions[kept])
-                distance = np.linalg.norm(fit.points(centers) - positions, axis=1)
-                kept = np.argsort(distance)[: max(3, int(np.ceil(KEPT * len(images))))]
-        except ProblemError:  # these few lie on a line
-            continue
-        found = float(np.sum(distance[kept] ** 2))
-        if found < error:
-            best, error = fit, found
-    scale, rotation, shift = best
-    cameras = np.array(problem.cameras, np.float64)
-    matrices = geometry.rotation_matrices(cameras[:, :3]) @ rotation.T
-    cameras[:, :3] = geometry.angle_axis(matrices)
-    cameras[:, 3:6] = scale * cameras[:, 3:6] - np.einsum("nij,j->ni", matrices, shift)
-    rigs = None if problem.rigs is None else problem.rigs.scaled(scale)
-    return problem.replace(cameras=cameras, points=best.points(np.asarray(problem.points)), rigs=rigs)
-
-
-def _images_at(problem: BundleProblem, images: Iterable[int] | Iterable[str]) -> np.ndarray:
-    at = positions_of(problem, np.asarray(list(images)), "image")
-    bad = at[(at < 0) | (at >= problem.num_cameras)]
-    if len(bad):
-        raise ValueError(f"there is no image {bad[0]}: there are {problem.num_cameras}")
+def _images_at(problem: BundleProblem, images: Iterable[int] | Iterable[str] | None) -> np.ndarray:
+    """The images of measurements, each once."""
+    if images is None:
+        return np.arange(problem.num_cameras)
+    at = positions_of(problem, images, "image")
+    values, counts = np.unique(at, return_counts=True)
+    if (counts > 1).any():
+        raise ValueError(f"{_name(problem, int(values[counts > 1][0]))} has more than one measurement")
     return at
 
 
-def _inverse_roots(what: str, covariance: Any, count: int) -> Float[np.ndarray, "n 3 3"]:
-    matrices = np.broadcast_to(np.asarray(covariance, np.float64), (count, 3, 3))
-    values, vectors = np.linalg.eigh(matrices)
+def _name(problem: BundleProblem, image: int) -> str:
+    return f"image {image}" if problem.labels is None else f"image {problem.labels.names[image]!r}"
+
+
+def _variances(stddev: Any, count: int) -> Float[np.ndarray, "n 3 3"]:
+    """Diagonal covariances from any of the shapes of `stddev`."""
+    spread = finite("stddev", stddev, (), (3,), (count,), (count, 1), (count, 3))
+    if spread.shape == (count,) != (3,):
+        spread = spread[:, None]
+    if not (spread > 0).all():
+        raise ValueError(f"stddev must be positive, is {spread.min():g}")
+    return np.broadcast_to(spread**2, (count, 3))[:, :, None] * np.eye(3)
+
+
+def _covariances(problem: BundleProblem, what: str, covariance: Any, at: np.ndarray) -> Float[np.ndarray, "n 3 3"]:
+    """A covariance for each image.
+
+    Raises:
+        ValueError: shapes; one line.
+        ProblemError: one is not symmetric positive definite; it names the image.
+    """
+    given = finite(f"the covariance of a {what}", covariance, (3, 3), (len(at), 3, 3))
+    matrices = np.broadcast_to(given, (len(at), 3, 3))
+    values = np.linalg.eigvalsh(matrices)
     symmetric = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-9 * np.abs(values).max(axis=1)
-    bad = np.flatnonzero(~(np.isfinite(matrices).all(axis=(1, 2)) & (values[:, 0] > 0) & symmetric))
+    bad = np.flatnonzero(~((values[:, 0] > LEAST_VARIANCE) & symmetric))
     if len(bad):
-        raise ProblemError(f"the covariance of {what} {bad[0]} is not symmetric positive definite")
+        where = _name(problem, int(at[bad[0]]))
+        raise ProblemError(f"the covariance of the {what} of {where} is not symmetric positive definite")
+    return matrices
+
+
+def _inverse_roots(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
+    values, vectors = np.linalg.eigh(matrices)
     return (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)

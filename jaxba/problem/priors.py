@@ -13,10 +13,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 from jaxtyping import Float
 
 from jaxba.problem.losses import Loss
+from jaxba.problem.values import finite, shown
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 
@@ -67,10 +67,7 @@ def checked_priors(priors: Priors, cameras: int, lenses: int, numbers: int) -> P
         "lenses": (lenses, numbers),
         "lens_weight": (lenses, numbers),
     }
-    arrays = {name: np.ascontiguousarray(getattr(priors, name), np.float64) for name in shapes}
-    for name, array in arrays.items():
-        if array.shape != shapes[name]:
-            raise ValueError(f"{name} of priors must have shape {shapes[name]}, not {array.shape}")
-        if not np.isfinite(array).all():
-            raise ValueError(f"{name} of priors are not finite")
+    if not isinstance(priors.position_loss, Loss):
+        raise ValueError(f"position_loss of priors must be a jaxba.Loss, not {shown(priors.position_loss)}")
+    arrays = {name: finite(f"{name} of priors", getattr(priors, name), shape) for name, shape in shapes.items()}
     return replace(priors, **arrays)

@@ -1,4 +1,4 @@
-"""The least-squares similarity between two sets of positions."""
+"""The least-squares similarity between two sets of positions, whole or as far as a line determines it."""
 
 from __future__ import annotations
 
@@ -34,8 +34,15 @@ class Similarity(NamedTuple):
         return np.concatenate([self.rotation @ poses[:, :, :3], centers[:, :, None]], axis=2)
 
 
-def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Similarity:
+def umeyama(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
+) -> Similarity:
     """The least-squares similarity from `source` to `target`.
+
+    Args:
+        source: points.
+        target: where they should be.
+        weights: of the squared distances; None: equal ones.
 
     Raises:
         ProblemError: fewer than three points, or all of them at one position or on one line.
@@ -44,10 +51,11 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) 
     """
     if len(source) < 3:
         raise ProblemError(f"an alignment needs 3 poses, not {len(source)}")
-    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    shares = np.full(len(source), 1 / len(source)) if weights is None else weights / weights.sum()
+    mean_source, mean_target = shares @ source, shares @ target
     a, b = source - mean_source, target - mean_target
     with np.errstate(over="ignore", invalid="ignore"):
-        covariance, square = b.T @ a / len(a), (a * a).sum()
+        covariance, square = (shares[:, None] * b).T @ a, shares @ (a * a).sum(axis=1)
     if not (np.isfinite(covariance).all() and np.isfinite(square)):
         raise ProblemError("the trajectories cannot be aligned: positions are too far apart to be squared")
     u, d, vt = np.linalg.svd(covariance)
@@ -55,5 +63,35 @@ def umeyama(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) 
         raise ProblemError("the trajectories cannot be aligned: the positions of one lie on a straight line")
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt
-    scale = float((d * sign).sum() / square * len(a))
+    scale = float((d * sign).sum() / square)
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def along_line(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"]
+) -> Similarity:
+    """The similarity that takes the line through `source` to that through `target`, without a turn about it.
+
+    Its rotation is the smallest one; where the lines are opposite it is about an axis as near to z as can be. Arguments
+    as for `umeyama`; the points of neither may be at one place.
+    """
+    shares = weights / weights.sum()
+    mean_source, mean_target = shares @ source, shares @ target
+    a = source - mean_source
+    line = np.linalg.svd(np.sqrt(shares)[:, None] * a, full_matrices=False)[2][0]
+    along = a @ line
+    slope = (shares * along) @ (target - mean_target) / (shares @ along**2)
+    scale = float(np.linalg.norm(slope))
+    rotation = _smallest_rotation(line, slope / scale)
+    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def _smallest_rotation(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation by the smallest angle that takes one unit vector to another: two reflections."""
+    middle = start + end
+    if np.linalg.norm(middle) < 1e-9:  # opposite: half a turn about what is perpendicular and nearest to z
+        up = np.array([0.0, 0.0, 1.0] if abs(start[2]) < 0.9 else [1.0, 0.0, 0.0])
+        axis = up - (up @ start) * start
+        return 2 * np.outer(axis, axis) / (axis @ axis) - np.eye(3)
+    reflected = np.eye(3) - 2 * np.outer(middle, middle) / (middle @ middle)
+    return reflected @ (np.eye(3) - 2 * np.outer(start, start))

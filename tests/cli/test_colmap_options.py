@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import support
 
-from jaxba import BundleProblem, hold, read_problem, with_gauge, write_colmap
+from jaxba import BundleProblem, ProblemWarning, hold, read_problem, with_gauge, write_colmap
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.common import UsageError
 from jaxba.cli.constraints import constrained
 from jaxba.cli.solve import run
+
+POSITIONS = "position_priors: {positions: {1: [0, 0, 0], 2: [1, 0, 0], 3: [0, 1, 0], 4: [0, 0, 1]}"
 
 
 @pytest.fixture
@@ -43,6 +46,34 @@ def test_constants_of_both_ways_are_gathered():
         ("gauge: [free]", "gauge: must be one of"),
         ("position_priors: {stddev: 0.1}", "position_priors: 'positions' is missing"),
         ("position_priors: {std: 0.1, positions: {}}", "position_priors: unknown key 'std'"),
+        ("position_priors: 5", "position_priors: must be a mapping with the keys positions, stddev, loss"),
+        ("position_priors: {positions: [[1, 2, 3]]}", "position_priors: positions: must be a mapping from images"),
+        (
+            "position_priors: {positions: {9: [1, 2]}}",
+            "position_priors: positions: 9: must be three numbers, not [1, 2]",
+        ),
+        (
+            "position_priors: {positions: {9: [1, 2, north]}}",
+            "positions: 9: must be three numbers, not [1, 2, 'north']",
+        ),
+        ("position_priors: {positions: {9: [1, 2, .nan]}}", "positions: 9: must be three numbers, not [1, 2, nan]"),
+        ("position_priors: {positions: {9: [1, 2, 3]}}", "none of the images is in the problem: 9"),
+        (f"{POSITIONS}, stddev: 0}}", "stddev: must be a positive number, or three, not 0"),
+        (f"{POSITIONS}, stddev: 2cm}}", "stddev: must be a positive number, or three, not '2cm'"),
+        (f"{POSITIONS}, stddev: [1, -1, 1]}}", "stddev: must be a positive number, or three, not [1, -1, 1]"),
+        (f"{POSITIONS}, stddev: [1, 2]}}", "one or three for each of 4 images, not 2 values"),
+        (
+            f"{POSITIONS}, stddev: [1, 2, [0, 1, 1], 1]}}",
+            "stddev: 3: must be a positive number, or three, not [0, 1, 1]",
+        ),
+        (f"{POSITIONS}, stddev: {{1: 1, 3: 1}}}}", "stddev: missing for 2, 4"),
+        (f"{POSITIONS}, loss: gauss}}", "position_priors: unknown loss 'gauss'"),
+        (f"{POSITIONS}, loss_scale: wide}}", "loss_scale: must be a number, not 'wide'"),
+        (f"{POSITIONS}, align: maybe}}", "align: must be true or false, not 'maybe'"),
+        ("constant_poses: {a: 1}", "constant_poses: must be a list (names or ids of images), not {'a': 1}"),
+        ("constant_poses: [[1]]", "constant_poses: must be a list (names or ids of images), not [1]"),
+        ("constant_cameras: 1.5", "constant_cameras: must be a list (ids of cameras"),
+        ("constant_numbers: ", "constant_numbers: must be a list (focal, principal_point"),
         ("constant_points: [true]", "constant_points: "),
         ("constant_numbers: k9", "constant_numbers: no lens has a number 'k9'"),
         ("constant_poses: [absent.jpg]", "constant_poses: there is no image 'absent.jpg'"),
@@ -53,7 +84,7 @@ def test_mistakes_in_a_file_of_constraints_are_one_line(model, tmp_path, capsys,
     (tmp_path / "c.yaml").write_text(text + "\n")
     assert run([str(model), "--constraints", str(tmp_path / "c.yaml")]) == 2
     error = capsys.readouterr().err
-    assert f"c.yaml: {message}" in error
+    assert message in error.partition("c.yaml: ")[2]
     assert error.count("\n") == 1
 
 
@@ -159,6 +190,43 @@ def test_priors_of_the_file_pull_images_to_their_positions(model, tmp_path):
     np.testing.assert_allclose(centers, goal, atol=0.3)
     (tmp_path / "c.yaml").write_text("constant_images: [1]\n")
     assert run([str(model), "--constraints", str(tmp_path / "c.yaml")]) == 2
+
+
+def test_positions_of_other_images_are_left_out_with_a_note(model, tmp_path):
+    from jaxba.cli.common import UsageError
+    from jaxba.cli.constraints import constrained
+    from jaxba.problem import geometry
+
+    problem, file = read_problem(model), tmp_path / "log.yaml"
+    centers = geometry.camera_centers(problem.cameras)
+    rows = {name: at for name, at in zip(problem.labels.names[:5], centers.tolist(), strict=False)}
+    rows |= {f"later{k}.jpg": [0, 0, 0] for k in range(6)}
+    accuracy = ["0.01", 1e3] * 5 + [1]
+    text = "".join(f"    {name}: {row}\n" for name, row in rows.items())
+    file.write_text(
+        f"position_priors:\n  align: false\n  stddev: [{', '.join(map(str, accuracy))}]\n  positions:\n{text}"
+    )
+    left = "positions of 6 images that the problem does not have: later0.jpg, later1.jpg, later2.jpg and 3 more"
+    with pytest.warns(ProblemWarning, match=f"log.yaml: position_priors: left out {left}"):
+        found = constrained(problem, (), None, str(file))
+    assert (found.priors.positions[:5] == centers[:5]).all()
+    np.testing.assert_allclose(found.priors.position_whitening[:, 0, 0], [100, 1e-3, 100, 1e-3, 100, 0])
+    with pytest.raises(UsageError, match=f"log.yaml: position_priors: {left}"):
+        constrained(problem, (), None, str(file), strict=True)
+
+
+def test_notes_of_a_solve_know_what_is_constant(unchecked):
+    from jaxba.cli import table
+
+    def remarks(problem: BundleProblem) -> str:
+        return "".join(table.remarks(problem, SimpleNamespace(problem=problem, set_aside=np.zeros(0, int))))
+
+    problem = support.odd()
+    free = remarks(problem)
+    assert all(words in free for words in ("seen once", "positions stay as they are", "poses stay as they are"))
+    for part, words in (("points", ("seen once", "positions stay")), ("poses", ("poses stay",))):
+        text = remarks(hold(problem, **{part: "all"}))
+        assert not any(word in text for word in words), text
 
 
 def test_options_say_the_same_as_the_functions_of_python(model):

@@ -1,0 +1,192 @@
+"""A scene moved, turned and scaled to measured positions, as far as these determine it."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
+from jaxba.problem.similarity import Similarity, along_line, umeyama
+
+ROUNDS, KEPT = 10, 0.5
+"""Rounds of a robust alignment, and the share of the images that each keeps: it stands half of the positions wrong."""
+
+SIGNIFICANT = 3.0
+"""Standard deviations by which positions must spread in a direction before they say anything about scale or rotation:
+three images on a line with this spread across it determine the roll about it to some 0.2 radians, 30 to 0.06."""
+
+MOST = 0.75
+"""Share of the images that must fit: it is noted if fewer do."""
+
+DOUBTFUL, MISFIT = 2.0, 5.0
+"""Distance of this share, in terms of that of noise alone, from which other axes or units are tried, and from which the
+scene does not fit its positions."""
+
+BETTER = 0.3
+"""Share of the misfit that other axes or units leave before they are taken for the true ones."""
+
+EXPLAINED = 0.1
+"""Largest misfit that they leave, as a share of the extent."""
+
+LEAST_IMAGES = 5
+"""Fewest images by which other axes or units are recognised: four fit too well by chance."""
+
+MEDIAN, UPPER_QUARTER, NEARLY_ALL = 1.538, 2.027, 3.37
+"""Norm of three standard normal numbers: its quantiles at 50, 75 and 99 percent."""
+
+LARGEST_AREA = 1.0
+"""Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent."""
+
+EARTH = 6.371e6
+"""Radius, metres."""
+
+NOT_DETERMINED = (
+    "the positions are at one place within their noise: the alignment only moves the scene",
+    "the positions lie on a line within their noise: the alignment does not turn the scene about it",
+)
+"""Notes, by the number of directions in which the positions spread."""
+
+
+def aligned(
+    problem: BundleProblem,
+    positions: Float[np.ndarray, "n 3"],
+    covariances: Float[np.ndarray, "n 3 3"],
+    images: np.ndarray,
+) -> BundleProblem:
+    """The problem moved, turned and scaled so that the centres of images are near the given positions.
+
+    What the positions do not determine beyond their noise stays as it was, with a `ProblemWarning`: the rotation about
+    a line, or all but the translation. Another one says that the positions do not fit.
+
+    Source: `umeyama` in rounds that each keep the nearer half of the images (least trimmed squares; Rousseeuw 1984).
+
+    Raises:
+        ProblemError: the positions are latitude and longitude, or mirrored; or too far apart.
+    """
+    if not len(images):
+        return problem
+    centers = geometry.camera_centers(problem.cameras)[images]
+    with np.errstate(over="ignore"):
+        if not np.isfinite([np.sum(centers**2), np.sum(positions**2)]).all():
+            raise ProblemError("the scene cannot be aligned: positions are too far apart to be squared")
+    best, rank = _robust_fit(centers, positions, covariances)
+    left_over = 3 * len(images) - (3, 6, 7)[rank]
+    chi = float(np.quantile(_distances(best, centers, positions, covariances), MOST)) / UPPER_QUARTER
+    chi = chi * np.sqrt(3 * len(images) / left_over) if left_over else 0.0
+    if chi > DOUBTFUL or _rank(positions[:, :2], covariances[:, :2, :2]) == 0:
+        _refuse_other_axes(centers, positions)
+    if rank < 2:
+        _note(NOT_DETERMINED[rank])
+    if chi > MISFIT:
+        away = np.quantile(np.linalg.norm(best.points(centers) - positions, axis=1), MOST)
+        _note(
+            f"a quarter of the images of the aligned scene are {away:.3g} or more from their positions, {chi:.3g} "
+            "times what the standard deviations explain"
+        )
+    scale, rotation, shift = best
+    cameras = np.array(problem.cameras, np.float64)
+    matrices = geometry.rotation_matrices(cameras[:, :3]) @ rotation.T
+    cameras[:, :3] = geometry.angle_axis(matrices)
+    cameras[:, 3:6] = scale * cameras[:, 3:6] - np.einsum("nij,j->ni", matrices, shift)
+    rigs = None if problem.rigs is None else problem.rigs.scaled(scale)
+    return problem.replace(cameras=cameras, points=best.points(np.asarray(problem.points)), rigs=rigs)
+
+
+def _note(text: str) -> None:
+    warnings.warn(text, ProblemWarning, stacklevel=4)
+
+
+def _robust_fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray) -> tuple[Similarity, int]:
+    """The similarity that fits most images, and in how many directions, at most two, positions and centres spread."""
+    rng, best, least = np.random.default_rng(0), None, np.inf
+    count = len(centers)
+    for start in range(ROUNDS):
+        kept = np.arange(count) if start == 0 else rng.choice(count, min(3, count), replace=False)
+        for _ in range(ROUNDS):
+            fit, _ = _fit(centers[kept], positions[kept], covariances[kept])
+            distance = _distances(fit, centers, positions, covariances)
+            kept = np.argsort(distance)[: max(3, int(np.ceil(KEPT * count)))]
+        if best is None or distance.sum() < least:  # of all: half of the images may lie on a line, and others not
+            best, least = distance, distance.sum()
+    assert best is not None
+    error = max(1.0, float(np.median(best)) / MEDIAN)  # in standard deviations: the scene has its own
+    near = best <= NEARLY_ALL * error
+    return _fit(centers[near], positions[near], max(1.0, error / SIGNIFICANT) ** 2 * covariances[near])
+
+
+def _fit(centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray) -> tuple[Similarity, int]:
+    """The similarity as far as it is determined, and the rank as `_robust_fit` says it."""
+    weights = _weights(covariances)
+    rank = min(2, _rank(positions, covariances))
+    if rank:
+        spread = np.linalg.svd(np.sqrt(weights)[:, None] * (centers - weights @ centers), compute_uv=False)
+        scale = np.sqrt(weights @ np.sum((positions - weights @ positions) ** 2, axis=1) / max(spread @ spread, 1e-300))
+        noise = np.sqrt(np.linalg.eigvalsh(np.einsum("n,nij->ij", weights, covariances))[0])
+        rounding = 1e-12 * np.abs(centers).max()
+        rank = min(rank, int(np.sum((scale * spread > SIGNIFICANT * noise) & (spread > rounding))))
+    if rank == 2:
+        try:
+            return umeyama(centers, positions, weights), 2
+        except ProblemError:  # both spread, but not together
+            rank = 1
+    if rank == 1:
+        return along_line(centers, positions, weights), 1
+    return Similarity(1.0, np.eye(3), weights @ (positions - centers)), 0
+
+
+def _rank(positions: np.ndarray, covariances: np.ndarray) -> int:
+    """In how many directions positions spread beyond their noise."""
+    weights = _weights(covariances)
+    values, vectors = np.linalg.eigh(np.einsum("n,nij->ij", weights, covariances))
+    white = (positions - weights @ positions) @ vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    white *= np.sqrt(weights)[:, None]
+    return int(np.sum(np.linalg.svd(white, compute_uv=False) > SIGNIFICANT))
+
+
+def _weights(covariances: np.ndarray) -> Float[np.ndarray, " n"]:
+    """Shares of the images in a fit: by their mean variance."""
+    weights = 1 / np.trace(covariances, axis1=1, axis2=2)
+    return weights / weights.sum()
+
+
+def _distances(
+    fit: Similarity, centers: np.ndarray, positions: np.ndarray, covariances: np.ndarray
+) -> Float[np.ndarray, " n"]:
+    """Distances from the measured positions in standard deviations."""
+    away = fit.points(centers) - positions
+    return np.sqrt(np.einsum("ni,ni->n", away, np.linalg.solve(covariances, away[:, :, None])[:, :, 0]))
+
+
+def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
+    """Refuses positions that fit well with other axes or units, and badly as they are.
+
+    Raises:
+        ProblemError: they are degrees, or mirrored.
+    """
+    if len(centers) < LEAST_IMAGES:
+        return
+    others = [(positions * [-1, 1, 1], "mirrored: are two axes swapped, or is one reversed?")]
+    for latitude, longitude in ((0, 1), (1, 0)):
+        middle = np.median(positions, axis=0)
+        near = np.median(np.abs(positions - middle)[:, :2].max(axis=1)) < LARGEST_AREA
+        if near and np.abs(positions[:, latitude]).max() <= 90 and np.abs(positions[:, longitude]).max() <= 180:
+            east, north = (np.radians(positions - middle)[:, at] * EARTH for at in (longitude, latitude))
+            metres = np.stack([east * np.cos(np.radians(middle[latitude])), north, positions[:, 2]], axis=1)
+            others.append((metres, "latitude and longitude in degrees: give metres, such as UTM's or east, north, up"))
+    misfit = _misfit(centers, positions)
+    for other, what in others:
+        if _misfit(centers, other) < min(BETTER * misfit, EXPLAINED):
+            raise ProblemError(f"the positions seem to be {what} (align: false takes them as they are)")
+
+
+def _misfit(centers: np.ndarray, positions: np.ndarray) -> float:
+    """Median distance of the centres from the positions that they best fit, as a share of the extent."""
+    extent = float(np.median(np.linalg.norm(positions - np.median(positions, axis=0), axis=1)))
+    if not extent > 0:
+        return np.inf
+    small = np.broadcast_to((1e-6 * extent) ** 2 * np.eye(3), (len(positions), 3, 3))
+    fit, _ = _robust_fit(centers, positions, small)
+    return float(np.median(np.linalg.norm(fit.points(centers) - positions, axis=1))) / extent
