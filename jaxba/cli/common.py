@@ -256,7 +256,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
     """
     import jax
 
-    from jaxba.runtime import compilation
+    from jaxba.runtime import compilation, distrust
     from jaxba.runtime.user_cache import user_cache
 
     choice = os.environ.get(CACHE_VARIABLE, "")
@@ -267,6 +267,7 @@ def use_compilation_cache(untraced: bool = False) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return  # without a writable cache folder the command only takes longer
+    distrust.limit_instructions(folder)
     if untraced:
         compilation.use_cache(folder)
         return

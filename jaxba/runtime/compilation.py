@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 from jax import monitoring
 
+from jaxba.runtime import distrust
 from jaxba.runtime.executable_cache import CachedExecutable, ExecutableCache, watch_compilation
 from jaxba.runtime.fusion import fast_compilation
 from jaxba.runtime.jit import Options, jit, known_options, right_options
@@ -262,7 +263,8 @@ class ParallelCompilation:
         if function in self._verified:
             return stored.run(*given)
         try:
-            result = jax.block_until_ready(stored.run(*given))
+            with distrust.first_run(stored.path.parent):
+                result = jax.block_until_ready(stored.run(*given))
         except Exception:  # XLA finds some damage only when it runs a program
             del self.loaded[function]
             if _cache is not None:

@@ -31,7 +31,7 @@ import numpy as np
 from jax import monitoring
 from jaxlib import xla_client
 
-from jaxba.runtime import process
+from jaxba.runtime import distrust, process
 from jaxba.runtime.atomic import TEMPORARY, atomic_write
 
 SUFFIX = ".jaxba-program"
@@ -96,7 +96,8 @@ class ExecutableCache:
         if path is None or not path.is_file():
             return None
         try:
-            stored = _load(path)
+            with distrust.reading(path.parent):
+                stored = _load(path)
         except Exception:  # of another version, damaged, or gone: it is compiled anew and overwritten
             return None
         with contextlib.suppress(OSError):  # the folder may belong to another user
@@ -272,10 +273,8 @@ def _environment() -> str:
 def _machine() -> str:
     names = [jax.__version__, jaxlib.__version__, platform.machine(), str(os.cpu_count())]
     names += [f"{device.platform} {device.device_kind} {device.client.platform_version}" for device in jax.devices()]
-    cpus = Path("/proc/cpuinfo")
-    lines = cpus.read_text().splitlines() if cpus.is_file() else []
-    features = sorted({line for line in lines if line.startswith(("flags", "Features"))})
-    return "\n".join([*names, *(features or [platform.node()])])  # else a folder may be shared with another processor
+    features = distrust.processor_features() or [platform.node()]
+    return "\n".join([*names, *features])  # else a folder may be shared with another processor
 
 
 def _source() -> str:
