@@ -48,6 +48,11 @@ def same(one: Any, other: Any) -> bool:
     return bool(one == other)
 
 
+def differ(one: Any, other: Any) -> bool:
+    """Whether two values are not the `same`: for a named tuple, since tuples bring a comparison of their own."""
+    return not same(one, other)
+
+
 def outline(value: Any) -> str:
     """A value in one short line: arrays by type and shape."""
     if isinstance(value, AnyArray) and value.ndim:

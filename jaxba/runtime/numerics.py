@@ -9,6 +9,7 @@ from typing import Any, TypeVar, cast
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from jaxba.runtime.process import refuse_fork, single_blas_thread
 
@@ -73,7 +74,7 @@ def for_traces(function: Function) -> Function:
 
 def refuse_traces(values: Any) -> None:
     """Raises a TypeError if JAX traces: one of the values, arrays in a pytree, is a tracer."""
-    if any(isinstance(value, jax.core.Tracer) for value in jax.tree.leaves(values)):
+    if any(isinstance(value, Tracer) for value in jax.tree.leaves(values)):
         raise TypeError(TRACED)
 
 

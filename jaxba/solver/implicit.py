@@ -55,7 +55,7 @@ from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, check_problem, set_up
 from jaxba.solver.solve import solve
 from jaxba.structure.layout import Layout
-from jaxba.typing import AnyArray, outline, same
+from jaxba.typing import AnyArray, differ, outline, same
 
 DAMPING = 1e-10
 """lambda of the Gauss-Newton system in the preconditioner: enough that a free gauge leaves it positive definite."""
@@ -82,7 +82,7 @@ class SolveInputs(NamedTuple):
     positions: Float[AnyArray, "cameras 3"] | None = None
     """Measured positions, if the problem has priors."""
 
-    __eq__, __repr__, __hash__ = same, outline, None  # pyright: ignore[reportAssignmentType]
+    __eq__, __ne__, __repr__, __hash__ = same, differ, outline, None  # pyright: ignore[reportAssignmentType]
 
 
 def inputs_of(problem: BundleProblem) -> SolveInputs:

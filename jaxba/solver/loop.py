@@ -25,7 +25,7 @@ from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout, num_partitions
 from jaxba.structure.segment_sums import point_sum
-from jaxba.typing import AnyArray, outline, same
+from jaxba.typing import AnyArray, differ, outline, same
 
 
 class History(NamedTuple):
@@ -55,7 +55,7 @@ class History(NamedTuple):
     step_norm: AnyArray
     """Norm of the candidate's step."""
 
-    __eq__, __repr__, __hash__ = same, outline, None  # pyright: ignore[reportAssignmentType]
+    __eq__, __ne__, __repr__, __hash__ = same, differ, outline, None  # pyright: ignore[reportAssignmentType]
 
 
 class Carry(NamedTuple):
