@@ -112,7 +112,7 @@ def few_programs():
     process.release_programs()
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture(scope="session", autouse=True)
 def ctrl_c():
     """Ctrl-C has Python's handler, and so the system's in child processes, also where the shell that started pytest
     ignores it, as `nohup` and many job systems do."""
