@@ -54,17 +54,17 @@ def test_a_step_with_fewer_point_iterations_is_that_of_options_with_fewer_and_co
     for count in (1, 3):
         expected, _ = step(layout, state, 1e-3, replace(options, refinement=replace(options.refinement, points=count)))
         found, _ = _step(layout, state, damping, options, effort=effort(count))
-        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-9)
         np.testing.assert_allclose(found.points, expected.points, rtol=1e-9, atol=1e-12)
         costs.append(float(found.cost))
     assert costs[1] < costs[0]
     compiled = _step._cache_size()
     none, _ = _step(layout, state, damping, options, effort=effort(0))
     more, _ = _step(layout, state, damping, options, effort=effort(9))
-    np.testing.assert_allclose(more.cost, costs[1], rtol=1e-12)  # never more than the options have
+    np.testing.assert_allclose(more.cost, costs[1], rtol=1e-9)  # never more than the options have
     assert _step._cache_size() == compiled
     plain, _ = step(layout, state, 1e-3, StepOptions())
-    np.testing.assert_allclose(none.cost, plain.cost, rtol=1e-12)
+    np.testing.assert_allclose(none.cost, plain.cost, rtol=1e-9)
     assert none.cost > costs[0]
 
 
@@ -81,7 +81,7 @@ def test_a_step_without_repairs_is_that_of_options_without_them_and_counts_its_w
         )
         (found, few), (_, many) = run(False), run(True)
         expected, plain = step(layout, state, damping, StepOptions(refinement=Refinement(points=1)))
-        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-12)
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-9)
         assert (few.repairs, few.camera_rounds, few.point_iterations) == (0, 0, 1)
         assert bool(few.accepted) == bool(plain.accepted)
         assert many.camera_rounds <= many.repairs
