@@ -125,4 +125,8 @@ def determined_directions(problem: BundleProblem) -> Float[np.ndarray, "points 3
     kept = np.greater(values, PARALLEL * np.maximum(values[:, 2:], np.finfo(float).tiny))
     if problem.constants is not None:
         kept &= ~np.asarray(problem.constants.points)[:, None]
-    return np.where(kept.all(axis=1)[:, None, None], np.eye(3), (vectors * kept[:, None]) @ vectors.transpose(0, 2, 1))
+    return np.where(
+        np.logical_and.reduce(kept, axis=1)[:, None, None],
+        np.eye(3),
+        (vectors * kept[:, None]) @ vectors.transpose(0, 2, 1),
+    )

@@ -63,6 +63,9 @@ DAMPING = 1e-10
 TOLERANCE = 1e-12
 """Relative residual at which conjugate gradients with the exact Hessian stop."""
 
+LARGEST_RESIDUAL = 1e-6
+"""Relative residual above which derivatives are refused. Where the solution is determined it is below 1e-12."""
+
 MAX_PRODUCTS = 300
 """Most products with the exact Hessian. Where residuals are small the Gauss-Newton system is nearly it, and ten do."""
 
@@ -174,7 +177,7 @@ def _transposed(
         still = _symmetries(setup.counted, here, setup.layout, order)
         arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, still, inputs, cotangents)
         found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
-    if not float(residual) < 1e-4:
+    if not float(residual) < LARGEST_RESIDUAL:
         raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
     return found
 

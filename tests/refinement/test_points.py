@@ -114,11 +114,7 @@ def test_every_point_ends_where_scipy_ends_on_that_point_alone(loss):
             return (r * np.sqrt(published_loss(loss.rho, loss.scale, squared)[0] / squared)[:, None]).ravel()
 
         best = least_squares(residuals, problem.points[point], method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-<<<<<<< HEAD
-        # SciPy's derivative by differences of 1.5e-8 is off by as much; where Huber bends, its minimum by 50 times that
-=======
         # SciPy's derivatives, by differences, are off by 1e-8, and by that times its conditioning a point's end
->>>>>>> cases
         np.testing.assert_allclose(found.points[point], best.x, rtol=1e-5, atol=2e-5)
         np.testing.assert_allclose(point_costs(found, loss)[point], best.cost, rtol=1e-9)
 
