@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxba.problem.checks import SHOWN
 from jaxba.problem.losses import Loss
-from jaxba.problem.values import shown
 
 NAMED = 3
 """Names that a message gives of a longer list."""
@@ -47,15 +47,15 @@ def names_of(names: Sequence[str]) -> str:
 
 
 def parse_items(value: Any, what: str) -> list[str]:
-    """A list of names or ids; one alone counts as a list, and no text as an empty one.
+    """A list of names or ids; one alone counts as a list.
 
     Raises:
         ValueError: something else; one line.
     """
-    items = value if isinstance(value, list) else [value] if value != "" else []
+    items = value if isinstance(value, list) else [value]
     for item in items:
-        if not isinstance(item, str):
-            raise ValueError(f"must be a list ({what}), not {shown(value if items is not value else item)}")
+        if not isinstance(item, str) or not item:
+            raise ValueError(f"must be a list ({what}), not {_written(value if items is not value else item)}")
     return items
 
 
@@ -67,15 +67,15 @@ def parse_position_priors(value: Any) -> PositionPriors:
         ValueError: something that this cannot be; one line that names the key and the image.
     """
     if not isinstance(value, dict):
-        raise ValueError(f"must be a mapping with the keys {', '.join(PARTS)}, not {shown(value)}")
+        raise ValueError(f"must be a mapping with the keys {', '.join(PARTS)}, not {_written(value)}")
     unknown = [key for key in value if key not in PARTS]
     if unknown:
-        raise ValueError(f"unknown key {shown(unknown[0])}; there are {', '.join(PARTS)}")
+        raise ValueError(f"unknown key {_written(unknown[0])}; there are {', '.join(PARTS)}")
     if "positions" not in value:
         raise ValueError("'positions' is missing")
     given = value["positions"]
     if not isinstance(given, dict) or not given:
-        raise ValueError(f"positions: must be a mapping from images to [x, y, z], not {shown(given)}")
+        raise ValueError(f"positions: must be a mapping from images to [x, y, z], not {_written(given)}")
     images = parse_items(list(given), "names or ids of images")
     places = [_numbers(f"positions: {image}", place, "three numbers", (3,)) for image, place in given.items()]
     return PositionPriors(
@@ -85,6 +85,17 @@ def parse_position_priors(value: Any) -> PositionPriors:
         Loss(value.get("loss", "squared"), float(_numbers("loss_scale", value.get("loss_scale", "1"), "a number", ()))),
         _truth("align", value.get("align", "true")),
     )
+
+
+def _written(value: Any) -> str:
+    """A value as the file has it, on one line and not too long."""
+    if isinstance(value, list):
+        text = f"[{', '.join(map(_written, value))}]"
+    elif isinstance(value, dict):
+        text = f"{{{', '.join(f'{key}: {_written(item)}' for key, item in value.items())}}}"
+    else:
+        text = " ".join(str(value).split()) or "nothing"
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
 def _stddev(value: Any, images: list[str]) -> Float[np.ndarray, "n 3"]:
@@ -105,7 +116,7 @@ def _stddev(value: Any, images: list[str]) -> Float[np.ndarray, "n 3"]:
 def _deviations(where: str, value: Any) -> Float[np.ndarray, "3"]:
     numbers = _numbers(where, value, "a positive number, or three", (), (3,))
     if not (numbers > 0).all():
-        raise ValueError(f"{where}: must be a positive number, or three, not {shown(value)}")
+        raise ValueError(f"{where}: must be a positive number, or three, not {_written(value)}")
     return np.broadcast_to(numbers, 3)
 
 
@@ -119,12 +130,12 @@ def _numbers(where: str, value: Any, what: str, *shapes: tuple[int, ...]) -> Flo
     except (TypeError, ValueError, OverflowError):
         numbers = np.array(np.nan)
     if numbers.shape not in shapes or not np.isfinite(numbers).all():
-        raise ValueError(f"{where}: must be {what}, not {shown(value)}")
+        raise ValueError(f"{where}: must be {what}, not {_written(value)}")
     return numbers
 
 
 def _truth(where: str, value: Any) -> bool:
     known = {"true": True, "false": False}
     if not isinstance(value, str) or value.lower() not in known:
-        raise ValueError(f"{where}: must be true or false, not {shown(value)}")
+        raise ValueError(f"{where}: must be true or false, not {_written(value)}")
     return known[value.lower()]

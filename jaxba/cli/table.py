@@ -13,7 +13,8 @@ from jaxba.cli.common import counted
 from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.facing import image_names, views_behind, without_views_of
+from jaxba.problem.facing import NAMED, views_behind, without_views_of
+from jaxba.problem.labels import part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK
@@ -223,6 +224,6 @@ def remarks(problem: BundleProblem, solution: Solution) -> list[str]:
         why = ": is the scene mirrored, or of another convention?" if 2 * np.sum(before) > len(before) else ""
         lines.append(
             f"note: observations behind their camera: {np.sum(before)} at the start, {np.sum(after)} at the end "
-            f"(most of {image_names(problem, most)}){why}"
+            f"(most of {part_names(problem.labels, 'image', most, NAMED)}){why}"
         )
     return lines

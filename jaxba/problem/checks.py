@@ -1,4 +1,4 @@
-"""Checks of arrays that people hand over, with messages of one line."""
+"""Checks of what people hand over, with messages of one line."""
 
 from __future__ import annotations
 
@@ -6,8 +6,18 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxba.runtime.numerics import TRACED
+
+SHOWN = 60
+"""Characters of a wrong value that a message shows."""
+
+
+def shown(value: Any) -> str:
+    """A value as a message shows it: on one line, and not too long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
 def plain_array(name: str, values: Any) -> np.ndarray:
@@ -41,3 +51,29 @@ def real_numbers(name: str, values: Any) -> np.ndarray:
     except (TypeError, ValueError, OverflowError):  # objects
         pass
     raise ValueError(f"{name} must be real numbers, not {array.dtype}")
+
+
+def finite(what: str, value: Any, *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """Finite numbers as a float64 array of one of the given shapes.
+
+    Args:
+        what: whose they are, the beginning of the message.
+        value: what the user gave.
+        shapes: those that are allowed.
+
+    Raises:
+        ValueError: something else; one line.
+        TypeError: JAX traces them.
+    """
+    wanted = "be one number" if shapes == ((),) else f"have shape {' or '.join(map(str, dict.fromkeys(shapes)))}"
+    try:
+        array = plain_array(what, value)
+    except ValueError:
+        array = np.asarray(None)
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{what} must {wanted}, not {shown(value)}")
+    if array.shape not in shapes:
+        raise ValueError(f"{what} must {wanted}, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{what} must be finite")
+    return np.ascontiguousarray(array, np.float64).reshape(array.shape)

@@ -16,10 +16,10 @@ from jaxtyping import Bool, Int
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
+from jaxba.problem.checks import shown
 from jaxba.problem.constants import ROTATION, Constants, constants_of
 from jaxba.problem.freedoms import fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
-from jaxba.problem.values import shown
 
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
 """Positions, names of images, a mask, or all of them."""

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Int
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemWarning
 from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.labels import part_names
 
 NAMED = 3
 """Most images that a message names."""
@@ -59,15 +60,8 @@ def aside_text(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> str:
         whose, stay = "an image that faces", "its pose stays as it is"
     if problem.rigs is not None:
         stay = "only a rig moves them" if len(away) > 1 else "only its rig moves it"
-    return f"left out {views} observations of {whose} away from them ({image_names(problem, away)}); {stay}"
-
-
-def image_names(problem: BundleProblem, cameras: Int[np.ndarray, " some"]) -> str:
-    """The first `NAMED` of some cameras by the names of their images, or by number where a file has no names."""
-    labels = problem.labels
-    names = [f"camera {at}" if labels is None else labels.names[at] for at in cameras[:NAMED]]
-    more = len(cameras) - len(names)
-    return ", ".join(names) + (f" and {more} more" if more else "")
+    names = part_names(problem.labels, "image", away, NAMED)
+    return f"left out {views} observations of {whose} away from them ({names}); {stay}"
 
 
 def without_views_of(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> BundleProblem:

@@ -60,10 +60,10 @@ def part_name(labels: Labels | None, kind: Part, at: int) -> str:
     return f"camera {labels.lenses[at]}" if kind == "lens" else f"point {labels.points[at]}"
 
 
-def part_names(labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"]) -> str:
-    """The same for some parts of a kind; of many the first."""
-    more = f" and {len(which) - 1} more" if len(which) > 1 else ""
-    return part_name(labels, kind, int(which[0])) + more
+def part_names(labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"], named: int = 1) -> str:
+    """The same for some parts of a kind; of more than `named` the first ones."""
+    more = f" and {len(which) - named} more" if len(which) > named else ""
+    return ", ".join(part_name(labels, kind, int(at)) for at in which[:named]) + more
 
 
 def _found(ids: Integer[np.ndarray, " n"], wanted: Iterable[int | str]) -> list[int]:

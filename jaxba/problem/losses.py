@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.problem.values import finite, shown
+from jaxba.problem.checks import finite, shown
 
 
 def _squared(s: Array) -> tuple[Array, Array]:

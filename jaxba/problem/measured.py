@@ -14,10 +14,10 @@ from jaxtyping import Float
 
 from jaxba.problem.alignment import aligned
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.checks import finite, shown
 from jaxba.problem.constraints import every_lens, number_columns, positions_of
 from jaxba.problem.losses import Loss
 from jaxba.problem.priors import Priors
-from jaxba.problem.values import finite, shown
 
 LEAST_VARIANCE = 1e-200
 """Smallest eigenvalue of a covariance whose inverse can be computed with."""

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field, replace
 
 from jaxtyping import Float
 
+from jaxba.problem.checks import finite, shown
 from jaxba.problem.losses import Loss
-from jaxba.problem.values import finite, shown
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 

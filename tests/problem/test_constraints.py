@@ -126,7 +126,7 @@ def test_a_gauge_holds_what_constants_and_priors_leave_free(fixed, numbers):
 WRONG = [5, None, "x", [[0], [1, 2]], [[1, 2]], [None], [float("nan")], [-1], [99], {"a": 1}, object()]
 
 
-@pytest.mark.parametrize("wrong", WRONG, ids=repr)
+@pytest.mark.parametrize("wrong", WRONG, ids=lambda wrong: repr(wrong)[:12])
 def test_wrong_values_are_one_line_in_our_own_words(wrong, unchecked):
     problem = support.tiny()
     centers, eye = geometry.camera_centers(problem.cameras), np.eye(3)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import support
@@ -26,8 +24,8 @@ from jaxba.cli.solve import run
 from jaxba.cli.table import remarks
 from jaxba.problem import geometry
 from jaxba.problem.camera_models import CAMERA_MODELS
-from jaxba.problem.facing import facing_away, image_names, views_behind
-from jaxba.problem.labels import Labels
+from jaxba.problem.facing import facing_away, views_behind
+from jaxba.problem.labels import Labels, part_names
 from jaxba.solver.loop import History
 
 BACK = np.diag([-1.0, 1.0, -1.0])
@@ -114,9 +112,8 @@ def test_all_views_of_a_start_of_bal_count():
 
 def test_images_are_named_as_in_their_file():
     labels = Labels(tuple("abcdef"), np.arange(6), np.arange(6), np.arange(40))
-    problem = dataclasses.replace(support.tiny(), labels=labels)
-    assert image_names(problem, np.array([4])) == "e"
-    assert image_names(problem, np.arange(1, 6)) == "b, c, d and 2 more"
+    assert part_names(labels, "image", np.array([4])) == "image 4 (e)"
+    assert part_names(labels, "image", np.arange(1, 4), 2) == "image 1 (b), image 2 (c) and 1 more"
 
 
 def test_the_command_refuses_under_strict_and_says_else_what_was_left_out(tmp_path, capsys):
