@@ -183,7 +183,7 @@ class Arguments:
     """Watch the solve in the browser while it runs (extra view)."""
 
     log: str | None = None
-    """Output file of a JSON record of the solve, compressed by its ending."""
+    """Output file of a JSON record of the solve, compressed by its ending; - is standard output."""
 
     device: Literal["auto", "cpu"] = "auto"
     """cpu: the CPU, also where JAX has a GPU."""

@@ -137,6 +137,8 @@ def solve(
         ValueError: unknown names, or options that exclude each other, or that contradict the name of the policy.
         ProblemError: the cost at the start is not finite, a factorisation needs more memory than the machine has, or
             the method does not support what the problem has (shared lenses, priors, rigs).
+        RuntimeError: this process was forked from one in which JAX had started.
+        TypeError: called inside `jax.jit`, `jax.vmap` or `jax.grad`.
     """
     return solve_without(None, problem, policy, options, callback=callback, watch=watch)
 
