@@ -124,6 +124,7 @@ SETTINGS = {  # of each how many directions of a similarity are free
 def from_a_body(problem: jaxba.BundleProblem, free: bool = False, apart: float = 1.0) -> jaxba.BundleProblem:
     """A rig whose axes are those of no camera: camera 1 is `apart` times as far from camera 0 as it was."""
     rig, cameras = in_rig(problem), np.array(problem.cameras)
+    assert rig.rigs is not None
     turn, place = rig.rigs.rotation, np.tile([0.2, -0.1, 0.3], (5, 1))
     centers = geometry.camera_centers(cameras)
     matrices = geometry.rotation_matrices(cameras[:, :3])
