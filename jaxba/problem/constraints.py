@@ -18,7 +18,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.checks import shown
 from jaxba.problem.constants import ROTATION, Constants, constants_of
-from jaxba.problem.freedoms import fixed_freedoms
+from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses
 
 Which = Literal["all"] | Iterable[int] | Iterable[str] | np.ndarray | jax.Array
@@ -101,8 +101,8 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     if gauge == "free":
         return problem
     constants = constants_of(problem.constants, problem.num_cameras, problem.num_points)
-    scaled = problem.rigs is not None and _has_baseline(problem)
-    if fixed_freedoms(problem, scale_known=scaled) == 7:
+    scaled = fixed_freedoms(problem.replace(constants=None, priors=None)) > 0  # by rigs alone
+    if fixed_freedoms(problem) == SIMILARITY:
         note = f"the gauge {gauge} is not needed: constants and priors fix position, orientation and scale already"
         warnings.warn(note, ProblemWarning, stacklevel=2)
         return problem
@@ -115,17 +115,6 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     else:
         _fix_three_points(problem, constants)
     return _with_constants(problem, constants)
-
-
-def _has_baseline(problem: BundleProblem) -> bool:
-    """Whether two observed cameras of a frame are in different places that are constant, which fixes the scale."""
-    assert problem.rigs is not None
-    seen = _placed(problem)
-    if not len(seen):
-        return False
-    centers = geometry.camera_centers(problem.cameras)[seen]
-    _, first, group = np.unique(np.asarray(problem.rigs.frame)[seen], return_index=True, return_inverse=True)
-    return bool((np.linalg.norm(centers - centers[first[group]], axis=1) > 1e-9 * np.ptp(centers)).any())
 
 
 def _placed(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:

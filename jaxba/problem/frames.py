@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.problem.rigs import EXTRINSICS_SIZE, Rigs
+from jaxba.problem.rigs import EXTRINSICS_SIZE, Rigs, first_of_group
 
 
 def in_frames(problem: BundleProblem) -> BundleProblem:
@@ -30,12 +30,37 @@ def in_frames(problem: BundleProblem) -> BundleProblem:
     moved = cameras[:, 3:6] - translation
     of_frame = rotation.transpose(0, 2, 1) @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
     poses = np.hstack([Rotation.from_matrix(of_frame).as_rotvec(), np.einsum("nji,nj->ni", rotation, moved)])
-    known, first = np.unique(frame[seen], return_index=True)
-    at, leader = np.isin(frame, known), np.arange(len(frame))
-    leader[at] = seen[first[np.searchsorted(known, frame[at])]]
-    poses = poses[leader]  # bit for bit the same in a frame
+    poses = poses[first_of_group(frame, seen)]  # bit for bit the same in a frame
     extrinsics = np.hstack([Rotation.from_matrix(rotation).as_rotvec(), translation])
     return problem.replace(cameras=np.hstack([poses, cameras[:, POSE_SIZE:], extrinsics]))
+
+
+def free_poses(problem: BundleProblem) -> Bool[np.ndarray, "cameras numbers"]:
+    """Which numbers of poses are optimised, and in rigs of extrinsics, of a problem `in_frames`.
+
+    Constant numbers of one camera are constant in its frame, also of one that nothing sees. The extrinsics of a lens
+    are constant where the pose of some camera of it is.
+    """
+    constants, rigs = problem.constants, problem.rigs
+    shape = problem.num_cameras, POSE_SIZE
+    held = np.zeros(shape, bool) if constants is None else np.asarray(constants.poses)
+    if rigs is None:
+        return ~held
+    places = np.zeros(shape, bool)
+    if rigs.free is not None:
+        assert problem.lenses is not None
+        of_lens = _any_of_group(np.asarray(problem.lenses.index), held)
+        of_lens = of_lens | of_lens[:, 3:].any(axis=1, keepdims=True)  # M turns t_r, too
+        places = np.asarray(rigs.free)[:, None] & ~of_lens
+    return np.hstack([~_any_of_group(np.asarray(rigs.frame), held), places])
+
+
+def _any_of_group(group: np.ndarray, values: Bool[np.ndarray, "cameras 6"]) -> Bool[np.ndarray, "cameras 6"]:
+    """Whether a value is true of any camera of the same group."""
+    _, own = np.unique(group, return_inverse=True)
+    found = np.zeros(values.shape, bool)
+    np.logical_or.at(found, own, values)
+    return found[own]
 
 
 def out_of_frames(

@@ -1,64 +1,166 @@
-"""How much of a scene's position, orientation and scale is fixed."""
+"""Directions in which a problem can move without a change of its cost: those of a similarity, and points along rays.
+
+The cost of pixels does not change when the whole scene is moved, turned and scaled about a middle m, in units of l:
+
+    X' = X + l e + w x (X - m) + s (X - m),    R' = exp(-R w) R,    t' = t - l R e + R (w x m) + s (t + R m).
+
+Constants, rigs and priors leave those combinations of the seven that keep each constant number and each measured value.
+A point whose rays are all parallel, as one that is seen once, can move along them.
+"""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.typing import AnyArray
+from jaxba.problem.frames import free_poses, in_frames
+from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.preprocess import far_middle, middle_and_extent, observed, shift
+from jaxba.problem.rigs import first_of_group
 
-NUMERICAL_RANK = 1e-6
-"""Smallest singular value, as a share of the largest, of a freedom that is fixed."""
+SIMILARITY = 7
+"""Degrees of freedom of a similarity."""
+
+RESOLVED = 1e-7
+"""Smallest change that is not rounding, of lengths as shares of the scene's extent and of radians. What a cost knows of
+it is a square, and this squared is some rounding errors of float64."""
 
 
-def fixed_freedoms(problem: BundleProblem, *, scale_known: bool = False) -> int:
-    """How many of the seven freedoms of a similarity constants and priors fix.
+class _Freedoms(NamedTuple):
+    combinations: Float[np.ndarray, "7 directions"]
+    """An orthonormal basis of what is free: of w, e and s, in this order."""
+
+    steps: Float[np.ndarray, "cameras numbers 7"]
+    """Derivatives of poses, and of extrinsics in rigs, with lengths in extents; zero for what is constant."""
+
+    points_move: Bool[np.ndarray, " points"]
+    middle: Float[np.ndarray, "3"]
+    extent: float
+
+
+def fixed_freedoms(problem: BundleProblem) -> int:
+    """How many of the seven freedoms of a similarity constants, rigs and priors fix.
 
     Args:
-        problem: any problem.
-        scale_known: whether something else gives the scale.
+        problem: any problem; one far from the origin as a solve shifts it.
     """
-    constants, priors = problem.constants, problem.priors
-    cameras = np.asarray(problem.cameras, np.float64)
-    matrices, centers = geometry.rotation_matrices(cameras[:, :3]), geometry.camera_centers(cameras)
-    middle = np.median(centers, axis=0)
-    extent = max(float(np.median(np.linalg.norm(centers - middle, axis=1))), np.finfo(float).tiny)
-    centers = (centers - middle) / extent
-    turned = np.tile(np.eye(3, 7), (len(cameras), 1, 1))  # columns: rotation, translation, scale
-    rows = [np.eye(7)[6:]] if scale_known else []
-    seen = np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0
-    placed = np.bincount(problem.point_index, minlength=problem.num_points) > 0
+    offset = far_middle(problem)
+    return SIMILARITY - _freedoms(problem if offset is None else shift(problem, -offset)).combinations.shape[1]
+
+
+def free_directions(
+    problem: BundleProblem,
+) -> tuple[Float[np.ndarray, "directions cameras parameters"], Float[np.ndarray, "directions points 3"]]:
+    """The directions of a similarity that a problem leaves free.
+
+    Args:
+        problem: any problem near the origin.
+
+    Returns:
+        Up to seven independent directions, scene units: steps of the parameters of cameras as `in_frames` has them,
+        rotations on the manifold, and of points. What does not move, and what nothing observes, has zeros.
+    """
+    found = _freedoms(problem)
+    of_poses = np.einsum("nij,jk->kni", found.steps, found.combinations)
+    of_poses *= np.where(np.arange(of_poses.shape[2]) % POSE_SIZE < 3, 1.0, found.extent)  # rotation and translation
+    lens = np.zeros((*of_poses.shape[:2], problem.cameras.shape[1] - POSE_SIZE))
+    moved = _motions((np.asarray(problem.points) - found.middle) / found.extent)
+    of_points = found.extent * np.einsum("nij,jk->kni", moved, found.combinations) * found.points_move[:, None]
+    return np.concatenate([of_poses[:, :, :POSE_SIZE], lens, of_poses[:, :, POSE_SIZE:]], axis=2), of_points
+
+
+def _freedoms(problem: BundleProblem) -> _Freedoms:
+    here, constants, priors = in_frames(problem), problem.constants, problem.priors
+    seen, points_move = observed(problem)
+    middle, extent = middle_and_extent(problem)
+    extent = extent if extent > 0 else 1.0
+    cameras = np.asarray(here.cameras, np.float64)
+    rotation, free = geometry.rotation_matrices(cameras[:, :3]), free_poses(here)
+    steps = np.zeros((*free.shape, SIMILARITY))
+    steps[:, :3, :3] = steps[:, 3:6, 3:6] = -rotation
+    steps[:, 3:6, :3] = np.cross(middle, rotation) / extent
+    steps[:, 3:6, 6] = (cameras[:, 3:6] + rotation @ middle) / extent
+    rows = [np.zeros((SIMILARITY, SIMILARITY))]
+    if here.rigs is not None:
+        rows.append(_scale_rigs(here, steps, seen, free, extent))
+    rows.append(steps[seen][~free[seen]])
     if constants is not None:
-        held = seen
-        if problem.rigs is not None:
-            frame = np.asarray(problem.rigs.frame)
-            held = np.isin(frame, frame[seen])
-        poses = np.asarray(constants.poses) & held[:, None]
-        points = (np.asarray(problem.points, np.float64)[np.asarray(constants.points) & placed] - middle) / extent
-        # t = -R c moves by -R v for a translation v, not at all for a rotation, and by s t for the scale
-        scaled = -np.einsum("nij,nj->ni", matrices, centers)[:, :, None]
-        moved = np.concatenate([0 * matrices, -matrices, scaled], axis=2)
-        rows += [turned[poses[:, 0]], moved[poses[:, 3:]], _motions(points)]
-    if priors is not None:  # images that nothing sees have none (structure/unknowns.py)
-        rows += [(_directions(priors.position_whitening) @ _motions(centers))[seen]]
-        rows += [(_directions(priors.rotation_whitening) @ matrices @ turned)[seen]]
-    stacked = np.concatenate([np.zeros((1, 7)), *(part.reshape(-1, 7) for part in rows)])
-    values = np.linalg.svd(stacked.T @ stacked, compute_uv=False)
-    return int(np.sum(values > NUMERICAL_RANK**2 * max(values[0], np.finfo(float).tiny)))
+        held = np.asarray(constants.points) & points_move
+        rows.append(_motions((np.asarray(problem.points)[held] - middle) / extent))
+        points_move = points_move & ~held
+    if priors is not None:
+        whole = np.asarray(problem.cameras)[seen]  # of cameras, not of their frames
+        turns = geometry.rotation_matrices(whole[:, :3]) @ np.eye(3, SIMILARITY)
+        places = _motions((geometry.camera_centers(whole) - middle) / extent)
+        for whitening, change in ((priors.position_whitening, places), (priors.rotation_whitening, turns)):
+            matrices = np.asarray(whitening, np.float64)[seen]
+            size = np.abs(matrices).max(axis=(1, 2), initial=0.0, keepdims=True)
+            rows.append(matrices / np.where(size > 0, size, 1.0) @ change)
+    staying = np.concatenate([part.reshape(-1, SIMILARITY) for part in rows])
+    staying /= np.maximum(np.abs(staying).max(axis=1, keepdims=True), 1.0)  # far away small turns are large motions
+    _, values, basis = np.linalg.svd(staying, full_matrices=False)
+    moves = free & seen[:, None]
+    return _Freedoms(basis[values <= RESOLVED].T, steps * moves[:, :, None], points_move, middle, extent)
+
+
+def _scale_rigs(
+    here: BundleProblem,
+    steps: Float[np.ndarray, "cameras 12 7"],
+    seen: Bool[np.ndarray, " cameras"],
+    free: Bool[np.ndarray, "cameras 12"],
+    extent: float,
+) -> Float[np.ndarray, "moved 3 7"]:
+    """Adds to steps how the places of cameras in rigs change with the scale; returns what must not change besides.
+
+    A rig becomes larger about the first of its cameras whose place is constant: the poses of frames move so that it is
+    where it has to be. All cameras of a lens have the same place.
+    """
+    assert here.rigs is not None
+    frame, turn, moved = (np.asarray(x) for x in (here.rigs.frame, here.rigs.rotation, here.rigs.translation))
+    places_move = free[:, POSE_SIZE:].any(axis=1)
+    held, moving = np.flatnonzero(seen & ~places_move), np.flatnonzero(seen & places_move)
+    if len(held):
+        first = np.where(np.isin(frame, frame[held]), first_of_group(frame, held), held[0])
+        center = np.einsum("nji,nj->ni", turn, moved)[first]
+        steps[:, 3:6, 6] += center / extent
+        moved = moved - np.einsum("nij,nj->ni", turn, center)
+    steps[:, 9:, 6] = moved / extent
+    same = first_of_group(np.arange(len(frame)) if here.lenses is None else np.asarray(here.lenses.index), moving)
+    return steps[moving, 9:] - steps[same[moving], 9:]
 
 
 def _motions(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 7"]:
-    """Derivatives of positions by a rotation, a translation and the scale."""
-    x, y, z = points.T
-    nothing = np.zeros_like(x)
-    crossed = np.array([[nothing, z, -y], [-z, nothing, x], [y, -x, nothing]]).transpose(2, 0, 1)
-    return np.concatenate([crossed, np.tile(np.eye(3), (len(points), 1, 1)), points[:, :, None]], axis=2)
+    """Derivatives of positions, about the middle and in extents, by a rotation, a translation and the scale."""
+    axes = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([np.cross(points[:, None], axes), axes, points[:, :, None]], axis=2)
 
 
-def _directions(whitening: Float[AnyArray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """Whitening matrices without their sizes."""
-    matrices = np.asarray(whitening, np.float64)
-    size = np.abs(matrices).max(axis=(1, 2), initial=0, keepdims=True)
-    return matrices / np.where(size > 0, size, 1)
+def determined_directions(problem: BundleProblem) -> Float[np.ndarray, "points 3 3"]:
+    """For each point the projection on the directions in which its rays determine it.
+
+    It is the identity for a point with rays that are not parallel, zero for one that is constant or has no rays.
+
+    Args:
+        problem: in the coordinates of its own cameras, not `in_frames`.
+    """
+    centers = geometry.camera_centers(problem.cameras)
+    rays = np.asarray(problem.points)[problem.point_index] - centers[problem.camera_index]
+    rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(float).tiny)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None]
+    if problem.whitening is not None:
+        across = across * np.asarray(problem.whitening).any(axis=(1, 2), keepdims=True)
+    total = np.zeros((problem.num_points, 3, 3))
+    np.add.at(total, problem.point_index, across)
+    values, vectors = np.linalg.eigh(total)
+    kept = np.greater(values, RESOLVED**2 * np.maximum(values[:, 2:], np.finfo(float).tiny))
+    if problem.constants is not None:
+        kept &= ~np.asarray(problem.constants.points)[:, None]
+    return np.where(
+        np.logical_and.reduce(kept, axis=1)[:, None, None],
+        np.eye(3),
+        (vectors * kept[:, None]) @ vectors.transpose(0, 2, 1),
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import camera_centers, depths, rotation_matrices, translations
@@ -75,25 +75,30 @@ def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
 def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"] | None:
     """The marginal median of the points if a scene is far from the origin, as georeferenced scenes are; else None.
 
-    "Far" is more than `FAR` times the extent: the larger of the median distances of points and of cameras from the
-    median of the points.
+    "Far" is more than `FAR` times the extent.
 
     Returns:
         Shape (3,), scene units.
     """
-    cameras, points = _observed(problem)
+    middle, extent = middle_and_extent(problem)
+    with np.errstate(all="ignore"):
+        return middle if np.linalg.norm(middle) > FAR * extent > 0 else None
+
+
+def middle_and_extent(problem: BundleProblem) -> tuple[Float[np.ndarray, "3"], float]:
+    """The marginal median of the observed points, and the larger of the median distances of them and of the cameras
+    that see them from it, scene units; zeros if nothing is observed."""
+    cameras, points = observed(problem)
     if not points.any():
-        return None
+        return np.zeros(3), 0.0
     with np.errstate(all="ignore"):  # a scene that overflows is rejected later, with a message
         positions = np.asarray(problem.points, np.float64)[points]
         centers = camera_centers(np.asarray(problem.cameras, np.float64)[cameras])
         middle = _upper_median(positions)
-        extent = max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in (positions, centers))
-        far = np.linalg.norm(middle) > FAR * extent > 0
-    return middle if far else None
+        return middle, max(float(np.median(np.linalg.norm(p - middle, axis=1))) for p in (positions, centers))
 
 
-def _observed(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
+def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool[np.ndarray, " points"]]:
     """Whether each camera, and each point, has an observation."""
     cameras = np.bincount(problem.camera_index, minlength=problem.num_cameras)
     return cameras > 0, np.bincount(problem.point_index, minlength=problem.num_points) > 0
@@ -109,7 +114,7 @@ def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProbl
         offset: translation, scene units.
     """
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
-    seen, placed = _observed(problem)
+    seen, placed = observed(problem)
     cameras[seen, 3:6] -= rotation_matrices(cameras[seen, :3]) @ offset  # t = -R c
     points[placed] += offset
     priors = problem.priors

@@ -131,6 +131,16 @@ def _checked_free(
     return free
 
 
+def first_of_group(
+    group: Int[np.ndarray, " cameras"], chosen: Int[np.ndarray, " chosen"]
+) -> Int[np.ndarray, " cameras"]:
+    """For each camera the first chosen one of its group; itself if there is none."""
+    known, first = np.unique(group[chosen], return_index=True)
+    at, found = np.isin(group, known), np.arange(len(group))
+    found[at] = chosen[first[np.searchsorted(known, group[at])]]
+    return found
+
+
 def with_unseen_of_frames(
     rigs: Rigs, cameras: Float[np.ndarray, "cameras parameters"], seen: Int[np.ndarray, " seen"]
 ) -> Float[np.ndarray, "cameras parameters"]:
@@ -138,12 +148,11 @@ def with_unseen_of_frames(
     from scipy.spatial.transform import Rotation
 
     frame = np.asarray(rigs.frame)
-    unseen = np.setdiff1d(np.arange(len(cameras)), seen)
-    known, first = np.unique(frame[seen], return_index=True)
-    unseen = unseen[np.isin(frame[unseen], known)]
+    of = first_of_group(frame, seen)
+    unseen = np.setdiff1d(np.flatnonzero(of != np.arange(len(cameras))), seen)
     if not len(unseen):
         return cameras
-    of = seen[first[np.searchsorted(known, frame[unseen])]]
+    of = of[unseen]
     rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
     found = np.array(cameras)
     back = np.einsum("nij,nkj->nik", rotation[unseen], rotation[of])  # M_unseen M_seen^T

@@ -29,6 +29,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.facing import facing_away, without_views_of
 from jaxba.problem.frames import in_frames
+from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, lens_size
 from jaxba.problem.labels import Part, part_names
 from jaxba.problem.losses import Loss
@@ -37,7 +38,6 @@ from jaxba.problem.preprocess import far_middle, shift
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.gauge import free_gauge
 from jaxba.solver.prepare import check_problem, layout_order
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.typing import ArrayRecord
@@ -130,16 +130,16 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     check_problem(problem)
     options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
     given, problem = problem, without_views_of(problem, facing_away(problem))
+    free = SIMILARITY - fixed_freedoms(problem)
+    if free:
+        which = "7 directions of the cameras are" if free == SIMILARITY else f"{free} of 7 directions of the scene are"
+        hint = "fix them with a gauge, constants or priors"
+        raise ProblemError(f"{which} not determined by what is observed; {hint}")
     offset = far_middle(problem)
     problem = in_frames(problem if offset is None else shift(problem, -offset))
     with numerics(np.dtype("float64")):
         layout = layout_for(problem, options)
         linear = jax.device_get(jit(_linear, static_argnames="options")(layout, problem, options))
-    free = len(free_gauge(problem, layout)[0])
-    if free:
-        which = "7 directions of the cameras are" if free == 7 else f"{free} of 7 directions of the scene are"
-        hint = "fix them with a gauge, constants or priors"
-        raise ProblemError(f"{which} not determined by what is observed; {hint}")
     index, count = _unknown_index(problem, layout)
     free_points = np.ones(problem.num_points, bool)
     if problem.constants is not None:

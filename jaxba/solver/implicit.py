@@ -8,7 +8,7 @@ measured positions and what is constant. So
 with the exact Hessian H, not its Gauss-Newton approximation. Reverse mode takes one solve with H: conjugate gradients
 with products by forward over reverse mode, preconditioned by the Schur complement of the Gauss-Newton system, that is,
 by the linear solver of the solve itself. Nothing is differentiated through iterations. Where symmetries leave an orbit
-of minima (solver/gauge.py), H is singular along it: y moves orthogonally to the orbit, by the pseudo-inverse.
+of minima (problem/freedoms.py), H is singular along it: y moves orthogonally to the orbit, by the pseudo-inverse.
 
 Source: Griewank and Walther 2008, "Evaluating Derivatives", chapter 15; Blondel et al. 2022, "Efficient and Modular
 Implicit Differentiation".
@@ -45,12 +45,12 @@ from jaxba.model.linearize import cost, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import facing_away
 from jaxba.problem.frames import in_frames
+from jaxba.problem.freedoms import RESOLVED, SIMILARITY, determined_directions, free_directions
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, numerics, refuse_traces
-from jaxba.solver.gauge import BROKEN, SIMILARITY, determined_directions, free_gauge
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY, check_problem, set_up
 from jaxba.solver.solve import solve
@@ -174,7 +174,7 @@ def _transposed(
         slots = set_up(solved.replace(observations=numbered), policy, options, away).layout.pixels[0]
         order = np.concatenate([np.asarray(members) for members in setup.layout.bucket_points])
         here = in_frames(setup.counted)
-        still = _symmetries(setup.counted, here, setup.layout, order)
+        still = _symmetries(setup.counted, setup.layout, order)
         arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, still, inputs, cotangents)
         found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
     if not float(residual) < LARGEST_RESIDUAL:
@@ -191,9 +191,11 @@ class Symmetries(NamedTuple):
     points: Float[AnyArray, "points 3 3"]
 
 
-def _symmetries(solved: BundleProblem, in_frames: BundleProblem, layout: Layout, order: np.ndarray) -> Symmetries:
+def _symmetries(solved: BundleProblem, layout: Layout, order: np.ndarray) -> Symmetries:
     determined = determined_directions(solved)
-    cameras, points = free_gauge(in_frames, layout)
+    cameras, points = free_directions(solved)
+    if layout.unknowns is not None:
+        cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
     # only what of it is not already a motion of points along their rays
     points = np.einsum("pij,kpj->kpi", determined, points)
     real = order < solved.num_points
@@ -202,7 +204,7 @@ def _symmetries(solved: BundleProblem, in_frames: BundleProblem, layout: Layout,
     whole = np.hstack([x.reshape(len(x), math.prod(x.shape[1:])) for x in (cameras, points)])
     _, sizes, rows = np.linalg.svd(whole, full_matrices=False)
     basis = np.zeros((SIMILARITY, whole.shape[1]))
-    basis[: len(whole)] = np.where((sizes > BROKEN * sizes.max(initial=0.0))[:, None], rows, 0.0)
+    basis[: len(whole)] = np.where((sizes > RESOLVED * sizes.max(initial=0.0))[:, None], rows, 0.0)
     split = math.prod(cameras.shape[1:])
     of_cameras, of_points = basis[:, :split], basis[:, split:]
     return Symmetries(

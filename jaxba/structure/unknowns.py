@@ -27,10 +27,10 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CameraModel
+from jaxba.problem.frames import free_poses
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
 from jaxba.problem.labels import part_name
 from jaxba.problem.priors import Priors
-from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.agreement import Agreement, size_of
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
@@ -131,7 +131,9 @@ class Unknowns(ArrayRecord):
         """The mean over the cameras of each frame."""
         return self.frame_total(values) / self.frame_total(jnp.ones_like(values[:, :1]))
 
-    def restricted(self, changes: Float[Array, "*steps parameters cameras"]) -> Float[Array, "*steps width cameras"]:
+    def restricted(
+        self, changes: Float[AnyArray, "*steps parameters cameras"]
+    ) -> Float[AnyArray, "*steps width cameras"]:
         """The unknowns of changes of all numbers of cameras."""
         rows = [*range(POSE_SIZE), *(POSE_SIZE + column for column in self.columns)]
         return changes[..., np.array(rows), :]
@@ -173,24 +175,21 @@ def unknowns_of(
     index = np.arange(count) if lenses is None else np.asarray(lenses.index)
     lens_free = np.ones((count, lens_size(lenses)), bool) if lenses is None else np.asarray(lenses.free)[index]
     lens_free = lens_free & (not fixed)
-    if in_rigs:
-        lens_free = np.hstack([lens_free, _free_extrinsics(problem, index)])
+    poses_free = free_poses(problem)
+    lens_free = np.hstack([lens_free, poses_free[:, POSE_SIZE:]])
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
-    pose_free = np.ones((count, POSE_SIZE), bool)
     free_points = None
-    if constants is not None:
-        pose_free = ~np.asarray(constants.poses)
-        if size_of(agreement, "constant points", int(np.asarray(constants.points).any())):
-            free_points = np.append(~np.asarray(constants.points), True)[np.minimum(order, problem.num_points)]
+    if constants is not None and size_of(agreement, "constant points", int(np.asarray(constants.points).any())):
+        free_points = np.append(~np.asarray(constants.points), True)[np.minimum(order, problem.num_points)]
     members = model = frame = None
     if in_rigs:
-        frame, pose_free = _frames(problem, seen[:count], pose_free)
+        frame = _frames(problem, seen[:count])
     shared, times = np.unique(index[seen[:count]], return_counts=True)
     shared = shared[times > 1]
     if lenses is not None and columns and len(shared):
         members = (index[:, None] == shared) & seen[:count, None]
     all_shared = bool((times > 1).all())
-    free = np.hstack([pose_free, lens_free[:, columns]])
+    free = np.hstack([poses_free[:, :POSE_SIZE], lens_free[:, columns]])
     models = None if lenses is None or lenses.all_bal else lenses.models
     if models is not None and len(models) > 1:
         assert lenses is not None
@@ -204,39 +203,19 @@ def unknowns_of(
     )
 
 
-def _free_extrinsics(problem: BundleProblem, index: Int[np.ndarray, " cameras"]) -> Bool[np.ndarray, "cameras 6"]:
-    """Which extrinsics of each camera are optimised: of a lens, those that no camera of it with a constant pose has."""
-    assert problem.rigs is not None
-    free = np.zeros((problem.num_cameras, EXTRINSICS_SIZE), bool)
-    if problem.rigs.free is None:
-        return free
-    free |= np.asarray(problem.rigs.free)[:, None]
-    if problem.constants is not None:
-        constant = np.zeros((index.max() + 1, EXTRINSICS_SIZE), bool)
-        np.logical_or.at(constant, index, np.asarray(problem.constants.poses))
-        constant |= constant[:, 3:].any(axis=1, keepdims=True)  # M turns t_r, too
-        free &= ~constant[index]
-    return free
-
-
-def _frames(
-    problem: BundleProblem, seen: np.ndarray, pose_free: Bool[np.ndarray, "cameras 6"]
-) -> tuple[Int[np.ndarray, " cameras"], Bool[np.ndarray, "cameras 6"]]:
-    """The frame of each camera, cameras that nothing sees by themselves, and which pose numbers of frames are free:
-    constant numbers of one camera are constant in its frame."""
+def _frames(problem: BundleProblem, seen: np.ndarray) -> Int[np.ndarray, " cameras"]:
+    """The frame of each camera, cameras that nothing sees by themselves."""
     assert problem.rigs is not None
     frame = np.asarray(problem.rigs.frame).astype(np.int64)
-    _, own = np.unique(frame, return_inverse=True)
     frame = np.where(seen, frame, frame.max(initial=0) + 1 + np.arange(len(frame)))
     _, frame = np.unique(frame, return_inverse=True)
-    part = ~pose_free[:, 3:].all(axis=1) & pose_free[:, 3:].any(axis=1)
-    bad = np.flatnonzero(part & problem.rigs.turned)
-    if bad.size:
-        name = part_name(problem.labels, "image", bad[0])
-        raise ProblemError(f"part of the translation of {name} is constant, which is turned in its rig")
-    constant = np.zeros(pose_free.shape, bool)
-    np.logical_or.at(constant, own, ~pose_free)  # also of cameras that nothing sees
-    return frame.astype(np.int32), ~constant[own]
+    if problem.constants is not None:
+        held = np.asarray(problem.constants.poses)[:, 3:]
+        bad = np.flatnonzero(held.any(axis=1) & ~held.all(axis=1) & problem.rigs.turned)
+        if bad.size:
+            name = part_name(problem.labels, "image", int(bad[0]))
+            raise ProblemError(f"part of the translation of {name} is constant, which is turned in its rig")
+    return frame.astype(np.int32)
 
 
 def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> Priors:

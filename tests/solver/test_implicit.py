@@ -12,12 +12,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxba
-from jaxba import SceneConfig, SolveOptions, StepOptions, Tolerances, differentiable_solve, inputs_of
+from jaxba import SceneConfig, SolveOptions, Tolerances, differentiable_solve, inputs_of
 from jaxba.model import camera
 from jaxba.problem import geometry
 from jaxba.problem.frames import in_frames, out_of_frames
-from jaxba.solver.gauge import determined_directions, free_gauge
-from jaxba.structure.layout import layout_for
+from jaxba.problem.freedoms import determined_directions, fixed_freedoms, free_directions
 
 TIGHT = SolveOptions(tolerances=Tolerances(ftol=1e-15, xtol=1e-15, gtol=1e-13), max_iterations=300)
 
@@ -122,22 +121,41 @@ SETTINGS = {  # of each how many directions of a similarity are free
 }
 
 
-@pytest.mark.parametrize("name", SETTINGS)
+def from_a_body(problem: jaxba.BundleProblem, free: bool = False, apart: float = 1.0) -> jaxba.BundleProblem:
+    """A rig whose axes are those of no camera: camera 1 is `apart` times as far from camera 0 as it was."""
+    rig, cameras = in_rig(problem), np.array(problem.cameras)
+    assert rig.rigs is not None
+    turn, place = rig.rigs.rotation, np.tile([0.2, -0.1, 0.3], (5, 1))
+    centers = geometry.camera_centers(cameras)
+    matrices = geometry.rotation_matrices(cameras[:, :3])
+    cameras[1, 3:6] = -matrices[1] @ (centers[0] + apart * (centers[1] - centers[0]))
+    place[1] = cameras[1, 3:6] - turn[1] @ (cameras[0, 3:6] - place[0])
+    lenses = jaxba.Lenses(np.array([0, 1, 0, 0, 0], np.int32), np.ones((2, 3), bool))
+    rigs = jaxba.Rigs(rig.rigs.frame, turn, place, np.arange(5) == 1 if free else None)
+    return problem.replace(cameras=cameras, lenses=lenses, rigs=rigs)
+
+
+DIRECTIONS = SETTINGS | {
+    "rig of a body": (from_a_body, 6),
+    "rig of a body, a free place": (lambda p: from_a_body(p, free=True), 7),
+    "rig of a body, a free place and a pose held": (lambda p: jaxba.hold(from_a_body(p, free=True), poses=[1]), 0),
+    "rig of a body, at one place": (lambda p: from_a_body(p, apart=0.0), 7),
+    "rig of a body, a free place, positions of two": (lambda p: measured(from_a_body(p, free=True)), 1),
+}
+
+
+@pytest.mark.parametrize("name", DIRECTIONS)
 def test_free_directions_of_the_gauge_change_no_residual_and_nothing_that_is_held(name):
-    make, count = SETTINGS[name]
+    make, count = DIRECTIONS[name]
     problem = make(small())
     here = in_frames(problem)
-    layout = layout_for(here, StepOptions())
-    cameras, points = free_gauge(here, layout)
-    assert len(cameras) == len(points) == count
+    cameras, points = free_directions(problem)
+    assert len(cameras) == len(points) == 7 - fixed_freedoms(problem) == count
     size = np.abs(cameras).max(axis=(1, 2), initial=0.0) + np.abs(points).max(axis=(1, 2), initial=0.0)
     assert (size > 0.1).all()
-    columns = range(here.cameras.shape[1] - 6) if layout.unknowns is None else layout.unknowns.columns
-    block = [*range(6), *(6 + column for column in columns)]
 
     def moved(scale: float, of_cameras, of_points) -> jaxba.BundleProblem:
-        found = np.array(here.cameras)
-        found[:, block] += scale * of_cameras
+        found = here.cameras + scale * of_cameras
         turns = Rotation.from_rotvec(scale * of_cameras[:, :3]) * Rotation.from_rotvec(here.cameras[:, :3])
         found[:, :3] = turns.as_rotvec()
         there = here.replace(cameras=found, points=here.points + scale * of_points)
