@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.geometry import angle_axis
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.rigs import EXTRINSICS_SIZE, Rigs, first_of_group
 
@@ -22,16 +23,16 @@ def in_frames(problem: BundleProblem) -> BundleProblem:
         return problem
     from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
 
-    frame, cameras = np.asarray(rigs.frame), np.asarray(problem.cameras)
+    frame, cameras = np.asarray(rigs.frame), np.array(problem.cameras)  # SciPy takes no read-only arrays
     seen = np.unique(problem.camera_index)
     if len(np.unique(frame[seen])) == len(seen):
         return problem.replace(rigs=None)
     rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
     moved = cameras[:, 3:6] - translation
     of_frame = rotation.transpose(0, 2, 1) @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
-    poses = np.hstack([Rotation.from_matrix(of_frame).as_rotvec(), np.einsum("nji,nj->ni", rotation, moved)])
+    poses = np.hstack([angle_axis(of_frame), np.einsum("nji,nj->ni", rotation, moved)])
     poses = poses[first_of_group(frame, seen)]  # bit for bit the same in a frame
-    extrinsics = np.hstack([Rotation.from_matrix(rotation).as_rotvec(), translation])
+    extrinsics = np.hstack([angle_axis(rotation), translation])
     return problem.replace(cameras=np.hstack([poses, cameras[:, POSE_SIZE:], extrinsics]))
 
 
@@ -77,5 +78,5 @@ def out_of_frames(
     turned = rotation @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
     moved = np.einsum("nij,nj->ni", rotation, cameras[:, 3:6]) + translation
     own = cameras[:, POSE_SIZE:-EXTRINSICS_SIZE]
-    cameras = np.hstack([Rotation.from_matrix(turned).as_rotvec(), moved, own])
+    cameras = np.hstack([angle_axis(turned), moved, own])
     return cameras, replace(rigs, rotation=rotation, translation=translation)

@@ -96,7 +96,7 @@ def checked_rigs(rigs: Rigs, cameras: np.ndarray, lenses: Lenses | None) -> Rigs
     proper = finite & (away <= LARGEST_DISAGREEMENT) & (np.linalg.det(known) > 0)
     if not proper.all():
         raise ValueError(f"the place of camera {np.argmin(proper)} in its rig is no rotation and translation")
-    rotations = Rotation.from_rotvec(cameras[:, :3]).as_matrix()
+    rotations = Rotation.from_rotvec(np.array(cameras[:, :3])).as_matrix()  # SciPy takes no read-only arrays
     _, first, group = np.unique(frame, return_index=True, return_inverse=True)
     rig_rotation = np.einsum("nji,njk->nik", rotation, rotations)
     rig_translation = np.einsum("nji,nj->ni", rotation, cameras[:, 3:6] - translation)

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -281,18 +281,21 @@ def _solve_transposed(
     _, pull = jax.vjp(lambda y: found(y, inputs), zero)
     of_points = jnp.where(order < solved.num_points, 1.0, 0.0)
     by_points = of_points * cotangents[1].T[:, jnp.minimum(order, solved.num_points - 1)]
-    right = project(pull((cotangents[0].T, by_points))[0])
+    size = lambda y: jnp.sqrt(sum(jnp.sum(part * part) for part in y))
+    (whole,) = pull((cotangents[0].T, by_points))
+    right, whole = project(whole), size(whole)  # where all of it is along the orbit, what is left is rounding
     product = lambda y: project(jax.jvp(lambda z: gradient(z, inputs), (zero,), (project(y),))[1])
     inverse = _gauss_newton(layout, state.cameras, state.points, options)
-    adjoint, _ = cg(product, right, tol=TOLERANCE, maxiter=MAX_PRODUCTS, M=lambda y: project(inverse(project(y))))
+    tolerance: Any = TOLERANCE * whole
+    preconditioner = lambda y: project(inverse(project(y)))
+    adjoint, _ = cg(product, right, tol=0.0, atol=tolerance, maxiter=MAX_PRODUCTS, M=preconditioner)
     left = jax.tree.map(lambda a, b: a - b, product(adjoint), right)
-    size = lambda y: jnp.sqrt(sum(jnp.sum(part * part) for part in y))
     # dL/dtheta = -w . dg/dtheta, and what of the solution is constant passes directly
     _, transpose = jax.vjp(lambda theta: gradient(zero, theta), inputs)
     direct = jax.vjp(lambda theta: found(zero, theta), inputs)[1]((cotangents[0].T, by_points))[0]
     through = transpose(adjoint)[0]
     total = jax.tree.map(lambda a, b: b - a, through, direct)
-    return total, size(left) / jnp.maximum(size(right), jnp.finfo(right[0].dtype).tiny)
+    return total, size(left) / jnp.maximum(whole, jnp.finfo(right[0].dtype).tiny)
 
 
 def _start_of_constants(layout: Layout, cameras: Array) -> Array:

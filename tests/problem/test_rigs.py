@@ -295,3 +295,11 @@ def test_what_rigs_do_not_support_is_one_line():
         BundleProblem.create(*support.arrays(problem), rigs=free)
     with pytest.raises(ProblemError, match="cameras 1 and 2 share a lens, but are in different places"):
         BundleProblem.create(*support.arrays(problem), lenses=problem.lenses, rigs=free)
+
+
+def test_arrays_that_cannot_be_written_are_read():
+    """As those that come from JAX."""
+    problem = rigged()
+    cameras = np.array(problem.cameras)
+    cameras.flags.writeable = False
+    assert support.same_bits(in_frames(problem.replace(cameras=cameras)).cameras, in_frames(problem).cameras)
