@@ -48,12 +48,16 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _flags_of_level_quick() -> str:
-    """XLA's flags that make `compiler_options("quick")` the options of all programs of a process and its children.
+    """XLA's flags by which all programs of a process and its children have `compiler_options("quick")`, and more.
 
     XLA ends a process whose flags it does not know, so another process asks which ones it knows. That one may import
     jaxba, too: here it must not be imported before the import hook of jaxtyping is there.
     """
-    code = "from jaxba.runtime.compilation import compiler_options; print(compiler_options('quick'))"
+    code = (
+        "from jaxba.runtime.compilation import compiler_options; from jaxba.runtime.jit import known_options; "
+        # all in one piece: two workers on two cores gain nothing from compiling the pieces of a program in parallel
+        "print(compiler_options('quick') | known_options({'xla_cpu_parallel_codegen_split_count': 1}))"
+    )
     told = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True).stdout
     return " ".join(f"--{name}={str(value).lower()}" for name, value in ast.literal_eval(told).items())
 

@@ -47,12 +47,12 @@ def names_of(names: Sequence[str]) -> str:
 
 
 def parse_items(value: Any, what: str) -> list[str]:
-    """A list of names or ids; one alone counts as a list.
+    """A list of names or ids; one alone counts as a list, an empty value as an empty one.
 
     Raises:
         ValueError: something else; one line.
     """
-    items = value if isinstance(value, list) else [value]
+    items = value if isinstance(value, list) else [value] if value != "" else []
     for item in items:
         if not isinstance(item, str) or not item:
             raise ValueError(f"must be a list ({what}), not {_written(value if items is not value else item)}")

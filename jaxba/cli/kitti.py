@@ -203,8 +203,8 @@ def _build(args: Arguments) -> int:
 def _check_apart(problems: Sequence[str], sequence: Any, args: Arguments) -> None:
     """Refuses a problem, or the frames beside one, in the place of a file of the sequence."""
     from jaxba.cli.overwriting import check_apart
-    from jaxba.datasets.kitti.evaluate import sidecar_path
     from jaxba.datasets.kitti.sequence import files_of
+    from jaxba.io.files import sidecar_path
 
     written = {"--out": [*problems, *map(sidecar_path, problems)]}
     own = [*sequence.images, *files_of(args.sequence, sequence.folder)]

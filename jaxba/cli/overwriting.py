@@ -8,7 +8,7 @@ from collections.abc import Hashable, Iterable, Mapping
 from pathlib import Path
 
 from jaxba.cli.common import UsageError
-from jaxba.io.files import StrPath, display_name, stream_number
+from jaxba.io.files import StrPath, display_name, sidecar_path, stream_number
 from jaxba.io.formats import files_of
 
 PROBLEM = "a file of the problem"
@@ -43,8 +43,6 @@ def check_apart(written: Mapping[str, Iterable[StrPath | None]], read: Mapping[s
 
 def problem_files(path: str | None) -> list[StrPath]:
     """The files that a problem is read from, and the frames that `jaxba-kitti` has written beside one."""
-    from jaxba.datasets.kitti.evaluate import sidecar_path
-
     return [] if path is None else [*files_of(path), sidecar_path(path)]
 
 

@@ -40,6 +40,11 @@ def strip_compression(path: StrPath) -> str:
     return root if suffix.lower() in _MAGIC else os.fspath(path)
 
 
+def sidecar_path(path: StrPath) -> Path:
+    """The file that `jaxba-kitti` writes beside a problem: `kitti00.txt.bz2` has `kitti00.frames.json`."""
+    return Path(strip_compression(path)).with_suffix(".frames.json")
+
+
 def display_name(path: StrPath) -> str:
     """The path for a message of one line: control characters and undecodable bytes are escaped."""
     return _one_line(os.fspath(path))

@@ -51,7 +51,7 @@ class Labels(ArrayRecord):
 Part = Literal["image", "lens", "point"]
 
 
-def part_name(labels: Labels | None, kind: Part, at: int) -> str:
+def part_name(labels: Labels | None, kind: Part, at: int | np.integer) -> str:
     """What a message calls a part of a problem: by its name and id, or by its position where nothing has labels."""
     if labels is None:
         return f"{'camera' if kind == 'image' else kind} {at}"
@@ -63,7 +63,7 @@ def part_name(labels: Labels | None, kind: Part, at: int) -> str:
 def part_names(labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"], named: int = 1) -> str:
     """The same for some parts of a kind; of more than `named` the first ones."""
     more = f" and {len(which) - named} more" if len(which) > named else ""
-    return ", ".join(part_name(labels, kind, int(at)) for at in which[:named]) + more
+    return ", ".join(part_name(labels, kind, at) for at in which[:named]) + more
 
 
 def _found(ids: Integer[np.ndarray, " n"], wanted: Iterable[int | str]) -> list[int]:

@@ -73,7 +73,7 @@ def test_constants_of_both_ways_are_gathered():
         ("constant_poses: {a: 1}", "constant_poses: must be a list (names or ids of images), not {a: 1}"),
         ("constant_poses: [[1]]", "constant_poses: must be a list (names or ids of images), not [1]"),
         ("constant_cameras: 1.5", "constant_cameras: there is no camera '1.5'"),
-        ("constant_numbers: ", "constant_numbers: must be a list (focal, principal_point"),
+        ("constant_numbers: [k1, '']", "constant_numbers: must be a list (focal, principal_point"),
         ("constant_points: [true]", "constant_points: "),
         ("constant_numbers: k9", "constant_numbers: no lens has a number 'k9'"),
         ("constant_poses: [absent.jpg]", "constant_poses: there is no image 'absent.jpg'"),

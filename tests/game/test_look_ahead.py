@@ -18,6 +18,8 @@ from jaxba.game.rollout import play
 from jaxba.game.scene_bank import draw_prices, reach
 from jaxba.problem.options import StepOptions
 
+pytestmark = pytest.mark.slow
+
 CONFIG = replace(
     AGENT, effort="points+repairs", refine_points=2, trials=1, camera_rounds=0, pattern_moves=0, lens_step="file"
 )

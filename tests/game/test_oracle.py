@@ -12,6 +12,8 @@ import pytest
 from jaxba.game.oracle import beam_search
 from jaxba.lm.records import LMState
 
+pytestmark = pytest.mark.slow
+
 GRID = (1e-3, 1e-2, 1e-1)
 DEPTH = 4
 

@@ -15,6 +15,8 @@ from jaxba.game.scene_bank import BankConfig, make_banks, solve_scenes
 from jaxba.game.warm_starts import warm_starts
 from jaxba.problem import geometry
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = StepOptions()
 
 
@@ -64,7 +66,6 @@ def test_a_share_that_is_none_is_refused(share):
         BankConfig(warm_share=share)
 
 
-@pytest.mark.slow
 def test_the_share_of_the_settings_reaches_the_bank(monkeypatch):
     monkeypatch.setattr("jaxba.game.scene_bank.PORTFOLIO", ("ceres",))
     banks = [BankConfig((KIND,), (60,), 0, share) for share in (0.0, 1.0)]

@@ -115,7 +115,7 @@ def test_a_padded_problem_comes_back_in_its_own_sizes():
 
 def test_double_precision_without_64_bits_is_refused_in_one_line():
     prepared = prepare(support.tiny(), "ceres", OPTIONS)
-    with jax.enable_x64(False), pytest.raises(ValueError, match="the state is float64: call jax") as caught:
+    with jax.enable_x64(False), pytest.raises(ValueError, match="float64 needs 64 bits in JAX: call jax") as caught:
         solve_loop(prepared.layout, prepared.state, prepared.policy, OPTIONS.tolerances, prepared.options, 3)
     assert "\n" not in str(caught.value)
 

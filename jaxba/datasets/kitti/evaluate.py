@@ -17,7 +17,7 @@ from jaxba.datasets.kitti.calibration import Calibration
 from jaxba.datasets.kitti.poses import poses_of, read_poses
 from jaxba.io import read_problem
 from jaxba.io.encoding import decode
-from jaxba.io.files import StrPath, display_name, open_output, reason, strip_compression
+from jaxba.io.files import StrPath, display_name, open_output, reason, sidecar_path, strip_compression
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.similarity import Similarity, umeyama
@@ -55,11 +55,6 @@ class Evaluated(NamedTuple):
     points: Float[np.ndarray, "points 3"]  # the same
     rms: float  # reprojection error, pixels
     scores: Scores | None
-
-
-def sidecar_path(path: StrPath) -> Path:
-    """Path of the sidecar file of a problem: `kitti00.txt.bz2` has `kitti00.frames.json`."""
-    return Path(strip_compression(path)).with_suffix(".frames.json")
 
 
 def write_sidecar(path: StrPath, contents: Mapping[str, Any]) -> None:
