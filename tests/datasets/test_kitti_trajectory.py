@@ -70,7 +70,9 @@ def test_the_alignment_minimises_the_rmse_over_all_similarities():
 
     start = np.concatenate([[-np.log(0.3)], Rotation.from_matrix(TURN.T).as_rotvec(), -SHIFT @ TURN / 0.3])
     best = minimize(mean_square, start, method="BFGS", options={"gtol": 1e-9})
-    assert absolute_errors(align(estimate, truth), truth).rmse == pytest.approx(np.sqrt(best.fun), rel=1e-6)
+    found = absolute_errors(align(estimate, truth), truth).rmse
+    assert found <= np.sqrt(best.fun) * (1 + 1e-12)
+    assert found == pytest.approx(np.sqrt(best.fun), rel=1e-4)  # as far as BFGS comes, by differences
 
 
 def test_the_rotation_is_that_of_scipys_wahba_solution():
