@@ -86,7 +86,7 @@ def solve_step(
         solution = MethodStep(solved[0], None, solved[1], residual_orthogonal=True)
     else:
         if previous is not None and layout.unknowns is not None:
-            previous = layout.unknowns.restricted(previous)
+            previous = jnp.asarray(layout.unknowns.restricted(previous))
         system = DampedSystem(layout, linear, eliminated, reduced, damping, cameras, iteration, forcing, previous)
         solution = cast(StepMethod, options.method).solve(system, options)
     manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
