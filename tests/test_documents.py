@@ -20,7 +20,6 @@ from jaxba.solver.names import parse_solver
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-NOTEBOOK = DOCS / "notebook"
 
 MOST_WORDS = 15_000
 
@@ -36,9 +35,9 @@ generate = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(generate)
 
 PAGES = [ROOT / "README.md", *(DOCS / page for page in generate.navigation())]
-"""What speaks of today; the notebook does not."""
+"""README, and the pages of the site in the order of the navigation."""
 
-TEXTS = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(NOTEBOOK.glob("*.md"))]
+TEXTS = [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
 
 
 def name_of(page: Path) -> str:
@@ -134,15 +133,10 @@ def test_links_lead_to_files_of_the_repository(page):
     assert not [link for link in LINK.findall(text) if not (page.parent / link).exists()]
 
 
-def test_every_page_is_in_the_navigation_once_or_in_the_notebook():
-    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md") if NOTEBOOK not in page.parents}
+def test_every_page_is_in_the_navigation_once():
+    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
     navigation = generate.navigation()
     assert sorted(navigation) == sorted(pages)
-
-
-def test_the_notebook_names_its_pages():
-    index = (NOTEBOOK / "index.md").read_text(encoding="utf-8")
-    assert set(LINK.findall(index)) == {page.name for page in NOTEBOOK.glob("*.md")} - {"index.md"}
 
 
 def test_the_documents_are_short():
