@@ -21,7 +21,8 @@ from jaxba.solver.names import parse_solver
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 
-MOST_WORDS = 15_000
+MOST_WORDS = 15_500
+"""Of README and the pages written by hand; the table of claims of the paper may have 1,500 more."""
 
 FENCE = re.compile(r"(?:^<!-- (no test)[^\n]*-->\n)?^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#[^)]*)?\)")
@@ -141,7 +142,7 @@ def test_every_page_is_in_the_navigation_once():
 
 def test_the_documents_are_short():
     assert sum(generate.count_words().values()) <= MOST_WORDS
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 110
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 80
 
 
 def test_documents_that_the_code_names_are_in_the_repository():
