@@ -1,6 +1,6 @@
 """Configuration of a reproduction run, and its YAML files.
 
-A file in `jaxba/configs/paper` states differences to the file that it extends, or to the defaults of the classes
+A file in `configs/paper` states differences to the file that it extends, or to the defaults of the classes
 (jaxba/io/configurations.py).
 """
 

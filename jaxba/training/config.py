@@ -1,6 +1,6 @@
 """The configuration of a training run, and the YAML files that hold it.
 
-A file in `jaxba/configs/train` lists differences to the file that it extends, or to the defaults of the classes
+A file in `configs/train` lists differences to the file that it extends, or to the defaults of the classes
 (jaxba/io/configurations.py); a run writes all settings into its folder.
 """
 

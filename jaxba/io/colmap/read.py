@@ -19,8 +19,7 @@ def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point
     Cameras are the registered images, by id, and points are sorted by id. Lenses keep their camera models and numbers;
     as in COLMAP, focal lengths and distortion are optimised, shared by the images of a camera. If all are
     SIMPLE_PINHOLE, SIMPLE_RADIAL or RADIAL and principal points stay, they become BAL's lenses, which are faster.
-    Images of one frame of a rig move together; the places of cameras in their rigs are optimised, but for the
-    reference sensor.
+    Images of one frame of a rig move together; where cameras are in their rigs is constant.
 
     What is wrong with one view, point or image only is left out, and a `ProblemWarning` says what and how many.
 
