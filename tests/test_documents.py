@@ -15,6 +15,7 @@ import pytest
 import tyro
 
 import jaxba
+from jaxba.cli import colmap_options
 from jaxba.damping.registry import SUFFIX
 from jaxba.solver.names import parse_solver
 
@@ -138,6 +139,11 @@ def test_every_page_is_in_the_navigation_once():
     pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
     navigation = generate.navigation()
     assert sorted(navigation) == sorted(pages)
+
+
+def test_the_page_for_users_of_colmap_names_every_option_that_the_command_understands():
+    page = (DOCS / "how-to/from-colmap.md").read_text(encoding="utf-8")
+    assert [name for name in (*colmap_options.OPTIONS, *colmap_options.PATHS) if name not in page] == []
 
 
 def test_the_documents_are_short():
