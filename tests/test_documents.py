@@ -22,8 +22,8 @@ from jaxba.solver.names import parse_solver
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
 
-MOST_WORDS = 15_500
-"""Of README and the pages written by hand; the table of claims of the paper may have 1,500 more."""
+MOST_WORDS = 15_150
+"""Of README and the pages written by hand; the table of claims of the paper has 1,850 more."""
 
 FENCE = re.compile(r"(?:^<!-- (no test)[^\n]*-->\n)?^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#[^)]*)?\)")
