@@ -39,7 +39,7 @@ class Chart:
     layout: dict[str, Any]
     note: str = ""
     xaxes: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """What the x axis has besides at each position of the switch."""
+    """Extra settings of the x axis for each position of the switch."""
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ FREE_DESCENT = 11.0
 GUARDED_DECADES, GUARDED_POINTS = -8.0, 1
 """log10 of lambda and point iterations of `guarded`. On 512 training scenes of the game in which work has a price, with
 a guard that leaves lambda free until a step fails, this constant action pays 0.3% more than the best one, which has -9
-(three seeds, docs/notebook/game.md); on real problems this one was measured."""
+(three seeds); on real problems this one was measured."""
 
 
 def guarded() -> ConstantAction:

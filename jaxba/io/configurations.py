@@ -1,8 +1,7 @@
-"""Configuration files `configs/KIND/NAME.yaml`: how they are found by name, and how one extends another.
+"""Configuration files `jaxba/configs/KIND/NAME.yaml`: how they are found by name, and how one extends another.
 
-An installed jaxba carries copies of them, which setup.py puts there; in a clone they lie beside the package. A file may
-begin with `extends: BASE`, the name of a configuration or a path relative to the file. It then states differences to
-its base: mappings are merged key by key, everything else, lists too, replaces what the base says.
+A file may begin with `extends: BASE`, the name of a configuration or a path relative to the file. It then states
+differences to its base: mappings are merged key by key, everything else, lists too, replaces what the base says.
 """
 
 from __future__ import annotations
@@ -109,9 +108,7 @@ def parse(text: str, name: str, *, as_text: bool = False) -> Any:
 
 
 def _folder(kind: Kind) -> Path:
-    """The copies inside an installed package; in a clone, what they would be copies of."""
-    installed = _PACKAGE / "configs" / kind
-    return installed if installed.is_dir() else _PACKAGE.parent / "configs" / kind
+    return _PACKAGE / "configs" / kind
 
 
 def read_file(path: Path, name: str, *, as_text: bool = False) -> dict[str, Any]:

@@ -113,8 +113,8 @@ def coarse_preconditioner(
 def _with_tied_lenses(
     lower: Float[Array, "unknowns unknowns"], tied: Bool[Array, "clusters lenses"], modes: int
 ) -> Float[Array, "more more"]:
-    """The coarse system with an unknown for each number of a shared lens in the place of one for each of its clusters,
-    whose rows become those of the unit matrix."""
+    """The coarse system with one unknown per number of a shared lens, not one per cluster; the replaced rows become
+    identity rows."""
     clusters = len(tied)
     full = jnp.tril(lower) + jnp.tril(lower, -1).T
     blocks = full.reshape(clusters, modes, clusters, modes)

@@ -85,7 +85,7 @@ class StepInfo(NamedTuple):
 class Prices(NamedTuple):
     """What the work of an iteration costs, in units of a plain step: linearise, solve by a factorisation, and evaluate
     one candidate. Source of the defaults but that of a product: geometric means over twelve real problems of 1,400 to
-    115,000 observations (`benchmarks.prices`, docs/notebook/game.md)."""
+    115,000 observations (`benchmarks.prices`)."""
 
     candidate: float | Float[Array, ""] = 0.1
     """Evaluating another candidate."""

@@ -144,7 +144,7 @@ def first_of_group(
 def with_unseen_of_frames(
     rigs: Rigs, cameras: Float[np.ndarray, "cameras parameters"], seen: Int[np.ndarray, " seen"]
 ) -> Float[np.ndarray, "cameras parameters"]:
-    """Cameras, of which those that nothing sees are where their rig has them from the first seen one of their frame."""
+    """Cameras, with unobserved ones placed by their rig relative to the first observed camera of the frame."""
     from scipy.spatial.transform import Rotation
 
     frame = np.asarray(rigs.frame)

@@ -194,10 +194,10 @@ def _threads(count: int) -> Iterator[None]:
 
 
 def together(work: Callable[[], T]) -> T:
-    """What a function returns in the first process, in all of them; the others wait and do not call it.
+    """Runs a function in the first process and returns its result in every process; the others wait.
 
     Raises:
-        MainFailedError: it raised something, in the others; in the first process that itself.
+        MainFailedError: in the other processes, if it raised an error; the first process raises that error itself.
     """
     if not jax.distributed.is_initialized() or jax.process_count() == 1:
         return work()

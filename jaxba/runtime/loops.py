@@ -50,7 +50,7 @@ def run_if(needed: Any, function: Callable[..., Carry], arguments: tuple[Any, ..
     Args:
         needed: whether, a boolean or 0 or 1.
         function: of arrays or pytrees of arrays.
-        arguments: its arguments. What it closes over may be computed from in any case.
+        arguments: its arguments. Closed-over values may be evaluated even if `needed` is false.
         otherwise: of the type of its result.
     """
 

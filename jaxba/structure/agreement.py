@@ -8,7 +8,7 @@ import numpy as np
 
 
 class Agreement:
-    """What one shard needs, and what all shards need as far as it is known.
+    """Sizes that the layouts of all shards must share, found by repeated rounds.
 
     A layout asks for a size, a list of keys or a sum by name, and gives its own. It gets that of all shards from the
     round before, or its own in the first one.

@@ -204,7 +204,7 @@ def unknowns_of(
 
 
 def _frames(problem: BundleProblem, seen: np.ndarray) -> Int[np.ndarray, " cameras"]:
-    """The frame of each camera, cameras that nothing sees by themselves."""
+    """The frame of each camera; unobserved cameras get frames of their own."""
     assert problem.rigs is not None
     frame = np.asarray(problem.rigs.frame).astype(np.int64)
     frame = np.where(seen, frame, frame.max(initial=0) + 1 + np.arange(len(frame)))

@@ -103,7 +103,7 @@ def prepare_folder(
 
     Raises:
         TrainError: a new run would overwrite another one, there is no run to resume or its configuration differs, or
-            checkpoints could not be read again from a folder of this name.
+            the folder's name contains * ? [, which Orbax reads as a pattern.
         SettingsError: the configuration in the folder cannot be read.
     """
     path = folder / CONFIG
