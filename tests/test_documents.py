@@ -27,7 +27,7 @@ MOST_WORDS = 15_150
 
 FENCE = re.compile(r"(?:^<!-- (no test)[^\n]*-->\n)?^```(\w+)[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)(?:#[^)]*)?\)")
-FILE = re.compile(r"`((?:jaxba|tests|benchmarks|docs|examples)/[\w/.-]+\.\w+)`")
+FILE = re.compile(r"`((?:jaxba|tests|benchmarks|configs|docs|examples)/[\w/.-]+\.\w+)`")
 COMMAND = re.compile(r"(?:.*/)?jaxba-(\w+)")
 
 spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
@@ -152,6 +152,6 @@ def test_the_documents_are_short():
 
 
 def test_documents_that_the_code_names_are_in_the_repository():
-    places = [*ROOT.glob("jaxba/**/*.py"), *ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("jaxba/**/*.yaml")]
+    places = [*ROOT.glob("jaxba/**/*.py"), *ROOT.glob("benchmarks/**/*.py"), *ROOT.glob("configs/**/*.yaml")]
     named = {(name_of(place), path) for place in places for path in re.findall(r"docs/[\w/-]+\.md", place.read_text())}
     assert not [(place, path) for place, path in sorted(named) if not (ROOT / path).exists()]

@@ -1,7 +1,8 @@
-"""Configuration files `jaxba/configs/KIND/NAME.yaml`: how they are found by name, and how one extends another.
+"""Configuration files `configs/KIND/NAME.yaml`: how they are found by name, and how one extends another.
 
-A file may begin with `extends: BASE`, the name of a configuration or a path relative to the file. It then states
-differences to its base: mappings are merged key by key, everything else, lists too, replaces what the base says.
+An installed jaxba carries copies of them, which setup.py puts there; in a clone they lie beside the package. A file may
+begin with `extends: BASE`, the name of a configuration or a path relative to the file. It then states differences to
+its base: mappings are merged key by key, everything else, lists too, replaces what the base says.
 """
 
 from __future__ import annotations
@@ -108,7 +109,9 @@ def parse(text: str, name: str, *, as_text: bool = False) -> Any:
 
 
 def _folder(kind: Kind) -> Path:
-    return _PACKAGE / "configs" / kind
+    """The copies inside an installed package; in a clone, what they would be copies of."""
+    installed = _PACKAGE / "configs" / kind
+    return installed if installed.is_dir() else _PACKAGE.parent / "configs" / kind
 
 
 def read_file(path: Path, name: str, *, as_text: bool = False) -> dict[str, Any]:

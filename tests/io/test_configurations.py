@@ -39,12 +39,12 @@ def refused(kind: Kind, name: str) -> str:
 
 
 def test_every_folder_of_configurations_is_a_kind():
-    assert sorted(KINDS) == sorted(path.name for path in (REPOSITORY / "jaxba/configs").iterdir())
+    assert sorted(KINDS) == sorted(path.name for path in (REPOSITORY / "configs").iterdir())
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_file_of_the_repository_is_found_by_its_name_and_as_a_path(kind):
-    files = sorted((REPOSITORY / "jaxba/configs" / kind).glob("*.yaml"))
+    files = sorted((REPOSITORY / "configs" / kind).glob("*.yaml"))
     assert names(kind) == [file.stem for file in files] != []
     for file in files:
         assert find(kind, file.stem).samefile(file)
@@ -135,8 +135,9 @@ def test_a_wheel_carries_every_configuration_and_so_does_one_from_a_source_distr
     pip = [sys.executable, "-m", "pip", "install", "-q", "--disable-pip-version-check"]
     subprocess.run([*pip, "--target", str(backend), *requires], check=True, timeout=300)
     clone.mkdir()
-    shutil.copytree(REPOSITORY / "jaxba", clone / "jaxba")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    for name in ("jaxba", "configs"):
+        shutil.copytree(REPOSITORY / name, clone / name)
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, clone)
 
     def build(what: str, source: Path) -> Path:
