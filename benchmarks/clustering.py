@@ -1,6 +1,6 @@
 """Time of a random clustering of the cameras on the host, compared with an iteration of the methods that use it.
 
-    python -m benchmarks.clustering PROBLEM ... [--methods stba,stba:16,ddlm]
+    python -m benchmarks.clustering PROBLEM ... [--methods stba,stba:16]
 
 A solve draws a fixed number of clusterings once, with the layout, and uses them in turn. The table shows what it would
 cost to draw a new one for every iteration. The time of an iteration is the median over a solve under Ceres' rule,
@@ -32,7 +32,7 @@ def main() -> None:
     """Prints a Markdown row for each pair of problem and method."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("problem", nargs="+", help="as for jaxba-bench")
-    parser.add_argument("--methods", default="stba,stba:16,ddlm")
+    parser.add_argument("--methods", default="stba,stba:16")
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     process.keep_memory()

@@ -86,24 +86,20 @@ def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats:
         layout = jax.device_put(layout_for(problem, options))
         state = jax.jit(step.initial_state, static_argnums=(2, 3))(layout, problem, options, dtype)
         given = (layout, state, jnp.asarray(1e-4, dtype))
+        propose = lambda la, s, d: step.propose(la, s, d, options)
+        proposal = jax.jit(lambda *given: propose(*given))(*given)  # a separate program, not the one that is timed
         parts: dict[str, tuple[Any, tuple[Any, ...]]] = {
-            "round": (lambda la, s, d: step.lm_step(la, s, d, options), given)
+            "propose": (propose, given),
+            "try_step": (lambda la, s, d, p: step.try_step(la, s, d, p, options), (*given, proposal)),
         }
-        if options.single_solve:
-            propose = lambda la, s, d: step.propose(la, s, d, options)
-            proposal = jax.jit(lambda *given: propose(*given))(*given)  # a separate program, not the one that is timed
-            parts = {
-                "propose": (propose, given),
-                "try_step": (lambda la, s, d, p: step.try_step(la, s, d, p, options), (*given, proposal)),
-            }
-            if has_repairs(options):
-                del parts["try_step"]
-                search = first_search(state.cameras, state.points, state.cost, proposal.step)
-                candidate = lambda la, s, p, *rest: try_candidate(la, s, p, options, jnp.zeros((), dtype), None, *rest)
-                parts["candidate"] = (candidate, (layout, state, proposal, search, state.cameras))
-            if options.refinement.camera_rounds:
-                cameras = lambda la, c, p: refine_cameras(la, c, p, options)
-                parts["cameras"] = (cameras, (layout, state.cameras, state.points))
+        if has_repairs(options):
+            del parts["try_step"]
+            search = first_search(state.cameras, state.points, state.cost, proposal.step)
+            candidate = lambda la, s, p, *rest: try_candidate(la, s, p, options, jnp.zeros((), dtype), None, *rest)
+            parts["candidate"] = (candidate, (layout, state, proposal, search, state.cameras))
+        if options.refinement.camera_rounds:
+            cameras = lambda la, c, p: refine_cameras(la, c, p, options)
+            parts["cameras"] = (cameras, (layout, state.cameras, state.points))
         for part, (function, arguments) in parts.items():
             measured = {level: measure(function, arguments, level, repeats) for level in LEVELS}
             line = f"{source.name[:28]:28s} {options.solver_name:13s} {part:9s}"

@@ -82,8 +82,7 @@ class Arguments:
 
     method: str = DEFAULT_METHOD
     """Method that computes a step. lm: Levenberg-Marquardt. stba: random clusters of at most 100 cameras; stba:16: of
-    at most 16. deeplm: conjugate gradients on all variables. ddlm, ddlm:16: clusters that are optimised in parallel.
-    poba: a power series."""
+    at most 16. deeplm: conjugate gradients on all variables. poba: a power series."""
 
     refine_points: int | None = None
     """Number of embedded point iterations after each camera step, without other embedded iterations. Default: the

@@ -98,14 +98,14 @@ class CameraSystem(NamedTuple):
 
 
 def eliminate_points(
-    layout: Layout, linear: Linearization, damping: Float[Array, "*points"], options: StepOptions
+    layout: Layout, linear: Linearization, damping: Float[Array, ""], options: StepOptions
 ) -> PointSystem:
     """Forms, damps and factors the 3 x 3 block of every point.
 
     Args:
         layout: the problem's observations.
         linear: residuals and Jacobians.
-        damping: lambda, one for all points or one each.
+        damping: lambda.
         options: scaling of the damping.
     """
     sums = point_sums(layout, normal_entries(linear.point_jacobian, linear.residual))
@@ -134,7 +134,7 @@ def camera_system(
     linear: Linearization,
     points: PointSystem,
     coordinates: RotationCoordinates,
-    damping: Float[Array, "*cameras_1"],
+    damping: Float[Array, ""],
     options: StepOptions,
 ) -> CameraSystem:
     """B + D_c, g_c and b of every camera.
@@ -147,7 +147,7 @@ def camera_system(
         linear: residuals and Jacobians.
         points: the eliminated points.
         coordinates: in which the damping is diagonal.
-        damping: lambda, one for all cameras or one each, shape (cameras, 1).
+        damping: lambda.
         options: scaling of the damping, and its factor for cameras.
     """
     solved = take(jnp.stack(points.solved), layout.slot_point)

@@ -13,14 +13,13 @@ class Step(NamedTuple):
 
     cameras: Float[Array, "parameters cameras"]  # in the coordinates of the options
     points: Float[Array, "3 points"]
-    # for the whole problem, or one entry per subproblem that is accepted on its own (refinement/subproblems.py):
-    slope: Float[Array, "*parts"]  # -g.d, which is d.(H + D) d if the step solves the damped system; pixels^2
-    damped: Float[Array, "*parts"]  # -g.d - d.H d, which is d.D d if the step solves the damped system; pixels^2
+    slope: Float[Array, ""]  # -g.d, which is d.(H + D) d if the step solves the damped system; pixels^2
+    damped: Float[Array, ""]  # -g.d - d.H d, which is d.D d if the step solves the damped system; pixels^2
     gradient_max: Float[Array, ""]  # largest absolute gradient entry before the step
     cg_iterations: Int[Array, ""]  # 0 when the system was factored
     forcing: Float[Array, ""]  # forcing term that stopped them; 0 for an exact solve
 
-    def predicted(self, fraction: Float[Array, "*parts"]) -> Float[Array, "*parts"]:
+    def predicted(self, fraction: Float[Array, ""]) -> Float[Array, ""]:
         """Decrease of the cost that the linear model predicts for `fraction * d`, pixels^2.
 
         `m(0) - m(a d) = -a g.d - a^2 d.H d / 2`, written with `slope` and `damped`, which are not negative, so that

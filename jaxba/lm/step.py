@@ -16,7 +16,7 @@ which is rejected like any other bad step.
 
 from __future__ import annotations
 
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
@@ -24,7 +24,6 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.linear.step import Effort, Step
 from jaxba.lm.damped_step import solve_step
-from jaxba.lm.method import Round, RoundMethod
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.model.linearize import Reference, cost, is_weightless, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem
@@ -33,7 +32,6 @@ from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
 from jaxba.refinement.acceptance import Candidate
 from jaxba.refinement.candidates import best_candidate
-from jaxba.refinement.subproblems import Whole
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.conventions import components_first
 from jaxba.structure.devices import sum_over_devices
@@ -104,7 +102,7 @@ def lm_step(
         options: static options of the step.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
         iteration: number of the iteration, from 0; methods with random clusters use other ones in each.
-        effort: overrides the point iterations and the repairs of the options; ignored by the method `ddlm`.
+        effort: overrides the point iterations and the repairs of the options.
 
     Returns:
         The next state (unchanged after a rejection) and the record of the iteration.
@@ -114,8 +112,6 @@ def lm_step(
             and 64 bits are not enabled in JAX.
     """
     check_x64(state.cost.dtype)
-    if not options.single_solve:
-        return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, iteration)
     proposal = propose(layout, state, damping, options, iteration)
     return try_step(layout, state, damping, proposal, options, min_gain, effort)
 
@@ -146,7 +142,7 @@ def try_step(
     effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
-    candidate = best_candidate(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    candidate = best_candidate(layout, *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
     return take_step(layout, state, damping, proposal, candidate)
 
 
@@ -155,14 +151,26 @@ def take_step(
 ) -> tuple[LMState, StepInfo]:
     """End of `try_step`: the state after the accept decision on a candidate, and the record. Arguments as there."""
     step = proposal.step
-    tried_step = [candidate.step_fraction * step.cameras, candidate.points - state.points]
-    return _advance(
-        layout,
-        state,
-        candidate,
-        tried_step,
-        jnp.asarray(damping, state.cost.dtype),
+    choose = lambda new, old: jnp.where(candidate.accepted, new, old)
+    previous = state.previous_steps
+    if previous is not None:
+        latest = candidate.cameras - state.cameras
+        previous = choose(jnp.concatenate([latest[None], previous[:-1]]), previous)
+    cameras, points, new_cost = (choose(*pair) for pair in zip(candidate[:3], state[:3], strict=True))
+    after = LMState(cameras, points, new_cost, previous)
+    tried = candidate.step_fraction * step.cameras, candidate.points - state.points
+    moved, size = sum_over_devices(layout, (jnp.sum(tried[1] ** 2), jnp.sum(state.points**2)))
+    return after, StepInfo(
+        cost=after.cost,
+        previous_cost=state.cost,
+        candidate_cost=candidate.cost,
+        predicted=candidate.predicted,
+        gain_ratio=candidate.gain,
+        accepted=candidate.accepted,
+        damping=jnp.asarray(damping, state.cost.dtype),
         gradient_max=step.gradient_max,
+        step_norm=safe_sqrt(jnp.sum(tried[0] ** 2) + moved),
+        parameter_norm=safe_sqrt(jnp.sum(jnp.where(layout.camera_seen, state.cameras, 0) ** 2) + size),
         cg_iterations=step.cg_iterations,
         forcing=step.forcing,
         step_fraction=candidate.step_fraction,
@@ -184,73 +192,3 @@ def _check_lenses(layout: Layout, options: StepOptions) -> None:
     if unknowns.shared or unknowns.priors is not None:
         what = "shared lenses" if unknowns.shared else "priors"
         raise ValueError(f"{what} need plain LM, not {options.solver_name}")
-    if not options.single_solve:
-        raise ValueError(f"{options.solver_name} optimises all numbers of BAL cameras, and nothing else")
-
-
-def _round(
-    layout: Layout,
-    state: LMState,
-    damping: Float[Array, ""],
-    options: StepOptions,
-    min_gain: float | Float[Array, ""],
-    iteration: int | Int[Array, ""],
-) -> tuple[LMState, StepInfo]:
-    """One round of a `RoundMethod`, which makes its own accept decisions."""
-    _check_lenses(layout, options)
-    method = cast(RoundMethod, options.method)
-    result = method.round(layout, *state[:3], damping, iteration, options, min_gain)
-    return _advance(
-        layout,
-        state,
-        result,
-        [result.cameras - state.cameras, result.points - state.points],
-        damping,
-        gradient_max=result.gradient_max,
-        cg_iterations=jnp.zeros((), jnp.int32),
-        forcing=jnp.zeros_like(state.cost),
-        step_fraction=result.step_fraction,
-        damping_fraction=jnp.clip(1 - result.curvature / result.slope, 0, 1),
-        weightless=result.weightless,
-        **result.work._asdict(),
-    )
-
-
-def _advance(
-    layout: Layout,
-    state: LMState,
-    candidate: Candidate | Round,
-    tried_step: list[Array],
-    damping: Float[Array, ""],
-    **fields: Array,
-) -> tuple[LMState, StepInfo]:
-    """The state after the accept decision, and the record of the iteration.
-
-    Args:
-        layout: the problem's observations; only cameras with observations count in the parameter norm.
-        state: before the iteration.
-        candidate: proposed parameters, with the decision.
-        tried_step: change of cameras and points that was evaluated, for its norm.
-        damping: lambda.
-        fields: the fields of `StepInfo` that are not set here.
-    """
-    choose = lambda new, old: jnp.where(candidate.accepted, new, old)
-    previous = state.previous_steps
-    if previous is not None:
-        latest = candidate.cameras - state.cameras
-        previous = choose(jnp.concatenate([latest[None], previous[:-1]]), previous)
-    cameras, points, new_cost = (choose(*pair) for pair in zip(candidate[:3], state[:3], strict=True))
-    after = LMState(cameras, points, new_cost, previous)
-    moved, size = sum_over_devices(layout, (jnp.sum(tried_step[1] ** 2), jnp.sum(state.points**2)))
-    return after, StepInfo(
-        cost=after.cost,
-        previous_cost=state.cost,
-        candidate_cost=candidate.cost,
-        predicted=candidate.predicted,
-        gain_ratio=candidate.gain,
-        accepted=candidate.accepted,
-        damping=damping,
-        step_norm=safe_sqrt(jnp.sum(tried_step[0] ** 2) + moved),
-        parameter_norm=safe_sqrt(jnp.sum(jnp.where(layout.camera_seen, state.cameras, 0) ** 2) + size),
-        **fields,
-    )

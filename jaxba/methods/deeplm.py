@@ -44,7 +44,6 @@ class GlobalConjugateGradients:
     rule: str = field(default="ceres", init=False)
     forms_reduced_system: bool = field(default=False, init=False)
     cluster_cameras: None = field(default=None, init=False)
-    single_solve: bool = field(default=True, init=False)
     uses_previous_steps: bool = field(default=True, init=False)
 
     def options(self, base: StepOptions) -> StepOptions:

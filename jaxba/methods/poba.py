@@ -41,7 +41,6 @@ class PowerSeries:
     forms_reduced_system: bool = field(default=False, init=False)
     cluster_cameras: None = field(default=None, init=False)
     conjugate_gradients: None = field(default=None, init=False)
-    single_solve: bool = field(default=True, init=False)
     uses_previous_steps: bool = field(default=True, init=False)
 
     def __post_init__(self) -> None:

@@ -1,7 +1,7 @@
 """The optimisation methods by name. Every method works with every damping policy.
 
-Plain Levenberg-Marquardt is `lm`. The others implement `StepMethod` or `RoundMethod` of `jaxba.lm.method`, so that
-solver, benchmark and game run all of them through `lm_step`.
+Plain Levenberg-Marquardt is `lm`. The others implement `StepMethod` of `jaxba.lm.method`, so that solver,
+benchmark and game run all of them through `lm_step`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol, get_args, runtime_checkable
 
-from jaxba.methods.ddlm import DomainDecomposition
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.methods.poba import PowerSeries
 from jaxba.methods.stba import StochasticClusters
 from jaxba.problem.options import StepOptions
 
-MethodName = Literal["lm", "stba", "deeplm", "ddlm", "poba"]
+MethodName = Literal["lm", "stba", "deeplm", "poba"]
 
 DEFAULT_METHOD: MethodName = "lm"
 """The method of a solver name without one."""
@@ -67,7 +66,6 @@ class LevenbergMarquardt:
 
 _CLUSTERED: dict[str, Callable[[int], Method]] = {
     "stba": lambda size: StochasticClusters(cluster_cameras=size),
-    "ddlm": lambda size: DomainDecomposition(cluster_cameras=size),
 }
 """Methods with clusters, by the largest number of cameras in a cluster."""
 
@@ -77,7 +75,6 @@ METHODS: dict[str, Method] = {
         LevenbergMarquardt(),
         StochasticClusters(),
         GlobalConjugateGradients(),
-        DomainDecomposition(),
         PowerSeries(),
     )
 }

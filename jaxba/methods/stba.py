@@ -68,7 +68,6 @@ class StochasticClusters:
     rule: str = field(default="stba", init=False)
     forms_reduced_system: bool = field(default=True, init=False)
     conjugate_gradients: None = field(default=None, init=False)
-    single_solve: bool = field(default=True, init=False)
     uses_previous_steps: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:

@@ -149,11 +149,6 @@ class MethodTraits(Protocol):
         ...
 
     @property
-    def single_solve(self) -> bool:
-        """Whether an iteration is one linear solve with one accept decision, not a round of several."""
-        ...
-
-    @property
     def uses_previous_steps(self) -> bool:
         """Whether it can use previous camera steps (`Refinement.previous_steps`)."""
         ...
@@ -222,11 +217,6 @@ class StepOptions:
         if self.method is not None:
             return self.method.conjugate_gradients
         return None if self.linear_solver == "explicit" else self.conjugate_gradients
-
-    @property
-    def single_solve(self) -> bool:
-        """Whether an iteration is one linear solve with one accept decision, not a round of several."""
-        return self.method is None or self.method.single_solve
 
     @property
     def kept_steps(self) -> int:

@@ -6,9 +6,6 @@ With the cost f, the candidate x' and the decrease that the linear model predict
 
 and no focal length changes its sign (`retraction.keep_focal_signs`).
 
-If a problem decomposes into subproblems (subproblems.py), the decision is made for each of them separately, and the
-arrays below have an axis `parts`.
-
 Source of the gain ratio rho: Nielsen 1999, "Damping Parameter in Marquardt's Method"; of embedded point iterations:
 Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment".
 """
@@ -23,12 +20,15 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.linear.step import Effort, Step
-from jaxba.model.linearize import Reference
+from jaxba.model.linearize import Reference, observation_costs, slot_frames, with_prior_costs
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide
-from jaxba.refinement.points import PreviousPoints
+from jaxba.refinement.midpoints import refine_from_starts
+from jaxba.refinement.points import PreviousPoints, refine_points
 from jaxba.refinement.retraction import keep_focal_signs
-from jaxba.refinement.subproblems import PointSearch, Subproblems
+from jaxba.structure.devices import sum_over_devices
+from jaxba.structure.layout import Layout
+from jaxba.structure.segment_sums import total
 
 NEGLIGIBLE = 1e-6
 """Predicted decrease, relative to the cost, below which there are no camera rounds and no further trials. Source: Ceres
@@ -50,20 +50,20 @@ problems, and 2e-15 in float64."""
 
 
 class Work(NamedTuple):
-    """What the search for the candidate of a step took, for every subproblem."""
+    """What the search for the candidate of a step took."""
 
-    repairs: Int[Array, "*parts"]
+    repairs: Int[Array, ""]
     """Camera rounds, trials and pattern moves after the first candidate."""
 
-    camera_rounds: Int[Array, "*parts"]
+    camera_rounds: Int[Array, ""]
     """The camera rounds among them."""
 
-    point_iterations: Int[Array, "*parts"]
+    point_iterations: Int[Array, ""]
     """Embedded point iterations of all candidates, as many as each might make."""
 
 
 class Candidate(NamedTuple):
-    """Proposed parameters, with the accept decision for every subproblem."""
+    """Proposed parameters, with the accept decision."""
 
     cameras: Float[Array, "parameters cameras"]
     """Proposed cameras."""
@@ -71,19 +71,19 @@ class Candidate(NamedTuple):
     points: Float[Array, "3 points"]
     """Proposed points, scene units."""
 
-    cost: Float[Array, "*parts"]
+    cost: Float[Array, ""]
     """Their cost, pixels^2."""
 
-    predicted: Float[Array, "*parts"]
+    predicted: Float[Array, ""]
     """Decrease that the linear model predicts for this step fraction, pixels^2."""
 
-    gain: Float[Array, "*parts"]
+    gain: Float[Array, ""]
     """Actual over predicted decrease."""
 
-    accepted: Bool[Array, "*parts"]
+    accepted: Bool[Array, ""]
     """The accept decision."""
 
-    step_fraction: Float[Array, "*parts"]
+    step_fraction: Float[Array, ""]
     """Length relative to the full step."""
 
     work: Work
@@ -93,8 +93,8 @@ class Candidate(NamedTuple):
 class Comparison(NamedTuple):
     """The data of one step with which its candidates are evaluated."""
 
-    parts: Subproblems
-    """The subproblems, each with its own accept decision."""
+    layout: Layout
+    """The problem's observations."""
 
     cameras: Float[Array, "parameters cameras"]
     """Cameras before the step."""
@@ -102,11 +102,12 @@ class Comparison(NamedTuple):
     points: Float[Array, "3 points"]
     """Points before the step, scene units."""
 
-    cost: Float[Array, "*parts"]
+    cost: Float[Array, ""]
     """Cost before the step, pixels^2."""
 
     terms: Float[Array, " terms"]
-    """Terms of that cost. Differences are summed, since the difference of sums cancels in float32."""
+    """Terms of that cost, of points if points are refined, else of slots. Differences are summed, since the difference
+    of sums cancels in float32."""
 
     previous: PreviousPoints
     """Where diverged points return to."""
@@ -124,17 +125,17 @@ class Comparison(NamedTuple):
     """Number of embedded point iterations."""
 
     starts: Int[Array, ""]
-    """Starts of points after the full step, see `PointSearch`."""
+    """Starts of points after the full step (`midpoints.refine_from_starts`)."""
 
-    matters: Bool[Array, "*parts"]
+    matters: Bool[Array, ""]
     """Whether the predicted decrease is worth camera rounds and further trials, and the effort allows them."""
 
 
 def comparison(
-    parts: Subproblems,
+    layout: Layout,
     cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
-    cost: Float[Array, "*parts"],
+    cost: Float[Array, ""],
     reference: Reference,
     step: Step,
     options: StepOptions,
@@ -149,19 +150,22 @@ def comparison(
     matters = predicted > NEGLIGIBLE * cost
     if effort is not None:
         matters = matters & effort.repairs
-    previous = PreviousPoints.of(parts.layout, points, reference)
+    previous = PreviousPoints.of(layout, points, reference)
+    terms = previous.costs if options.refinement.points else reference.costs
+    if reference.prior_costs is not None:
+        terms = jnp.concatenate([terms, reference.prior_costs])
     return Comparison(
-        parts=parts,
+        layout=layout,
         cameras=cameras,
         points=points,
         cost=cost,
-        terms=parts.terms(reference, previous, options),
+        terms=terms,
         previous=previous,
         step=step,
         options=options,
         min_gain=min_gain,
         point_iterations=point_iterations,
-        starts=jnp.where(jnp.all(predicted <= NEAR_CONVERGENCE * cost), 2, 1),
+        starts=jnp.where(predicted <= NEAR_CONVERGENCE * cost, 2, 1),
         matters=matters,
     )
 
@@ -170,7 +174,7 @@ def assess(
     against: Comparison,
     cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
-    step_fraction: Float[Array, "*parts"],
+    step_fraction: Float[Array, ""],
     work: Work,
     full_step: Bool[Array, ""],
 ) -> Candidate:
@@ -182,26 +186,38 @@ def assess(
         points: points before their embedded iterations.
         step_fraction: it scales the predicted decrease.
         work: what the search took so far, without the point iterations of this candidate.
-        full_step: whether this is the full step of some subproblem, after which points may also start from their rays.
+        full_step: whether this is the full step, after which points may also start from their rays.
     """
-    options, parts = against.options, against.parts
-    min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * jnp.sum(against.step.predicted(step_fraction)))
-    search = PointSearch(against.point_iterations, jnp.where(full_step, against.starts, 0), min_decrease)
-    work = work._replace(point_iterations=(work.point_iterations + against.point_iterations).astype(jnp.int32))
-    points, terms = parts.refine(cameras, points, against.previous, options, search)
-    cost, decrease = parts.sums(terms), parts.sums(against.terms - terms)
+    layout = against.layout
     predicted = against.step.predicted(step_fraction)
+    work = work._replace(point_iterations=(work.point_iterations + against.point_iterations).astype(jnp.int32))
+    points, terms = _refined(against, cameras, points, predicted, full_step)
+    cost, decrease = (sum_over_devices(layout, total(each)) for each in (terms, against.terms - terms))
     gain = safe_divide(decrease, predicted)
     accepted = (decrease > 0) & (cost <= against.cost) & (predicted > 0) & (gain > against.min_gain)
     # costs before and after come from two computations: a decrease that nothing predicts may be their rounding alone
     rounding = float(jnp.finfo(against.cost.dtype).eps) * against.cost
     accepted = accepted & ((predicted > rounding) | (decrease > COST_ROUNDING * rounding))
-    accepted = accepted & jnp.isfinite(cost) & parts.all_cameras(keep_focal_signs(against.cameras, cameras))
+    accepted = accepted & jnp.isfinite(cost) & jnp.all(keep_focal_signs(against.cameras, cameras))
     return Candidate(cameras, points, cost, predicted, gain, accepted, step_fraction, work)
 
 
-def select(parts: Subproblems, which: Bool[Array, "*parts"], new: Candidate, old: Candidate) -> Candidate:
-    """The new candidate for the subproblems in `which`, the old one for the others."""
-    values = jax.tree.map(lambda *pair: jnp.where(which, *pair), new[2:], old[2:])
-    cameras = jnp.where(parts.of_cameras(which), new.cameras, old.cameras)
-    return Candidate(cameras, jnp.where(parts.of_points(which), new.points, old.points), *values)
+def _refined(
+    against: Comparison, cameras: Array, points: Array, predicted: Float[Array, ""], full_step: Bool[Array, ""]
+) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
+    """The points after embedded iterations, if there are any, and the terms of the cost there."""
+    layout, loss, refinement = against.layout, against.options.loss, against.options.refinement
+    if not refinement.points:
+        return points, with_prior_costs(layout, cameras, observation_costs(layout, cameras, points, loss))
+    arguments = layout, slot_frames(layout, cameras), points, loss, against.point_iterations, against.previous
+    min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * predicted)
+    if refinement.starts == "step":
+        points, costs = refine_points(*arguments, min_decrease)
+    else:
+        points, costs = refine_from_starts(*arguments, jnp.where(full_step, against.starts, 0), min_decrease)
+    return points, with_prior_costs(layout, cameras, costs)
+
+
+def select(which: Bool[Array, ""], new: Candidate, old: Candidate) -> Candidate:
+    """The new candidate if `which`, else the old one."""
+    return jax.tree.map(lambda *pair: jnp.where(which, *pair), new, old)

@@ -35,9 +35,9 @@ def should_refine_cameras(
     against: Comparison,
     candidate: Candidate,
     best: Candidate,
-    full_step: Bool[Array, "*parts"],
-    done: Int[Array, "*parts"],
-) -> Bool[Array, "*parts"]:
+    full_step: Bool[Array, ""],
+    done: Int[Array, ""],
+) -> Bool[Array, ""]:
     """Whether a camera round, or another one, may lead to the acceptance of a candidate.
 
     Args:

@@ -33,13 +33,13 @@ from jaxba.refinement.camera_rounds import should_refine_cameras
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.pattern_move import should_extend, should_repeat
 from jaxba.refinement.retraction import keep_focal_signs, move_cameras, step_between
-from jaxba.refinement.subproblems import Subproblems
 from jaxba.runtime import loops
+from jaxba.structure.layout import Layout
 
 
 class Search(NamedTuple):
-    """The candidates of every subproblem: shorter steps until one is accepted, then pattern moves; after each of them
-    its camera rounds."""
+    """The candidates of a step: shorter ones until one is accepted, then pattern moves; after each of them its camera
+    rounds."""
 
     best: Candidate
     """The last rejected candidate or, once one was accepted, the one with the lowest cost."""
@@ -52,49 +52,49 @@ class Search(NamedTuple):
     direction: tuple[Float[Array, "parameters cameras"], Float[Array, "3 points"]]
     """The step, or the change by the first accepted candidate."""
 
-    length: Float[Array, "*parts"]
+    length: Float[Array, ""]
     """Length of the next candidate, in units of `direction`."""
 
-    active: Bool[Array, "*parts"]
+    active: Bool[Array, ""]
     """Whether there is a next candidate."""
 
     candidate: Candidate
     """The candidate that camera rounds improve."""
 
-    rounds: Int[Array, "*parts"]
+    rounds: Int[Array, ""]
     """Its camera rounds so far."""
 
-    refining: Bool[Array, "*parts"]
+    refining: Bool[Array, ""]
     """Whether it has another camera round, before there is a next candidate."""
 
 
 def best_candidate(
-    parts: Subproblems,
+    layout: Layout,
     cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
-    cost: Float[Array, "*parts"],
+    cost: Float[Array, ""],
     reference: Reference,
     step: Step,
     options: StepOptions,
     min_gain: float | Float[Array, ""],
     effort: Effort | None = None,
 ) -> Candidate:
-    """Evaluates a step: the candidate of the iteration, with the accept decision, for every subproblem.
+    """Evaluates a step: the candidate of the iteration, with the accept decision.
 
     It is the first accepted candidate, possibly extended by pattern moves, or the last rejected one.
 
     Args:
-        parts: the subproblems that are accepted separately.
+        layout: the problem's observations.
         cameras: current cameras.
         points: current points.
         cost: their cost, pixels^2.
         reference: costs and depths of the slots at the current parameters.
-        step: solution of the damped system, with the linear model of each subproblem.
+        step: solution of the damped system.
         options: static options of the step.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
         effort: overrides the number of point iterations of the options.
     """
-    against = comparison(parts, cameras, points, cost, reference, step, options, min_gain, effort)
+    against = comparison(layout, cameras, points, cost, reference, step, options, min_gain, effort)
     start = jax.tree.map(jnp.asarray, first_search(cameras, points, cost, step))
     if not has_repairs(options):
         return _assess_next(against, start, start.cameras)
@@ -103,13 +103,13 @@ def best_candidate(
         if not options.refinement.camera_rounds:
             return next_search(against, search, search.cameras)
         last = search.candidate
-        refine = lambda cameras, points: refine_cameras(parts.layout, cameras, points, options)
-        refined = loops.run_if(jnp.any(search.refining), refine, (last.cameras, last.points), last.cameras)
+        refine = lambda cameras, points: refine_cameras(layout, cameras, points, options)
+        refined = loops.run_if(search.refining, refine, (last.cameras, last.points), last.cameras)
         return next_search(against, search, refined)
 
     # full step, shorter steps, pattern moves and camera rounds are iterations of one loop, so that the program contains
     # the evaluation of a candidate only once
-    return loops.while_loop(lambda search: jnp.any(search.active), advance, start).best
+    return loops.while_loop(lambda search: search.active, advance, start).best
 
 
 def has_repairs(options: StepOptions) -> bool:
@@ -126,7 +126,7 @@ def first_search(cameras: Any, points: Any, cost: Any, step: Step) -> Search:
     Args:
         cameras: current cameras [9, cameras]. Arrays, or their shapes and types.
         points: current points [3, points].
-        cost: their cost, pixels^2, of every subproblem.
+        cost: their cost, pixels^2.
         step: solution of the damped system.
     """
     constant = lambda value, dtype: cast(Array, np.full(cost.shape, value, dtype))
@@ -143,17 +143,16 @@ def first_search(cameras: Any, points: Any, cost: Any, step: Step) -> Search:
 
 def _assess_next(against: Comparison, search: Search, refined: Float[Array, "parameters cameras"]) -> Candidate:
     """Evaluates the next candidate or, where that is due, a camera round of the last one."""
-    parts, best = against.parts, search.best
-    lengths = parts.of_cameras(search.length)
-    cameras = move_cameras(parts.layout, search.cameras, lengths * search.direction[0], against.options)
+    best = search.best
+    cameras = move_cameras(against.layout, search.cameras, search.length * search.direction[0], against.options)
     if against.options.refinement.trials > 1:
         cameras = jnp.where(keep_focal_signs(search.cameras, cameras), cameras, search.cameras)
-    points = search.points + parts.of_points(search.length) * search.direction[1]
+    points = search.points + search.length * search.direction[1]
     fraction = jnp.where(best.accepted, best.step_fraction, search.length)
-    full_step = jnp.any(_is_full_step(search) & search.active)
+    full_step = _is_full_step(search) & search.active
     work = best.work._replace(repairs=best.work.repairs + 1)
     if against.options.refinement.camera_rounds:
-        last, refining = search.candidate, jnp.any(search.refining)
+        last, refining = search.candidate, search.refining
         cameras = jnp.where(refining, refined, cameras)
         points = jnp.where(refining, last.points, points)
         fraction = jnp.where(refining, last.step_fraction, fraction)
@@ -163,7 +162,7 @@ def _assess_next(against: Comparison, search: Search, refined: Float[Array, "par
     return assess(against, cameras, points, fraction, work, full_step)
 
 
-def _is_full_step(search: Search) -> Bool[Array, "*parts"]:
+def _is_full_step(search: Search) -> Bool[Array, ""]:
     return ~search.best.accepted & (search.length == 1)
 
 
@@ -178,24 +177,22 @@ def next_search(against: Comparison, search: Search, refined: Float[Array, "para
     candidate = _assess_next(against, search, refined)
     if not against.options.refinement.camera_rounds:
         return _after_candidate(against, search._replace(candidate=candidate))
-    refined = jnp.any(search.refining)
-    candidate = select(against.parts, search.refining | ~refined, candidate, search.candidate)
-    rounds = jnp.where(refined, search.rounds + 1, 0)
+    rounds = jnp.where(search.refining, search.rounds + 1, 0)
     full_step = _is_full_step(search)
     refining = should_refine_cameras(against, candidate, search.best, full_step, rounds) & search.active
     same = search._replace(candidate=candidate, rounds=rounds, refining=refining)
-    choose = lambda new, old: jnp.where(jnp.any(refining), old, new)
+    choose = lambda new, old: jnp.where(refining, old, new)
     return jax.tree.map(choose, _after_candidate(against, same), same)
 
 
 def _after_candidate(against: Comparison, search: Search) -> Search:
     """What to try after a candidate that has had its camera rounds."""
-    parts, best, candidate = against.parts, search.best, search.candidate
+    best, candidate = search.best, search.candidate
     first = candidate.accepted & ~best.accepted
     better = candidate.accepted & best.accepted & (candidate.cost < best.cost)
     spent = jax.tree.map(lambda *pair: jnp.where(search.active, *pair), candidate.work, best.work)
     tried = best._replace(work=spent)
-    best_now = select(parts, search.active & (better | ~best.accepted), candidate, tried)
+    best_now = select(search.active & (better | ~best.accepted), candidate, tried)
     shorter = should_backtrack(against, candidate, search.length)
     if not against.options.refinement.pattern_moves:
         return search._replace(best=best_now, length=SHORTER * search.length, active=search.active & shorter)
@@ -205,11 +202,11 @@ def _after_candidate(against: Comparison, search: Search) -> Search:
     change = step_between(against.cameras, best_now.cameras, against.options), best_now.points - against.points
     return search._replace(
         best=best_now,
-        cameras=jnp.where(parts.of_cameras(best_now.accepted), best_now.cameras, against.cameras),
-        points=jnp.where(parts.of_points(best_now.accepted), best_now.points, against.points),
+        cameras=jnp.where(best_now.accepted, best_now.cameras, against.cameras),
+        points=jnp.where(best_now.accepted, best_now.points, against.points),
         direction=(
-            jnp.where(parts.of_cameras(starts_pattern), change[0], search.direction[0]),
-            jnp.where(parts.of_points(starts_pattern), change[1], search.direction[1]),
+            jnp.where(starts_pattern, change[0], search.direction[0]),
+            jnp.where(starts_pattern, change[1], search.direction[1]),
         ),
         length=jnp.where(first, 1, jnp.where(best.accepted, 2, SHORTER) * search.length),
         active=search.active & continues,

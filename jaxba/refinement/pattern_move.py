@@ -22,7 +22,7 @@ SMALL_DAMPING_FRACTION = 0.1
 predicted such a step, it is a Gauss-Newton step, and nothing is gained beyond it."""
 
 
-def should_repeat(against: Comparison, first: Candidate) -> Bool[Array, "*parts"]:
+def should_repeat(against: Comparison, first: Candidate) -> Bool[Array, ""]:
     """Whether the first accepted candidate is repeated in its direction."""
     step = against.step
     predicted = (
@@ -33,8 +33,6 @@ def should_repeat(against: Comparison, first: Candidate) -> Bool[Array, "*parts"
     return against.matters & ~predicted
 
 
-def should_extend(
-    against: Comparison, better: Bool[Array, "*parts"], length: Float[Array, "*parts"]
-) -> Bool[Array, "*parts"]:
+def should_extend(against: Comparison, better: Bool[Array, ""], length: Float[Array, ""]) -> Bool[Array, ""]:
     """Whether a pattern move that was `better` is followed by one of twice the length."""
     return better & (length < 2.0 ** (against.options.refinement.pattern_moves - 1))

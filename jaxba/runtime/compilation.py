@@ -51,9 +51,9 @@ that medium is left out there."""
 OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
 """The option that switches XLA's newer kernel emitters off."""
 
-Part = Literal["factorization", "iterative", "acceptance", "cameras", "decomposition"]
+Part = Literal["factorization", "iterative", "acceptance", "cameras"]
 """What is compiled by itself: a linear solve by factorisation or by an iterative method, the test whether its step is
-accepted, the camera rounds of a step that is not, or a round of domain decomposition."""
+accepted, or the camera rounds of a step that is not."""
 
 COMPILE_EVENTS = "/jax/core/compile/"
 """Prefix of the durations that JAX reports while it traces, lowers and compiles."""
@@ -85,7 +85,6 @@ BREAK_EVEN: dict[Part, BreakEven] = {
     "iterative": BreakEven(typical=8, quick=1_000_000, medium=15_000_000),
     "acceptance": BreakEven(typical=20, quick=3_000_000, medium=8_000_000),
     "cameras": BreakEven(typical=20, quick=3_000_000, medium=8_000_000),
-    "decomposition": BreakEven(typical=8, quick=1_600_000, medium=8_000_000),
 }
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy, decides_effort, effort_of
 from jaxba.lm.records import LMState, Prices, StepInfo
-from jaxba.lm.step import lm_step, propose, try_step
+from jaxba.lm.step import propose, try_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
@@ -94,17 +94,13 @@ class _Loop(NamedTuple):
         part = lambda function: program(function, "options", level=levels[function.__name__])
         # NumPy's: each conversion by JAX is a program
         min_gain = np.asarray(self.policy.min_gain, state.cost.dtype)
-        if options.single_solve:
-            arguments = (self.layout, state, carry.damping)
-            proposal = call(part(propose), *arguments, options, carry.iteration)
-            arguments = (*arguments, proposal, options, min_gain, effort)
-            if has_repairs(options):
-                state, step = try_step_by_parts(call, part, *arguments)
-            else:
-                state, step = call(part(try_step), *arguments)
+        arguments = (self.layout, state, carry.damping)
+        proposal = call(part(propose), *arguments, options, carry.iteration)
+        arguments = (*arguments, proposal, options, min_gain, effort)
+        if has_repairs(options):
+            state, step = try_step_by_parts(call, part, *arguments)
         else:
-            arguments = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
-            state, step = call(part(lm_step), *arguments)
+            state, step = call(part(try_step), *arguments)
         limit, partitions = np.int32(self.max_iterations), np.int32(num_partitions(self.layout))
         policy_arguments = (carry._replace(state=None), step, self.policy, self.tolerances, limit, partitions)
         carry, report = call(program(_advance_and_pack, level="quick"), *policy_arguments)
@@ -114,9 +110,6 @@ class _Loop(NamedTuple):
 def parts_of(options: StepOptions) -> dict[str, Part]:
     """The parts into which a step with these options is compiled, by the names of their functions."""
     found: dict[str, Part] = {}
-    if not options.single_solve:
-        found[lm_step.__name__] = "decomposition"
-        return found
     factors = options.forms_reduced_system and options.truncated is None
     found[propose.__name__] = "factorization" if factors else "iterative"
     found[(try_candidate if has_repairs(options) else try_step).__name__] = "acceptance"

@@ -22,7 +22,6 @@ from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import Candidate, comparison
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.candidates import Search, first_search, next_search
-from jaxba.refinement.subproblems import Whole
 from jaxba.runtime.compilation import Program, program
 from jaxba.structure.layout import Layout
 
@@ -46,7 +45,7 @@ def try_candidate(
     refined: Float[Array, "parameters cameras"],
 ) -> tuple[Search, Int[Array, ""]]:
     """One turn of the search for the candidate of a step, and what comes next. Arguments as for `next_search`."""
-    against = comparison(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
     search = next_search(against, search, refined)
     following = jnp.where(search.active, jnp.where(search.refining, Next.CAMERA_ROUND, Next.CANDIDATE), Next.NOTHING)
     return search, following

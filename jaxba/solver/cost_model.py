@@ -295,8 +295,6 @@ def _check_method(problem: BundleProblem, options: StepOptions) -> None:
         raise ProblemError(f"shared lenses need plain LM, not {name}")
     if problem.priors is not None:
         raise ProblemError(f"priors need plain LM, not {name}")
-    if not options.single_solve and not (lenses is None and problem.constants is None and options.intrinsics == "free"):
-        raise ProblemError(f"{name} optimises all numbers of BAL cameras, and nothing else")
 
 
 def device_memory() -> float | None:

@@ -1,4 +1,4 @@
-"""Random partitions of the cameras into clusters, for methods that solve one cluster at a time (STBA, DeepLM).
+"""Random partitions of the cameras into clusters, for the method STBA (methods/stba.py).
 
 A fixed number of partitions is drawn once per problem, with their index arrays, and iteration t uses number t modulo
 that number. Random clusters then cost nothing during the iterations, and the solve is one compiled program.
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
 from jaxba.structure.camera_clusters import cluster_members
 from jaxba.structure.covisibility import PairLayout
@@ -50,9 +50,6 @@ class Partition:
 
     levels: tuple[Int[AnyArray, "*t _ _"], ...]
     """Summation tree from slots to point replicas."""
-
-    is_shared: Bool[AnyArray, "*t points"]
-    """Whether a point, in layout order, is seen from several clusters."""
 
     def at(self, iteration: int | Int[Array, ""]) -> Partition:
         """The partition of an iteration, counted from 0."""
@@ -99,16 +96,13 @@ def partition_layout(
     sizes = np.stack([np.bincount(label, minlength=clusters) for label in labels])
     replicas = [_point_replicas(label[camera], point, clusters) for label in labels]
     most = max(len(counts) for _, counts in replicas) + 1
-    trees, slot_replica, is_shared = [], [], []
+    trees, slot_replica = [], []
     for which, counts in replicas:
         counts = np.append(counts, np.zeros(most - len(counts), int))
         order = np.argsort(which, kind="stable")
         trees.append(sum_tree(slot[order], counts, empty, TREE_WIDTH))
         slot_replica.append(np.full(len(slot_point), most - 1, np.int32))
         slot_replica[-1][slot] = which
-        first = np.unique(which, return_index=True)[1]
-        replicas_of_point = np.bincount(slot_point[slot[first]], minlength=int(slot_point.max()) + 1)
-        is_shared.append(replicas_of_point > 1)
     tables = [cluster_members(label, clusters, int(sizes.max())) for label in labels]
     return Partition(
         label=labels.astype(np.int32),
@@ -116,7 +110,6 @@ def partition_layout(
         blocks=np.stack([_blocks(table, label, pairs) for table, label in zip(tables, labels, strict=True)]),
         slot_replica=np.stack(slot_replica),
         levels=_stack(trees, empty),
-        is_shared=np.stack(is_shared),
     )
 
 

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from jaxba.damping.agent_config import AgentConfig, EffortMode
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
 from jaxba.damping.policy_file import LARGEST_FILE
 from jaxba.game.env import GameConfig
@@ -98,16 +98,6 @@ class TrainConfig:
             raise ValueError(f"bank.dtype must be float64 or float32, not {self.bank.dtype!r}")
         _check_agent(self.sac)
         _check_size(self.sac, self.game.agent)
-        _check_effort(self.game.agent.effort, self.method, self.step_options)
-
-
-def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None:
-    """Refuses an effort that the method cannot use."""
-    if effort != "fixed" and not options.single_solve:
-        raise ValueError(
-            f"game.agent.effort: {effort!r} has no effect on method {method}, "
-            "whose rounds always have all point iterations"
-        )
 
 
 def _check_agent(sac: SacConfig) -> None:

@@ -242,7 +242,6 @@ def test_the_best_constant_action_is_searched_one_number_after_the_other(monkeyp
     [
         (("game.agent.effort=all",), r"effort must be one of fixed, points\+repairs"),
         (("game.agent={effort: points+repairs, refine_points: 0}",), "needs embedded point iterations"),
-        (("game.agent.effort=points+repairs", "method=ddlm"), "has no effect on method ddlm"),
     ],
 )
 def test_an_effort_that_cannot_be_chosen_is_refused_in_one_line(changes, message):

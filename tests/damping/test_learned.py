@@ -297,7 +297,7 @@ def test_a_name_says_with_which_embedded_iterations_a_step_is_made(shipped):
 def test_learned_means_the_shipped_policy_that_fits_the_step(shipped):
     """Each with the camera damping that it was trained with: another library has none."""
     expected = load_policy(shipped["learned"]).layers
-    for method in (*METHODS, "ddlm:3"):
+    for method in (*METHODS, "stba:3"):
         chex.assert_trees_all_equal(parse_solver(f"{method}+learned").build()[0].layers, expected, strict=True)
         chex.assert_trees_all_equal(parse_solver(f"{method}+learned+refine3").build()[0].layers, expected, strict=True)
         alone = parse_solver(f"{method}+learned+refine0").build()[0]

@@ -41,7 +41,6 @@ from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, select
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState
 from jaxba.lm.step import lm_step
-from jaxba.methods.ddlm import DomainDecomposition
 from jaxba.problem import geometry
 from jaxba.problem.options import Refinement
 from jaxba.structure.layout import partition_of
@@ -170,9 +169,8 @@ def test_a_scene_is_played_as_it_is_solved():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["deeplm", "ddlm"])
-def test_a_scene_is_played_as_it_is_solved_by_every_method(method):
-    bank, options = tiny_bank(), make_method(method).options(StepOptions())
+def test_a_scene_is_played_as_it_is_solved_by_a_method():
+    bank, options = tiny_bank(), make_method("deeplm").options(StepOptions())
     found = play(KIND, bank, CERES, options, 6)
     for k in (0, 5):
         alone = solve(problem_of(KIND, bank.scenes, k), "ceres", options, max_iterations=6)
@@ -206,9 +204,8 @@ def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
         np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["stba", "ddlm"])
-def test_scenes_of_a_class_share_random_clusters(method):
-    bank, options = tiny_bank(), make_method(f"{method}:2").options(StepOptions())
+def test_scenes_of_a_class_share_random_clusters():
+    bank, options = tiny_bank(), make_method("stba:2").options(StepOptions())
     labels = partition_of(class_layout(KIND, options)).label
     assert labels.max() >= 1
     assert len(np.unique(labels, axis=0)) > 1
@@ -219,13 +216,10 @@ def test_scenes_of_a_class_share_random_clusters(method):
 
 
 @pytest.mark.slow
-def test_scenes_whose_clusters_have_trials_and_rounds_are_played_as_each_alone():
-    """Rounds that accept cluster by cluster, vectorised over scenes: the same as one scene after the other."""
+def test_scenes_whose_steps_have_trials_and_rounds_are_played_as_each_alone():
+    """Candidates and camera rounds, vectorised over scenes: the same as one scene after the other."""
     bank, damping = tiny_bank(), 1e-6
-    options = StepOptions(
-        method=DomainDecomposition(cluster_cameras=2),
-        refinement=Refinement(points=2, trials=3, camera_rounds=2, pattern_moves=2),
-    )
+    options = StepOptions(refinement=Refinement(points=2, trials=3, camera_rounds=2, pattern_moves=2))
     found = play(KIND, bank, make_policy(f"constant:{damping}"), options, 4)
     layout = class_layout(KIND, options)
     iterate = jax.jit(lambda own, state, turn: lm_step(own, state, jnp.asarray(damping), options, 0.0, turn))

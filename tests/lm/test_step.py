@@ -199,9 +199,8 @@ def test_a_start_that_is_not_finite_stays_as_it_is():
         ({"method": make_method("deeplm")}, 1e-3),
         ({"method": make_method("poba")}, 0.0),
         ({"method": make_method("stba")}, 0.0),
-        ({"method": make_method("ddlm")}, 0.0),
     ],
-    ids=["explicit", "mixed", "sparse", "implicit", "deeplm", "poba", "stba", "ddlm"],
+    ids=["explicit", "mixed", "sparse", "implicit", "deeplm", "poba", "stba"],
 )
 def test_a_step_says_by_which_forcing_term_it_ended(changes, forcing):
     options = StepOptions(**changes)

@@ -13,13 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import support
-from support import DAMPINGS, bal_file, check_step, needs_data, paper, solve, start, step
+from support import DAMPINGS, bal_file, check_step, needs_data, solve, start, step
 
 from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy, read_bal
 from jaxba.linear.schur import RotationCoordinates, apply_reduced, camera_system, eliminate_points
-from jaxba.lm.damped_step import solve_step
-from jaxba.lm.termination import converged_in_cost
-from jaxba.methods.ddlm import MIN_STEP_FRACTION, DomainDecomposition, decomposed_round
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.methods.poba import PowerSeries
 from jaxba.methods.registry import UnknownMethodError
@@ -33,15 +30,13 @@ from jaxba.methods.stba import (
     split_right_hand_side,
 )
 from jaxba.model.linearize import linearize
-from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement
+from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.runtime.compilation import CompileClock
 from jaxba.structure.layout import partition_of
 
 CLUSTERED = StepOptions(method=StochasticClusters(cluster_cameras=2))
 ONE_CLUSTER = StepOptions(method=StochasticClusters(cluster_cameras=100))
-DECOMPOSED = StepOptions(method=DomainDecomposition(cluster_cameras=2))
 MANIFOLD = replace(CLUSTERED, coordinates=Coordinates(rotation="manifold"))
-EMBEDDED = Refinement(points=3, camera_rounds=2, trials=3)
 NORMAL = StepOptions(
     method=GlobalConjugateGradients(ConjugateGradients(forcing=0.0, tolerance=1e-15, max_iterations=20000))
 )
@@ -201,194 +196,6 @@ def test_global_deeplm_run_to_convergence_is_the_exact_step(make, damping):
     check_step(make(), NORMAL, damping)
 
 
-# Domain decomposition
-
-
-@pytest.mark.parametrize("embedded", [Refinement(), EMBEDDED], ids=["plain", "embedded"])
-def test_ddlm_with_one_block_is_plain_lm(embedded):
-    problem, whole = support.tiny(), StepOptions(refinement=embedded)
-    one = replace(whole, method=DomainDecomposition(cluster_cameras=100))
-    layout, state = start(problem, one)
-    plain, _ = start(problem, whole)
-    for iteration, damping in enumerate([1e-4, 1e-2, 1e-6, 1.0]):
-        before = state
-        state, ours = step(layout, before, damping, one, iteration=iteration)
-        same, theirs = step(plain, before, damping, whole)
-        assert ours.accepted
-        assert theirs.accepted
-        names = (
-            "cost",
-            "predicted",
-            "gain_ratio",
-            "gradient_max",
-            "step_norm",
-            "damping_fraction",
-            "step_fraction",
-            "repairs",
-        )
-        for name in names:
-            np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-6, err_msg=name)
-        np.testing.assert_allclose(state.cameras, same.cameras, rtol=1e-8, atol=1e-10)
-
-
-@pytest.mark.parametrize("embedded", [Refinement(), Refinement(points=2), EMBEDDED], ids=["plain", "points", "all"])
-@pytest.mark.parametrize("damping", [1e-10, 1e-4, 1.0])
-def test_a_round_of_ddlm_never_raises_the_cost_and_accounts_for_it(damping, embedded):
-    problem, options = support.odd(), replace(DECOMPOSED, refinement=embedded)
-    layout, first = start(problem, options)
-    state = first
-    for iteration in range(6):
-        before = state
-        state, info = step(layout, state, damping, options, iteration=iteration)
-        assert state.cost <= before.cost
-        assert bool(info.accepted) == (state.cost < before.cost)
-        np.testing.assert_allclose(state.cost, support.cost(support.back(problem, first, state), options), rtol=1e-9)
-
-
-@pytest.mark.slow
-def test_clusters_of_ddlm_have_shares_and_repairs_of_their_own():
-    """Three scenes in one problem: one step passes, one is shortened, one repaired, as each would be alone."""
-    scenes, damping = [paper(2), turned(paper(1)), turned(paper(3))], 1e-3
-    plain = StepOptions(refinement=EMBEDDED)
-    options = replace(plain, method=DomainDecomposition(cluster_cameras=scenes[0].num_cameras))
-    layout, state = start(side_by_side(scenes), options)
-    part = partition_of(layout).at(0)
-    found = _round(layout, state, jnp.asarray(damping), part, options)
-    alone, first = [], 0
-    for problem in scenes:
-        after, info = step(*start(problem, plain), damping, plain)
-        mine = np.arange(first, first + problem.num_cameras)
-        assert len(set(np.asarray(part.label)[mine])) == 1
-        np.testing.assert_allclose(np.asarray(found.cameras)[:, mine], after.cameras, rtol=1e-6, atol=1e-9)
-        first += problem.num_cameras
-        alone.append(info)
-    shares, repairs = (
-        [float(x) for x in column] for column in zip(*[(i.step_fraction, i.repairs) for i in alone], strict=True)
-    )
-    assert (shares, repairs) == ([1, 0.25, 1], [0, 1, 1])
-    assert found.work.repairs == 1
-    np.testing.assert_allclose(found.predicted, sum(info.predicted for info in alone), rtol=1e-6)
-    whole = [_step_of(problem, damping).predicted(jnp.ones(())) for problem in scenes]
-    np.testing.assert_allclose(found.step_fraction, np.dot(shares, whole) / np.sum(whole), rtol=1e-6)
-
-
-def _step_of(problem: BundleProblem, damping: float):
-    layout, state = start(problem)
-    linear = linearize(layout, state.cameras, state.points, StepOptions().loss)
-    return solve_step(layout, linear, state.cameras, state.points, jnp.asarray(damping), StepOptions())
-
-
-def turned(problem: BundleProblem) -> BundleProblem:
-    """A start from which bold steps fail: cameras turned by half a radian and more."""
-    turns = 0.6 * np.random.default_rng(0).normal(size=(problem.num_cameras, 3))
-    return problem.replace(cameras=problem.cameras + np.pad(turns, ((0, 0), (0, 6))))
-
-
-def side_by_side(problems: list[BundleProblem]) -> BundleProblem:
-    """Problems that share nothing, as one."""
-    join = lambda name: np.concatenate([getattr(problem, name) for problem in problems])
-    before = lambda name: np.cumsum([0, *(getattr(problem, name) for problem in problems)])
-    camera = [first + problem.camera_index for first, problem in zip(before("num_cameras"), problems, strict=False)]
-    point = [first + problem.point_index for first, problem in zip(before("num_points"), problems, strict=False)]
-    parts = [join(name) for name in ("cameras", "points", "observations")]
-    return BundleProblem.create(*parts, np.concatenate(camera), np.concatenate(point))
-
-
-def test_a_round_of_ddlm_that_refuses_its_clusters_is_no_convergence():
-    """Points move on alone, and the cost with them, less and less."""
-    options = replace(DECOMPOSED, refinement=Refinement(points=3))
-    layout, state = start(support.tiny(), options)
-    _, good = step(layout, state, 1e-2, options)
-    assert good.step_fraction == 1
-    decreases = []
-    for iteration in range(8):
-        state, info = step(layout, state, 1e-2, options, 1e9, iteration)  # no gain is enough
-        decreases.append(float(info.previous_cost - info.cost) / float(info.cost))
-        assert info.step_fraction == MIN_STEP_FRACTION
-        assert not converged_in_cost(info, 1e-6)
-    small = [d for d in decreases if d <= 1e-6]
-    assert decreases[0] > 1e-6
-    assert small
-
-
-def test_clusters_of_ddlm_that_cannot_be_factored_have_no_gain_while_separators_move(monkeypatch):
-    """A gain of 0 / 0 would become the next lambda."""
-    from jaxba.methods import ddlm
-
-    options = replace(DECOMPOSED, refinement=Refinement(points=3))
-    layout, state = start(support.tiny(), options)
-    monkeypatch.setattr(ddlm, "solve_clusters", lambda *arguments: jnp.full_like(arguments[4], jnp.nan))
-    part = partition_of(layout).at(0)
-    found = jax.jit(lambda state: decomposed_round(layout, *state[:3], jnp.asarray(1e-3), part, options, 0.0))(state)
-    assert found.accepted
-    assert found.cost < state.cost
-    assert found.gain == 0
-    assert found.predicted == 0
-
-
-@pytest.mark.slow
-def test_a_cluster_of_ddlm_that_cannot_be_factored_leaves_the_others_alone(monkeypatch):
-    """Also that of camera 0, which owns the empty slots that padding reads."""
-    from jaxba.methods import ddlm
-
-    options = replace(DECOMPOSED, refinement=EMBEDDED)
-    layout, state = start(support.tiny(), options)
-    part = partition_of(layout).at(0)
-    label = np.asarray(part.label)
-    expected = _round(layout, state, jnp.asarray(1e-3), part, options)
-    solve_all = ddlm.solve_clusters
-
-    def fail(*arguments):
-        return jnp.where((label == label[0])[:, None], jnp.nan, solve_all(*arguments))
-
-    monkeypatch.setattr(ddlm, "solve_clusters", fail)
-    found = jax.jit(lambda state: decomposed_round(layout, *state[:3], jnp.asarray(1e-3), part, options, 0.0))(state)
-    mine, others = label == label[0], label != label[0]
-    assert others.any()
-    np.testing.assert_array_equal(np.asarray(found.cameras)[:, mine], np.asarray(state.cameras)[:, mine])
-    np.testing.assert_allclose(found.cameras[:, others], expected.cameras[:, others], rtol=1e-9, atol=1e-12)
-    assert (np.asarray(found.cameras)[:, others] != np.asarray(state.cameras)[:, others]).any()
-    assert found.accepted
-    assert found.step_fraction == MIN_STEP_FRACTION
-
-
-@functools.partial(jax.jit, static_argnames=("options",))
-def _round(layout, state, damping, part, options):
-    return decomposed_round(layout, *state[:3], damping, part, options, 0.0)
-
-
-def test_clusters_of_ddlm_share_no_variable():
-    """What a cluster does is what it would do with all others left out: cameras of the others and points that any of
-    them sees stand still."""
-    problem, damping = support.tiny(), 1e-3
-    layout, state = start(problem, DECOMPOSED)
-    part = partition_of(layout).at(0)
-    found = _round(layout, state, jnp.asarray(damping), part, DECOMPOSED)
-    label = np.asarray(part.label)
-    tested = 0
-    for name in range(label.max() + 1):
-        mine = np.flatnonzero(label[problem.camera_index] == name)
-        shared = np.isin(problem.point_index[mine], problem.point_index[label[problem.camera_index] != name])
-        # separators become constants: dense step with their columns left out
-        seen = problem.observations[mine], problem.camera_index[mine], problem.point_index[mine]
-        only = BundleProblem.create(problem.cameras, problem.points, *seen)
-        residual, jacobian = support.linear(only, DECOMPOSED)
-        fixed = np.unique(problem.point_index[mine][shared])
-        size = problem.cameras.size
-        free = np.concatenate([9 * np.flatnonzero(label == name)[:, None] + np.arange(9)]).ravel()
-        own = np.setdiff1d(np.unique(problem.point_index[mine]), fixed)
-        free = np.concatenate([free, (size + 3 * own[:, None] + np.arange(3)).ravel()]).astype(int)
-        part_jacobian = jacobian[:, free]
-        hessian = part_jacobian.T @ part_jacobian
-        hessian += damping * np.diag(np.clip(np.diag(hessian), 1e-6, 1e32))
-        expected = -np.linalg.solve(hessian, part_jacobian.T @ residual)[: 9 * np.sum(label == name)].reshape(-1, 9)
-        moved = np.asarray(found.cameras - state.cameras).T[label == name]
-        if np.abs(moved).max() > 0:  # the cluster was accepted
-            np.testing.assert_allclose(moved, expected, rtol=1e-5, atol=1e-8)
-            tested += 1
-    assert tested >= 1
-
-
 # Power series
 
 
@@ -416,10 +223,10 @@ def test_the_power_series_comes_closer_with_every_order(damping, left):
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_lowers_the_cost_under_its_own_rule_and_stops(method):
     problem = support.tiny()
-    small = f"{method}:3" if method in ("stba", "ddlm") else method
+    small = f"{method}:3" if method == "stba" else method
     solution = solve(problem, make_method(method).rule, method=small)
     reference = solve(problem, "ceres")
-    assert solution.converged or method == "ddlm"  # whose rounds come closer for ever
+    assert solution.converged
     assert np.all(np.diff(solution.history.cost) <= 0)
     assert solution.final_cost <= reference.final_cost * (1 + 1e-2)
 
@@ -439,7 +246,7 @@ def test_a_method_with_its_own_solver_takes_no_other():
 
 
 def test_an_unknown_method_is_named_with_the_known_ones():
-    with pytest.raises(UnknownMethodError, match="lm, stba, deeplm, ddlm, poba"):
+    with pytest.raises(UnknownMethodError, match="lm, stba, deeplm, poba"):
         solve(support.tiny(), method="magic")
 
 
@@ -449,11 +256,10 @@ def test_every_method_names_a_rule_that_exists(method):
 
 
 @needs_data
-@pytest.mark.parametrize("method", ["stba", "ddlm"])
-def test_random_clusters_are_one_program_for_all_turns(method):
+def test_random_clusters_are_one_program_for_all_turns():
     """Ladybug-49 in clusters of 16: iterations draw different clusters and compile nothing new."""
     problem = read_bal(bal_file("problem-49-7776-pre"))
-    options = make_method(f"{method}:16").options(StepOptions())
+    options = make_method("stba:16").options(StepOptions())
     layout, state = start(problem, options)
     label = partition_of(layout).label
     assert len(np.unique(label, axis=0)) > 10

@@ -111,8 +111,8 @@ def test_a_step_with_previous_ones_predicts_what_its_own_linear_model_says():
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"linear_solver": "implicit"}, {"method": make_method("stba")}, {"method": make_method("ddlm")}],
-    ids=["explicit", "implicit", "stba", "ddlm"],
+    [{}, {"linear_solver": "implicit"}, {"method": make_method("stba")}],
+    ids=["explicit", "implicit", "stba"],
 )
 def test_other_solvers_keep_no_steps(options):
     _, state = start(support.tiny(), StepOptions(**options, refinement=Refinement(previous_steps=1)))

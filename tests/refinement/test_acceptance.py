@@ -31,7 +31,6 @@ from jaxba.refinement.camera_rounds import GOOD_GAIN, MAX_COST_RATIO, MIN_GAINS,
 from jaxba.refinement.cameras import DAMPINGS, refine_cameras
 from jaxba.refinement.candidates import best_candidate
 from jaxba.refinement.pattern_move import GAIN_TOLERANCE, SMALL_DAMPING_FRACTION
-from jaxba.refinement.subproblems import Whole
 
 pytestmark = pytest.mark.step
 
@@ -249,7 +248,7 @@ def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
     linear = linearize(layout, before.cameras, before.points, PLAIN.loss)
     whole = _whole_step(layout, linear, before.cameras, before.points, jnp.asarray(1e-3), PLAIN)
     mirrored = whole._replace(cameras=whole.cameras.at[6, 0].set(-1.5 * before.cameras[6, 0]))
-    found = lambda options: _best_candidate(Whole(layout), *before[:3], linear.reference, mirrored, options, 0.0)
+    found = lambda options: _best_candidate(layout, *before[:3], linear.reference, mirrored, options, 0.0)
     plain, kept = found(PLAIN), found(SHORTER_ONLY)
     assert plain.cameras[6, 0] < 0
     assert not plain.accepted

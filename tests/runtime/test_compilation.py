@@ -79,7 +79,6 @@ def test_this_jaxlib_compiles_at_both_lower_levels():
         {"policy": "ceres"},
         {"policy": "learned"},
         {"policy": "learned", "method": "stba"},
-        {"policy": "learned", "method": "ddlm"},
         {"policy": "learned", "method": "deeplm"},
         {"policy": "learned", "linear_solver": "sparse"},
         {"policy": "learned", "linear_solver": "implicit"},
@@ -101,7 +100,7 @@ def test_a_solve_compiled_at_level_quick_is_the_same_solve(how):
 
 @pytest.mark.fully_compiled
 @on_a_cpu
-@pytest.mark.parametrize("how", [{}, {"linear_solver": "implicit"}, {"method": "ddlm"}, {"method": "stba"}], ids=str)
+@pytest.mark.parametrize("how", [{}, {"linear_solver": "implicit"}, {"method": "stba"}], ids=str)
 def test_a_solve_compiled_at_level_medium_is_the_same_solve(how, monkeypatch):
     full = solve(support.tiny(), "learned", **how, max_iterations=8, callback=lambda record: None)
     monkeypatch.setattr(
@@ -131,8 +130,8 @@ def test_every_program_is_compiled_once_before_the_first_iteration(how):
         solved = solve(problem, "learned", **how, max_iterations=4, callback=watch)
     assert solved.iterations == 4
     assert late == [len(set(seen.names) - {"camera_round"})] * 4
-    step = ["lm_step"] if how.get("method") == "ddlm" else ["propose", "take_step", "try_candidate"]
-    assert sorted({"lm_step", "propose", "take_step", "try_candidate"} & set(seen.names)) == step
+    assert {"propose", "take_step", "try_candidate"} <= set(seen.names)
+    assert "lm_step" not in seen.names
     assert len(seen.names) == len(set(seen.names))
     assert seen.names.count("_advance_and_pack") == 1
 

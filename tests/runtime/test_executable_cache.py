@@ -92,7 +92,7 @@ def call(x, power=1):
     [
         {"policy": "learned", "compilation": "auto"},
         {"policy": "ceres", "dtype": "mixed"},
-        {"policy": "learned", "method": "ddlm"},
+        {"policy": "learned", "method": "stba"},
         {"policy": "ceres", "linear_solver": "implicit"},
         {"policy": "learned", "pad": True},
     ],
@@ -116,7 +116,6 @@ def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how
         "try_candidate",
         "camera_round",
         "take_step",
-        "lm_step",
         "_advance_and_pack",
     )
     assert not set(seen.names) & set(parts)

@@ -28,13 +28,13 @@ def beyond(offset: float = 1e3) -> BundleProblem:
     return problem.replace(observations=geometry.project(problem) + offset)
 
 
-@pytest.mark.parametrize("method", ["lm", "ddlm:3", "deeplm"])
+@pytest.mark.parametrize("method", ["lm", "deeplm"])
 def test_a_solve_in_which_no_observation_has_a_weight_is_no_success(method):
     found = jaxba.solve(beyond(), "ceres", SolveOptions(loss=Loss("tukey", 2.0), method=method))
     assert (found.termination, found.iterations) == (Termination.NO_WEIGHT, 1)
     assert not found.converged
     assert "larger scale" in found.termination.reason
-    assert np.array_equal(found.problem.cameras, beyond().cameras) or method == "ddlm:3"
+    assert np.array_equal(found.problem.cameras, beyond().cameras)
 
 
 def test_nor_in_the_compiled_loop_or_with_a_loss_of_ones_own():
@@ -110,7 +110,7 @@ def test_no_policy_changes_the_sign_of_a_focal_length(name, ending):
     assert (np.diff([found.initial_cost, *found.history.cost]) <= 0).all()
 
 
-@pytest.mark.parametrize("method", ["stba:3", "deeplm", "ddlm:3", "poba"])
+@pytest.mark.parametrize("method", ["stba:3", "deeplm", "poba"])
 def test_nor_does_any_method(method):
     found = jaxba.solve(mirrored(), "gauss-newton", SolveOptions(max_iterations=15, method=method))
     assert (found.problem.cameras[:, 6] > 0).all()

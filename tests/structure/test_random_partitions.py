@@ -15,7 +15,6 @@ from scipy.sparse.csgraph import connected_components
 from support import bal_file, needs_data
 
 from jaxba import BundleProblem, StepOptions, read_bal
-from jaxba.methods.ddlm import DomainDecomposition
 from jaxba.methods.stba import StochasticClusters
 from jaxba.structure.layout import build_layout, layout_for, partition_of
 from jaxba.structure.louvain import camera_graph, cluster, clusterings
@@ -128,8 +127,6 @@ def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
         for slots in pieces.values():
             assert len(set(part.slot_replica[slots].tolist())) == 1
             np.testing.assert_allclose(sums[part.slot_replica[slots[0]]], values[slots].sum(), atol=1e-12)
-        seen_from = [{name for column, name in pieces if column == p} for p in range(layout.num_points)]
-        assert part.is_shared.tolist() == [len(names) > 1 for names in seen_from]
         listed = part.members[part.members < problem.num_cameras]
         assert sorted(listed.tolist()) == list(range(problem.num_cameras))
         for name, members in enumerate(part.members):
@@ -139,7 +136,6 @@ def test_copies_are_the_observations_of_a_point_from_one_cluster(size, largest):
 def test_small_problems_have_one_partition_with_one_cluster():
     partitions = partition_of(layout_for(support.tiny(), StepOptions(method=StochasticClusters())))
     assert partitions.label.shape == (1, 6)
-    assert not partitions.is_shared.any()
     many = partition_of(layout_for(support.tiny(), StepOptions(method=StochasticClusters(cluster_cameras=2))))
     assert many.label.shape == (PARTITIONS, 6)
 
@@ -154,6 +150,6 @@ def test_a_layout_without_partitions_says_how_to_get_them():
 @needs_data
 def test_no_cluster_of_a_real_problem_is_larger_than_asked():
     problem = read_bal(bal_file("problem-49-7776-pre"))
-    partitions = partition_of(layout_for(problem, StepOptions(method=DomainDecomposition(cluster_cameras=16))))
+    partitions = partition_of(layout_for(problem, StepOptions(method=StochasticClusters(cluster_cameras=16))))
     assert partitions.members.shape[2] <= 16
     assert 3 <= partitions.members.shape[1] <= 12
