@@ -61,9 +61,8 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
     if unknowns is not None and unknowns.in_rigs and problem.cameras.shape[1] != POSE_SIZE + unknowns.size:
         raise ValueError("a problem with rigs must be in_frames (jaxba.problem.frames); jaxba.prepare does it")
     cameras = components_first(jnp.asarray(problem.cameras, dtype))
-    order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
     # padding points have an index out of range and are placed at the origin
-    points = components_first(jnp.asarray(problem.points, dtype).at[order].get(mode="fill", fill_value=0))
+    points = components_first(jnp.asarray(problem.points, dtype).at[layout.points].get(mode="fill", fill_value=0))
     return state_at(cameras, points, cost(layout, cameras, points, options.loss), options)
 
 

@@ -29,7 +29,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.runtime.jit import jit
-from jaxba.solver.prepare import layout_order, write_back
+from jaxba.solver.place import Placed
 from jaxba.structure.layout import Layout, layout_for
 
 FORCED_DECREASE = 1e200
@@ -133,7 +133,8 @@ class StepAcceptance:
 
     def bundle(self) -> BundleProblem:
         """The problem at the current state."""
-        return write_back(self.run.colmap.start, self.layout, layout_order(self.layout), self.state, self.options)
+        start = self.run.colmap.start
+        return Placed(start, np.zeros(3), start).after(self.layout, self.state, self.options)
 
 
 @functools.partial(jit, static_argnames="options")
@@ -157,8 +158,7 @@ def _evaluate(
     cameras = jnp.concatenate(
         [flip * rotation, flip * (after[0][:, 4:] - before[0][:, 4:]).T, lens[jnp.array([0, 3, 4])]]
     )
-    order = jnp.concatenate([jnp.asarray(members) for members in layout.bucket_points])
-    points = (after[2] - before[2]).at[order].get(mode="fill", fill_value=0).T
+    points = (after[2] - before[2]).at[layout.points].get(mode="fill", fill_value=0).T
     linear = linearize(layout, state.cameras, state.points, options.loss)
     residual, change = jnp.stack(linear.residual), jnp.stack(jacobian_product(layout, linear, cameras.T, points))
     slope = -jnp.sum(residual * change)

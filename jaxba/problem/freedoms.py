@@ -48,8 +48,7 @@ def fixed_freedoms(problem: BundleProblem) -> int:
     Args:
         problem: any problem; one far from the origin as a solve shifts it.
     """
-    offset = far_middle(problem)
-    return SIMILARITY - _freedoms(problem if offset is None else shift(problem, -offset)).combinations.shape[1]
+    return SIMILARITY - _freedoms(shift(problem, -far_middle(problem))).combinations.shape[1]
 
 
 def free_directions(

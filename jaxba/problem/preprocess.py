@@ -72,17 +72,14 @@ def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
     )
 
 
-def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"] | None:
-    """The marginal median of the points if a scene is far from the origin, as georeferenced scenes are; else None.
+def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"]:
+    """The marginal median of the points if a scene is far from the origin, as georeferenced scenes are; else zero.
 
-    "Far" is more than `FAR` times the extent.
-
-    Returns:
-        Shape (3,), scene units.
+    "Far" is more than `FAR` times the extent. In scene units.
     """
     middle, extent = middle_and_extent(problem)
     with np.errstate(all="ignore"):
-        return middle if np.linalg.norm(middle) > FAR * extent > 0 else None
+        return middle if np.linalg.norm(middle) > FAR * extent > 0 else np.zeros(3)
 
 
 def middle_and_extent(problem: BundleProblem) -> tuple[Float[np.ndarray, "3"], float]:
@@ -111,8 +108,10 @@ def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProbl
 
     Args:
         problem: the problem to shift.
-        offset: translation, scene units.
+        offset: translation, scene units; zero leaves the problem as it is.
     """
+    if not np.any(offset):
+        return problem
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
     seen, placed = observed(problem)
     cameras[seen, 3:6] -= rotation_matrices(cameras[seen, :3]) @ offset  # t = -R c

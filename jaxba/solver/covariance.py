@@ -27,18 +27,16 @@ from jaxba.lm.step import initial_state
 from jaxba.model.linearize import Linearization, linearize, only_free
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
-from jaxba.problem.facing import facing_away, without_views_of
-from jaxba.problem.frames import in_frames
+from jaxba.problem.facing import facing_away
 from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, lens_size
 from jaxba.problem.labels import Part, part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Coordinates, StepOptions
-from jaxba.problem.preprocess import far_middle, shift
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.prepare import check_problem, layout_order
+from jaxba.solver.place import check_problem, placed
 from jaxba.structure.layout import Layout, layout_for
 from jaxba.typing import ArrayRecord
 
@@ -129,15 +127,13 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     """
     check_problem(problem)
     options = StepOptions(linear_solver="implicit", loss=loss or Loss(), coordinates=Coordinates(rotation="manifold"))
-    given, problem = problem, without_views_of(problem, facing_away(problem))
-    free = SIMILARITY - fixed_freedoms(problem)
+    given, (counted, offset, problem) = problem, placed(problem, facing_away(problem))
+    free = SIMILARITY - fixed_freedoms(counted)
     if free:
         which = "7 directions of the cameras are" if free == SIMILARITY else f"{free} of 7 directions of the scene are"
         hint = "fix them with a gauge, constants or priors"
         raise ProblemError(f"{which} not determined by what is observed; {hint}")
-    offset = far_middle(problem)
-    problem = in_frames(problem if offset is None else shift(problem, -offset))
-    with numerics(np.dtype("float64")):
+    with numerics(np.float64):
         layout = layout_for(problem, options)
         linear = jax.device_get(jit(_linear, static_argnames="options")(layout, problem, options))
     index, count = _unknown_index(problem, layout)
@@ -176,7 +172,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
 
 
 def _changes(
-    problem: BundleProblem, layout: Layout, rotations: Float[np.ndarray, "cameras 3 3"], offset: np.ndarray | None
+    problem: BundleProblem, layout: Layout, rotations: Float[np.ndarray, "cameras 3 3"], offset: np.ndarray
 ) -> Float[np.ndarray, "cameras 6 width"]:
     """`Covariance.changes`. With a step w, d of its frame and v, e of its extrinsics, a camera in a rig turns by
     `M w + v` and moves by `M d + v x M t_r + e`; of a scene shifted by -o, `t = t' - R o`."""
@@ -194,11 +190,9 @@ def _changes(
         for place, column in enumerate(unknowns.columns):
             if column >= start:
                 changes[:, :, POSE_SIZE + place] = by_extrinsics[:, :, column - start]
-    if offset is not None:
-        back = np.tile(np.eye(6), (len(rotations), 1, 1))
-        back[:, 3:, :3] = [_cross(moved) for moved in rotations @ offset]  # -(w x R o) = [R o]x w
-        changes = back @ changes
-    return changes
+    back = np.tile(np.eye(6), (len(rotations), 1, 1))
+    back[:, 3:, :3] = [_cross(moved) for moved in rotations @ offset]  # -(w x R o) = [R o]x w
+    return back @ changes
 
 
 def _linear(layout: Layout, problem: BundleProblem, options: StepOptions) -> Linearization:
@@ -255,7 +249,7 @@ def _system(
     from scipy.sparse import csr_matrix, vstack
 
     mask, points = np.asarray(layout.slot_mask), len(free_points)
-    point = layout_order(layout)[np.asarray(layout.slot_point)[mask]]
+    point = layout.points[np.asarray(layout.slot_point)[mask]]
     order = np.argsort(point, kind="stable")
     camera, point = np.asarray(layout.slot_camera)[mask][order], point[order]
     columns = lambda rows: np.moveaxis(np.array([[row[mask] for row in pair] for pair in rows]), 2, 0)[order]

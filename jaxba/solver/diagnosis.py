@@ -11,13 +11,13 @@ from jaxba.lm.step import initial_state
 from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, view_terms
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.frames import in_frames
 from jaxba.problem.labels import part_name
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import COST_ROUNDING
 from jaxba.runtime.compilation import compile_and_run, program
 from jaxba.runtime.numerics import numerics
+from jaxba.solver.place import placed
 from jaxba.structure.layout import Layout, build_layout
 
 
@@ -27,28 +27,25 @@ def explain_start(problem: BundleProblem, loss: Loss | None = None, dtype: Any =
     Costs and depths are those of the step's own model in the same arithmetic, so that the message cannot contradict it.
 
     Args:
-        problem: at which the cost is not finite, in the coordinates in which it was computed.
+        problem: at which the cost is not finite.
         loss: of the solve; None: squared residuals.
         dtype: type of the solve's parameters.
     """
     dtype = np.dtype(dtype)
     loss = loss or Loss()
-    problem = in_frames(problem)
-    layout = build_layout(problem, pairs=False, grid=False)
     with numerics(dtype):
-        found = compile_and_run(program(_start_terms, "loss", "dtype", level="quick"), layout, problem, loss, dtype)
+        here = placed(problem).here
+        layout = build_layout(here, pairs=False, grid=False)
+        found = compile_and_run(program(_start_terms, "loss", "dtype", level="quick"), layout, here, loss, dtype)
         costs, inverse_depth = (np.asarray(x) for x in found)
     slots = np.flatnonzero(np.asarray(layout.slot_mask) & ~np.isfinite(costs))
     narrow = "" if dtype == np.float64 else f" in {dtype}; float64 has a larger range"
     if not slots.size:
         return f"the cost at the start overflows{narrow}"
-    order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
-    cameras, points = (np.asarray(index)[slots] for index in (layout.slot_camera, layout.slot_point))
-    bad = set(zip(cameras.tolist(), order[points].tolist(), strict=True))
-    pairs = zip(problem.camera_index.tolist(), problem.point_index.tolist(), strict=True)
-    number, (camera, point) = next((n, pair) for n, pair in enumerate(pairs) if pair in bad)
-    here = (cameras == camera) & (order[points] == point)
-    on_plane = not np.isfinite(inverse_depth[slots[here]]).all()
+    first = slots[np.argmin(np.asarray(layout.observation)[slots])]
+    number = int(layout.observation[first])
+    camera, point = int(problem.camera_index[number]), int(problem.point_index[number])
+    on_plane = not np.isfinite(inverse_depth[first])
     name = lambda kind, at: part_name(problem.labels, kind, at)
     view = name("image", camera)
     why = f"lies on the plane of {view}" if on_plane else f"has a residual in {view} that overflows"

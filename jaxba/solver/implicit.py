@@ -44,7 +44,6 @@ from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import facing_away
-from jaxba.problem.frames import in_frames
 from jaxba.problem.freedoms import RESOLVED, SIMILARITY, determined_directions, free_directions
 from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
@@ -52,7 +51,8 @@ from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, numerics, refuse_traces
 from jaxba.solver.options import SolveOptions, checked_options
-from jaxba.solver.prepare import DEFAULT_POLICY, check_problem, set_up
+from jaxba.solver.place import check_problem
+from jaxba.solver.prepare import DEFAULT_POLICY, set_up
 from jaxba.solver.solve import solve
 from jaxba.structure.layout import Layout
 from jaxba.typing import AnyArray, differ, outline, same
@@ -167,15 +167,14 @@ def _transposed(
         coordinates=replace(setup.options.coordinates, rotation="manifold"),
         conjugate_gradients=ConjugateGradients(forcing=0.0, tolerance=1e-10),
     )
-    if setup.offset is not None:
+    counted, offset, here = setup.placed
+    if offset.any():
         raise ProblemError("derivatives need a scene near the origin: shift it first (its extent is much smaller)")
-    numbered = np.stack([np.arange(solved.num_observations, dtype=float)] * 2, axis=1)
-    with numerics(np.dtype("float64")):
-        slots = set_up(solved.replace(observations=numbered), policy, options, away).layout.pixels[0]
-        order = np.concatenate([np.asarray(members) for members in setup.layout.bucket_points])
-        here = in_frames(setup.counted)
-        still = _symmetries(setup.counted, setup.layout, order)
-        arguments = (setup.layout, jnp.asarray(order), jnp.asarray(slots).astype(int), here, still, inputs, cotangents)
+    kept = np.flatnonzero(~np.isin(solved.camera_index, away))  # observations that count
+    with numerics(np.float64):
+        slots = jnp.asarray(np.append(kept, 0)[setup.layout.observation])
+        still = _symmetries(counted, setup.layout)
+        arguments = (setup.layout, slots, here, still, inputs, cotangents)
         found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
     if not float(residual) < LARGEST_RESIDUAL:
         raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
@@ -191,8 +190,8 @@ class Symmetries(NamedTuple):
     points: Float[AnyArray, "points 3 3"]
 
 
-def _symmetries(solved: BundleProblem, layout: Layout, order: np.ndarray) -> Symmetries:
-    determined = determined_directions(solved)
+def _symmetries(solved: BundleProblem, layout: Layout) -> Symmetries:
+    order, determined = np.asarray(layout.points), determined_directions(solved)
     cameras, points = free_directions(solved)
     if layout.unknowns is not None:
         cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
@@ -216,7 +215,6 @@ def _symmetries(solved: BundleProblem, layout: Layout, order: np.ndarray) -> Sym
 
 def _solve_transposed(
     layout: Layout,
-    order: Array,
     slots: Array,
     solved: BundleProblem,
     still: Symmetries,
@@ -226,7 +224,7 @@ def _solve_transposed(
     options: StepOptions,
 ) -> tuple[SolveInputs, Array]:
     state = initial_state(layout, solved, options, jnp.float64)
-    unknowns = layout.unknowns
+    unknowns, order = layout.unknowns, layout.points
     width = POSE_SIZE + LENS_SIZE if unknowns is None else unknowns.width
     count = state.cameras.shape[1]
     seen = jnp.asarray(layout.camera_seen)[:, None]
@@ -316,7 +314,7 @@ def _start_of_constants(layout: Layout, cameras: Array) -> Array:
     return (kept - jax.lax.stop_gradient(kept)).T
 
 
-def _start_of_points(solved: BundleProblem, still: Symmetries, points: Array, order: Array) -> Array:
+def _start_of_points(solved: BundleProblem, still: Symmetries, points: Array, order: AnyArray) -> Array:
     """The same for points that are constant or that nothing sees, in layout order."""
     own = points.T[:, jnp.minimum(order, solved.num_points - 1)]
     kept = jnp.where(jnp.any(still.points != 0, axis=(1, 2)), 0, own)

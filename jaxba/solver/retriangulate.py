@@ -25,8 +25,7 @@ from jaxba.model.linearize import slot_costs, slot_frames, view_residuals
 from jaxba.model.observations import Views, point_passes
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.facing import facing_away, without_views_of
-from jaxba.problem.frames import in_frames
+from jaxba.problem.facing import facing_away
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import midpoints
@@ -35,7 +34,7 @@ from jaxba.runtime import process
 from jaxba.runtime.compilation import compile_and_run, level_after, program, stages
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import explain_start
-from jaxba.solver.prepare import check_problem
+from jaxba.solver.place import check_problem, placed
 from jaxba.structure.conventions import components_first, items_first
 from jaxba.structure.layout import Layout, build_layout
 from jaxba.typing import ArrayRecord
@@ -113,17 +112,16 @@ def retriangulate_without(
     away: Int[np.ndarray, " away"], problem: BundleProblem, loss: Loss | None = None
 ) -> Retriangulation:
     """`retriangulate` where it is known which images face away."""
-    given, problem = problem, without_views_of(problem, away)
     with numerics(np.float64):
-        here = in_frames(problem)
+        counted, offset, here = placed(problem, away)
         layout = build_layout(here, pairs=False, grid=False)
-        order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
-        real = order < problem.num_points  # without padding points
+        order, real = layout.points, layout.points < problem.num_points  # without padding points
         first = np.zeros(problem.num_points, np.int64)
-        first[problem.point_index[::-1]] = problem.camera_index[::-1]  # the first observation is written last and stays
+        first[here.point_index[::-1]] = here.camera_index[::-1]  # the first observation is written last and stays
         origin = np.zeros((3, len(order)))
-        origin[:, real] = components_first(geometry.camera_centers(problem.cameras)[first[order[real]]])
-        level = level_after(EQUIVALENT_STEPS, stages("acceptance", problem.num_observations))
+        centers = geometry.camera_centers(counted.cameras) - offset
+        origin[:, real] = components_first(centers[first[order[real]]])
+        level = level_after(EQUIVALENT_STEPS, stages("acceptance", here.num_observations))
         search = program(_search, "loss", level=level)
         arguments = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
         found = jax.device_get(compile_and_run(search, *arguments))
@@ -131,9 +129,9 @@ def retriangulate_without(
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem, loss))
     points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real
-    points[order[moved]] = items_first(np.asarray(found.points))[moved]
+    points[order[moved]] = items_first(np.asarray(found.points))[moved] + offset
     return Retriangulation(
-        given.replace(points=points), int(moved.sum()), float(found.cost_before), float(found.cost_after)
+        problem.replace(points=points), int(moved.sum()), float(found.cost_before), float(found.cost_after)
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -44,10 +45,7 @@ class Shards:
     """Layouts of all shards, of equal shapes, along a leading axis that is divided among the devices."""
 
     first: Layout
-    """The layout of this process's first shard, on the host."""
-
-    order: Int[np.ndarray, "shards points"]
-    """The point of the problem at each position in layout order; the number of points for padding."""
+    """The layout of this process's first shard, on the host, with the points of all shards one after the other."""
 
     def __init__(
         self, problem: BundleProblem, options: StepOptions, devices: Sequence[jax.Device], dtype: np.dtype[Any]
@@ -73,10 +71,11 @@ class Shards:
             raise ProblemError(f"{len(devices)} devices are more than there are observed points")
         own = [shard_of(problem, points) for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
         layouts = sharded_layout(own, options, distributed.gather)
-        self.layout, self.first = self._placed(layouts), layouts[0]
+        self.layout = self._placed(layouts)
         here = [points for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
         orders = [_order(layout, points, problem) for layout, points in zip(layouts, here, strict=True)]
-        self.order = distributed.to_host(self._placed(orders))
+        order = distributed.to_host(self._placed(orders)).reshape(-1)
+        self.first = replace(layouts[0], points=order)
         known = np.append(np.asarray(problem.points, dtype), np.zeros((1, 3), dtype), axis=0)
         self._points = self._placed([np.ascontiguousarray(known[order].T) for order in orders])
         cameras = np.ascontiguousarray(np.asarray(problem.cameras, dtype).T)
@@ -119,8 +118,7 @@ def _is_here(device: jax.Device) -> bool:
 
 def _order(layout: Layout, points: Int[np.ndarray, " own"], problem: BundleProblem) -> Int[np.ndarray, " points"]:
     """The point of the problem at each position of a shard."""
-    members = np.concatenate([np.asarray(one) for one in layout.bucket_points])
-    return np.append(points, problem.num_points)[np.minimum(members, len(points))]
+    return np.append(points, problem.num_points)[np.minimum(layout.points, len(points))]
 
 
 def _own(layout: Layout) -> Layout:

@@ -155,7 +155,7 @@ def solve_without(
     """`solve` where it is known which images face away; None: it is not."""
     options = checked_options(options)
     setup = set_up(problem, policy, options, away)
-    problem = setup.counted
+    problem = setup.placed.counted
     with numerics(setup.dtype):
         stages_of_parts = _stages(options.compilation, problem, setup.options)
         run = functools.partial(

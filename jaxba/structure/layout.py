@@ -23,6 +23,7 @@ Everything is computed once per problem, on the host, with vectorised NumPy.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -59,14 +60,17 @@ class Layout(ArrayRecord):
     slot_mask: Bool[AnyArray, " slots"]
     """Whether the slot holds an observation."""
 
+    observation: Int[AnyArray, " slots"]
+    """Index in the problem of the observation of each slot; out of range in empty slots."""
+
     pixels: Float[AnyArray, "2 slots"]
     """Measured pixels; zero in empty slots."""
 
     whitening: Float[AnyArray, "2 2 slots"] | None
     """`Sigma^(-1/2)` of each observation."""
 
-    bucket_points: tuple[Int[AnyArray, " _"], ...]
-    """Index in the problem of the points of each bucket; padding points have an index out of range."""
+    points: Int[AnyArray, " points"]
+    """Index in the problem of each point in layout order; padding points have an index out of range."""
 
     point_levels: tuple[Int[AnyArray, "_ _"], ...] | None
     """In a layout with fixed capacity the ranks of chunks that are added to the first one of each point
@@ -109,7 +113,7 @@ class Layout(ArrayRecord):
     @property
     def num_points(self) -> int:
         """Number of points in layout order, including padding."""
-        return sum(members.shape[-1] for members in self.bucket_points)
+        return self.points.shape[-1]
 
     @property
     def num_cameras(self) -> int:
@@ -170,28 +174,25 @@ def build_layout(
     assignment = bucket_slots(tracks, part("buckets")) if capacity is None else padded_slots(tracks, capacity)
     slot, slot_point, empty = assignment.slot, assignment.point, assignment.empty
     slots = len(slot_point)
-    mask = np.zeros(slots, bool)
-    mask[slot] = True
-    slot_camera = np.zeros(slots, np.int32)
-    slot_camera[slot] = camera
-    pixels = np.zeros((2, slots))
-    pixels[:, slot] = np.asarray(problem.observations)[order].T
-    whitening = None
-    if problem.whitening is not None:
-        whitening = np.zeros((2, 2, slots))
-        whitening[:, :, slot] = np.moveaxis(np.asarray(problem.whitening)[order], 0, -1)
+
+    def in_slots(values: np.ndarray, otherwise: Any = 0) -> np.ndarray:
+        """Values of the sorted observations, which are their first axis, as the last axis of the slots."""
+        found = np.full((*values.shape[1:], slots), otherwise, values.dtype)
+        found[..., slot] = np.moveaxis(values, 0, -1)
+        return found
+
+    in_order = lambda values: in_slots(np.asarray(values, np.float64)[order])
     room = None if capacity is None else room_for(seen, capacity.usual_observations(len(camera)), capacity.points)
     by_camera = sorted_by(camera, cameras)
     levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, part("cameras"))
     camera_levels = with_spare_row(levels, empty)
     slot_grid = None
-    columns = sum(map(len, assignment.members))
+    columns = len(assignment.points)
     if pairs and factor and grid and _is_dense(camera, point, tracks, cameras, columns, agreement):
         slot_grid = np.full((columns, cameras), empty, np.int32)
         slot_grid[slot_point[slot], camera] = slot
     pair_lists = None
-    members = np.concatenate([np.asarray(points) for points in assignment.members])
-    unknowns = unknowns_of(problem, is_seen, members, fixed=fixed_intrinsics, agreement=agreement)
+    unknowns = unknowns_of(problem, is_seen, assignment.points, fixed=fixed_intrinsics, agreement=agreement)
     if pairs and slot_grid is None:
         slots_by_camera = camera_levels[0].ravel()
         sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot
@@ -222,12 +223,13 @@ def build_layout(
         sorted_observations = camera, point, slot, cameras, len(tracks), slot_point, empty
         camera_clusters = cluster_layout(*sorted_observations, shared, part("clusters"))
     return Layout(
-        slot_camera=slot_camera,
+        slot_camera=in_slots(camera.astype(np.int32)),
         slot_point=slot_point,
-        slot_mask=mask,
-        pixels=pixels,
-        whitening=whitening,
-        bucket_points=assignment.members,
+        slot_mask=in_slots(np.ones(len(camera), bool)),
+        observation=in_slots(order.astype(np.int32), problem.num_observations),
+        pixels=in_order(problem.observations),
+        whitening=None if problem.whitening is None else in_order(problem.whitening),
+        points=assignment.points,
         point_levels=assignment.levels,
         camera_levels=camera_levels,
         camera_seen=is_seen,

@@ -48,8 +48,8 @@ class Slots(NamedTuple):
     point: Int[np.ndarray, " slots"]
     """Point of each slot in layout order, for empty slots too."""
 
-    members: tuple[Int[np.ndarray, " _"], ...]
-    """Index in the problem of the points in layout order, by bucket; padding points have an index out of range."""
+    points: Int[np.ndarray, " points"]
+    """Index in the problem of the points in layout order; padding points have an index out of range."""
 
     buckets: tuple[Bucket, ...]
     """Shape of each bucket; empty for a layout with fixed capacity."""
@@ -105,7 +105,7 @@ def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement | None
     return Slots(
         slot=np.repeat(first - start * tile, tracks) + np.arange(int(tracks.sum())) * np.repeat(tile, tracks),
         point=np.concatenate(slot_point),
-        members=tuple(bucket_points),
+        points=np.concatenate(bucket_points),
         buckets=tuple(buckets),
         levels=None,
         empty=empty,
@@ -146,7 +146,7 @@ def padded_slots(tracks: Int[np.ndarray, " points"], capacity: Capacity) -> Slot
     return Slots(
         slot=row * chunks + chunk[np.repeat(first, tracks) + at],
         point=np.tile(chunk_point, POINT_CHUNK),
-        members=(members,),
+        points=members,
         buckets=(),
         levels=prefix_levels(chunk, all_counts, chunks - 1, room, first=1),
         empty=chunks - 1,

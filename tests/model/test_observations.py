@@ -47,7 +47,7 @@ def sums(layout: Layout, problem: BundleProblem, loss: Loss, fast: bool, dtype: 
         one_pass = point_passes(layout, slot_frames(layout, state.cameras))
         return jnp.stack(one_pass(state.points, lambda views: point_terms(views, loss)))
 
-    columns = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    columns = np.asarray(layout.points)
     real = columns < problem.num_points
     with fast_compilation(fast):
         values = np.asarray(jax.jit(found)(layout, problem))

@@ -52,7 +52,7 @@ def test_residuals_and_derivatives_are_those_of_the_host_and_of_differences(name
     problem = scene(*names, shared=False)
     layout, state = support.start(problem, StepOptions(linear_solver="implicit"))
     linear = linearize(layout, state.cameras, state.points, Loss())
-    order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    order = np.asarray(layout.points)
     rng = np.random.default_rng(2)
     scale = np.where(np.abs(problem.cameras) > 10, 1.0, 1e-2)  # of focal lengths and principal points, and of the rest
     change = scale * rng.normal(size=problem.cameras.shape), 1e-2 * rng.normal(size=problem.points.shape)

@@ -52,7 +52,7 @@ _midpoints = jax.jit(lambda layout, cameras: midpoints(layout, slot_frames(layou
 
 def order_of(problem: BundleProblem) -> tuple[np.ndarray, np.ndarray]:
     """Columns of a layout's points that are points of the problem, and which."""
-    order = np.concatenate([np.asarray(members) for members in build_layout(problem).bucket_points])
+    order = np.asarray(build_layout(problem).points)
     real = np.flatnonzero(order < problem.num_points)
     return real, order[real]
 

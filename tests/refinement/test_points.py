@@ -239,7 +239,7 @@ def settled(problem: BundleProblem, iterations: int) -> BundleProblem:
     """The problem with its points after point iterations alone."""
     layout, state = start(problem)
     found, _ = _refined_after(layout, state, state.points, Loss(), iterations)
-    order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    order = np.asarray(layout.points)
     points = np.array(problem.points)
     real = order < problem.num_points
     points[order[real]] = np.asarray(found).T[real]

@@ -126,7 +126,7 @@ def test_every_observation_is_on_one_device_and_each_has_its_share():
     assert shapes[0] == shapes[1] == shapes[2]
     found = Counter()
     for layout, points in zip(layouts, dealt, strict=True):
-        order = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+        order = np.asarray(layout.points)
         mask = np.asarray(layout.slot_mask)
         own = points[order[np.asarray(layout.slot_point)[mask]]]
         camera, pixels = np.asarray(layout.slot_camera)[mask], np.asarray(layout.pixels)[:, mask]

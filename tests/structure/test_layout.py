@@ -63,7 +63,7 @@ tracks_and_cameras = st.composite(track_lengths)()
 
 def points_of(layout: Layout) -> np.ndarray:
     """Problem index of every column of the layout; the number of points for padding."""
-    return np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    return np.asarray(layout.points)
 
 
 def rows_of(layout: Layout) -> Counter:
@@ -312,7 +312,7 @@ def test_a_grid_names_the_slot_of_every_view_and_an_empty_one_elsewhere():
     layout = build_layout(problem)
     assert layout.grid is not None
     assert layout.pairs is None
-    column = np.concatenate([np.asarray(members) for members in layout.bucket_points])
+    column = np.asarray(layout.points)
     seen = {(int(p), int(c)) for p, c in zip(problem.point_index, problem.camera_index, strict=True)}
     for row, views in enumerate(np.asarray(layout.grid)):
         for camera, slot in enumerate(views):

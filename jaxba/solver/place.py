@@ -1,0 +1,112 @@
+"""From a problem to the one that is computed with, and back: without views that do not count, near the origin, and of
+frames in the place of cameras in rigs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba.lm.records import LMState
+from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.constants import Constants
+from jaxba.problem.facing import without_views_of
+from jaxba.problem.frames import in_frames, out_of_frames
+from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.problem.options import StepOptions
+from jaxba.problem.preprocess import far_middle, shift
+from jaxba.problem.rigs import with_unseen_of_frames
+from jaxba.runtime import process
+from jaxba.runtime.numerics import refuse_traces
+from jaxba.structure.conventions import items_first
+from jaxba.structure.layout import Layout
+
+NOBODY = np.zeros(0, int)
+"""No cameras."""
+
+
+class Placed(NamedTuple):
+    """A problem where it is computed."""
+
+    counted: BundleProblem
+    """The problem without the views of images that face away (problem/facing.py), where it was."""
+
+    offset: Float[np.ndarray, "3"]
+    """The middle of a scene far from the origin, scene units; zero for others. It was subtracted."""
+
+    here: BundleProblem
+    """The same problem near the origin, `in_frames` if it has rigs."""
+
+    def after(self, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:
+        """The counted problem with the parameters of a state; what was not optimised is copied exactly.
+
+        Args:
+            layout: of `here`.
+            state: parameters in layout order; points of several shards one shard after the other.
+            options: whether intrinsics were fixed.
+        """
+        problem = shift(self.counted, -self.offset)
+        points = np.array(problem.points, np.float64)
+        seen = np.flatnonzero(layout.camera_seen)  # padding cameras are not seen
+        cameras = np.array(self.here.cameras, np.float64)
+        cameras[seen] = items_first(np.asarray(state.cameras, np.float64))[seen]
+        lenses, rigs = problem.lenses, problem.rigs
+        if lenses is not None:  # unobserved cameras follow the others with their lens
+            lens = np.asarray(lenses.index)
+            used, first = np.unique(lens[seen], return_index=True)
+            follows = np.isin(lens, used)
+            cameras[follows, 6:] = cameras[seen[first[np.searchsorted(used, lens[follows])]], 6:]
+        if self.here.rigs is not None:
+            cameras, rigs = out_of_frames(problem, cameras)
+        if options.intrinsics == "fixed":
+            cameras[:, 6:] = problem.cameras[:, 6:]
+        elif lenses is not None:
+            cameras[:, 6:] = np.where(np.asarray(lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
+        if rigs is not None:
+            cameras = with_unseen_of_frames(rigs, cameras, seen)
+        order = np.asarray(layout.points)
+        real = order < problem.num_points
+        points[order[real]] = items_first(np.asarray(state.points, np.float64))[real]
+        found, constants = problem.replace(cameras=cameras, points=points, rigs=rigs), problem.constants
+        if constants is None:
+            return shift(found, self.offset)
+        poses = np.asarray(constants.poses)
+        found = shift(_with_constants(found, problem, constants, poses), self.offset)
+        # bit for bit: parts of a translation are constant only where the rotation is, else those of the shifted scene
+        return _with_constants(found, self.counted, constants, poses & poses[:, :1])
+
+
+def placed(problem: BundleProblem, away: Int[np.ndarray, " away"] = NOBODY) -> Placed:
+    """Places a problem.
+
+    Args:
+        problem: any problem.
+        away: cameras whose views are left out.
+    """
+    counted = without_views_of(problem, away)
+    offset = far_middle(counted)
+    return Placed(counted, offset, in_frames(shift(counted, -offset)))
+
+
+def check_problem(problem: BundleProblem) -> None:
+    """First of all in every public function of a problem that computes with JAX.
+
+    Raises:
+        ValueError: it is no problem.
+        TypeError: JAX traces it.
+        RuntimeError: the process was forked from one in which JAX had started.
+    """
+    if not isinstance(problem, BundleProblem):
+        raise ValueError(f"problem must be a BundleProblem, as jaxba.read_problem returns it, not {problem!r}")
+    refuse_traces(problem)
+    process.refuse_fork()
+
+
+def _with_constants(
+    found: BundleProblem, given: BundleProblem, constants: Constants, poses: np.ndarray
+) -> BundleProblem:
+    """A problem with the constant points of another one, and these numbers of its poses."""
+    cameras, points = np.array(found.cameras), np.asarray(constants.points)[:, None]
+    cameras[:, :POSE_SIZE] = np.where(poses, given.cameras[:, :POSE_SIZE], cameras[:, :POSE_SIZE])
+    return found.replace(cameras=cameras, points=np.where(points, given.points, found.points))
