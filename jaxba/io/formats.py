@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath
 
 from jaxba.io.colmap import is_colmap, read_colmap
-from jaxba.io.colmap.records import PARTS, RIG_PARTS
+from jaxba.io.colmap.model import PARTS, RIG_PARTS
 from jaxba.io.files import READ_ERRORS, StrPath, display_name, strip_compression
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 

@@ -20,7 +20,7 @@ from jaxba.io.distortion import Distortion
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import FIXED, ForeignLens, assemble
-from jaxba.io.remarks import note, note_origin
+from jaxba.io.notes import note, note_origin
 from jaxba.io.text import LineReader, NumberReader, number
 from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError

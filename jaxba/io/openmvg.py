@@ -13,7 +13,7 @@ from jaxba.io.distortion import Distortion
 from jaxba.io.files import StrPath
 from jaxba.io.foreign import ForeignLens
 from jaxba.io.json_records import Record, read_json
-from jaxba.io.remarks import note_unused
+from jaxba.io.notes import note_unused
 from jaxba.io.sfm_data import UNDEFINED, Landmark, View, build, checked_pose, part
 from jaxba.problem.bundle_problem import BundleProblem
 

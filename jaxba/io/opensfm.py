@@ -19,7 +19,7 @@ from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import ALL_FREE, ForeignLens, assemble
 from jaxba.io.json_records import Record, read_json
-from jaxba.io.remarks import note, note_unused
+from jaxba.io.notes import note, note_unused
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import are_rotations
