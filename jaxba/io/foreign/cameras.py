@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.distortion import Distortion
 from jaxba.io.files import StrPath, display_name
+from jaxba.io.foreign.distortion import Distortion
 from jaxba.io.notes import note, note_center
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
