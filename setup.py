@@ -6,7 +6,7 @@ from setuptools import setup
 from setuptools.command.build_py import build_py
 
 FILES = sorted(Path("configs").glob("*/*.yaml"))
-"""As `jaxba/io/configurations.py` looks for them: configs/KIND/NAME.yaml."""
+"""As `jaxba/settings/configurations.py` looks for them: configs/KIND/NAME.yaml."""
 
 
 class BuildWithConfigs(build_py):

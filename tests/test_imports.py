@@ -16,13 +16,15 @@ import jaxba
 
 ORDER = (
     *("typing", "runtime", "problem", "structure", "model", "linear", "refinement", "lm", "methods", "damping"),
-    *("solver", "io", "scenes", "datasets", "viewer", "jaxba", "game", "training", "peers", "bench", "paper", "cli"),
+    *("solver", "io", "settings", "scenes", "datasets", "viewer", "jaxba", "game", "training", "peers", "bench"),
+    *("paper", "cli"),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
 
 NO_MORE_THAN = {
     "runtime": {"typing"},
     "io": {"typing", "runtime", "problem"},
+    "settings": {"typing", "runtime", "problem", "io"},
     "scenes": {"typing", "runtime", "problem"},
     "datasets": {"typing", "runtime", "problem", "io"},
 }

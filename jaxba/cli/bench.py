@@ -215,7 +215,8 @@ def _with_suite(args: Arguments) -> Arguments:
     """The arguments, completed by those of the suite."""
     if args.suite is None:
         return args
-    from jaxba.io import configurations, settings
+    from jaxba import settings
+    from jaxba.settings import configurations
 
     try:
         data = configurations.read("bench", args.suite)

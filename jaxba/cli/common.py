@@ -220,9 +220,9 @@ def notes_printed(say: Callable[[str], object] = print_line) -> Iterator[None]:
     Args:
         say: prints a line.
     """
-    from jaxba.io.notes import told
+    from jaxba.io.notes import notes_to
 
-    with told(lambda note: say(f"note: {note}")):
+    with notes_to(lambda note: say(f"note: {note}")):
         yield
 
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from jaxba.cli.common import UsageError, counted
 from jaxba.cli.constraint_values import PositionPriors, names_of, parse_items, parse_position_priors
-from jaxba.io.configurations import SettingsError, read_file
 from jaxba.io.notes import report
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
 from jaxba.problem.constraints import Gauge, hold, with_gauge
 from jaxba.problem.labels import part_name
 from jaxba.problem.measured import with_position_priors
+from jaxba.settings.configurations import SettingsError, read_file
 
 PARTS = ("poses", "rotations", "points", "extrinsics", "frames", "frame-rotations")
 """What `--constant` names besides numbers of lenses."""

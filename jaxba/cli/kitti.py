@@ -217,7 +217,7 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
     from jaxba.datasets.kitti.images import image_size
     from jaxba.datasets.kitti.poses import poses_of, read_poses
     from jaxba.datasets.kitti.sequence import read_sequence
-    from jaxba.io.remarks import note, note_center
+    from jaxba.io.notes import note, note_center
 
     sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
     poses = None

@@ -60,10 +60,10 @@ def _paper(args: Arguments) -> int:
     from rich.console import Console
 
     from jaxba.cli.overwriting import check_apart
-    from jaxba.io.configurations import find
-    from jaxba.io.settings import SettingsError
     from jaxba.paper import config as configs
     from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
+    from jaxba.settings import SettingsError
+    from jaxba.settings.configurations import find
 
     console = Console(soft_wrap=True, highlight=False)
     if args.list:
@@ -96,7 +96,7 @@ def _open(folder: Path, config: Any) -> None:
     Raises:
         UsageError: the folder has another configuration, or cannot be written.
     """
-    from jaxba.io import settings
+    from jaxba import settings
     from jaxba.paper import config as configs
     from jaxba.runtime.atomic import write_text
 

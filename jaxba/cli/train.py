@@ -124,7 +124,7 @@ def _train(args: Arguments, command: str) -> int:
 def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     """The configuration of the run, and its folder."""
     from jaxba.cli.overwriting import check_apart
-    from jaxba.io import configurations
+    from jaxba.settings import configurations
     from jaxba.training import config as configs
     from jaxba.training import driver
 
@@ -148,7 +148,7 @@ def _board(args: Arguments, folder: Path, config: Any) -> Any:
     """The log at Weights & Biases, if one is asked for."""
     if not args.wandb:
         return None
-    from jaxba.io import settings
+    from jaxba import settings
     from jaxba.training.driver import TrainError
     from jaxba.training.wandb_log import WandbLog
 
@@ -160,9 +160,9 @@ def _board(args: Arguments, folder: Path, config: Any) -> Any:
 
 def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
     from jaxba.game import scene_bank
-    from jaxba.io.settings import SettingsError
     from jaxba.runtime import process
     from jaxba.runtime.distributed import is_main, together
+    from jaxba.settings import SettingsError
     from jaxba.training import driver, task
     from jaxba.training.placement import Placement
 

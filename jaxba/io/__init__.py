@@ -45,13 +45,12 @@ def read_problem(path: StrPath, *, strict: bool = False) -> BundleProblem:
     """
     if is_colmap(path):
         return read_colmap(path, strict=strict)
-    read = formats.read_folder if os.path.isdir(path) else formats.read
     if not strict:
-        return read(path)
+        return formats.read(path)
     with warnings.catch_warnings():
         warnings.simplefilter("error", ProblemWarning)
         try:
-            return read(path)
+            return formats.read(path)
         except ProblemWarning as note:
             raise ProblemError(str(note)) from None
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name, open_output
-from jaxba.io.remarks import note_origin
+from jaxba.io.notes import note_origin
 from jaxba.io.text import NumberReader
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
 from jaxba.typing import LARGEST_COUNT

@@ -13,8 +13,8 @@ import numpy as np
 from jaxba.io.bal import check_bal_lenses
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name, open_output
+from jaxba.io.notes import note_origin
 from jaxba.io.ply import POINT_COLOUR
-from jaxba.io.remarks import note_origin
 from jaxba.io.text import LineReader, NumberReader
 from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError

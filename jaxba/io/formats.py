@@ -7,9 +7,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 
+from jaxba.io.bal import read_bal, write_bal
+from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap
-from jaxba.io.colmap.records import PARTS, RIG_PARTS
+from jaxba.io.colmap.model import PARTS, RIG_PARTS
+from jaxba.io.encoding import open_text
 from jaxba.io.files import READ_ERRORS, StrPath, display_name, strip_compression
+from jaxba.io.foreign import RECONSTRUCTION, TRACKS
+from jaxba.io.ply import write_ply
+from jaxba.io.recognise import nerfstudio, recognised
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 Reader = Callable[[StrPath], BundleProblem]
@@ -18,7 +24,7 @@ Writer = Callable[[BundleProblem, StrPath], None]
 
 @dataclass(frozen=True)
 class Format:
-    """A format of single files. Readers and writers import what they need when they are called."""
+    """A format of single files."""
 
     name: str
     """What messages call it."""
@@ -36,55 +42,20 @@ class Format:
     """First bytes of its files after blanks, by which a file without a known ending is recognised."""
 
 
-def _read_bal(path: StrPath) -> BundleProblem:
-    from jaxba.io.bal import read_bal
-
-    return read_bal(path)
-
-
-def _write_bal(problem: BundleProblem, path: StrPath) -> None:
-    from jaxba.io.bal import write_bal
-
-    write_bal(problem, path)
-
-
-def _read_bundler(path: StrPath) -> BundleProblem:
-    from jaxba.io.bundler import read_bundler
-
-    return read_bundler(path)
-
-
-def _write_bundler(problem: BundleProblem, path: StrPath) -> None:
-    from jaxba.io.bundler import write_bundler
-
-    write_bundler(problem, path)
-
-
-def _write_ply(problem: BundleProblem, path: StrPath) -> None:
-    from jaxba.io.ply import write_ply
-
-    write_ply(problem, path)
-
-
 def _read_nvm(path: StrPath) -> BundleProblem:
-    from jaxba.io.nvm import read_nvm
+    from jaxba.io.foreign.nvm import read_nvm
 
     return read_nvm(path)
 
 
 def _read_json(path: StrPath) -> BundleProblem:
     """Reads OpenSfM's, OpenMVG's or AliceVision's file, which are told apart by their contents."""
-    from jaxba.io import alicevision, json_records, openmvg, opensfm
-    from jaxba.io.recognise import nerfstudio
+    from jaxba.io.foreign import alicevision, json_records, openmvg, opensfm
 
     document = json_records.read_json(path)
-    for recognised, read in (
-        (opensfm.is_opensfm, opensfm.from_document),
-        (openmvg.is_openmvg, openmvg.from_document),
-        (alicevision.is_alicevision, alicevision.from_document),
-    ):
-        if recognised(document):
-            return read(document, path)
+    for program in (opensfm, openmvg, alicevision):
+        if program.recognises(document):
+            return program.from_document(document, path)
     if nerfstudio(document.value):
         document.fail(
             "is nerfstudio's transforms.json, which has poses but no points: give the COLMAP model it was made from"
@@ -93,19 +64,13 @@ def _read_json(path: StrPath) -> BundleProblem:
 
 
 FORMATS = (
-    Format("BAL", (".txt", ".bal"), _read_bal, _write_bal),
-    Format("Bundler", (".out",), _read_bundler, _write_bundler, (b"# Bundle file",)),
+    Format("BAL", (".txt", ".bal"), read_bal, write_bal),
+    Format("Bundler", (".out",), read_bundler, write_bundler, (b"# Bundle file",)),
     Format("VisualSFM", (".nvm",), _read_nvm, begins=(b"NVM_V3",)),
     Format("OpenSfM, OpenMVG or AliceVision", (".json", ".sfm"), _read_json, begins=(b"{", b"[")),
-    Format("PLY", (".ply",), write=_write_ply),
+    Format("PLY", (".ply",), write=write_ply),
 )
 """Formats of files. The first is that of names whose ending says nothing. Folders are COLMAP models, or OpenSfM's."""
-
-RECONSTRUCTION = "reconstruction.json"
-"""File by which a folder of OpenSfM is known."""
-
-TRACKS = tuple(f"tracks.csv{ending}" for ending in ("", ".gz", ".bz2", ".xz"))
-"""Files of OpenSfM's observations, beside the reconstruction."""
 
 OTHER_ENDINGS = (
     *(".abc", ".b3dm", ".bin", ".blend", ".csv", ".dae", ".db", ".dot", ".e57", ".fbx", ".g2o", ".glb", ".gltf"),
@@ -151,16 +116,19 @@ def formats_written() -> str:
 
 
 def read(path: StrPath) -> BundleProblem:
-    """Reads a file in the format of its ending, or else of its first bytes.
+    """Reads a file in the format of its ending, or else of its first bytes; a folder as OpenSfM's or a COLMAP model.
 
     Raises:
         ProblemError: it cannot be read; one line. Of a file of another program it says what that is.
     """
+    if Path(path).is_dir():
+        reconstruction = Path(path) / RECONSTRUCTION
+        return _read_json(reconstruction) if reconstruction.is_file() and not is_colmap(path) else read_colmap(path)
     known = by_ending(path)
     if known is not None and known.read is None:
         raise ProblemError(f"cannot read {display_name(path)}: {known.name} is only written; {formats_read()}")
     try:
-        return _read_bal(path) if known is None or known.read is None else known.read(path)
+        return read_bal(path) if known is None or known.read is None else known.read(path)
     except ProblemError as error:
         begin = _beginning(path)
         found = next((one for one in FORMATS if begin.lstrip().startswith(one.begins)), None) if begin else None
@@ -171,8 +139,6 @@ def read(path: StrPath) -> BundleProblem:
 
 def _explained(path: StrPath, begin: bytes, error: ProblemError) -> ProblemError:
     """The error of a reader, or what the file is instead, if that is known."""
-    from jaxba.io.recognise import recognised
-
     what = recognised(path, begin) if begin else None
     if what is not None:
         return ProblemError(f"{display_name(path)}: is {what}{'' if ': ' in what else f'; {formats_read()}'}")
@@ -209,13 +175,6 @@ def holds_problem(path: StrPath) -> bool:
     return is_colmap(path) or (Path(path) / RECONSTRUCTION).is_file()
 
 
-def read_folder(path: StrPath) -> BundleProblem:
-    """Reads a folder: a COLMAP model, or else OpenSfM's. Raises ProblemError."""
-    if (Path(path) / RECONSTRUCTION).is_file() and not is_colmap(path):
-        return _read_json(Path(path) / RECONSTRUCTION)
-    return read_colmap(path)
-
-
 def files_of(path: StrPath) -> list[StrPath]:
     """The files that a problem of this path is read from, or would be if they were there.
 
@@ -235,17 +194,13 @@ def model_files(folder: StrPath) -> list[Path]:
 
 def _beginning(path: StrPath) -> bytes:
     """First bytes of a regular file, decompressed; empty if they cannot be read (again)."""
-    from jaxba.io.encoding import open_text
-
     if not Path(path).is_file():
         return b""
+    text = b""
     try:
         with open_text(path) as blocks:
-            text = b""
-            for block in blocks:
-                text = (text + block)[:_SNIFFED]
-                if len(text) == _SNIFFED:
-                    break
-            return text
+            while len(text) < _SNIFFED and (block := next(blocks, None)) is not None:
+                text += block
+            return text[:_SNIFFED]
     except (ProblemError, *READ_ERRORS):
         return b""

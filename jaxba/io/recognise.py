@@ -6,7 +6,7 @@ import re
 import zipfile
 from pathlib import Path
 
-from jaxba.io.colmap.records import PARTS, RIG_PARTS
+from jaxba.io.colmap.model import PARTS, RIG_PARTS
 from jaxba.io.files import StrPath, display_name
 
 _ARCHIVE = "an archive: unpack it and give the problem in it"

@@ -45,6 +45,29 @@ def number(word: str) -> float:
     raise ValueError(f"{word!r} is no number")
 
 
+def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: str) -> list[float]:
+    """The words as finite numbers.
+
+    Args:
+        words: to read.
+        fields: what each of them is, for messages.
+        where: where they stand; begins the messages.
+
+    Raises:
+        ProblemError: a word is no number, or not finite.
+    """
+    found = []
+    for word, field in zip(words, fields, strict=True):
+        text = word if isinstance(word, str) else word.decode("latin-1")
+        try:
+            found.append(number(text))
+        except ValueError:
+            raise ProblemError(f"{where}: {text[:40]!a} is not a number ({field})") from None
+        if not np.isfinite(found[-1]):
+            raise ProblemError(f"{where}: {text[:40]!a} is not a finite number ({field})")
+    return found
+
+
 class LineReader:
     """The first lines of a text; what follows them is handed on in blocks."""
 

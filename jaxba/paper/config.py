@@ -1,15 +1,15 @@
 """Configuration of a reproduction run, and its YAML files.
 
 A file in `configs/paper` states differences to the file that it extends, or to the defaults of the classes
-(jaxba/io/configurations.py).
+(jaxba/settings/configurations.py).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from jaxba.io import configurations, settings
-from jaxba.io.settings import SettingsError
+from jaxba import settings
+from jaxba.settings import SettingsError, configurations
 
 CONFIG = "config.yaml"
 """Settings of a run, in its folder."""

@@ -1,7 +1,7 @@
 """The configuration of a training run, and the YAML files that hold it.
 
 A file in `configs/train` lists differences to the file that it extends, or to the defaults of the classes
-(jaxba/io/configurations.py); a run writes all settings into its folder.
+(jaxba/settings/configurations.py); a run writes all settings into its folder.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from jaxba import settings
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
 from jaxba.damping.policy_file import LARGEST_FILE
 from jaxba.game.env import GameConfig
 from jaxba.game.scene_bank import BankConfig
-from jaxba.io import configurations, settings
-from jaxba.io.settings import SettingsError
 from jaxba.methods.registry import DEFAULT_METHOD, MethodName, make_method
 from jaxba.problem.options import StepOptions
+from jaxba.settings import SettingsError, configurations
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig
 

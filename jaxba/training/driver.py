@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxba.io import settings
+from jaxba import settings
 from jaxba.io.files import visible
 from jaxba.runtime import distributed
 from jaxba.runtime.atomic import write_text

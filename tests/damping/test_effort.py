@@ -24,10 +24,10 @@ from jaxba.game import constant_actions
 from jaxba.game.env import POINT_ITERATION_COST, make_game
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import draw_prices
-from jaxba.io.settings import SettingsError
 from jaxba.linear.step import Effort
 from jaxba.lm.records import Prices
 from jaxba.problem.options import Refinement
+from jaxba.settings import SettingsError
 from jaxba.training import config as configs
 
 PAID = replace(AGENT, effort="points+repairs", refine_points=3)

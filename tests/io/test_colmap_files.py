@@ -11,10 +11,9 @@ import pytest
 from support import DATA, needs_data
 
 from jaxba import read_colmap, write_colmap
-from jaxba.io.colmap.encode import encode
-from jaxba.io.colmap.folder import read_model
-from jaxba.io.colmap.lenses import principal_point
-from jaxba.io.colmap.records import CAMERA_MODELS, NO_POINT, SENSORS, Camera, Model
+from jaxba.io.colmap import binary, text
+from jaxba.io.colmap.files import read_model
+from jaxba.io.colmap.model import CAMERA_MODELS, NO_POINT, SENSORS, Camera, Model
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
@@ -106,7 +105,7 @@ def test_camera_models_are_colmaps(kind):
         params = camera.params * np.arange(1, size + 1)
         camera.params = params
         ours = Camera(1, kind, 1024, 768, tuple(params.tolist()))
-        assert principal_point(ours) == (camera.principal_point_x, camera.principal_point_y)
+        assert ours.principal_point == (camera.principal_point_x, camera.principal_point_y)
 
 
 def test_all_camera_models_and_sensors_of_colmap_are_known():
@@ -117,18 +116,18 @@ def test_all_camera_models_and_sensors_of_colmap_are_known():
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_read_from_binary_files_gives_their_bytes(tmp_path, kind):
     folder = write(synthetic(kind, num_cameras_per_rig=3), tmp_path / "m", "binary")
-    written = dict(encode(read_model(folder), ".bin"))
+    written = dict(binary.encode(read_model(folder)))
     assert sorted(written) == sorted(f"{part}.bin" for part in FILES)
     for name, content in written.items():
         assert content == (folder / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("suffix", [".bin", ".txt"])
+@pytest.mark.parametrize("form", [binary, text])
 @pytest.mark.parametrize("layout", ["binary", "text"])
-def test_what_is_written_colmap_reads_with_the_same_numbers(tmp_path, layout, suffix):
+def test_what_is_written_colmap_reads_with_the_same_numbers(tmp_path, layout, form):
     model = read_model(write(synthetic(num_cameras_per_rig=2), tmp_path / "m", layout))
     (tmp_path / "out").mkdir()
-    for name, content in encode(model, suffix):
+    for name, content in form.encode(model):
         (tmp_path / "out" / name).write_bytes(content)
     same_numbers(model, pycolmap.Reconstruction(str(tmp_path / "out")))
 

@@ -7,10 +7,11 @@ import pytest
 import support
 
 from jaxba import write_bal
-from jaxba.io import ProblemWarning, configurations, files, read_problem, write_bundler, write_problem
+from jaxba.io import ProblemWarning, files, read_problem, write_bundler, write_problem
 from jaxba.io.text import number
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.settings import configurations
 
 ENCODINGS = {
     "UTF-8": lambda text: b"\xef\xbb\xbf" + text.encode(),

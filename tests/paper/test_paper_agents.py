@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from support import paper, solve
 
-from jaxba import StepOptions
+from jaxba import StepOptions, settings
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, held_out_count, make_banks
-from jaxba.io import settings
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
 from jaxba.paper.tables_and_figures.small import SmallScene

@@ -12,7 +12,6 @@ import pytest
 from jaxba import BundleProblem, ProblemError
 from jaxba.bench.records import Record, TracePoint
 from jaxba.bench.sources import Source
-from jaxba.io.settings import SettingsError
 from jaxba.paper import agents, claims, config, real_problems, rows
 from jaxba.paper.markdown import Line, disagreements, lines_table
 from jaxba.paper.rows import Outcome, Row
@@ -20,6 +19,7 @@ from jaxba.paper.schedule import average_schedule
 from jaxba.paper.store import PLAYS, SOLVES, Play, Store
 from jaxba.paper.subproblem import SubProblem, neighbouring_cameras, sub_problem
 from jaxba.paper.tables_and_figures import profiles
+from jaxba.settings import SettingsError
 
 # Sub-problems
 

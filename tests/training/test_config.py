@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from jaxba import settings
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.random_scenes import SceneClass
-from jaxba.io import settings
 from jaxba.problem.options import StepOptions
 from jaxba.training import config
 from jaxba.training.config import SettingsError, TrainConfig, load, to_yaml

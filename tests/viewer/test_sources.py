@@ -8,7 +8,7 @@ import pytest
 import jaxba
 from jaxba.cli import solve, view
 from jaxba.datasets.kitti.evaluate import write_poses
-from jaxba.io.colmap.look import read_colmap_with_looks
+from jaxba.io.colmap.problem import read_colmap_with_looks
 from jaxba.problem.similarity import Similarity
 from jaxba.viewer.geometry import poses_of
 from jaxba.viewer.sources import open_all

@@ -4,8 +4,8 @@ What COLMAP calls a camera is a lens here (`jaxba.problem.intrinsics`): its imag
 without COLMAP. Source: COLMAP, doc/cameras.rst and doc/format.rst.
 """
 
-from jaxba.io.colmap.folder import is_colmap
-from jaxba.io.colmap.read import read_colmap
+from jaxba.io.colmap.files import is_colmap
+from jaxba.io.colmap.problem import read_colmap
 from jaxba.io.colmap.write import write_colmap
 
 __all__ = ["is_colmap", "read_colmap", "write_colmap"]

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.colmap.records import CAMERA_MODELS, KEY, POINT, TRACK, WXYZ, Camera, Image, Model, Points, pose_of
+from jaxba.io.colmap.model import CAMERA_MODELS, KEY, POINT, TRACK, Camera, Image, Model, Points
+from jaxba.io.colmap.poses import colmap_poses
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import COLMAP_FLIP, colmap_quaternions
-from jaxba.problem.intrinsics import LENS_SIZE
+from jaxba.problem.constraints import every_lens
+from jaxba.problem.geometry import COLMAP_FLIP
+from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.labels import part_name
 
 _NAME_DIGITS = 4  # at least, so that the names of images sort as their ids do
@@ -28,23 +30,20 @@ def create_model(problem: BundleProblem, target: str) -> Model:
     """
     arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
     valid = BundleProblem.create(*arrays, lenses=problem.lenses)
-    cameras, camera_index, point_index = (
-        np.asarray(part) for part in (valid.cameras, valid.camera_index, valid.point_index)
-    )
-    general = valid.lenses is not None and not valid.lenses.all_bal
+    cameras, camera_index, point_index = map(np.asarray, (valid.cameras, valid.camera_index, valid.point_index))
+    lenses = every_lens(valid)
     wrong = np.flatnonzero(~(cameras[:, 6] > 0))
     if wrong.size:
         at = f"f of {part_name(problem.labels, 'image', wrong[0])} is {cameras[wrong[0], 6]:g}"
         raise ProblemError(f"cannot write {target}: {at}, and COLMAP's focal lengths are positive")
-    lens = np.arange(len(cameras)) if valid.lenses is None else np.asarray(valid.lenses.index)
-    _, first, lens = np.unique(lens, return_index=True, return_inverse=True)
-    pixels = np.asarray(valid.observations) * (1.0 if general else COLMAP_FLIP[:2])
+    _, first, lens = np.unique(lenses.index, return_index=True, return_inverse=True)
+    pixels = np.asarray(valid.observations) * (COLMAP_FLIP[:2] if lenses.all_bal else 1.0)
     half = np.ones((len(first), 2))
-    np.maximum.at(half, lens[camera_index], np.ceil(np.abs(pixels) / (2.0 if general else 1.0)))
+    np.maximum.at(half, lens[camera_index], np.ceil(np.abs(pixels) / (1.0 if lenses.all_bal else 2.0)))
     if half.max() > _LARGEST_HALF:
         raise ProblemError(f"cannot write {target}: a pixel is {half.max():g} from the centre of its image")
     keys = np.empty(len(pixels), KEY)
-    keys["xy"], keys["point"] = pixels + (0.0 if general else half[lens[camera_index]]), point_index + 1
+    keys["xy"], keys["point"] = pixels + (half[lens[camera_index]] if lenses.all_bal else 0.0), point_index + 1
     by_image, image_ends = _grouped(camera_index, len(cameras))
     by_point, point_ends = _grouped(point_index, len(valid.points))
     key_number = np.empty(len(pixels), np.int64)
@@ -55,33 +54,17 @@ def create_model(problem: BundleProblem, target: str) -> Model:
     heads["id"], heads["xyz"] = np.arange(1, len(heads) + 1), valid.points
     heads["length"] = np.diff(point_ends, prepend=0)
     heads["error"] = mean_errors(geometry.residuals(valid), point_index, len(heads))
-    poses = np.hstack([colmap_quaternions(cameras[:, :3])[:, WXYZ], cameras[:, 3:6] * COLMAP_FLIP])
     digits = max(_NAME_DIGITS, len(str(len(cameras))))
+    rows = zip(colmap_poses(cameras), lens.tolist(), np.split(keys[by_image], image_ends[:-1]), strict=True)
     images = {
-        number: Image(number, pose_of(pose), int(of) + 1, f"image{number:0{digits}d}.jpg".encode(), seen)
-        for number, (pose, of, seen) in enumerate(
-            zip(poses, lens, np.split(keys[by_image], image_ends[:-1]), strict=True), 1
-        )
+        number: Image(number, pose, of + 1, f"image{number:0{digits}d}.jpg".encode(), seen)
+        for number, (pose, of, seen) in enumerate(rows, 1)
     }
-    free = np.ones((len(first), LENS_SIZE), bool)
-    of_problem = valid.lenses
-    if of_problem is not None:
-        free = np.asarray(of_problem.free)[np.asarray(of_problem.index)[first]]
-    rows = enumerate(zip(cameras[first, 6:], free, half, strict=True), 1)
-    if of_problem is not None and general:
-        models = [of_problem.model_of(int(of_problem.index[at])) for at in first]
-        for model in models:
-            if model.name not in CAMERA_MODELS:
-                raise ProblemError(f"cannot write {target}: COLMAP has no camera model {model.name}")
-        lenses = {
-            number: Camera(
-                number, model.name, int(2 * size[0]), int(2 * size[1]), tuple(numbers[: len(model)].tolist())
-            )
-            for (number, (numbers, _, size)), model in zip(rows, models, strict=True)
-        }
-    else:
-        lenses = {number: _camera(number, *row) for number, row in rows}
-    return Model(target, ".bin", lenses, images, Points(heads, tracks), None, None)
+    made = {
+        number: _camera(number, lenses, int(lenses.index[at]), cameras[at, 6:], size, target)
+        for number, (at, size) in enumerate(zip(first, half, strict=True), 1)
+    }
+    return Model(target, ".bin", made, images, Points(heads, tracks), None, None)
 
 
 def mean_errors(
@@ -94,13 +77,19 @@ def mean_errors(
     return np.where(np.isfinite(mean), mean, -1.0)
 
 
-def _camera(number: int, numbers: np.ndarray, free: np.ndarray, half: np.ndarray) -> Camera:
-    f, k1, k2 = numbers.tolist()
-    x, y = half.tolist()
+def _camera(number: int, lenses: Lenses, lens: int, numbers: np.ndarray, half: np.ndarray, target: str) -> Camera:
+    """The camera of a lens; of one of BAL the smallest model that has all that is not zero or constant."""
+    model, (x, y) = lenses.model_of(lens), half.tolist()
     size = int(2 * x), int(2 * y)
-    if k2 or free[2]:
+    if not lenses.all_bal:
+        if model.name not in CAMERA_MODELS:
+            raise ProblemError(f"cannot write {target}: COLMAP has no camera model {model.name}")
+        return Camera(number, model.name, *size, tuple(numbers[: len(model)].tolist()))
+    f, k1, k2 = numbers.tolist()
+    _, free1, free2 = np.asarray(lenses.free)[lens]
+    if k2 or free2:
         return Camera(number, "RADIAL", *size, (f, x, y, k1, k2))
-    if k1 or free[1]:
+    if k1 or free1:
         return Camera(number, "SIMPLE_RADIAL", *size, (f, x, y, k1))
     return Camera(number, "SIMPLE_PINHOLE", *size, (f, x, y))
 

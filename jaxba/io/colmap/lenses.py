@@ -11,22 +11,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from jaxba.io.colmap.records import CAMERA_MODELS, Camera, Model
+from jaxba.io.colmap.model import CAMERA_MODELS, Camera, Model
 from jaxba.problem import camera_models
 from jaxba.problem.bundle_problem import ProblemError
-from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.camera_models import BAL
+from jaxba.problem.intrinsics import Lenses
 
-AS_BAL = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-}
-"""Camera models that are BAL's but for the principal point and numbers that stay zero, and their parameters."""
-
-PARAMETERS = ("f", "k1", "k2")
-"""Parameters of a BAL lens."""
+AS_BAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+"""Camera models that are BAL's but for the principal point and numbers that stay zero."""
 
 LARGEST_RATIO = 1e6
 """Of the focal lengths of a lens; a larger one is damage."""
@@ -38,17 +32,11 @@ def check_lens(model: Model, camera: Camera) -> None:
     Raises:
         ProblemError: it cannot be used; one line that names file and camera.
     """
-    focals = np.array(camera.params[: CAMERA_MODELS[camera.model].focals])
-    possible = np.isfinite(camera.params).all() and (focals > 0).all()
-    if not possible or (len(focals) and focals.max() / LARGEST_RATIO > focals.min()):
+    focals = camera.params[: CAMERA_MODELS[camera.model].focals]
+    if not camera.possible or (focals and max(focals) / LARGEST_RATIO > min(focals)):
         shown = ", ".join(f"{value:g}" for value in camera.params)
         name = f"{model.file('cameras')}: camera {camera.id}"
         raise ProblemError(f"{name} has impossible parameters: {shown} ({camera.model})")
-
-
-def are_bal(cameras: Sequence[Camera], *, refine_principal_point: bool) -> bool:
-    """Whether lenses can be those of a BAL problem."""
-    return not refine_principal_point and all(camera.model in AS_BAL for camera in cameras)
 
 
 def lenses_of(
@@ -67,30 +55,24 @@ def lenses_of(
     Returns:
         The lenses are None if every image has its own, and all of it is optimised.
     """
-    if are_bal(cameras, refine_principal_point=refine_principal_point):
-        named = [dict(zip(AS_BAL[camera.model], camera.params, strict=True)) for camera in cameras]
-        numbers = np.array([[one.get(name, 0.0) for name in PARAMETERS] for one in named]).reshape(-1, LENS_SIZE)
-        free = np.array([[name in one for name in PARAMETERS] for one in named]).reshape(-1, LENS_SIZE)
-        unshared = len(np.unique(index)) == len(index)
-        return numbers, None if unshared and free.all() else Lenses(index, free)
-    names = sorted({camera.model for camera in cameras})
+    bal = not refine_principal_point and all(camera.model in AS_BAL for camera in cameras)
+    names = ["BAL"] if bal else sorted({camera.model for camera in cameras})
     models = tuple(camera_models.CAMERA_MODELS[name] for name in names)
     size = max(map(len, models))
     numbers, free = np.zeros((len(cameras), size)), np.zeros((len(cameras), size), bool)
     for at, camera in enumerate(cameras):
         model = camera_models.CAMERA_MODELS[camera.model]
-        numbers[at, : len(model)] = camera.params
-        if model.focal:
-            moves = [*model.focal, *model.distortion, *(model.principal_point if refine_principal_point else ())]
-            free[at, moves] = True
-    model_index = np.array([names.index(camera.model) for camera in cameras])
-    return numbers, Lenses(index, free, model_index, models)
-
-
-def principal_point(camera: Camera) -> tuple[float, float]:
-    """Pixel of the principal point."""
-    at = CAMERA_MODELS[camera.model].focals
-    return camera.params[at], camera.params[at + 1]
+        moves = [*model.focal, *model.distortion, *(model.principal_point if refine_principal_point else ())]
+        if bal:
+            places = [BAL.parameters.index(model.parameters[k]) for k in moves]
+            numbers[at, places], free[at, places] = np.array(camera.params)[moves], True
+        else:
+            numbers[at, : len(model)] = camera.params
+            free[at, moves if model.focal else []] = True
+    if not bal:
+        return numbers, Lenses(index, free, np.array([names.index(camera.model) for camera in cameras]), models)
+    unshared = len(np.unique(index)) == len(index)
+    return numbers, None if unshared and free.all() else Lenses(index, free)
 
 
 def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool) -> Camera:
@@ -103,11 +85,6 @@ def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool)
     """
     if not bal:
         return replace(camera, params=tuple(lens[: len(camera.params)].tolist()))
-    values = dict(zip(AS_BAL[camera.model], camera.params, strict=True))
-    new = dict(zip(PARAMETERS, lens.tolist(), strict=True))
-    return replace(camera, params=tuple(new.get(one, values[one]) for one in AS_BAL[camera.model]))
-
-
-def finite_rows(values: Float[np.ndarray, "n width"]) -> Bool[np.ndarray, " n"]:
-    """Whether all numbers of a row are finite."""
-    return np.asarray(np.isfinite(values).all(axis=1))
+    names = camera_models.CAMERA_MODELS[camera.model].parameters
+    new = {**dict(zip(names, camera.params, strict=True)), **dict(zip(BAL.parameters, lens.tolist(), strict=True))}
+    return replace(camera, params=tuple(new[name] for name in names))

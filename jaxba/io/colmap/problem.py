@@ -1,7 +1,6 @@
-"""The bundle adjustment problem of a COLMAP model, and where its parts stand in the model.
+"""Reads COLMAP models as problems, and says where the parts of a problem stand in its model.
 
-COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards: poses of a problem are BAL's. Where its
-lenses are BAL's, too, its pixels are relative to the principal point, which is not optimised (lenses.py).
+Where the lenses of a problem are BAL's, its pixels are relative to the principal point, which is not optimised.
 """
 
 from __future__ import annotations
@@ -10,33 +9,22 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from jaxba.io.colmap import lenses
-from jaxba.io.colmap.records import (
-    CAMERA_MODELS,
-    CAMERA_SENSOR,
-    WXYZ,
-    XYZW,
-    Frame,
-    Image,
-    Model,
-    Pose,
-    pose_of,
-    quaternions,
-)
-from jaxba.io.colmap.views import Ordered, Views, find_views, ordered
-from jaxba.io.colmap.wording import note
-from jaxba.io.files import display_name
+from jaxba.io.colmap.files import read_model
+from jaxba.io.colmap.model import CAMERA_MODELS, CAMERA_SENSOR, Camera, Frame, Image, Model
+from jaxba.io.colmap.observations import Ordered, Views, find_views, ordered
+from jaxba.io.colmap.poses import Pose, bal_poses, composed, differ, pose_of, rotations, translations
+from jaxba.io.files import StrPath, display_name
+from jaxba.io.notes import counted, report
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations
+from jaxba.problem.geometry import COLMAP_FLIP
+from jaxba.problem.labels import Labels
 from jaxba.problem.rigs import Rigs
 
 _EDGE = 0.01
 """A principal point is at the edge of an image within this fraction of its size."""
-
-_SAME = 1e-6
-"""Poses that differ by less, relatively, are the same."""
 
 
 class Assembled(NamedTuple):
@@ -46,14 +34,62 @@ class Assembled(NamedTuple):
     images: list[Image]
     """Those of the problem's cameras."""
 
-    cameras: list[int]
-    """Ids of the cameras of the problem's lenses."""
-
     points: Int[np.ndarray, " points"]
     """Positions in `model.points.heads`."""
 
     notes: list[str]
     """What was left out or mended, one line each."""
+
+
+class Looks(NamedTuple):
+    """What a model holds for looking at, in the order of the problem."""
+
+    colours: UInt8[np.ndarray, "points 3"] | None
+    """Red, green and blue of points; None if they are not known."""
+
+    sizes: Float[np.ndarray, "cameras 2"]
+    """Width and height of images, pixels; 0 where they are not known."""
+
+    principal: Float[np.ndarray, "cameras 2"]
+    """Principal points, pixels from the upper left corner."""
+
+
+def read_colmap(folder: StrPath, *, strict: bool = False, refine_principal_point: bool = False) -> BundleProblem:
+    """Reads a COLMAP model, binary or text.
+
+    Cameras are the registered images, by id, and points are sorted by id. Lenses keep their camera models and numbers;
+    as in COLMAP, focal lengths and distortion are optimised, shared by the images of a camera. If all are
+    SIMPLE_PINHOLE, SIMPLE_RADIAL or RADIAL and principal points stay, they become BAL's lenses, which are faster.
+    Images of one frame of a rig move together; where cameras are in their rigs is constant.
+
+    What is wrong with one view, point or image only is left out, and a `ProblemWarning` says what and how many.
+
+    Args:
+        folder: of the model.
+        strict: refuse a model of which a part would be left out.
+        refine_principal_point: whether principal points are optimised, too. COLMAP's default is no.
+
+    Raises:
+        ProblemError: no model, one whose structure is damaged, a rig that does not say where a camera is, nothing is
+            observed, or a part would be left out and `strict`; one line that names the file, and the record by its id.
+    """
+    model = read_model(folder)
+    assembled = assemble(model, refine_principal_point=refine_principal_point)
+    report(assembled.notes, strict=strict)
+    report(_hints(model))
+    return assembled.problem
+
+
+def read_colmap_with_looks(folder: StrPath) -> tuple[BundleProblem, Looks]:
+    """`read_colmap`, and the looks. Raises as it does."""
+    model = read_model(folder)
+    assembled = assemble(model)
+    report(assembled.notes, strict=False)
+    cameras = [model.cameras[image.camera] for image in assembled.images]
+    sizes = np.array([(one.width, one.height) for one in cameras], np.float64)
+    found = [one.principal_point if CAMERA_MODELS[one.model].focals else (np.nan, np.nan) for one in cameras]
+    principal = np.where(np.isnan(found), sizes / 2, found)  # a panorama has its own in the middle
+    return assembled.problem, Looks(model.points.heads["rgb"][assembled.points], sizes, principal)
 
 
 def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:
@@ -77,55 +113,43 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
         raise ProblemError("; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]]))
     sees = np.bincount(views.image, minlength=len(images)) > 0
     observed = np.bincount(views.point, minlength=len(table.points)) > 0
-    blind, unseen = np.flatnonzero(~sees), np.flatnonzero(~observed & lenses.finite_rows(table.points["xyz"]))
-    notes += note(model.file("images"), blind, "image", "left out, without observations", lambda at: str(images[at]))
-    notes += note(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
-    images = [image for image, kept in zip(images, sees, strict=True) if kept]
-    camera_index, point_index = (np.cumsum(sees) - 1)[views.image], (np.cumsum(observed) - 1)[views.point]
+    unseen = np.flatnonzero(~observed & np.isfinite(table.points["xyz"]).all(axis=1))
+    seeing, blind = ([one for one, kept in zip(images, mask, strict=True) if kept] for mask in (sees, ~sees))
     other = [(one, rig) for rig in (model.rigs or {}).values() for one in rig.sensors if one.type != CAMERA_SENSOR]
-    sensor = lambda at: f"sensor {other[at][0].id} of rig {other[at][1].id}"
-    notes += note(model.file("rigs"), np.arange(len(other)), "sensor", "left out, no camera", sensor)
-    points = table.points["xyz"][observed]
-    pixels = table.keys["xy"][views.key]
-    problem, cameras = _problem(
-        model, images, points, pixels, camera_index, point_index, refine_principal_point=refine_principal_point
-    )
-    return Assembled(problem, images, cameras, table.order[observed], notes)
+    name = lambda pair: f"sensor {pair[0].id} of rig {pair[1].id}"
+    notes += counted(model.file("images"), blind, "image", "left out, without observations")
+    notes += counted(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
+    notes += counted(model.file("rigs"), other, "sensor", "left out, no camera", name)
+    new = Views((np.cumsum(sees) - 1)[views.image], views.key, (np.cumsum(observed) - 1)[views.point])
+    points = table.order[observed]
+    problem = _problem(model, seeing, points, table.keys["xy"], new, refine_principal_point=refine_principal_point)
+    return Assembled(problem, seeing, points, notes)
 
 
-def hints(model: Model) -> list[str]:
+def _hints(model: Model) -> list[str]:
     """What looks wrong in a model, one line each."""
     odd = []
     for camera in model.cameras.values():
         if camera.width and camera.height and CAMERA_MODELS[camera.model].focals:
-            at = np.array(lenses.principal_point(camera)) / (float(camera.width), float(camera.height))
+            at = np.array(camera.principal_point) / (float(camera.width), float(camera.height))
             if not ((at >= _EDGE) & (at <= 1 - _EDGE)).all():
                 odd.append(camera)
 
-    def place(at: int) -> str:
-        x, y = lenses.principal_point(odd[at])
-        return f"camera {odd[at].id}: pixel {x:g}, {y:g} of {odd[at].width} x {odd[at].height}"
+    def place(camera: Camera) -> str:
+        x, y = camera.principal_point
+        return f"camera {camera.id}: pixel {x:g}, {y:g} of {camera.width} x {camera.height}"
 
-    notes = note(model.file("cameras"), np.arange(len(odd)), "principal point", "at the edge of the image", place)
-    frames = _frames(model)
-    posed = lambda one: composed(place_in_rig(model, frames[one.id], one.camera), frames[one.id].pose)
-    other = [one for one in model.images.values() if one.id in frames and _differ(one.pose, posed(one))]
+    frames = model.frame_of
+    other = [one for one in model.images.values() if one.id in frames and differ(one.pose, _posed(model, one).pose)]
     where = f"with another pose than in {model.file('frames')}, which counts"
-    return notes + note(model.file("images"), np.arange(len(other)), "image", where, lambda at: str(other[at]))
+    notes = counted(model.file("cameras"), odd, "principal point", "at the edge of the image", place)
+    return notes + counted(model.file("images"), other, "image", where)
 
 
-def _differ(one: Pose, other: Pose) -> bool:
-    """Whether two poses are not the same to the digits of a file."""
-    if one == other:
-        return False
-    first, second = quaternions([one, other])
-    parallel = abs(first @ second) >= (1 - _SAME) * np.linalg.norm(first) * np.linalg.norm(second)
-    return not (parallel and np.allclose(one.tvec, other.tvec, rtol=_SAME, atol=_SAME))
-
-
-def _frames(model: Model) -> dict[int, Frame]:
-    """Frames by the ids of their images."""
-    return {image: frame for frame in (model.frames or {}).values() for _, image in frame.images}
+def _posed(model: Model, image: Image) -> Image:
+    """An image with the pose that its frame gives it. Raises ProblemError as `place_in_rig`."""
+    frame = model.frame_of[image.id]
+    return replace(image, pose=composed(place_in_rig(model, frame, image.camera), frame.pose))
 
 
 def _registered(model: Model) -> tuple[list[Image], list[str]]:
@@ -134,20 +158,14 @@ def _registered(model: Model) -> tuple[list[Image], list[str]]:
     Raises:
         ProblemError: it is not known where a camera is in its rig.
     """
-    images = [model.images[identity] for identity in sorted(model.images)]
-    frames = _frames(model)
+    images, frames = [model.images[identity] for identity in sorted(model.images)], model.frame_of
     if model.frames is None:
         return images, []
-    away = np.flatnonzero([image.id not in frames for image in images])
-    lost = [frame for number, frame in sorted(frames.items()) if number not in model.images]
-    notes = note(model.file("images"), away, "image", "left out, without a frame", lambda at: str(images[at]))
-    name = lambda at: f"frame {lost[at].id}"
-    notes += note(model.file("frames"), np.arange(len(lost)), "frame", "left out, without an image", name)
-    posed = [image for image in images if image.id in frames]
-    return [
-        replace(image, pose=composed(place_in_rig(model, frames[image.id], image.camera), frames[image.id].pose))
-        for image in posed
-    ], notes
+    away = [image for image in images if image.id not in frames]
+    lost = [frame.id for number, frame in sorted(frames.items()) if number not in model.images]
+    notes = counted(model.file("images"), away, "image", "left out, without a frame")
+    notes += counted(model.file("frames"), lost, "frame", "left out, without an image", lambda frame: f"frame {frame}")
+    return [_posed(model, image) for image in images if image.id in frames], notes
 
 
 def place_in_rig(model: Model, frame: Frame, camera: int) -> Pose | None:
@@ -164,39 +182,16 @@ def place_in_rig(model: Model, frame: Frame, camera: int) -> Pose | None:
     return sensors[at].from_rig if at else None
 
 
-def composed(outer: Pose | None, inner: Pose) -> Pose:
-    """The transform `outer` after `inner`; exactly the inner one for None."""
-    if outer is None:
-        return inner
-    from scipy.spatial.transform import Rotation
-
-    first, second = (Rotation.from_quat(quaternions([pose])[0, XYZW]) for pose in (inner, outer))
-    translation = second.apply(inner.tvec) + np.array(outer.tvec)
-    return pose_of([*(second * first).as_quat()[WXYZ], *translation])
-
-
-def inverse(pose: Pose) -> Pose:
-    """The inverse transform."""
-    from scipy.spatial.transform import Rotation
-
-    back = Rotation.from_quat(quaternions([pose])[0, XYZW]).inv()
-    return pose_of([*back.as_quat()[WXYZ], *(-back.apply(pose.tvec))])
-
-
 def _rigs_of(model: Model, images: list[Image]) -> Rigs | None:
     """The rigs of a problem of these images; None if no two of them are of one frame."""
-    frames = _frames(model)
+    frames = model.frame_of
     ids = [frames[image.id].id if image.id in frames else -1 for image in images]
     if model.frames is None or len(set(ids)) == len(ids):
         return None
-    from scipy.spatial.transform import Rotation
-
     places = [place_in_rig(model, frames[image.id], image.camera) for image in images]
     same = pose_of([1, 0, 0, 0, 0, 0, 0])
     poses = [same if place is None else place for place in places]
-    flip = np.diag(COLMAP_FLIP)
-    rotations = flip @ Rotation.from_quat(quaternions(poses)[:, XYZW]).as_matrix()
-    translations = np.array([pose.tvec for pose in poses]) * COLMAP_FLIP
+    rotation = np.diag(COLMAP_FLIP) @ rotations(poses).as_matrix()
     # a rig whose reference sensor sees nothing has its frames where the first of its other cameras says
     rig, known = [frames[image.id].rig for image in images], {}
     for of_rig, place, image in sorted(zip(rig, places, images, strict=True), key=lambda one: one[2].camera):
@@ -204,50 +199,49 @@ def _rigs_of(model: Model, images: list[Image]) -> Rigs | None:
             known[of_rig] = None if place is None else image.camera
     free = np.array([p is not None and known[r] != i.camera for r, p, i in zip(rig, places, images, strict=True)])
     frame = np.unique(ids, return_inverse=True)[1].astype(np.int32)
-    return Rigs(frame, rotations, translations, free if free.any() else None)
+    return Rigs(frame, rotation, translations(poses) * COLMAP_FLIP, free if free.any() else None)
 
 
 def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
     """Views of finite pixels and points, and notes on the others."""
-    model, finite, what = table.model, lenses.finite_rows(table.points["xyz"]), "left out, not finite"
-    notes = note(model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name)
+    model, what = table.model, "left out, not finite"
+    finite = np.asarray(np.isfinite(table.points["xyz"]).all(axis=1))
+    notes = counted(model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name)
     views = views.of(finite[views.point])
-    visible = lenses.finite_rows(table.keys["xy"][views.key])
-    notes += note(model.file("images"), views.key[~visible], "key-point", what, table.key_name)
+    visible = np.asarray(np.isfinite(table.keys["xy"][views.key]).all(axis=1))
+    notes += counted(model.file("images"), views.key[~visible], "key-point", what, table.key_name)
     return views.of(visible), notes
 
 
 def _problem(
     model: Model,
     images: list[Image],
-    points: Float[np.ndarray, "points 3"],
-    pixels: Float[np.ndarray, "observations 2"],
-    camera_index: Int[np.ndarray, " observations"],
-    point_index: Int[np.ndarray, " observations"],
+    points: Int[np.ndarray, " points"],
+    keys: Float[np.ndarray, "keys 2"],
+    views: Views,
     *,
     refine_principal_point: bool,
-) -> tuple[BundleProblem, list[int]]:
-    """The problem, and the ids of the cameras of its lenses."""
+) -> BundleProblem:
+    """The problem of some images, points by their positions in the file, and views of these."""
     cameras = sorted({image.camera for image in images})
     lens = np.searchsorted(cameras, [image.camera for image in images])
     used = [model.cameras[camera] for camera in cameras]
     intrinsics, of_problem = lenses.lenses_of(used, lens, refine_principal_point=refine_principal_point)
+    pixels = keys[views.key]
     if of_problem is None or of_problem.all_bal:
-        centers = np.array([lenses.principal_point(camera) for camera in used])[lens[camera_index]]
+        centers = np.array([camera.principal_point for camera in used])[lens[views.image]]
         with np.errstate(over="ignore"):  # what is not finite is refused below
             pixels = (pixels - centers) * COLMAP_FLIP[:2]
-    poses = [image.pose for image in images]
-    rotations = bal_rotations(quaternions(poses)[:, XYZW])
-    translations = np.array([pose.tvec for pose in poses]) * COLMAP_FLIP
+    parameters = np.hstack([bal_poses([image.pose for image in images]), intrinsics[lens]])
+    heads = model.points.heads[points]
     try:
-        problem = BundleProblem.create(
-            np.hstack([rotations, translations, intrinsics[lens]]),
-            points,
-            pixels,
-            camera_index,
-            point_index,
-            lenses=of_problem,
-        )
+        problem = BundleProblem.create(parameters, heads["xyz"], pixels, views.image, views.point, lenses=of_problem)
     except ProblemError as error:
         raise ProblemError(f"{display_name(model.folder)}: {error}") from error
-    return problem.replace(rigs=_rigs_of(model, images)), cameras
+    labels = Labels(
+        tuple(image.name.decode("utf-8", "surrogateescape") for image in images),
+        np.array([image.id for image in images]),
+        np.array(cameras),
+        heads["id"],
+    )
+    return problem.replace(rigs=_rigs_of(model, images), labels=labels)

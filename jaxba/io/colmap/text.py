@@ -1,128 +1,187 @@
-"""Reader of the text files of a COLMAP model.
+"""The text files of a COLMAP model.
 
 Comments, empty lines, byte order marks, Windows line ends and blanks at ends do not matter, and a name is all that
-follows the ninth field of its line. Source: COLMAP, src/colmap/scene/reconstruction_io_text.cc.
+follows the ninth field of its line. Numbers are written with as many digits as reading them back bit by bit needs.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from typing import Any, NoReturn
 
 import numpy as np
 
-from jaxba.io.colmap.records import (
-    CAMERA_MODELS,
-    KEY,
-    NO_ID,
-    NO_POINT,
-    SENSORS,
-    Camera,
-    Frame,
-    Image,
-    Points,
-    Pose,
-    Record,
-    Rig,
-    Sensor,
-    make_points,
-    pose_of,
-)
-from jaxba.io.colmap.words import Words, lines
+from jaxba.io.colmap import fields
+from jaxba.io.colmap.fields import Fields, Source
+from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model, Points
+from jaxba.io.colmap.poses import pose_of
+from jaxba.io.encoding import utf8
+from jaxba.io.text import number
+from jaxba.problem.bundle_problem import ProblemError
 
 _UNIT = 0.1  # how far the norm of a quaternion may be from 1, if that is to tell a pose from pixels
-_POSE = ("qw", "qx", "qy", "qz", "tx", "ty", "tz")
-_NAME = 9  # fields before the name of an image: id, pose, camera
+_NAME = len(fields.IMAGE.names)  # fields before the name of an image
+_LARGEST = {"B": 255, "I": NO_ID, "Q": NO_POINT}
+_HEADERS = {
+    "cameras": "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+    "images": "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; next line: POINTS2D[] as (X, Y, POINT3D_ID)",
+    "points3D": "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
+    "rigs": "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, [POSE])",
+    "frames": "FRAME_ID, RIG_ID, QW, QX, QY, QZ, TX, TY, TZ, NUM_DATA, DATA[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)",
+}
 
 
-def read_cameras(data: bytes, name: str) -> dict[int, Camera]:
-    """Cameras by id, in the order of the file.
+class _Line(Source):
+    """The words of a line, taken one after the other; every error names the line and the field."""
+
+    def __init__(self, place: str, text: bytes, record: str):
+        """`record` is what the line holds, such as "camera"."""
+        self.place, self.text, self.record = place, text, record
+        self.rest = text.split()
+        self.about = ""  # the record with its id
+
+    def fail(self, complaint: str) -> NoReturn:
+        raise ProblemError(f"{self.place}: {self.about}{': ' if self.about else ''}{complaint}")
+
+    def take(self, fields: Fields, what: str = "") -> tuple[Any, ...]:
+        if what and len(self.rest) != len(fields.names):
+            self.fail(f"{what} has {len(fields.names)} parameters, not {len(self.rest)}")
+        return tuple([self._value(name, code, fields) for name, code in zip(fields.names, fields.codes, strict=True)])
+
+    def count(self, field: str, each: Fields) -> int:
+        largest = len(self.rest)
+        return self.integers([self._word(field)], field, largest)[0]
+
+    def floats(self, words: list[bytes], field: str) -> list[float]:
+        """Words of this line as numbers, which may be infinite or no number."""
+        if b"_" not in self.text:  # Python takes 1_000 for a number
+            try:
+                return list(map(float, words))
+            except ValueError:
+                pass
+        return [self._float(word, field) for word in words]
+
+    def integers(self, words: list[bytes], field: str, high: int) -> list[int]:
+        """Words of this line as integers in 0..`high`, where -1, COLMAP's word for nothing, means `high`."""
+        try:
+            values = list(map(int, words)) if b"_" not in self.text else [self._integer(w, field) for w in words]
+        except ValueError:
+            values = [self._integer(word, field) for word in words]
+        if values and (min(values) < 0 or max(values) > high):
+            if min(values) < -1 or max(values) > high:
+                bad = next(word for word, value in zip(words, values, strict=True) if not -1 <= value <= high)
+                self.fail(f"{_shown(bad)} is outside 0..{high} ({field})")
+            values = [high if value < 0 else value for value in values]
+        return values
+
+    def _value(self, name: str, code: str, of: Fields) -> Any:
+        word = self._word(name)
+        if code == "d":
+            return self.floats([word], name)[0]
+        if code == "i" and of.kinds is not None:
+            kind = word.decode("latin-1")
+            if kind not in of.kinds.numbers:
+                self.fail(f"{kind!a} {of.kinds.unknown_word}")
+            return of.kinds.numbers[kind]
+        (value,) = self.integers([word], name, of.largest or _LARGEST[code])
+        self.about = self.about or f"{self.record} {value}"
+        return value
+
+    def _word(self, field: str) -> bytes:
+        if not self.rest:
+            self.fail(f"the line ends before its {field}")
+        return self.rest.pop(0)
+
+    def _float(self, word: bytes, field: str) -> float:
+        try:
+            return float(word) if b"_" not in word else number("")
+        except ValueError:
+            pass
+        try:
+            return number(word.decode("latin-1"))
+        except ValueError:
+            self.fail(f"{_shown(word)} is not a number ({field})")
+
+    def _integer(self, word: bytes, field: str) -> int:
+        try:
+            return int(word) if b"_" not in word else int("")
+        except ValueError:
+            value = self._float(word, field)
+        if not value.is_integer():
+            self.fail(f"{_shown(word)} is not an integer ({field})")
+        return int(value)
+
+
+def _shown(word: bytes) -> str:
+    text = word.decode("latin-1")
+    return ascii(text if len(text) <= 40 else text[:37] + "...")
+
+
+def _lines(data: bytes, name: str, record: str, *, empty: bool = False) -> Iterator[_Line]:
+    """Lines of a file that are no comments, without blanks at their ends; also `empty` ones if asked for."""
+    data = b"".join(utf8(iter([data]), name))
+    start, number = 0, 0
+    while start < len(data):
+        end = data.find(b"\n", start)
+        end = len(data) if end < 0 else end
+        text = data[start:end].strip()
+        start, number = end + 1, number + 1
+        if (text or empty) and not text.startswith(b"#"):
+            yield _Line(f"{name} line {number}", text, record)
+
+
+def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
+    """The records of a file by id, in its order; of `points3D` all points and tracks. The line of an image's key-points
+    may be empty or missing. Arguments as for `binary.read`.
 
     Raises:
-        ProblemError: as all readers here: a line cannot be understood; one line that names the file, the line and the
-            field.
+        ProblemError: a line cannot be understood; one line that names the file, the line and the field.
     """
-    return _records(map(_camera, lines(data, name)))
-
-
-def read_images(data: bytes, name: str) -> dict[int, Image]:
-    """Images by id, in the order of the file. The line of key-points may be empty or missing."""
-    return _records(_images(lines(data, name, empty=True)))
-
-
-def read_rigs(data: bytes, name: str) -> dict[int, Rig]:
-    """Rigs by id, in the order of the file."""
-    return _records(map(_rig, lines(data, name)))
-
-
-def read_frames(data: bytes, name: str) -> dict[int, Frame]:
-    """Frames by id, in the order of the file."""
-    return _records(map(_frame, lines(data, name)))
-
-
-def read_points(data: bytes, name: str) -> Points:
-    """All points and tracks."""
-    heads, tracks = [], []
-    for line in lines(data, name):
-        identity = line.integer("POINT3D_ID", NO_POINT)
-        line.about = f"point {identity}"
-        xyz = line.floats("x", "y", "z")
-        rgb = [line.integer(colour, 255) for colour in ("red", "green", "blue")]
-        (error,) = line.floats("error")
-        if len(line.rest) % 2:
-            line.fail(f"the track has {len(line.rest)} numbers, which are no pairs of IMAGE_ID and POINT2D_IDX")
-        track = line.to_integers(line.rest, "IMAGE_ID or POINT2D_IDX of the track", NO_ID)
-        heads.append((identity, xyz, rgb, error, len(track) // 2))
-        tracks.extend(zip(track[::2], track[1::2], strict=True))
-    return make_points(heads, tracks)
-
-
-def _records(records: Iterator[tuple[Words, Record]]) -> dict[int, Record]:
-    found: dict[int, Record] = {}
-    for line, record in records:
+    lines = _lines(data, name, part.removesuffix("3D")[:-1], empty=part == "images")
+    if part == "points3D":
+        return _read_points(lines)
+    found = {}
+    for line, record in _images(lines) if part == "images" else ((one, fields.READERS[part][1](one)) for one in lines):
+        if line.rest:
+            line.fail(f"{_shown(line.rest[0])} is left over")
         if record.id in found:
             line.fail("is there twice")
         found[record.id] = record
     return found
 
 
-def _camera(line: Words) -> tuple[Words, Camera]:
-    identity = line.integer("CAMERA_ID", NO_ID)
-    line.about = f"camera {identity}"
-    model = line.word("model").decode("latin-1")
-    if model not in CAMERA_MODELS:
-        line.fail(f"{model!a} is an unknown camera model")
-    width, height = (line.integer(field, NO_POINT) for field in ("width", "height"))
-    count = CAMERA_MODELS[model].size
-    if len(line.rest) != count:
-        line.fail(f"{model} has {count} parameters, not {len(line.rest)}")
-    return line, Camera(
-        identity, model, width, height, tuple(line.floats(*(f"parameter {k + 1}" for k in range(count))))
-    )
+def _read_points(lines: Iterator[_Line]) -> Points:
+    heads, tracks = [], []
+    for line in lines:
+        identity, x, y, z, red, green, blue, error = line.take(fields.POINT)
+        if len(line.rest) % 2:
+            line.fail(f"the track has {len(line.rest)} numbers, which are no pairs of IMAGE_ID and POINT2D_IDX")
+        track = line.integers(line.rest, "IMAGE_ID or POINT2D_IDX of the track", NO_ID)
+        heads.append((identity, (x, y, z), (red, green, blue), error, len(track) // 2))
+        tracks.extend(zip(track[::2], track[1::2], strict=True))
+    return Points(np.array(heads, POINT), np.array(tracks, TRACK))
 
 
-def _images(file: Iterator[Words]) -> Iterator[tuple[Words, Image]]:
+def _images(file: Iterator[_Line]) -> Iterator[tuple[_Line, Image]]:
     line = next(file, None)
     while line is not None:
         if not line.rest:
             line = next(file, None)
             continue
-        identity = line.integer("IMAGE_ID", NO_ID)
-        line.about = f"image {identity}"
-        pose = _pose(line)
-        camera = line.integer("CAMERA_ID", NO_ID)
-        image = Image(identity, pose, camera, line.after(_NAME), np.empty(0, KEY))
+        identity, *pose, camera = line.take(fields.IMAGE)
+        name, line.rest = line.text.split(None, _NAME)[_NAME:], []
+        image = Image(identity, pose_of(pose), camera, b"".join(name), np.empty(0, KEY))
         below = next(file, None)
         if below is not None and not _starts_image(below):
             below.about = str(image)
-            yield line, Image(identity, pose, camera, image.name, _keys(below))
+            image = image.with_keys(_keys(below))
             below = next(file, None)
-        else:
-            yield line, image
+        yield line, image
         line = below
 
 
-def _starts_image(line: Words) -> bool:
+def _starts_image(line: _Line) -> bool:
     """Whether a line where key-points are due is that of the next image."""
     words = line.rest
     if len(words) <= _NAME or not _all(int, [words[0], words[_NAME - 1]]) or not _all(float, words[1 : _NAME - 1]):
@@ -139,45 +198,43 @@ def _all(convert: Callable[[bytes], object], words: list[bytes]) -> bool:
         return False
 
 
-def _keys(line: Words) -> np.ndarray:
+def _keys(line: _Line) -> np.ndarray:
     words = line.rest
     if len(words) % 3:
         line.fail(f"{len(words)} numbers, which are no key-points of x, y and POINT3D_ID")
     keys = np.empty(len(words) // 3, KEY)
-    keys["point"] = np.array(line.to_integers(words[2::3], "POINT3D_ID of a key-point", NO_POINT), np.uint64)
+    keys["point"] = np.array(line.integers(words[2::3], "POINT3D_ID of a key-point", NO_POINT), np.uint64)
     for axis, field in enumerate("xy"):
-        keys["xy"][:, axis] = line.to_floats(words[axis::3], f"{field} of a key-point")
+        keys["xy"][:, axis] = line.floats(words[axis::3], f"{field} of a key-point")
     return keys
 
 
-def _pose(line: Words) -> Pose:
-    return pose_of(line.floats(*_POSE))
+def encode(model: Model) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of the files of a model with rigs and frames."""
+    lines = {part: map(_joined, records.values()) for part, records in model.records.items()}
+    for part, found in {**lines, "points3D": _point_lines(model.points)}.items():
+        yield f"{part}.txt", b"\n".join([f"# {_HEADERS[part]}".encode(), *found, b""])
 
 
-def _rig(line: Words) -> tuple[Words, Rig]:
-    identity = line.integer("RIG_ID", NO_ID)
-    line.about = f"rig {identity}"
-    sensors = []
-    for number in range(line.integer("number of sensors", len(line.rest))):
-        kind, sensor = _sensor(line)
-        pose = number and line.integer("whether there is a pose", 1)
-        sensors.append(Sensor(kind, sensor, _pose(line) if pose else None))
-    line.finish()
-    return line, Rig(identity, tuple(sensors))
+def _joined(record: Any) -> bytes:
+    words: list[str] = []
+    for of, numbers in fields.values(record):
+        kinds = {number: word for word, number in of.kinds.numbers.items()} if of.kinds is not None else {}
+        words += [kinds[v] if code == "i" else str(v) for code, v in zip(of.codes, numbers, strict=True)]
+    text = " ".join(words).encode()
+    if not isinstance(record, Image):
+        return text
+    x, y = record.keys["xy"].T.tolist()
+    points = [-1 if point == NO_POINT else point for point in record.keys["point"].tolist()]
+    keys = " ".join([f"{x} {y} {point}" for x, y, point in zip(x, y, points, strict=True)])
+    return b"".join([text, b" ", record.name, b"\n", keys.encode()])
 
 
-def _frame(line: Words) -> tuple[Words, Frame]:
-    identity = line.integer("FRAME_ID", NO_ID)
-    line.about = f"frame {identity}"
-    rig, pose = line.integer("RIG_ID", NO_ID), _pose(line)
-    count = line.integer("number of data", len(line.rest))
-    data = tuple((*_sensor(line), line.integer("id of a datum", NO_POINT)) for _ in range(count))
-    line.finish()
-    return line, Frame(identity, rig, pose, data)
-
-
-def _sensor(line: Words) -> tuple[int, int]:
-    kind = line.word("type of a sensor").decode("latin-1")
-    if kind not in SENSORS:
-        line.fail(f"{kind!a} is no type of sensors")
-    return SENSORS[kind], line.integer("id of a sensor", NO_ID)
+def _point_lines(points: Points) -> Iterator[bytes]:
+    elements = [f" {image} {key}" for image, key in points.tracks.tolist()]
+    at = 0
+    columns = (points.heads[field].tolist() for field in ("id", "xyz", "rgb", "error", "length"))
+    for identity, (x, y, z), (red, green, blue), error, length in zip(*columns, strict=True):
+        track = "".join(elements[at : at + length])
+        yield f"{identity} {x} {y} {z} {red} {green} {blue} {error}{track}".encode()
+        at += length

@@ -2,35 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from jaxba.io.colmap import lenses
 from jaxba.io.colmap.create import create_model, mean_errors
-from jaxba.io.colmap.encode import encode
-from jaxba.io.colmap.folder import is_binary, read_model
-from jaxba.io.colmap.problem import Assembled, assemble, composed, inverse, place_in_rig
-from jaxba.io.colmap.records import (
-    CAMERA_MODELS,
-    CAMERA_SENSOR,
-    WXYZ,
-    Camera,
-    Frame,
-    Model,
-    Points,
-    Rig,
-    Sensor,
-    pose_of,
-)
-from jaxba.io.files import StrPath, display_name, reason
+from jaxba.io.colmap.files import is_binary, read_model, write_model
+from jaxba.io.colmap.lenses import with_lens
+from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Model, Points, Rig, Sensor
+from jaxba.io.colmap.poses import colmap_poses, composed, inverse
+from jaxba.io.colmap.problem import Assembled, assemble, place_in_rig
+from jaxba.io.files import StrPath, display_name
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, colmap_quaternions
+from jaxba.problem.geometry import angle_axis
 
 
 def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None = None) -> None:
@@ -56,78 +41,84 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
             intrinsics, or the folder cannot be written.
     """
     if like is None:
-        _save(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
+        write_model(_with_rigs(create_model(problem, display_name(folder))), folder, ".bin")
         return
-    model = read_model(like)
-    assembled = assemble(model, refine_principal_point=_is_general(problem))
+    model, target = read_model(like), display_name(folder)
+    bal = problem.lenses is None or problem.lenses.all_bal
+    assembled = assemble(model, refine_principal_point=not bal)
     counts = problem.num_cameras, problem.num_points, problem.num_observations
     old = assembled.problem
     if counts != (old.num_cameras, old.num_points, old.num_observations):
-        raise ProblemError(f"cannot write {display_name(folder)}: the problem is not one of {display_name(like)}")
+        raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(like)}")
     text = model.suffix == ".txt" and not is_binary(folder)  # COLMAP ignores text files beside a binary model
-    _save(_with_rigs(_updated(model, assembled, problem, display_name(folder))), folder, ".txt" if text else ".bin")
+    _check_finite(model, assembled, problem, target)
+    model = replace(model, cameras={**model.cameras, **_new_cameras(model, assembled, problem, bal, target)})
+    model = _with_poses(_with_places(model, assembled, problem), assembled, problem)
+    model = _with_points(model, assembled, problem)
+    write_model(_with_rigs(model), folder, ".txt" if text else ".bin")
 
 
-def _updated(model: Model, assembled: Assembled, problem: BundleProblem, target: str) -> Model:
-    """The model with the numbers of the problem."""
-    cameras = np.asarray(problem.cameras, np.float64)
-    points = np.asarray(problem.points, np.float64)
+def _check_finite(model: Model, assembled: Assembled, problem: BundleProblem, target: str) -> None:
+    poses, points = np.asarray(problem.cameras)[:, :6], np.asarray(problem.points)
     pose_name = lambda at: f"the pose of {assembled.images[at]}"
     point_name = lambda at: f"point {model.points.heads['id'][assembled.points[at]]}"
-    for values, name in ((cameras[:, :6], pose_name), (points, point_name)):
-        if not (finite := lenses.finite_rows(values)).all():
+    for values, name in ((poses, pose_name), (points, point_name)):
+        if not (finite := np.isfinite(values).all(axis=1)).all():
             raise ProblemError(f"cannot write {target}: {name(int(finite.argmin()))} is not finite")
-    new_lenses: dict[int, np.ndarray] = {}
-    for number, image in enumerate(assembled.images):
-        lens = new_lenses.setdefault(image.camera, cameras[number, 6:])
-        if (lens != cameras[number, 6:]).any():
-            raise ProblemError(f"cannot write {target}: images of camera {image.camera} have different intrinsics")
-    new_cameras = {
-        identity: lenses.with_lens(model.cameras[identity], lens, bal=not _is_general(problem))
-        for identity, lens in new_lenses.items()
-    }
-    for camera in new_cameras.values():
-        _check_lens(camera, target)
-    quaternions = colmap_quaternions(cameras[:, :3])[:, WXYZ]
-    poses = [pose_of(row) for row in np.hstack([quaternions, cameras[:, 3:6] * COLMAP_FLIP])]
-    same = (cameras[:, :6] == np.asarray(assembled.problem.cameras)[:, :6]).all(axis=1)
-    poses = [image.pose if kept else pose for image, pose, kept in zip(assembled.images, poses, same, strict=True)]
-    new_images = {
-        image.id: replace(model.images[image.id], pose=pose)
-        for image, pose in zip(assembled.images, poses, strict=True)
-    }
-    model = _with_places(model, assembled, problem)
-    frames = model.frames
-    if frames is not None:
-        changed = {image.id for image, kept in zip(assembled.images, same, strict=True) if not kept}
-        for frame in model.frames.values() if model.frames is not None else ():
-            seen = [(camera, image) for camera, image in frame.images if image in changed]
-            if not seen:
-                continue
-            reference = [pair for pair in frame.images if place_in_rig(model, frame, pair[0]) is None]
-            kept = [pair for pair in reference if pair[1] in new_images and pair[1] not in changed]
-            # the image of the reference sensor has the frame's pose itself
-            camera, image = next(iter([*kept, *(pair for pair in seen if pair in reference), seen[0]]))
-            place = place_in_rig(model, frame, camera)
-            pose = new_images[image].pose
-            moved = pose if place is None else composed(inverse(place), pose)
-            frames = {**frames, frame.id: replace(frame, pose=moved)}
-            for camera, image in frame.images:  # also of images that see nothing
-                if image in model.images:
-                    at = composed(place_in_rig(model, frame, camera), moved)
-                    new_images[image] = replace(new_images.get(image, model.images[image]), pose=at)
+
+
+def _with_points(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
+    """The model with the points of the problem, and their errors."""
     heads = model.points.heads.copy()
-    heads["xyz"][assembled.points] = points
+    heads["xyz"][assembled.points] = problem.points
     with np.errstate(over="ignore", invalid="ignore"):
         difference = geometry.project(problem) - np.asarray(problem.observations)
     heads["error"][assembled.points] = mean_errors(difference, np.asarray(problem.point_index), problem.num_points)
-    return replace(
-        model,
-        cameras={**model.cameras, **new_cameras},
-        images={**model.images, **new_images},
-        points=Points(heads, model.points.tracks),
-        frames=frames,
-    )
+    return replace(model, points=Points(heads, model.points.tracks))
+
+
+def _new_cameras(
+    model: Model, assembled: Assembled, problem: BundleProblem, bal: bool, target: str
+) -> dict[int, Camera]:
+    """The lenses of the problem by the ids of their cameras."""
+    found: dict[int, np.ndarray] = {}
+    for image, lens in zip(assembled.images, np.asarray(problem.cameras, np.float64)[:, 6:], strict=True):
+        if (found.setdefault(image.camera, lens) != lens).any():
+            raise ProblemError(f"cannot write {target}: images of camera {image.camera} have different intrinsics")
+    cameras = {identity: with_lens(model.cameras[identity], lens, bal=bal) for identity, lens in found.items()}
+    for camera in cameras.values():
+        if not camera.possible:
+            shown = ", ".join(f"{value:g}" for value in camera.params)
+            raise ProblemError(f"cannot write {target}: camera {camera.id} would have impossible parameters: {shown}")
+    return cameras
+
+
+def _with_poses(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
+    """The model with the poses of the problem, those that have not changed as they were, bit by bit.
+
+    The pose of a frame is that of its reference sensor's image if the problem has that, else it follows from another.
+    """
+    cameras = np.asarray(problem.cameras, np.float64)[:, :6]
+    same = (cameras == np.asarray(assembled.problem.cameras)[:, :6]).all(axis=1)
+    images, frames, changed, known = dict(model.images), dict(model.frames or {}), set(), set()
+    for image, kept, pose in zip(assembled.images, same, colmap_poses(cameras), strict=True):
+        known.add(image.id)
+        images[image.id] = replace(images[image.id], pose=image.pose if kept else pose)
+        if not kept:
+            changed.add(image.id)
+    for frame in (model.frames or {}).values():
+        moved = [pair for pair in frame.images if pair[1] in changed]
+        if not moved:
+            continue
+        own = [pair for pair in frame.images if place_in_rig(model, frame, pair[0]) is None and pair[1] in known]
+        camera, image = next((pair for pair in own if pair[1] not in changed), (own or moved)[0])
+        place = place_in_rig(model, frame, camera)
+        pose = images[image].pose if place is None else composed(inverse(place), images[image].pose)
+        frames[frame.id] = replace(frame, pose=pose)
+        for camera, image in frame.images:  # also of images that see nothing
+            if image in images:
+                images[image] = replace(images[image], pose=composed(place_in_rig(model, frame, camera), pose))
+    return replace(model, images=images, frames=None if model.frames is None else frames)
 
 
 def _with_places(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
@@ -138,14 +129,10 @@ def _with_places(model: Model, assembled: Assembled, problem: BundleProblem) -> 
     turned = (old.rotation != new.rotation).any(axis=(1, 2))
     if not turned.any() and (old.translation == new.translation).all():
         return model
-    quaternions = colmap_quaternions(angle_axis(new.rotation))[:, WXYZ]
-    translations = np.asarray(new.translation) * COLMAP_FLIP
-    rig_of = {image: frame.rig for frame in (model.frames or {}).values() for _, image in frame.images}
+    poses = colmap_poses(np.hstack([angle_axis(new.rotation), new.translation]))
     moved = {
-        (rig_of[image.id], image.camera): (pose_of([*quaternion, *translation]), turn)
-        for image, quaternion, translation, turn in zip(
-            assembled.images, quaternions, translations, turned, strict=True
-        )
+        (model.frame_of[image.id].rig, image.camera): (pose, turn)
+        for image, pose, turn in zip(assembled.images, poses, turned, strict=True)
     }
 
     def placed(rig: Rig, sensor: Sensor) -> Sensor:
@@ -161,19 +148,6 @@ def _with_places(model: Model, assembled: Assembled, problem: BundleProblem) -> 
     return replace(model, rigs=rigs)
 
 
-def _check_lens(camera: Camera, target: str) -> None:
-    """Refuses a lens that `read_colmap` would refuse."""
-    focals = camera.params[: CAMERA_MODELS[camera.model].focals]
-    if not np.isfinite(camera.params).all() or min(focals, default=1.0) <= 0:
-        shown = ", ".join(f"{value:g}" for value in camera.params)
-        raise ProblemError(f"cannot write {target}: camera {camera.id} would have impossible parameters: {shown}")
-
-
-def _is_general(problem: BundleProblem) -> bool:
-    """Whether a problem's lenses have camera models of their own."""
-    return problem.lenses is not None and not problem.lenses.all_bal
-
-
 def _with_rigs(model: Model) -> Model:
     """The model with a rig of each camera and a frame of each image, as COLMAP reads one without."""
     if model.frames is not None:
@@ -184,20 +158,3 @@ def _with_rigs(model: Model) -> Model:
         for image in model.images.values()
     }
     return replace(model, rigs=rigs, frames=frames)
-
-
-def _save(model: Model, folder: StrPath, suffix: str) -> None:
-    target = Path(folder)
-    beside = target if target.is_dir() else target.absolute().parent  # writable, and on the same file system
-    try:
-        with tempfile.TemporaryDirectory(dir=beside, prefix=".jaxba-") as temporary:
-            for name, content in encode(model, suffix):
-                (Path(temporary) / name).write_bytes(content)
-            target.mkdir(exist_ok=True)
-            for file in sorted(Path(temporary).iterdir()):
-                place = os.path.realpath(target / file.name)
-                if os.path.exists(place):
-                    shutil.copymode(place, file)
-                os.replace(file, place)
-    except (OSError, ValueError, MemoryError) as error:  # ValueError: a name with NUL
-        raise ProblemError(f"cannot write {display_name(folder)}: {reason(error)}") from error

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.distortion import Distortion
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.remarks import note, note_center
+from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.notes import note, note_center
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 from jaxba.problem.intrinsics import LENS_SIZE, Lenses

@@ -14,12 +14,14 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
-from jaxba.io.configurations import SettingsError
+from jaxba.settings.configurations import SettingsError
 
 Settings = TypeVar("Settings")
 
 _SCIENTIFIC = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 """Numbers such as 3e-4, which YAML 1.1 reads as text."""
+
+_SCALARS = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
 
 
 def read(kind: type[Settings], data: Any, path: str = "") -> Settings:
@@ -35,10 +37,7 @@ def read(kind: type[Settings], data: Any, path: str = "") -> Settings:
     """
     if not isinstance(data, Mapping):
         raise SettingsError(f"{path or 'settings'} must be a mapping, is {_show(data)}")
-    types_by_name = field_types(kind)
-    for key in data:
-        if key not in types_by_name:
-            raise SettingsError(f"unknown key {_join(path, key)}; {_hint(str(key), types_by_name)}")
+    types_by_name = {key: _type_of(kind, key, _join(path, key)) for key in data}
     values = {key: _value(types_by_name[key], value, _join(path, key)) for key, value in data.items()}
     try:
         return kind(**values)
@@ -74,20 +73,15 @@ def assign(data: dict[str, Any], path: str, value: Any, kind: type) -> None:
         SettingsError: there is no such key, or the path continues below a value.
     """
     *above, last = path.split(".")
-    for depth, key in enumerate(above):
-        known = field_types(kind)
-        if key not in known:
-            raise SettingsError(f"unknown key {path}; {_hint(key, known)}")
-        kind = known[key]
+    for depth, key in enumerate(above, 1):
+        kind, inside = _type_of(kind, key, path), ".".join(above[:depth])
         if not dataclasses.is_dataclass(kind):
-            raise SettingsError(f"unknown key {path}; {'.'.join(above[: depth + 1])} has no parts")
+            raise SettingsError(f"unknown key {path}; {inside} has no parts")
         inner = data.setdefault(key, {})
         data = {} if inner is None else inner
         if not isinstance(data, dict):
-            raise SettingsError(f"{'.'.join(above[: depth + 1])} must be a mapping, is {_show(data)}")
-    known = field_types(kind)
-    if last not in known:
-        raise SettingsError(f"unknown key {path}; {_hint(last, known)}")
+            raise SettingsError(f"{inside} must be a mapping, is {_show(data)}")
+    _type_of(kind, last, path)
     data[last] = value
 
 
@@ -118,34 +112,31 @@ def _value(kind: Any, value: Any, path: str) -> Any:
         return tuple(_value(inside[0], item, f"{path}[{k}]") for k, item in enumerate(value))
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
         return read(kind, value, path)
-    if kind is float:
-        if isinstance(value, str) and _SCIENTIFIC.fullmatch(value):
-            value = float(value)
-        if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < float("inf"):
-            return float(value)
-        raise SettingsError(f"{path} must be a number, is {_show(value)}")
-    if kind is int:
-        if isinstance(value, int) and not isinstance(value, bool):
-            return value
-        raise SettingsError(f"{path} must be a whole number, is {_show(value)}")
-    if kind is bool:
-        if isinstance(value, bool):
-            return value
-        raise SettingsError(f"{path} must be true or false, is {_show(value)}")
-    if kind is str:
-        if isinstance(value, str):
-            return value
-        raise SettingsError(f"{path} must be text, is {_show(value)}: put it in quotes")
-    raise AssertionError(f"{path}: no rule for fields of type {kind}")
+    return _scalar(kind, value, path)
+
+
+def _scalar(kind: Any, value: Any, path: str) -> Any:
+    if (kind, type(value)) == (float, str) and _SCIENTIFIC.fullmatch(value):
+        value = float(value)
+    fits = isinstance(value, (int, float) if kind is float else kind) and isinstance(value, bool) == (kind is bool)
+    if fits and (kind is not float or abs(value) < float("inf")):
+        return kind(value)
+    quotes = ": put it in quotes" if kind is str else ""
+    raise SettingsError(f"{path} must be {_SCALARS[kind]}, is {_show(value)}{quotes}")
 
 
 def _join(path: str, key: Any) -> str:
     return f"{path}.{key}" if path else str(key)
 
 
-def _hint(key: str, known: Mapping[str, Any]) -> str:
-    near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
-    return f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
+def _type_of(kind: type, key: Any, path: str) -> Any:
+    """The type of a field of a dataclass; `path` names it in messages. Raises SettingsError."""
+    known = field_types(kind)
+    if key not in known:
+        near = difflib.get_close_matches(str(key), known, n=3, cutoff=0.5)
+        hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(known)}"
+        raise SettingsError(f"unknown key {path}; {hint}")
+    return known[key]
 
 
 def _show(value: Any, longest: int = 40) -> str:

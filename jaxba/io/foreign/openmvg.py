@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from jaxba.io.distortion import Distortion
 from jaxba.io.files import StrPath
-from jaxba.io.foreign import ForeignLens
-from jaxba.io.json_records import Record, read_json
-from jaxba.io.remarks import note_unused
-from jaxba.io.sfm_data import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.io.foreign.cameras import ForeignLens
+from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.foreign.json_records import Record
+from jaxba.io.foreign.views import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.io.notes import note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
 VERSION = "sfm_data_version"
@@ -41,41 +41,30 @@ _FIRST = 1 << 31
 _PROGRAM = "OpenMVG"
 
 
-def read_openmvg(path: StrPath) -> BundleProblem:
-    """Reads a whole result of OpenMVG.
-
-    Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. `pinhole`,
-    `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. Of the others in `MODELS` pixels are
-    undistorted once and intrinsics stay.
-
-    Args:
-        path: the file, plain or compressed.
-
-    Raises:
-        ProblemError: the file cannot be read, lacks a part, names a camera model that is not in `MODELS`, or views
-            share a pose; one line that names the file, the record and the field.
-    """
-    return from_document(read_json(path), path)
-
-
-def is_openmvg(document: Record) -> bool:
+def recognises(document: Record) -> bool:
     """Whether a JSON document is of OpenMVG."""
     return isinstance(document.value, dict) and VERSION in document.value
 
 
 def from_document(document: Record, path: StrPath) -> BundleProblem:
-    """As `read_openmvg`, from the contents of its file. Raises ProblemError."""
+    """The problem of a whole result of OpenMVG.
+
+    Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. `pinhole`,
+    `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. Of the others in `MODELS` pixels are
+    undistorted once and intrinsics stay.
+
+    Raises:
+        ProblemError: the file lacks a part, names a camera model that is not in `MODELS`, or views share a pose; one
+            line that names the file, the record and the field.
+    """
     views = {}
     unused = dict.fromkeys(PRIORS.values(), 0)
     for key, value in _map(part(document, "views", _PROGRAM), "view"):
         data = value.get("ptr_wrapper").get("data").called(value.where)
         for flag, what in PRIORS.items():
-            unused[what] += data.has(flag) and data.get(flag).flag()
-        number = data.get("id_view").integer() if data.has("id_view") else key
-        pose, intrinsic = (
-            data.get(one).integer() if data.has(one) else UNDEFINED for one in ("id_pose", "id_intrinsic")
-        )
-        views[number] = View(pose, intrinsic)
+            unused[what] += data.get(flag, False).flag()
+        pose, intrinsic = (data.get(one, UNDEFINED).integer() for one in ("id_pose", "id_intrinsic"))
+        views[data.get("id_view", key).integer()] = View(pose, intrinsic)
     intrinsics = _intrinsics(part(document, "intrinsics", _PROGRAM))
     poses = {}
     for key, value in _map(part(document, "extrinsics", _PROGRAM), "pose"):
@@ -95,8 +84,7 @@ def _map(record: Record, what: str) -> Iterator[tuple[int, Record]]:
 def _intrinsics(record: Record) -> dict[int, tuple[str, Record]]:
     """Model and parameters of each intrinsic, with the references of the serialisation library resolved."""
     found = {}
-    models: dict[int, str] = {}
-    objects: dict[int, Record] = {}
+    models, objects = {}, {}
     for key, value in _map(record, "intrinsic"):
         identity = value.get("polymorphic_id").integer()
         if value.has("polymorphic_name"):
@@ -120,10 +108,7 @@ def _lens(model: str, data: Record) -> ForeignLens:
     numbers = data.get(key).vector(count) if key else []
     focal, size = data.get("focal_length").number(), (data.get("width").number(), data.get("height").number())
     x, y = data.get("principal_point").vector(2)
-    fisheye = model == "fisheye"
-    distortion = Distortion(
-        tuple(numbers if fisheye else numbers[:3]), (numbers[3], numbers[4]) if count == 5 else (0.0, 0.0), fisheye
-    )
+    distortion = Distortion.of(numbers, model == "fisheye")
     return ForeignLens(data.where, (focal, focal), (x, y), distortion, (True, count > 0, count > 1), size)
 
 

@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxba.io.distortion import Distortion
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.foreign import FIXED, ForeignLens, assemble
-from jaxba.io.remarks import note, note_origin
-from jaxba.io.text import LineReader, NumberReader, number
+from jaxba.io.foreign.cameras import FIXED, ForeignLens, assemble
+from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.notes import note, note_origin
+from jaxba.io.text import LineReader, NumberReader, finite_numbers
 from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import are_rotations, translations
@@ -111,7 +111,7 @@ def _header(lines: LineReader) -> _Header:
         return _Header(words[0] == HEADERS[1], None)
     if words[1] != b"FixedK" or len(words) != 7:
         raise ProblemError(f"{where}: after {words[0].decode()} there must be nothing, or FixedK and fx cx fy cy r")
-    return _Header(words[0] == HEADERS[1], tuple(_numbers(words[2:], ("fx", "cx", "fy", "cy", "r"), where)))
+    return _Header(words[0] == HEADERS[1], tuple(finite_numbers(words[2:], ("fx", "cx", "fy", "cy", "r"), where)))
 
 
 def _images(lines: LineReader, header: _Header) -> _Images:
@@ -119,7 +119,7 @@ def _images(lines: LineReader, header: _Header) -> _Images:
     where = f"{lines.name} line {max(lines.line, 1)}"
     if not line:
         raise ProblemError(f"{where}: the file ends before the number of images")
-    count = _numbers([line], ("number of images",), where)[0]
+    count = finite_numbers([line], ("number of images",), where)[0]
     if not count.is_integer() or not 1 <= count <= LARGEST_COUNT:
         raise ProblemError(f"{where}: {count:g} is no number of images of a model")
     fields = _FIELDS_R9T if header.matrices else _FIELDS
@@ -131,7 +131,7 @@ def _images(lines: LineReader, header: _Header) -> _Images:
             raise ProblemError(f"{where}: the file ends before image {image} of {count:g}")
         if len(words) != len(fields) + 1:
             raise ProblemError(f"{where}: image {image} has {len(words)} fields instead of {len(fields) + 1}")
-        rows.append(_numbers(words[1:], fields, f"{where}: image {image}"))
+        rows.append(finite_numbers(words[1:], fields, f"{where}: image {image}"))
         if header.matrices and not are_rotations(np.array(rows[-1][1:10]).reshape(1, 3, 3))[0]:
             raise ProblemError(f"{where}: image {image}: R11 to R33 are no rotation")
         if not header.matrices and not any(rows[-1][1:5]):
@@ -145,16 +145,3 @@ def _images(lines: LineReader, header: _Header) -> _Images:
     largest = np.abs(quaternions).max(axis=1, keepdims=True)  # without it squares overflow
     rotations = Rotation.from_quat(quaternions / largest).as_matrix()
     return _Images(table[:, 0], rotations, translations(rotations, table[:, 5:8]), table[:, 8])
-
-
-def _numbers(words: list[bytes], fields: tuple[str, ...], where: str) -> list[float]:
-    found = []
-    for word, field in zip(words, fields, strict=True):
-        shown = word[:40].decode("latin-1")
-        try:
-            found.append(number(word.decode("latin-1")))
-        except ValueError:
-            raise ProblemError(f"{where}: {shown!a} is not a number ({field})") from None
-        if not np.isfinite(found[-1]):
-            raise ProblemError(f"{where}: {shown!a} is not a finite number ({field})")
-    return found

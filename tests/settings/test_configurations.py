@@ -14,8 +14,8 @@ from typing import get_args
 
 import pytest
 
-from jaxba.io import configurations
-from jaxba.io.configurations import Kind, SettingsError, find, names, read
+from jaxba.settings import configurations
+from jaxba.settings.configurations import Kind, SettingsError, find, names, read
 
 REPOSITORY = Path(__file__).parents[2]
 KINDS = get_args(Kind)
@@ -161,7 +161,7 @@ def test_a_wheel_carries_every_configuration_and_so_does_one_from_a_source_distr
             archive.extractall(installed)
         wheel.unlink()
         code = (
-            "from jaxba.io.configurations import find, names, read\n"
+            "from jaxba.settings.configurations import find, names, read\n"
             f"kinds, expected, fast = {KINDS!r}, {expected!r}, {str(installed / 'jaxba/configs/train/fast.yaml')!r}\n"
             "assert str(find('train', 'fast')) == fast\n"
             "assert {kind: {name: read(kind, name) for name in names(kind)} for kind in kinds} == expected\n"

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.foreign import ForeignLens, assemble
-from jaxba.io.json_records import Record
-from jaxba.io.remarks import note
+from jaxba.io.foreign.cameras import ForeignLens, assemble
+from jaxba.io.foreign.json_records import Record
+from jaxba.io.notes import note
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import are_rotations, translations
 

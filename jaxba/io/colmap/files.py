@@ -1,23 +1,24 @@
-"""Folders of COLMAP models: which files they have, and reading them."""
+"""The files of COLMAP models: which a folder has, reading them, and writing them whole or not at all."""
 
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from pathlib import Path
 from typing import Any
 
 from jaxba.io.colmap import binary, text
-from jaxba.io.colmap.check import check_model
-from jaxba.io.colmap.records import PARTS, RIG_PARTS, Model, file_name
+from jaxba.io.colmap.model import PARTS, RIG_PARTS, Model, check_model, file_name
 from jaxba.io.files import READ_ERRORS, StrPath, display_name, reason
 from jaxba.problem.bundle_problem import ProblemError
 
-_READERS: dict[str, Any] = {".bin": binary, ".txt": text}
+_FORMS: dict[str, Any] = {".bin": binary, ".txt": text}
 
 
 def is_colmap(path: StrPath) -> bool:
     """Whether a path is a folder that holds a COLMAP model."""
-    return any((Path(path) / f"cameras{suffix}").is_file() for suffix in _READERS)
+    return any((Path(path) / f"cameras{suffix}").is_file() for suffix in _FORMS)
 
 
 def is_binary(folder: StrPath) -> bool:
@@ -34,8 +35,8 @@ def read_model(folder: StrPath) -> Model:
     """
     if not is_colmap(folder):
         raise ProblemError(f"{display_name(folder)}: no directory with a COLMAP model (cameras.bin or cameras.txt)")
-    whole = [suffix for suffix in _READERS if _has(folder, suffix)]
-    suffix = whole[0] if whole else next(s for s in _READERS if (Path(folder) / f"cameras{s}").is_file())
+    whole = [suffix for suffix in _FORMS if _has(folder, suffix)]
+    suffix = whole[0] if whole else next(s for s in _FORMS if (Path(folder) / f"cameras{s}").is_file())
     here = [part for part in (*PARTS, *RIG_PARTS) if os.path.lexists(Path(folder) / (part + suffix))]
     for part in PARTS if set(here).isdisjoint(RIG_PARTS) else (*PARTS, *RIG_PARTS):
         if part not in here:
@@ -63,12 +64,31 @@ def _read(folder: StrPath, part: str, suffix: str) -> Any:
         data = path.read_bytes()
     except (*READ_ERRORS, ValueError) as error:
         raise ProblemError(f"cannot read {name}: {reason(error)}") from error
-    readers = _READERS[suffix]
-    read = {
-        "cameras": readers.read_cameras,
-        "images": readers.read_images,
-        "points3D": readers.read_points,
-        "rigs": readers.read_rigs,
-        "frames": readers.read_frames,
-    }
-    return read[part](data, name)
+    return _FORMS[suffix].read(part, data, name)
+
+
+def write_model(model: Model, folder: StrPath, suffix: str) -> None:
+    """Writes the files of a model: all to a hidden folder, then each replaces the old one.
+
+    Args:
+        model: with rigs and frames.
+        folder: made if it does not exist.
+        suffix: `.bin` or `.txt`.
+
+    Raises:
+        ProblemError: the folder cannot be written.
+    """
+    target = Path(folder)
+    beside = target if target.is_dir() else target.absolute().parent  # writable, and on the same file system
+    try:
+        with tempfile.TemporaryDirectory(dir=beside, prefix=".jaxba-") as temporary:
+            for name, content in _FORMS[suffix].encode(model):
+                (Path(temporary) / name).write_bytes(content)
+            target.mkdir(exist_ok=True)
+            for file in sorted(Path(temporary).iterdir()):
+                place = os.path.realpath(target / file.name)
+                if os.path.exists(place):
+                    shutil.copymode(place, file)
+                os.replace(file, place)
+    except (OSError, ValueError, MemoryError) as error:  # ValueError: a name with NUL
+        raise ProblemError(f"cannot write {display_name(folder)}: {reason(error)}") from error

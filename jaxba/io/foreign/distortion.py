@@ -13,6 +13,7 @@ VisualSFM's acts the other way round, and is inverted here: `p = (1 + k1 r'^2 + 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,13 @@ class Distortion:
 
     inverse: bool = False
     """Whether the coefficients are those of the way from the measured point to that of the image plane."""
+
+    @classmethod
+    def of(cls, numbers: Sequence[float], fisheye: bool) -> Distortion:
+        """The lens of coefficients as OpenMVG and AliceVision write them; p1 and p2 of Brown's model are last."""
+        if fisheye:
+            return cls(tuple(numbers), fisheye=True)
+        return cls(tuple(numbers[:3]), (numbers[3], numbers[4]) if len(numbers) == 5 else (0.0, 0.0))
 
     @property
     def is_bal(self) -> bool:

@@ -7,28 +7,22 @@ doc/source/dataset.rst and geometry.rst; map/src/tracks_manager.cc for the three
 
 from __future__ import annotations
 
-import os
 from collections.abc import Container
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxba.io.distortion import Distortion
 from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.foreign import ALL_FREE, ForeignLens, assemble
-from jaxba.io.json_records import Record, read_json
-from jaxba.io.remarks import note, note_unused
-from jaxba.io.text import number
+from jaxba.io.foreign import TRACKS
+from jaxba.io.foreign.cameras import ALL_FREE, ForeignLens, assemble
+from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.foreign.json_records import Record
+from jaxba.io.notes import note, note_unused
+from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import are_rotations
-
-RECONSTRUCTION = "reconstruction.json"
-"""Name of the file of cameras and points in OpenSfM's folder."""
-
-TRACKS = "tracks.csv"
-"""Name of the file of observations, beside the reconstruction."""
 
 TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"
 """Begins the first line of tracks; files of version 0 have no such line."""
@@ -57,35 +51,24 @@ class _Observations(NamedTuple):
     unused: dict[str, int]
 
 
-def read_opensfm(path: StrPath, tracks: StrPath | None = None) -> BundleProblem:
-    """Reads the first reconstruction of a file, which is the largest.
-
-    `perspective`, `simple_radial` and `radial` cameras are optimised; of `brown`, `fisheye` and `fisheye_opencv` pixels
-    are undistorted once and intrinsics stay. Images share the lens of their camera. Images and tracks that are not
-    reconstructed are ignored; of repeated observations the last one counts.
-
-    Args:
-        path: `reconstruction.json`, or the folder that holds it; plain or compressed.
-        tracks: the file of observations. Default: `tracks.csv`, also compressed, in the same folder.
-
-    Raises:
-        ProblemError: a file is missing or malformed, a camera model is not one of `MODELS`, or images are of a rig;
-            one line that names the file, the record and the field.
-    """
-    path = Path(path) / RECONSTRUCTION if os.path.isdir(path) else Path(path)
-    document = read_json(path)
-    return from_document(document, path, tracks)
-
-
-def is_opensfm(document: Record) -> bool:
+def recognises(document: Record) -> bool:
     """Whether a JSON document is a list of reconstructions, or one of them."""
     first = document.value[0] if isinstance(document.value, list) and document.value else document.value
     return isinstance(first, dict) and "shots" in first and "cameras" in first
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
-def from_document(document: Record, path: StrPath, tracks: StrPath | None = None) -> BundleProblem:
-    """As `read_opensfm`, from the contents of its file. Raises ProblemError."""
+def from_document(document: Record, path: StrPath) -> BundleProblem:
+    """The problem of the first reconstruction of a file, which is the largest, and of the tracks beside it.
+
+    `perspective`, `simple_radial` and `radial` cameras are optimised; of `brown`, `fisheye` and `fisheye_opencv` pixels
+    are undistorted once and intrinsics stay. Images share the lens of their camera. Images and tracks that are not
+    reconstructed are ignored; of repeated observations the last one counts.
+
+    Raises:
+        ProblemError: tracks are missing or malformed, a camera model is not one of `MODELS`, or images are of a rig;
+            one line that names the file, the record and the field.
+    """
     if isinstance(document.value, list):
         if not document.value:
             document.fail("holds no reconstruction")
@@ -112,7 +95,7 @@ def from_document(document: Record, path: StrPath, tracks: StrPath | None = None
     points = {key: point.get("coordinates").vector(3) for key, point in document.get("points").entries("point")}
     if not shots or not points:
         document.fail(f"has no {'points' if shots else 'shots'}")
-    seen = _read_tracks(_tracks_beside(path) if tracks is None else tracks, shots, set(points))
+    seen = _read_tracks(_tracks_beside(path), shots, set(points))
     note_unused(path, document.unknown(PARTS) | _unused(document, path) | seen.unused)
     from scipy.spatial.transform import Rotation
 
@@ -161,14 +144,14 @@ def _refuse_rigs(document: Record) -> None:
 
 def _lens(camera: Record) -> ForeignLens:
     """The lens of a camera, in pixels from the corner of the image."""
-    model = camera.get("projection_type").text() if camera.has("projection_type") else "perspective"
+    model = camera.get("projection_type", "perspective").text()
     if model not in MODELS:
         camera.fail(f"has projection_type {model!a}, which is not read; read are {', '.join(MODELS)}")
     width, height = camera.get("width").number(), camera.get("height").number()
     if not min(width, height) > 0:
         camera.fail("has no width and height, so that nothing can be in pixels")
     side = max(width, height)
-    optional = lambda key: camera.get(key).number() if camera.has(key) else 0.0
+    optional = lambda key: camera.get(key, 0.0).number()
     if model in _RADIAL:
         focal = camera.get("focal_x").number(), camera.get("focal_y").number()
         offset = optional("c_x"), optional("c_y")
@@ -190,11 +173,10 @@ def _lens(camera: Record) -> ForeignLens:
 
 
 def _tracks_beside(path: StrPath) -> Path:
-    folder = Path(path).parent
-    for ending in ("", ".gz", ".bz2", ".xz"):
-        if (folder / f"{TRACKS}{ending}").is_file():
-            return folder / f"{TRACKS}{ending}"
-    raise ProblemError(f"{display_name(path)}: there is no {TRACKS} beside it, which has OpenSfM's observations")
+    there = [file for name in TRACKS if (file := Path(path).parent / name).is_file()]
+    if not there:
+        raise ProblemError(f"{display_name(path)}: there is no {TRACKS[0]} beside it, which has OpenSfM's observations")
+    return there[0]
 
 
 def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -> _Observations:
@@ -220,19 +202,10 @@ def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -
         if image not in shots or track not in points:
             continue
         scales.update(words[5:6] if version else ())
-        found[image, track] = (_pixel(words[3], "x", f"{name} line {at}"), _pixel(words[4], "y", f"{name} line {at}"))
+        x, y = finite_numbers([word.strip() for word in words[3:5]], "xy", f"{name} line {at}")
+        found[image, track] = x, y
     if not found:
         raise ProblemError(f"{name}: no image of the reconstruction sees a point of it")
     images, tracks = zip(*found, strict=True)
     unused = {"scales of key-points": len(found)} if len(scales) > 1 else {}  # OpenSfM divides residuals by them
     return _Observations(list(images), list(tracks), list(found.values()), unused)
-
-
-def _pixel(word: str, field: str, where: str) -> float:
-    try:
-        found = number(word.strip())
-    except ValueError:
-        raise ProblemError(f"{where}: {word[:40]!a} is not a number ({field})") from None
-    if not np.isfinite(found):
-        raise ProblemError(f"{where}: {word[:40]!a} is not a finite number ({field})")
-    return found

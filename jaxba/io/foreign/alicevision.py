@@ -10,12 +10,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from jaxba.io.distortion import Distortion
 from jaxba.io.files import StrPath
-from jaxba.io.foreign import FIXED, ForeignLens
-from jaxba.io.json_records import Record, read_json
-from jaxba.io.remarks import note, note_unused
-from jaxba.io.sfm_data import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.io.foreign.cameras import FIXED, ForeignLens
+from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.foreign.json_records import Record
+from jaxba.io.foreign.views import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.io.notes import note, note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
 DISTORTIONS = {
@@ -42,24 +42,7 @@ LOCKS = ("scaleLocked", "offsetLocked", "distortionLocked")
 _PROGRAM = "AliceVision"
 
 
-def read_alicevision(path: StrPath) -> BundleProblem:
-    """Reads a scene of AliceVision.
-
-    Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. Intrinsics without
-    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Of the others
-    in `DISTORTIONS` pixels are undistorted once and intrinsics stay.
-
-    Args:
-        path: the file, plain or compressed.
-
-    Raises:
-        ProblemError: the file cannot be read, lacks a part, names a model that is not in `DISTORTIONS`, or views are of
-            a rig; one line that names the file, the record and the field.
-    """
-    return from_document(read_json(path), path)
-
-
-def is_alicevision(document: Record) -> bool:
+def recognises(document: Record) -> bool:
     """Whether a JSON document is of AliceVision."""
     return (
         isinstance(document.value, dict)
@@ -69,14 +52,24 @@ def is_alicevision(document: Record) -> bool:
 
 
 def from_document(document: Record, path: StrPath) -> BundleProblem:
-    """As `read_alicevision`, from the contents of its file. Raises ProblemError."""
+    """The problem of a scene of AliceVision.
+
+    Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. Intrinsics without
+    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Of the others
+    in `DISTORTIONS` pixels are undistorted once and intrinsics stay.
+
+    Raises:
+        ProblemError: the file lacks a part, names a model that is not in `DISTORTIONS`, or views are of a rig; one line
+            that names the file, the record and the field.
+    """
     version = tuple(row.integer() for row in document.get("version").rows())
     views = {}
     for number, value in _numbered(part(document, "views", _PROGRAM), "viewId", "view"):
-        independent = value.get("isPoseIndependant").flag() if value.has("isPoseIndependant") else True
-        if _number(value, "rigId") >= 0 and _number(value, "rigId") != UNDEFINED and not independent:
+        independent = value.get("isPoseIndependant", True).flag()
+        rig, pose, intrinsic = (value.get(key, UNDEFINED).integer() for key in ("rigId", "poseId", "intrinsicId"))
+        if rig >= 0 and rig != UNDEFINED and not independent:
             value.fail("is of a rig of several cameras, whose poses depend on it; rigs are not read")
-        views[number] = View(_number(value, "poseId"), _number(value, "intrinsicId"))
+        views[number] = View(pose, intrinsic)
     intrinsics = dict(_numbered(part(document, "intrinsics", _PROGRAM), "intrinsicId", "intrinsic"))
     poses, locked = {}, 0
     for number, value in _numbered(part(document, "poses", _PROGRAM), "poseId", "pose"):
@@ -84,13 +77,13 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         inside = pose.get("transform") if pose.has("transform") else pose
         rotation = np.array(inside.get("rotation").vector(9)).reshape(3, 3).T
         poses[number] = checked_pose(value, rotation, inside.get("center").vector(3))
-        locked += pose.get("locked").flag() if pose.has("locked") else False
+        locked += pose.get("locked", False).flag()
     if locked:
         note(path, f"{locked} of {len(poses)} poses are locked in the file, but are optimised here")
     landmarks = list(_landmarks(part(document, "structure", _PROGRAM)))
     unused = document.unknown(PARTS)
     for lock in LOCKS:
-        unused[lock] = sum(one.has(lock) and one.get(lock).flag() for one in intrinsics.values())
+        unused[lock] = sum(one.get(lock, False).flag() for one in intrinsics.values())
     scales = [scale for _, of_landmark in landmarks for scale in of_landmark]
     if len(set(scales)) > 1:  # AliceVision divides residuals by them
         unused["scales of key-points"] = len(scales)
@@ -105,15 +98,11 @@ def _numbered(record: Record, key: str, what: str) -> Iterator[tuple[int, Record
         yield number, row.called(f"{what} {number}")
 
 
-def _number(record: Record, key: str) -> int:
-    return record.get(key).integer() if record.has(key) else UNDEFINED
-
-
 def _lens(value: Record, version: tuple[int, ...]) -> ForeignLens:
     """The lens of an intrinsic in pixels from the corner of the image, whatever the version of the file."""
     kind = value.get("type").text()
-    model = value.get("distortionType").text() if kind == "pinhole" and value.has("distortionType") else kind
-    undistortion = value.get("undistortionType").text() if value.has("undistortionType") else "none"
+    model = value.get("distortionType", kind).text() if kind == "pinhole" else kind
+    undistortion = value.get("undistortionType", "none").text()
     for name in (model, undistortion if undistortion != "none" else model):
         if name not in DISTORTIONS:
             value.fail(f"is of the model {name!a}, which is not read; read are {', '.join(DISTORTIONS)}")
@@ -124,12 +113,8 @@ def _lens(value: Record, version: tuple[int, ...]) -> ForeignLens:
     x, y = value.get("principalPoint").vector(2)
     if version >= (1, 2, 1):
         x, y = x + width / 2, y + height / 2
-    fisheye = model == "fisheye4"
-    distortion = Distortion(
-        tuple(numbers if fisheye else numbers[:3]), (numbers[3], numbers[4]) if count == 5 else (0.0, 0.0), fisheye
-    )
-    stays = value.has("locked") and value.get("locked").flag()
-    free = FIXED if stays else (True, count > 0, count > 1)
+    distortion = Distortion.of(numbers, model == "fisheye4")
+    free = FIXED if value.get("locked", False).flag() else (True, count > 0, count > 1)
     return ForeignLens(value.where, _focal(value, version, width), (x, y), distortion, free, (width, height))
 
 
@@ -141,8 +126,7 @@ def _focal(value: Record, version: tuple[int, ...], width: float) -> tuple[float
     if version < (1, 2, 2):
         x, y = value.get("pxFocalLength").vector(2)
         return x, y
-    sensor = value.get("sensorWidth").number() if value.has("sensorWidth") else SENSOR_WIDTH
-    ratio = value.get("pixelRatio").number() if value.has("pixelRatio") else 1.0
+    sensor, ratio = value.get("sensorWidth", SENSOR_WIDTH).number(), value.get("pixelRatio", 1.0).number()
     if not (sensor > 0 and ratio > 0):
         value.fail("has a sensorWidth or pixelRatio that is not positive")
     focal = value.get("focalLength").number() / sensor * width

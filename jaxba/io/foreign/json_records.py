@@ -44,8 +44,10 @@ class Record:
         """Whether this is an object with a key whose value is not null."""
         return isinstance(self.value, dict) and self.value.get(key) is not None
 
-    def get(self, key: str) -> Record:
-        """The value of a key, which must be there. Raises ProblemError."""
+    def get(self, key: str, default: Any = None) -> Record:
+        """The value of a key; where it is not there or null, the default if there is one. Raises ProblemError."""
+        if default is not None and not self.has(key):
+            return Record(default, self.name, self.where)
         if not isinstance(self.value, dict):
             self.fail(f"must be an object with {key}, is {_shown(self.value)}")
         if key not in self.value:

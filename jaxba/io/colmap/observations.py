@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
-from jaxba.io.colmap.records import KEY, NO_POINT, Image, Model
-from jaxba.io.colmap.wording import note
+from jaxba.io.colmap.model import KEY, NO_POINT, Image, Model
+from jaxba.io.notes import counted
 
 
 class Ordered(NamedTuple):
@@ -146,7 +146,7 @@ def _track_notes(
         (np.flatnonzero(absent), f"left out, of an image that {images} does not have"),
         (repeated, "left out, there twice"),
     )
-    return [line for at, what in found for line in note(model.file("points3D"), at, "track element", what, name)]
+    return [line for at, what in found for line in counted(model.file("points3D"), at, "track element", what, name)]
 
 
 def _key_notes(table: Ordered, untracked: Views, lost: Views) -> list[str]:
@@ -158,9 +158,9 @@ def _key_notes(table: Ordered, untracked: Views, lost: Views) -> list[str]:
     in_no_track = f"left out, in no track of {points}"
     no_point = f"left out, of a point that {points} does not have"
     return [
-        *note(points, np.unique(untracked.point), "point", believed, table.point_name),
-        *note(model.file("images"), lost.key, "key-point", in_no_track, name),
-        *note(model.file("images"), dangling, "key-point", no_point, name),
+        *counted(points, np.unique(untracked.point), "point", believed, table.point_name),
+        *counted(model.file("images"), lost.key, "key-point", in_no_track, name),
+        *counted(model.file("images"), dangling, "key-point", no_point, name),
     ]
 
 

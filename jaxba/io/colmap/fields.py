@@ -1,0 +1,133 @@
+"""The fields of a COLMAP model's records, from which its text and its binary files are read and written.
+
+Both forms have the same fields in the same order. Source: COLMAP, doc/format.rst, and src/colmap/scene/
+reconstruction_io_binary.cc and reconstruction_io_text.cc.
+"""
+
+from __future__ import annotations
+
+import struct
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+from jaxba.io.colmap.model import CAMERA_MODELS, SENSORS, Camera, Frame, Image, Rig, Sensor
+from jaxba.io.colmap.poses import pose_of
+
+
+class Kinds(NamedTuple):
+    """A field that is a word in text and its number in a binary file."""
+
+    numbers: Mapping[str, int]
+    unknown_word: str
+    """What a message says of another word."""
+
+    unknown_number: str
+    """And of another number, after the name of the record."""
+
+
+class Fields:
+    """Fields that follow one another."""
+
+    def __init__(self, names: str, codes: str, kinds: Kinds | None = None, largest: int | None = None):
+        """Names are separated by commas; codes are those of `struct`, of which `i` is one of the `kinds`; `largest` is
+        that of integers in text, where it is not their type's."""
+        self.names, self.codes, self.kinds, self.largest = names.split(", "), codes, kinds, largest
+        self.struct = struct.Struct(f"<{codes}")
+
+
+class Source(ABC):
+    """A file in one of the two forms. Methods raise ProblemError."""
+
+    @abstractmethod
+    def take(self, fields: Fields, what: str = "") -> tuple[Any, ...]:
+        """The next values; with `what` they are all that is left of a record, and this is what it is called."""
+
+    @abstractmethod
+    def count(self, field: str, each: Fields) -> int:
+        """The next value as the number of records that follow."""
+
+
+_POSE_NAMES = "qw, qx, qy, qz, tx, ty, tz"
+_MODELS = {name: model.number for name, model in CAMERA_MODELS.items()}
+_NAMES = {number: name for name, number in _MODELS.items()}
+
+CAMERA = Fields(
+    "CAMERA_ID, model, width, height",
+    "IiQQ",
+    Kinds(_MODELS, "is an unknown camera model", " has an unknown model, number {}"),
+)
+PARAMETERS = {
+    name: Fields(", ".join(f"parameter {k + 1}" for k in range(model.size)), model.size * "d")
+    for name, model in CAMERA_MODELS.items()
+}
+POSE = Fields(_POSE_NAMES, 7 * "d")
+IMAGE = Fields(f"IMAGE_ID, {_POSE_NAMES}, CAMERA_ID", f"I{7 * 'd'}I")
+POINT = Fields("POINT3D_ID, x, y, z, red, green, blue, error", "QdddBBBd")
+COUNT = Fields("number of what follows", "I")
+RIG = Fields("RIG_ID", "I")
+SENSOR = Fields(
+    "type of a sensor, id of a sensor",
+    "iI",
+    Kinds(SENSORS, "is no type of sensors", ": {} is the number of no type of sensors"),
+)
+PLACED = Fields("whether there is a pose", "B", largest=1)
+FRAME = Fields(f"FRAME_ID, RIG_ID, {_POSE_NAMES}", f"II{7 * 'd'}")
+DATUM = Fields("type of a sensor, id of a sensor, id of a datum", "iIQ", SENSOR.kinds)
+
+
+def _read_camera(file: Source) -> Camera:
+    identity, number, width, height = file.take(CAMERA)
+    return Camera(identity, _NAMES[number], width, height, file.take(PARAMETERS[_NAMES[number]], _NAMES[number]))
+
+
+def _read_rig(file: Source) -> Rig:
+    (identity,) = file.take(RIG)
+    sensors = []
+    for number in range(file.count("number of sensors", SENSOR)):
+        kind, sensor = file.take(SENSOR)
+        placed = number and any(file.take(PLACED))
+        sensors.append(Sensor(kind, sensor, pose_of(file.take(POSE)) if placed else None))
+    return Rig(identity, tuple(sensors))
+
+
+def _read_frame(file: Source) -> Frame:
+    identity, rig, *pose = file.take(FRAME)
+    return Frame(
+        identity, rig, pose_of(pose), tuple(file.take(DATUM) for _ in range(file.count("number of data", DATUM)))
+    )
+
+
+READERS: dict[str, tuple[Fields, Callable[[Any], Any]]] = {
+    "cameras": (CAMERA, _read_camera),
+    "rigs": (RIG, _read_rig),
+    "frames": (FRAME, _read_frame),
+}
+"""Of each file of records that are read alike in both forms: the fields with which one begins, and what reads it."""
+
+Values = Iterator[tuple[Fields, tuple[Any, ...]]]
+"""Fields and their values, one group after the other."""
+
+
+def values(record: Camera | Image | Rig | Frame) -> Values:
+    """The values of a record; those of an image without its name and key-points."""
+    match record:
+        case Camera():
+            yield CAMERA, (record.id, _MODELS[record.model], record.width, record.height)
+            yield PARAMETERS[record.model], record.params
+        case Image():
+            yield IMAGE, (record.id, *record.pose.numbers, record.camera)
+        case Rig():
+            yield RIG, (record.id,)
+            yield COUNT, (len(record.sensors),)
+            for number, one in enumerate(record.sensors):
+                yield SENSOR, (one.type, one.id)
+                if number:
+                    yield PLACED, (int(one.from_rig is not None),)
+                if number and one.from_rig is not None:
+                    yield POSE, one.from_rig.numbers
+        case Frame():
+            yield FRAME, (record.id, record.rig, *record.pose.numbers)
+            yield COUNT, (len(record.data),)
+            for datum in record.data:
+                yield DATUM, datum

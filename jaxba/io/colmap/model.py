@@ -1,0 +1,259 @@
+"""What the files of a COLMAP model hold, with the model's own ids and names, and the checks of its structure.
+
+Source: COLMAP, doc/format.rst and doc/cameras.rst; numbers of models and sensors as in COLMAP 4.2.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+from jaxtyping import Shaped
+
+from jaxba.io.colmap.poses import Pose
+from jaxba.io.files import display_name
+from jaxba.problem import camera_models
+from jaxba.problem.bundle_problem import ProblemError
+
+PARTS = ("cameras", "images", "points3D")
+"""Files that every model has."""
+
+RIG_PARTS = ("rigs", "frames")
+"""Files that models have since COLMAP 3.12, both or none."""
+
+
+_LONGEST_NAME = 60  # of an image in messages
+
+
+class CameraModel(NamedTuple):
+    """A kind of lens."""
+
+    number: int  # in a binary file
+    size: int  # number of parameters
+    focals: int  # how many of them, from the first, are focal lengths
+
+
+_NUMBERED = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+    *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
+)
+CAMERA_MODELS = {
+    name: CameraModel(number, len(camera_models.CAMERA_MODELS[name]), len(camera_models.CAMERA_MODELS[name].focal))
+    for number, name in enumerate(_NUMBERED)
+}
+"""All camera models by name. The principal point follows the focal lengths, if there are any."""
+
+NO_ID = 2**32 - 1
+"""COLMAP's id of no camera, image, rig or frame, and its index of no key-point."""
+
+NO_POINT = 2**64 - 1
+"""COLMAP's id of no point; -1 in a text file."""
+
+CAMERA_SENSOR = 0
+"""Number of the sensor type of cameras."""
+
+SENSORS = {"CAMERA": CAMERA_SENSOR, "IMU": 1}
+"""Numbers of sensor types by name."""
+
+KEY = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+"""A key-point: pixels, and the id of its point or `NO_POINT`."""
+
+POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")],
+)
+"""A point, with the number of elements of its track. As in a binary file, where the track follows."""
+
+TRACK = np.dtype([("image", "<u4"), ("key", "<u4")])
+"""An element of a track: id of an image, and index of one of its key-points."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A lens, which images share."""
+
+    id: int
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Its pixel; not of a model without focal lengths."""
+        at = CAMERA_MODELS[self.model].focals
+        return self.params[at], self.params[at + 1]
+
+    @property
+    def possible(self) -> bool:
+        """Whether all parameters are finite and focal lengths positive."""
+        return bool(np.isfinite(self.params).all()) and all(
+            f > 0 for f in self.params[: CAMERA_MODELS[self.model].focals]
+        )
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image, its pose and its key-points."""
+
+    id: int
+    pose: Pose
+    camera: int
+    name: bytes
+    keys: Shaped[np.ndarray, " keys"]
+    """Of type `KEY`."""
+
+    def with_keys(self, keys: Shaped[np.ndarray, " keys"]) -> Image:
+        """The same image with other key-points."""
+        return replace(self, keys=keys)
+
+    def __str__(self) -> str:
+        name = display_name(self.name.decode("utf-8", "backslashreplace"))
+        return f"image {self.id} ({name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME - 3] + '...'})"
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor of a rig."""
+
+    type: int
+    id: int
+    from_rig: Pose | None
+    """None for the reference sensor, or where it is not known."""
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Sensors that move together; the first is the reference, whose pose is that of the rig."""
+
+    id: int
+    sensors: tuple[Sensor, ...]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the sensors of a rig took at one moment, and the pose of the rig."""
+
+    id: int
+    rig: int
+    pose: Pose
+    data: tuple[tuple[int, int, int], ...]
+    """Type and id of the sensor, and id of what it took (of a camera: of the image)."""
+
+    @property
+    def images(self) -> list[tuple[int, int]]:
+        """Ids of camera and image of what cameras took."""
+        return [(sensor, image) for kind, sensor, image in self.data if kind == CAMERA_SENSOR]
+
+
+@dataclass(frozen=True)
+class Points:
+    """All points and their tracks."""
+
+    heads: Shaped[np.ndarray, " points"]
+    """Of type `POINT`."""
+
+    tracks: Shaped[np.ndarray, " elements"]
+    """Of type `TRACK`: those of the first point, then those of the second, and so on."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """A COLMAP model. Records are in the order of the files."""
+
+    folder: str
+    suffix: str
+    """`.bin` or `.txt`."""
+
+    cameras: dict[int, Camera]
+    images: dict[int, Image]
+    points: Points
+    rigs: dict[int, Rig] | None
+    """None in models of COLMAP before 3.12, whose images are all registered."""
+
+    frames: dict[int, Frame] | None
+
+    @property
+    def records(self) -> dict[str, dict[int, Any]]:
+        """Records of each file but that of the points, by their ids."""
+        rigs, frames = self.rigs or {}, self.frames or {}
+        return {"cameras": self.cameras, "images": self.images, "rigs": rigs, "frames": frames}
+
+    @cached_property
+    def frame_of(self) -> dict[int, Frame]:
+        """Frames by the ids of their images."""
+        return {image: frame for frame in (self.frames or {}).values() for _, image in frame.images}
+
+    def file(self, part: str) -> str:
+        """Name of a file for messages."""
+        return file_name(self.folder, part + self.suffix)
+
+
+def file_name(folder: str, file: str) -> str:
+    """Name of a file of a model for messages."""
+    return display_name(os.path.join(folder, file))
+
+
+def check_model(model: Model) -> None:
+    """Refuses a model whose structure is damaged.
+
+    Raises:
+        ProblemError: an id stands for none or is there twice, an image names no camera or a frame no rig, a pose is not
+            finite or has no rotation; one line that names the file and the record.
+    """
+    rigs, frames = model.rigs or {}, model.frames or {}
+    for part, records in model.records.items():
+        if NO_ID in records:
+            _fail(model, part, f"{NO_ID} is the id of no {part[:-1]}")
+    ids, counts = np.unique(model.points.heads["id"], return_counts=True)
+    if (counts > 1).any():
+        _fail(model, "points3D", f"point {ids[counts.argmax()]} is there twice")
+    if len(ids) and ids[-1] == NO_POINT:
+        _fail(model, "points3D", f"{NO_POINT} is the id of no point")
+    for image in model.images.values():
+        if image.camera not in model.cameras:
+            _fail(model, "images", f"{image}: camera {image.camera} is not in {model.file('cameras')}")
+        _check_pose(model, "images", str(image), image.pose)
+    for rig in rigs.values():
+        for sensor in rig.sensors:
+            if sensor.type == CAMERA_SENSOR and sensor.id not in model.cameras:
+                _fail(model, "rigs", f"rig {rig.id}: camera {sensor.id} is not in {model.file('cameras')}")
+            if sensor.from_rig is not None:
+                _check_pose(model, "rigs", f"rig {rig.id}, sensor {sensor.id}", sensor.from_rig)
+    _check_frames(model, rigs, frames)
+
+
+def _check_frames(model: Model, rigs: dict[int, Rig], frames: dict[int, Frame]) -> None:
+    sensors = {rig.id: {(sensor.type, sensor.id) for sensor in rig.sensors} for rig in rigs.values()}
+    for frame in frames.values():
+        if frame.rig not in rigs:
+            _fail(model, "frames", f"frame {frame.id}: rig {frame.rig} is not in {model.file('rigs')}")
+        for kind, sensor, datum in frame.data:
+            if (kind, sensor) not in sensors[frame.rig]:
+                _fail(model, "frames", f"frame {frame.id}: rig {frame.rig} has no sensor {sensor} of datum {datum}")
+        for camera, identity in frame.images:
+            image = model.images.get(identity)
+            if image is not None and image.camera != camera:
+                _fail(model, "frames", f"frame {frame.id}: {image} is of camera {image.camera}, not {camera}")
+        seen = [str(model.images[image]) for _, image in frame.images[:1] if image in model.images]
+        _check_pose(model, "frames", " of ".join([f"frame {frame.id}", *seen]), frame.pose)
+    ids = sorted(image for frame in frames.values() for _, image in frame.images)
+    twice = next((one for one, other in pairwise(ids) if one == other), None)
+    if twice is not None:
+        _fail(model, "frames", f"image {twice} is in two frames")
+
+
+def _check_pose(model: Model, part: str, record: str, pose: Pose) -> None:
+    for field, values in (("qvec", pose.qvec), ("tvec", pose.tvec)):
+        if not np.isfinite(values).all():
+            _fail(model, part, f"{record}: {field} is not finite: {' '.join(f'{value:g}' for value in values)}")
+    if not any(pose.qvec):
+        _fail(model, part, f"{record}: qvec is zero, which is no rotation")
+
+
+def _fail(model: Model, part: str, complaint: str) -> NoReturn:
+    raise ProblemError(f"{model.file(part)}: {complaint}")
