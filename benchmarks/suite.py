@@ -314,8 +314,9 @@ def main() -> int:
     parser.add_argument("--update-baseline", action="store_true")
     parser.add_argument("--out", default="", help="output file of the metrics as JSON")
     args = parser.parse_args()
-    from jaxba.bench.run import machine, threads
+    from jaxba.bench.run import machine
     from jaxba.runtime import process
+    from jaxba.runtime.process import threads
 
     process.keep_memory()
     solvers = args.solvers.split(",")

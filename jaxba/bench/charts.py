@@ -13,7 +13,7 @@ from jaxba.bench.levels import levels, merged, representatives, time_is_log
 from jaxba.bench.page import SYMBOLS, Chart, line
 from jaxba.bench.plots import LABEL_DISTANCE, Style, solver_styles
 from jaxba.bench.profile import Target
-from jaxba.bench.records import Record
+from jaxba.solver.record import Record
 
 AXES = ("iterations", "time")
 """Positions of the switch."""

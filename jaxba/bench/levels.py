@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from jaxba.bench import profile
-from jaxba.bench.records import Record
+from jaxba.solver.record import Record
 
 CLIPPING = 1e3
 """A convergence plot reaches below the lowest tolerance line by this factor."""

@@ -26,8 +26,8 @@ from matplotlib.ticker import AutoLocator, FuncFormatter, LogLocator, MaxNLocato
 from jaxba.bench import profile
 from jaxba.bench.levels import levels, merged, representatives, time_is_log
 from jaxba.bench.profile import Target
-from jaxba.bench.records import Record, TracePoint
 from jaxba.solver.figure import COLOURS
+from jaxba.solver.record import Record, TracePoint
 
 LINES = ("-", (0, (6, 1.5)), (0, (6, 1.5, 1, 1.5)), (0, (1.5, 1.2)))
 """Line styles, a different one for each next solver, so that curves can be told apart in black and white."""

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from jaxba.bench.records import Record
+from jaxba.solver.record import Record
 
 ITERATION_LIMIT = 100
 """A solve that has not converged within this many iterations is a failure. Source: the paper."""

@@ -10,11 +10,11 @@ from typing import Any
 
 from jaxba.bench import charts, page, plots, profile
 from jaxba.bench.profile import RELATIVE_TOLERANCES, Target
-from jaxba.bench.records import Record
 from jaxba.bench.summary import Summary, summarize, write_summary
 from jaxba.bench.tables import Table, tables
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import write_text
+from jaxba.solver.record import Record
 
 
 def write_all(

@@ -15,9 +15,9 @@ from typing import Any
 import jax
 
 import jaxba
-from jaxba.bench.records import Record, TracePoint, append_record, read_records
 from jaxba.bench.sources import SCENE_PREFIX, Source
 from jaxba.damping.registry import SUFFIX
+from jaxba.io import json_lines
 from jaxba.io.files import visible
 from jaxba.lm.termination import Tolerances
 from jaxba.methods.registry import DEFAULT_METHOD
@@ -25,11 +25,12 @@ from jaxba.peers import require
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text
-from jaxba.runtime.process import out_of_memory
+from jaxba.runtime.process import out_of_memory, threads
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import SolverName, SolverNameError, parse_solver
 from jaxba.solver.options import MAX_ITERATIONS
-from jaxba.solver.solve import Solution, solve
+from jaxba.solver.record import Record, record_of
+from jaxba.solver.solve import solve
 
 try:
     import fcntl
@@ -140,55 +141,6 @@ def _run_peer(
     return replace(record, backend=backend(mode), device="cpu: host")
 
 
-def record_of(
-    solution: Solution, steps: Sequence[IterationRecord], *, name: str, family: str, solver: SolverName, repeat: int = 0
-) -> Record:
-    """The record of a solution and its iterations."""
-    trace = [TracePoint(0, 0.0, solution.initial_cost, float("nan"), True, 0, float("nan"))]
-    for item in steps:
-        step = item.step
-        trace.append(
-            TracePoint(
-                iteration=item.iteration,
-                time_s=item.time_s,
-                cost=float(step.cost),
-                damping=float(step.damping),
-                accepted=bool(step.accepted),
-                cg_iterations=int(step.cg_iterations),
-                gain_ratio=float(step.gain_ratio),
-            )
-        )
-    device = jax.devices()[0]
-    return Record(
-        problem=name,
-        family=family,
-        cameras=solution.problem.num_cameras,
-        points=solution.problem.num_points,
-        observations=solution.problem.num_observations,
-        solver=str(solver),
-        backend=f"jaxba {jaxba.__version__} ({solution.linear_solver})",
-        device=f"{device.platform}: {device.device_kind}",
-        dtype=solver.dtype,
-        threads=threads(),
-        repeat=repeat,
-        setup_s=solution.setup_s,
-        compile_s=solution.compile_s,
-        total_s=solution.total_s,
-        initial_cost=solution.initial_cost,
-        final_cost=solution.final_cost,
-        iterations=solution.iterations,
-        accepted=solution.accepted,
-        cg_iterations=int(solution.history.cg_iterations.sum()),
-        termination=solution.termination.name.lower(),
-        trace=tuple(trace),
-    )
-
-
-def threads() -> int:
-    """Number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
-
-
 def machine() -> dict[str, str]:
     """Device, processor and versions, for a report."""
     device = jax.devices()[0]
@@ -289,7 +241,7 @@ def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> lis
 
 def _results(path: Path) -> list[Record]:
     first: dict[tuple[str, str, int], Record] = {}
-    for record in read_records(path) if path.exists() else []:
+    for record in json_lines.read(path, Record) if path.exists() else []:
         first.setdefault((record.problem, record.solver, record.repeat), record)  # a run may have been done twice
     return list(first.values())
 
@@ -362,5 +314,5 @@ def execute(
                 raise
             on_error(job, ProblemError(f"{job.source.name}, {job.solver}: not enough memory"))
             continue
-        append_record(folder / RESULTS, record)
+        json_lines.append(folder / RESULTS, record)
         yield record

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from jaxba.datasets.bal.paths import resolve
@@ -12,31 +12,13 @@ from jaxba.io.files import display_name, strip_compression
 from jaxba.io.formats import by_ending, holds_problem
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import set_aside, without_views_of
-from jaxba.scenes import SceneConfig, random_scene, scene_like
+from jaxba.scenes import DEFAULT_SCENES, random_scene, scene_like
 
 SCENE_PREFIX = "scene:"
 """Prefix of a random scene: `scene:NAME` or `scene:NAME:SEED`."""
 
 _GENERIC_FOLDER = re.compile(r"sparse|model|\d+", re.IGNORECASE)
 """Folder names that do not identify a COLMAP model."""
-
-
-def _far(config: SceneConfig) -> SceneConfig:
-    """The scene with a start that is five to ten times as far away as usual."""
-    return replace(config, start_rotation=0.01, start_center=0.1, start_point=0.03, start_focal=0.03)
-
-
-DEFAULT_SCENES: dict[str, SceneConfig] = {
-    "street-40": SceneConfig(cameras=40, points=4000, mean_track=4.5),
-    "street-20-drift": SceneConfig(cameras=20, points=2500, mean_track=4.5, start_drift=0.003),
-    "street-24-outliers": SceneConfig(cameras=24, points=2500, mean_track=4.5, outlier_share=0.02),
-    "lateral-30": SceneConfig(cameras=30, points=3000, mean_track=4.5, trajectory="lateral"),
-    "photos-24": SceneConfig(cameras=24, points=3000, mean_track=4.0, trajectory="photos"),
-    "photos-14-far": _far(SceneConfig(cameras=14, points=2500, mean_track=4.0, trajectory="photos")),
-    "orbit-16-noisy": SceneConfig(cameras=16, points=1500, mean_track=5.0, trajectory="orbit", noise=2.0),
-    "orbit-12-far": _far(SceneConfig(cameras=12, points=1500, mean_track=5.0, trajectory="orbit")),
-}
-"""Random scenes of the benchmark that runs if no problem is given."""
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from typing import Any
 
 from jaxba.bench import profile
 from jaxba.bench.profile import NEVER, Reach, Target
-from jaxba.bench.records import Record
 from jaxba.bench.virtual import best_reach, rules_of_one_step
 from jaxba.runtime.atomic import write_text
+from jaxba.solver.record import Record
 
 YARDSTICKS = ("classic", "ceres")
 """Solvers that all others are compared with: the baseline of the paper, and the rule of the most used library."""
@@ -235,6 +235,8 @@ def _solver(
     own = [cell for cell in cells if cell.solver == solver]
     runs = [r for r in records if r.solver == solver]
     yardsticks = [y for y in YARDSTICKS if y != solver and any(cell.solver == y for cell in cells)]
+    by_pair = {(cell.solver, cell.problem): cell.reach for cell in cells}
+    reaches = lambda who, key: [by_pair[who, name][key] if (who, name) in by_pair else NEVER for name in names]
     iterations = sum(r.iterations for r in runs)
     points = [point for r in runs for point in r.trace[1:]]
     failures = sum(not p.accepted and not math.isfinite(p.gain_ratio) for p in points)
@@ -244,7 +246,7 @@ def _solver(
         run=len(own),
         total=len(names),
         targets={t.key: _target([cell.reach[t.key] for cell in own], len(names)) for t in targets},
-        against={y: {t.key: _compare(cells, solver, y, t.key, names) for t in targets} for y in yardsticks},
+        against={y: {t.key: compare(reaches(solver, t.key), reaches(y, t.key)) for t in targets} for y in yardsticks},
         final_ratio_worst=max(cell.final_ratio for cell in own),
         final_ratio_mean=geometric_mean(cell.final_ratio for cell in own),
         rejected_share=(iterations - sum(r.accepted for r in runs)) / iterations if iterations else math.nan,
@@ -276,14 +278,13 @@ def _target(own: Sequence[Reach], total: int) -> TargetSummary:
     )
 
 
-def _compare(cells: Sequence[Cell], solver: str, yardstick: str, key: str, names: Sequence[str]) -> Comparison:
-    reaches = {(cell.problem, cell.solver): cell.reach[key] for cell in cells}
-    pairs = [(reaches.get((name, solver), NEVER), reaches.get((name, yardstick), NEVER)) for name in names]
-    both = [(a, b) for a, b in pairs if math.isfinite(a.iterations) and math.isfinite(b.iterations)]
-    ours, theirs = (sum(math.isfinite(pair[side].iterations) for pair in pairs) - len(both) for side in (0, 1))
+def compare(ours: Sequence[Reach], theirs: Sequence[Reach]) -> Comparison:
+    """A solver compared with a yardstick, problem by problem."""
+    ran = [(math.isfinite(a.iterations), math.isfinite(b.iterations)) for a, b in zip(ours, theirs, strict=True)]
+    both = [(a, b) for a, b, reached in zip(ours, theirs, ran, strict=True) if all(reached)]
     iterations = geometric_mean(max(a.iterations, 1.0) / max(b.iterations, 1.0) for a, b in both)
     seconds = geometric_mean(max(a.seconds, SHORTEST_TIME) / max(b.seconds, SHORTEST_TIME) for a, b in both)
-    return Comparison(len(both), ours, theirs, iterations, seconds)
+    return Comparison(len(both), ran.count((True, False)), ran.count((False, True)), iterations, seconds)
 
 
 def _coverage_warnings(cells: Sequence[Cell], solvers: Sequence[str], names: Sequence[str]) -> list[str]:

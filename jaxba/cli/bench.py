@@ -17,7 +17,7 @@ from jaxba.cli import common
 from jaxba.problem.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "guarded,learned,bold,classic,ceres,ceres+refine3,ceres+embedded"
-"""The shipped policy, its twin without a network, the paper's baseline, and Ceres' rule alone and with embedded
+"""The default policy, the other two that ship, the paper's rule, and Ceres' rule with and without embedded
 iterations."""
 
 FILE_WIDTH = 180
@@ -36,16 +36,16 @@ class Arguments:
 
     problems: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Files, downloaded BAL problems such as ladybug-49 (see jaxba-data), or random scenes such as scene:ladybug-49 or
-    scene:tiny:7. Default: the problems of the suite, or four random scenes."""
+    scene:tiny:7. Default: the problems of the suite, or eight random scenes."""
 
     suite: str | None = None
     """A suite (methods, real, rules, synthetic), or the path of a YAML file with any of: problems (names or paths, in
     which wildcards and $VARIABLES are expanded), solvers, tolerance, repeats, max_iterations."""
 
-    solvers: str | None = None
+    solvers: Annotated[str | None, tyro.conf.arg(help_behavior_hint=f"(default: {DEFAULT_SOLVERS})")] = None
     """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], or, with the extra `ceres`,
-    pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default:
-    learned,bold,classic,ceres,ceres+refine3,ceres+embedded."""
+    pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default: the
+    default policy, the other two that ship, the paper's rule, and Ceres' rule with and without embedded iterations."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default: 1e-3."""
@@ -121,9 +121,9 @@ def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, stric
     from rich.console import Console
 
     from jaxba.bench import report, run
-    from jaxba.bench.records import Record
     from jaxba.bench.summary import summarize
     from jaxba.bench.tables import print_summary
+    from jaxba.solver.record import Record
 
     done = run.open_folder(folder, settings, jobs)
     common.prepare_process()

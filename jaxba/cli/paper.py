@@ -42,7 +42,8 @@ class Arguments:
     second run with the same folder computes only what is missing."""
 
     report: str | None = None
-    """Markdown file of the report; figures go into a folder of the same name beside it. Default: OUT/paper.md."""
+    """Markdown file of the report; figures go into a folder of the same name beside it. Default: OUT/paper.md. The
+    table of claims alone is OUT/claims.md."""
 
 
 def main() -> None:
@@ -61,6 +62,7 @@ def _paper(args: Arguments) -> int:
 
     from jaxba.cli.overwriting import check_apart
     from jaxba.paper import config as configs
+    from jaxba.paper.report import CLAIMS
     from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
     from jaxba.settings import SettingsError
     from jaxba.settings.configurations import find
@@ -83,7 +85,10 @@ def _paper(args: Arguments) -> int:
     stem = Path(name).stem
     folder = Path(args.out or Path("runs") / ("paper" if stem == FULL else f"paper-{stem}"))
     report = Path(args.report or folder / REPORT)
-    check_apart({"--report": [report], "--out": [folder / TIMES]}, {"the file of --config": [find("paper", name)]})
+    check_apart(
+        {"--report": [report], "--out": [folder / TIMES, folder / CLAIMS]},
+        {"the file of --config": [find("paper", name)]},
+    )
     _open(folder, config)
     common.check_writable("--report", str(report))
     common.prepare_process()
@@ -151,7 +156,7 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
         listed = {name: seconds[name] for name in TABLES_AND_FIGURES if name in seconds}
         files = write(runner, sections, report, _command(args), listed)
     console.print(
-        f"wrote {report} and {len(files) - 1} figures; {sum(wall for wall, _ in seconds.values()):.0f} s of work in "
+        f"wrote {report}, {files[1]} and {len(files) - 2} figures; {sum(wall for wall, _ in seconds.values()):.0f} s of work in "
         f"{folder}"
     )
     return status

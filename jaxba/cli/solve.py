@@ -40,6 +40,7 @@ from jaxba.problem.options import (
     Scaling,
 )
 from jaxba.runtime.compilation import Compilation
+from jaxba.scenes import DEFAULT_SCENES, random_scene
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.covariance import covariance
@@ -57,8 +58,8 @@ STREAM = "-"
 _STDOUT = 1
 """File descriptor of standard output."""
 
-DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
-"""Description of the scene that is solved if no problem is given."""
+DEFAULT_SCENE = next(iter(DEFAULT_SCENES))
+"""Name of the scene that is solved if no problem is given."""
 
 OPTION_OF_FIELD = {"points": "refine_points", "scale": "loss_scale"}
 """Fields of options whose command-line option has another name."""
@@ -313,7 +314,7 @@ def _solve(args: Arguments) -> int:
     policy, options = solve_options(args)
     path, problem = _in_all_processes(args) if _is_divided(args) else _checked(args)
     common.prepare_process(untraced=not _is_divided(args))
-    name = DEFAULT_SCENE if args.problem is None else path if args.problem == STREAM else args.problem
+    name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     watching = Watching.of(problem, path, args.record is not None, args.view)
@@ -329,12 +330,12 @@ def _solve(args: Arguments) -> int:
             solved = hold(solved, lenses="all")
         _write_covariance(args.covariance, solved, options.loss)
     if args.log:
-        from jaxba.bench.records import record_to_json
-        from jaxba.bench.run import record_of
+        from jaxba.io import json_lines
+        from jaxba.solver.record import record_of
 
         record = record_of(solution, steps, name=name, family="", solver=solver_name(args))
         with open_output(args.log) as file:
-            file.write(json.dumps(record_to_json(record), allow_nan=False).encode() + b"\n")
+            file.write(json.dumps(json_lines.plain(record), allow_nan=False).encode() + b"\n")
         common.print_line(f"wrote {args.log}")
     if watching:
         watching.end(args.record)
@@ -402,9 +403,7 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
 
 
 def _default_scene() -> BundleProblem:
-    from jaxba.bench.sources import default_sources
-
-    return default_sources()[0].read()
+    return random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0)
 
 
 def _iterate(

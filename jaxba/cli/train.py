@@ -13,7 +13,7 @@ import tyro
 
 from jaxba.cli import common, processes
 from jaxba.cli.interrupt import Interrupt
-from jaxba.cli.training_view import TrainingView
+from jaxba.training.view import TrainingView
 
 if TYPE_CHECKING:
     from jaxba.bench.tables import Table
@@ -267,10 +267,9 @@ def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -
 def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: TrainingView, command: str) -> int:
     """Writes the policies, the learning curve and the page, and prints the comparison with the rules."""
     from jaxba.bench import run as bench_run
+    from jaxba.bench import training_curve, training_page
     from jaxba.bench.plots import save_figure
     from jaxba.bench.tables import to_rich
-    from jaxba.cli import training_page
-    from jaxba.cli.training_curve import plot_curve
     from jaxba.game.episode import replay
     from jaxba.runtime.atomic import write_text
     from jaxba.training import log
@@ -280,7 +279,7 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
     rules_of_game = work.config.game
     paid = rules_of_game.reward == "price"
     rules = {name: {**one._asdict(), "score": one.price if paid else one.mean} for name, one in work.rules.items()}
-    figure = plot_curve(rows, rules, rules_of_game.tolerance)
+    figure = training_curve.plot_curve(rows, rules, rules_of_game.tolerance)
     files += save_figure(figure, folder / CURVE)
     view.stage("comparing with the rules")
     compared = work.compare([one.actor for one in best])

@@ -7,9 +7,9 @@ or a fraction (all solves succeed). The report states the rules (`CRITERION`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 from jaxba.bench.tables import number
 from jaxba.paper.rows import Row
@@ -64,44 +64,75 @@ class Claim:
     """The same as `ours` in iterations to f*(1+1e-3)."""
 
 
+class Statement(NamedTuple):
+    """A claim before it is tested: the rule, the claim in words, the paper's number, and the methods."""
+
+    test: Callable[..., Claim]
+    """`ratio_claim`, `time_claim`, `order_claim` or `success_claim`."""
+
+    text: str
+    """In words; `{}` stands for the set of problems."""
+
+    paper: Any
+    """The paper's number, as the test takes it."""
+
+    ours: str
+    """Method that the claim is about."""
+
+    base: str = ""
+    """Method that it is compared with; none for `success_claim`."""
+
+
+def judge(statements: Iterable[Statement], row: Callable[[str], Row | None], where: str = "") -> tuple[Claim, ...]:
+    """Tests claims on a set of problems.
+
+    Args:
+        statements: the claims.
+        row: gives the row of a method by name, None if it was not run.
+        where: name of the set.
+    """
+    return tuple(
+        one.test(one.text.format(where), one.paper, *(row(name) for name in (one.ours, one.base) if name))
+        for one in statements
+    )
+
+
 def is_less_successful(one: Row, other: Row) -> bool:
     """Whether a method succeeds so much less often than another one that fewer iterations or seconds are no gain."""
     return one.success < other.success - FRACTION_TOLERANCE
 
 
-def _comparable(one: float, other: float, rows: tuple[Row, Row]) -> bool:
+def _comparable(name: str, one: Row | None, other: Row | None) -> bool:
     """Whether two means are positive numbers, over the same number of problems."""
-    return math.isfinite(one) and math.isfinite(other) and min(one, other) > 0 and rows[0].solves == rows[1].solves
+    if one is None or other is None:
+        return False
+    means = getattr(one, name), getattr(other, name)
+    return all(math.isfinite(mean) and mean > 0 for mean in means) and one.solves == other.solves
 
 
-def ratio_claim(text: str, paper: float, ours: Row | None, base: Row | None) -> Claim:
-    """The claim that `ours` takes the fraction `paper` of the iterations of `base`."""
-    if ours is None or base is None or not _comparable(ours.iterations, base.iterations, (ours, base)):
+def ratio_claim(text: str, paper: float, ours: Row | None, base: Row | None, of: str = "iterations") -> Claim:
+    """The claim that `ours` takes the fraction `paper` of the iterations of `base`, or of its seconds."""
+    if ours is None or base is None or not _comparable(of, ours, base):
         return Claim(text, f"{paper:.2f}", "-", "not run")
-    found = ours.iterations / base.iterations
+    one, other = getattr(ours, of), getattr(base, of)
+    found = one / other
     status: Status = "reproduced" if found <= RATIO_TOLERANCE * paper else "partly" if found <= PARTLY_RATIO else "not"
-    detail = f"{found:.2f} ({ours.iterations:.1f} / {base.iterations:.1f})"
+    parts = f"{one:.1f} / {other:.1f}" if of == "iterations" else f"{number(one)} / {number(other)} s"
+    detail = f"{found:.2f} ({parts})"
     if is_less_successful(ours, base):
         status, detail = "not", f"{detail}, success {100 * ours.success:.0f} % against {100 * base.success:.0f} %"
-    near = f"{ours.near / base.near:.2f} ({ours.near:.1f} / {base.near:.1f})"
+    near = f"{ours.near / base.near:.2f} ({ours.near:.1f} / {base.near:.1f})" if of == "iterations" else "-"
     return Claim(text, f"{paper:.2f}", detail, status, near)
 
 
 def time_claim(text: str, paper: float, ours: Row | None, base: Row | None) -> Claim:
     """The claim that `ours` takes the fraction `paper` of the seconds of `base`, by the rule of `ratio_claim`."""
-    if ours is None or base is None or not _comparable(ours.seconds, base.seconds, (ours, base)):
-        return Claim(text, f"{paper:.2f}", "-", "not run")
-    found = ours.seconds / base.seconds
-    status: Status = "reproduced" if found <= RATIO_TOLERANCE * paper else "partly" if found <= PARTLY_RATIO else "not"
-    detail = f"{found:.2f} ({number(ours.seconds)} / {number(base.seconds)} s)"
-    if is_less_successful(ours, base):
-        status, detail = "not", f"{detail}, success {100 * ours.success:.0f} % against {100 * base.success:.0f} %"
-    return Claim(text, f"{paper:.2f}", detail, status)
+    return ratio_claim(text, paper, ours, base, "seconds")
 
 
 def order_claim(text: str, paper: str, better: Row | None, worse: Row | None) -> Claim:
     """The claim that `better` takes fewer iterations than `worse`."""
-    if better is None or worse is None or not _comparable(better.iterations, worse.iterations, (better, worse)):
+    if better is None or worse is None or not _comparable("iterations", better, worse):
         return Claim(text, paper, "-", "not run")
     clear = better.iterations <= PARTLY_RATIO * worse.iterations
     clear &= better.high < worse.low or not (better.seeds or worse.seeds)
@@ -112,6 +143,11 @@ def order_claim(text: str, paper: str, better: Row | None, worse: Row | None) ->
     if min(better.success, worse.success) < 1:
         detail += f", success {100 * better.success:.0f} % and {100 * worse.success:.0f} %"
     return Claim(text, paper, detail, status, f"{better.near:.1f} against {worse.near:.1f}")
+
+
+def success_claim(text: str, paper: float, ours: Row | None) -> Claim:
+    """The claim that a method succeeds on the fraction `paper` of the problems."""
+    return fraction_claim(text, paper, ours.success if ours else math.nan)
 
 
 def fraction_claim(text: str, paper: float, ours: float) -> Claim:

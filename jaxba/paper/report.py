@@ -15,6 +15,9 @@ from jaxba.paper.runner import Runner
 from jaxba.paper.tables_and_figures import figures
 from jaxba.runtime.atomic import atomic_write, write_text
 
+CLAIMS = "claims.md"
+"""File of the table of claims alone, in the folder of the run."""
+
 BUSY_CORES = 0.9
 """With fewer processor cores in use on average, other programs must have slowed the run down."""
 
@@ -93,7 +96,7 @@ is done here."""
 def write(
     runner: Runner, sections: Sequence[Section], path: Path, command: str, seconds: Mapping[str, tuple[float, float]]
 ) -> list[Path]:
-    """Writes the report, and copies the figures into a folder beside it.
+    """Writes the report and its table of claims, and copies the figures into a folder beside the report.
 
     Args:
         runner: the run, with its settings and results.
@@ -118,47 +121,55 @@ def write(
         with atomic_write(target) as file:
             file.write(source.read_bytes())
         files.append(target)
-    text = _text(runner, sections, command, seconds).replace(f"]({figures.FIGURES}/", f"]({path.stem}/")
-    write_text(path, text)
-    return [path, *files]
+    claims = _claims(runner, sections, command)
+    rest = "\n\n".join(_rest(runner, sections, seconds)).replace(f"]({figures.FIGURES}/", f"]({path.stem}/")
+    write_text(path, f"{claims}\n{rest}\n")
+    write_text(runner.folder / CLAIMS, claims)
+    return [path, runner.folder / CLAIMS, *files]
 
 
-def _text(runner: Runner, sections: Sequence[Section], command: str, seconds: Mapping[str, tuple[float, float]]) -> str:
+def _claims(runner: Runner, sections: Sequence[Section], command: str) -> str:
+    """What the report begins with: how it was made, and the table of claims."""
     properties = machine()
     claims = [claim for section in sections for claim in section.claims]
     tally = {status: sum(c.status == status for c in claims) for status in ("reproduced", "partly", "not", "not run")}
-    config = runner.config
+    agents = runner.config.agents
     parts = [
-        "# The paper, table by table",
-        'Belder, Vivanti, Tal, "A Game of Bundle Adjustment - Learning Efficient Convergence", ICCV 2023, beside '
-        "what jaxba "
-        f"measures. This file is made by `{command}`; nothing in it is written by hand.",
+        "# The paper, claim by claim",
+        'Belder, Vivanti, Tal, "A Game of Bundle Adjustment - Learning Efficient Convergence", ICCV 2023, beside what '
+        f"jaxba measures. This file is made by `{command}`; nothing in it is written by hand.",
         f"Machine: {properties['device']}, {properties['processor']}, Python {properties['python']}, "
         f"JAX {properties['jax']}, jaxba {properties['jaxba']}. "
-        f"Agents: {config.agents.seeds} training runs of each kind, of {updates(config)} updates, all of which enter "
+        f"Agents: {agents.seeds} training runs of each kind, of {updates(runner.config)} updates, all of which enter "
         "the tables. All arithmetic is in float64. An iteration is one linear solve, accepted or rejected. Means are "
-        "arithmetic, as in the paper; "
-        "**a failure counts as 100 iterations**. `good ends`: fraction of the solves that end within 1 % of the best "
-        "cost found in this run. `seeds: range`: number of training runs and the range of their means.",
+        "arithmetic, as in the paper; **a failure counts as 100 iterations**.",
         "## Claims",
         "; ".join(f"{count} {status}" for status, count in tally.items()) + f" of {len(claims)}.",
         CRITERION,
         claims_table(claims) if claims else "None was tested.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _rest(runner: Runner, sections: Sequence[Section], seconds: Mapping[str, tuple[float, float]]) -> list[str]:
+    """What follows the claims: interpretations, every table and figure, settings and times."""
+    parts = [
         "## What the paper leaves open, and what is done here",
         table(("subject", "paper: text and released code", "here"), INTERPRETATIONS, 3),
+        "## Tables and figures",
+        "`good ends`: fraction of the solves that end within 1 % of the best cost found in this run. `seeds: range`: "
+        "number of training runs and the range of their means.",
     ]
     for section in sections:
         parts += [f"## {section.title}", *(paragraph for paragraph in section.body if paragraph)]
-    parts += ["## Settings", f"```yaml\n{to_yaml(config).strip()}\n```"]
+    parts += ["## Settings", f"```yaml\n{to_yaml(runner.config).strip()}\n```"]
     if seconds:
         wall, cpu = (sum(pair[k] for pair in seconds.values()) for k in (0, 1))
         cells = [(name, number(pair[0]), number(pair[1])) for name, pair in seconds.items()]
         parts += [
             "## Time",
             table(("table or figure", "s", "processor s"), [*cells, ("total", number(wall), number(cpu))]),
-        ]
-        parts.append(
             f"Compilation is included. The program used {cpu / wall:.2f} processor cores on average"
-            + ("; other programs slowed it down, so that all times are too long." if cpu < BUSY_CORES * wall else ".")
-        )
-    return "\n\n".join(parts) + "\n"
+            + ("; other programs slowed it down, so that all times are too long." if cpu < BUSY_CORES * wall else "."),
+        ]
+    return parts

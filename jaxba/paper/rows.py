@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 from jaxba.bench import profile
 from jaxba.bench.profile import ITERATION_LIMIT
-from jaxba.bench.records import Record
 from jaxba.paper.store import Play
+from jaxba.solver.record import Record
 
 NEAR = 1e-3
 """Relative tolerance of `Row.near`: iterations until the cost is within this of the best known cost."""

@@ -13,7 +13,6 @@ import jax
 import numpy as np
 
 from jaxba.bench import profile
-from jaxba.bench.records import Record
 from jaxba.bench.run import RunSettings, record_of, run_solver
 from jaxba.bench.sources import Source
 from jaxba.damping import DampingPolicy
@@ -32,6 +31,7 @@ from jaxba.runtime import process
 from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.names import SolverName, SolverNameError, parse_solver
 from jaxba.solver.options import SolveOptions
+from jaxba.solver.record import Record
 from jaxba.solver.solve import solve
 
 LIMIT = profile.ITERATION_LIMIT

@@ -6,16 +6,16 @@ whole set of small scenes, a line for each policy and seed. A killed run loses a
 
 from __future__ import annotations
 
-import json
 import math
-import os
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
-from jaxba.bench.records import Record, append_record, read_records
-from jaxba.problem.bundle_problem import ProblemError
+from jaxba.io import json_lines
+from jaxba.solver.record import Record
+
+T = TypeVar("T")
 
 SOLVES, PLAYS = "solves.jsonl", "plays.jsonl"
 
@@ -51,33 +51,10 @@ class Play:
     seconds: float
     """Time for all scenes together, including compilation, and so not a measure of speed."""
 
-
-def play_to_json(play: Play) -> dict[str, Any]:
-    """The JSON object of a play; infinity becomes null."""
-    data = asdict(play)
-    data["near"] = [x if math.isfinite(x) else None for x in play.near]
-    data["end"] = [x if math.isfinite(x) else None for x in play.end]
-    return data
-
-
-def play_from_json(data: Mapping[str, Any]) -> Play:
-    """The inverse of `play_to_json`.
-
-    Raises:
-        KeyError, TypeError: the object has another form.
-    """
-    numbers = lambda name: tuple(math.inf if x is None else float(x) for x in data[name])
-    return Play(
-        scenes=str(data["scenes"]),
-        method=str(data["method"]),
-        seed=int(data["seed"]),
-        iterations=tuple(int(x) for x in data["iterations"]),
-        converged=tuple(bool(x) for x in data["converged"]),
-        near=numbers("near"),
-        end=numbers("end"),
-        first=tuple(tuple(float(x) for x in row) for row in data["first"]),
-        seconds=float(data["seconds"]),
-    )
+    def __post_init__(self) -> None:
+        for name in ("near", "end"):  # null in the file is read as NaN
+            never = tuple(math.inf if math.isnan(x) else x for x in getattr(self, name))
+            object.__setattr__(self, name, never)
 
 
 class Store:
@@ -90,9 +67,8 @@ class Store:
             ProblemError: a file is damaged; the message names the file and the line.
         """
         self.folder = folder
-        path = folder / SOLVES
-        self.solves: list[Record] = read_records(path) if path.is_file() else []
-        self.plays = _read_plays(folder / PLAYS)
+        self.solves = _read(folder / SOLVES, Record)
+        self.plays = _read(folder / PLAYS, Play)
 
     def solve(self, problem: str, solver: str, repeat: int) -> Record | None:
         """The record of a solve, None if there is none."""
@@ -106,16 +82,12 @@ class Store:
 
     def add_solve(self, record: Record) -> None:
         """Appends a line to the file, followed by fsync. Raises OSError."""
-        append_record(self.folder / SOLVES, record)
+        json_lines.append(self.folder / SOLVES, record)
         self.solves.append(record)
 
     def add_play(self, play: Play) -> None:
         """Appends a line to the file, followed by fsync. Raises OSError."""
-        line = json.dumps(play_to_json(play), allow_nan=False, separators=(",", ":")).encode() + b"\n"
-        with (self.folder / PLAYS).open("ab") as file:
-            file.write(line)
-            file.flush()
-            os.fsync(file.fileno())
+        json_lines.append(self.folder / PLAYS, play)
         self.plays.append(play)
 
     def solves_of(self, problems: Sequence[str], solvers: Sequence[str]) -> list[Record]:
@@ -124,19 +96,5 @@ class Store:
         return sorted((r for r in self.solves if r.problem in problems and r.solver in solvers), key=rank)
 
 
-def _read_plays(path: Path) -> list[Play]:
-    if not path.is_file():
-        return []
-    *lines, rest = path.read_bytes().split(b"\n")
-    if rest:  # an incomplete line of a killed run
-        with path.open("r+b") as file:
-            file.truncate(path.stat().st_size - len(rest))
-    plays = []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        try:
-            plays.append(play_from_json(json.loads(line)))
-        except (ValueError, KeyError, TypeError) as error:
-            raise ProblemError(f"{path}, line {number}: not a line of this program ({type(error).__name__})") from None
-    return plays
+def _read(path: Path, kind: type[T]) -> list[T]:
+    return json_lines.read(path, kind) if path.is_file() else []

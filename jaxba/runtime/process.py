@@ -39,6 +39,11 @@ _mappings_left = 0
 """Mappings that were left when programs were dropped last."""
 
 
+def threads() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+
+
 def keep_memory() -> bool:
     """Makes glibc keep freed memory instead of returning it to the system.
 

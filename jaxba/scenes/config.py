@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -224,3 +224,21 @@ def scene_like(name: str) -> SceneConfig:
     if name not in LIKE:
         raise ProblemError(f"no scene is called {name!r}; known are {', '.join(LIKE)}")
     return LIKE[name]
+
+
+def _far(config: SceneConfig) -> SceneConfig:
+    """The scene with a start that is five to ten times as far away as usual."""
+    return replace(config, start_rotation=0.01, start_center=0.1, start_point=0.03, start_focal=0.03)
+
+
+DEFAULT_SCENES: dict[str, SceneConfig] = {
+    "street-40": SceneConfig(cameras=40, points=4000, mean_track=4.5),
+    "street-20-drift": SceneConfig(cameras=20, points=2500, mean_track=4.5, start_drift=0.003),
+    "street-24-outliers": SceneConfig(cameras=24, points=2500, mean_track=4.5, outlier_share=0.02),
+    "lateral-30": SceneConfig(cameras=30, points=3000, mean_track=4.5, trajectory="lateral"),
+    "photos-24": SceneConfig(cameras=24, points=3000, mean_track=4.0, trajectory="photos"),
+    "photos-14-far": _far(SceneConfig(cameras=14, points=2500, mean_track=4.0, trajectory="photos")),
+    "orbit-16-noisy": SceneConfig(cameras=16, points=1500, mean_track=5.0, trajectory="orbit", noise=2.0),
+    "orbit-12-far": _far(SceneConfig(cameras=12, points=1500, mean_track=5.0, trajectory="orbit")),
+}
+"""Random scenes that commands use if no problem is given: `jaxba-bench` all of them, `jaxba-solve` the first."""

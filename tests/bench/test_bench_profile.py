@@ -8,7 +8,7 @@ import pytest
 
 from jaxba.bench import profile
 from jaxba.bench.profile import Curve, Reach, Target
-from jaxba.bench.records import Record, TracePoint
+from jaxba.solver.record import Record, TracePoint
 
 
 def make_record(problem, solver, costs, *, step_s=1.0, repeat=0, termination="ftol"):

@@ -13,10 +13,10 @@ import pytest
 
 from jaxba.bench import plots
 from jaxba.bench.profile import Target
-from jaxba.bench.records import Record, TracePoint
 from jaxba.bench.report import file_names, run_metadata, to_html, write_all
 from jaxba.bench.summary import summarize
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.solver.record import Record, TracePoint
 
 pytestmark = pytest.mark.filterwarnings("error")
 

@@ -7,9 +7,9 @@ import math
 import pytest
 from rich.console import Console
 
-from jaxba.bench.records import Record, TracePoint
 from jaxba.bench.summary import geometric_mean, summarize, to_json, write_summary, write_text
 from jaxba.bench.tables import number, print_summary, to_markdown
+from jaxba.solver.record import Record, TracePoint
 
 
 def make_record(problem, solver, iterations, *, per_iteration_s=1.0, end=100.0, repeat=0, termination="ftol", failed=0):

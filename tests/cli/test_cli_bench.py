@@ -229,7 +229,7 @@ def test_a_run_with_two_records_counts_once(folder, undrawn, capsys):
     assert "2 of 2 runs already in" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("module", "writer"), [(bench_run, "append_record"), (report, "write_all")])
+@pytest.mark.parametrize(("module", "writer"), [(bench_run.json_lines, "append"), (report, "write_all")])
 def test_a_full_disk_is_one_line_and_status_2(module, writer, tmp_path, capsys, monkeypatch):
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

@@ -20,11 +20,12 @@ import support
 from support import solve
 
 from jaxba import Refinement, SolveOptions, StepOptions, read_bal, read_problem, write_bal, write_bundler
-from jaxba.bench.records import record_from_json
 from jaxba.cli import table
 from jaxba.cli.solve import Arguments, run, solve_options
+from jaxba.io import json_lines
 from jaxba.problem import geometry
 from jaxba.problem.options import Coordinates
+from jaxba.solver.record import Record
 
 RECORD_KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
@@ -66,7 +67,7 @@ def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
     assert costs[0] == record["initial_cost"]
     assert costs[-1] == record["final_cost"]
     assert [point["iteration"] for point in record["trace"]] == list(range(record["iterations"] + 1))
-    assert record_from_json(record).accepted == record["iterations"]
+    assert json_lines.from_plain(Record, record).accepted == record["iterations"]
     assert "6 cameras, 40 points, 200 observations" in printed.out
     assert "converged: relative decrease" in printed.out
     assert f"wrote {output}" in printed.out
@@ -80,8 +81,7 @@ def test_a_file_is_solved_and_the_solution_written(tiny, tmp_path, capsys):
 def test_without_a_problem_a_built_in_scene_is_solved(capsys):
     assert run([]) == 0
     printed = capsys.readouterr()
-    assert "random scene (30 cameras, 1500 points, seed 0)" in printed.out
-    assert "30 cameras, 1500 points" in printed.out
+    assert "random scene street-40: 40 cameras, 4000 points, " in printed.out
     assert "\nconverged: " in printed.out
     assert printed.err == ""
 

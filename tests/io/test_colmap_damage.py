@@ -11,9 +11,10 @@ from colmap_model import FIRST_POINT, TextModel, head_with, noted, refusal, swap
 
 from benchmarks.damage import damaged
 from jaxba import BundleProblem, ProblemError, ProblemWarning, read_colmap, read_problem, write_colmap
-from jaxba.bench.records import read_records
 from jaxba.cli.bench import run as run_bench
 from jaxba.cli.solve import run
+from jaxba.io import json_lines
+from jaxba.solver.record import Record
 
 
 def same(one: BundleProblem, other: BundleProblem) -> bool:
@@ -370,7 +371,10 @@ def test_a_benchmark_goes_on_after_models_that_cannot_be_read(tmp_path, capsys):
     assert printed.err.startswith(f"error: {bad}/images.txt: image 4 (view3.jpg): qvec is not finite: ")
     assert printed.err.count("\n") == 1
     assert f"note: {odd}/images.txt: 1 image left out, without observations (image 9 (last.jpg))\n" in printed.out
-    assert [record.problem for record in read_records(tmp_path / "runs" / "results.jsonl")] == ["odd", "good"]
+    assert [record.problem for record in json_lines.read(tmp_path / "runs" / "results.jsonl", Record)] == [
+        "odd",
+        "good",
+    ]
     (good / "._cameras.txt").write_text("of a Mac")  # the model is still the same
     assert run_bench([str(good), *arguments[3:], "--out", str(tmp_path / "runs")]) == 0
     assert run_bench([str(odd), "--strict", *arguments[3:], "--out", str(tmp_path / "strict")]) == 2

@@ -28,14 +28,15 @@ from jaxba import (
     solve,
     write_colmap,
 )
-from jaxba.bench.records import read_records
 from jaxba.bench.sources import sources
 from jaxba.cli.bench import run as run_bench
 from jaxba.cli.constraints import constrained
 from jaxba.cli.solve import run
+from jaxba.io import json_lines
 from jaxba.io.colmap.lenses import AS_BAL
 from jaxba.problem import geometry
 from jaxba.problem.camera_models import CAMERA_MODELS
+from jaxba.solver.record import Record
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
@@ -267,7 +268,7 @@ def test_a_benchmark_takes_models_and_skips_what_a_solver_refuses(tmp_path, caps
     assert len(errors) == 2
     assert errors[0].startswith("error: garden-sparse-0, stba+ceres: shared lenses need plain LM")
     assert errors[1].startswith("error: garden-sparse-0, pyceres:dense: Ceres as a peer takes no covariances")
-    assert [record.solver for record in read_records(out / "results.jsonl")] == ["ceres"]
+    assert [record.solver for record in json_lines.read(out / "results.jsonl", Record)] == ["ceres"]
     assert (out / "report.html").is_file()
 
 

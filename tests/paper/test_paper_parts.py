@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from jaxba import BundleProblem, ProblemError
-from jaxba.bench.records import Record, TracePoint
 from jaxba.bench.sources import Source
 from jaxba.paper import agents, claims, config, real_problems, rows
 from jaxba.paper.markdown import Line, disagreements, lines_table
@@ -18,8 +17,9 @@ from jaxba.paper.rows import Outcome, Row
 from jaxba.paper.schedule import average_schedule
 from jaxba.paper.store import PLAYS, SOLVES, Play, Store
 from jaxba.paper.subproblem import SubProblem, neighbouring_cameras, sub_problem
-from jaxba.paper.tables_and_figures import profiles
+from jaxba.paper.tables_and_figures import figures
 from jaxba.settings import SettingsError
+from jaxba.solver.record import Record, TracePoint
 
 # Sub-problems
 
@@ -266,7 +266,7 @@ def test_a_claim_about_speed_asks_for_the_same_success(ours, faster, status):
     )
     records = [solve(name, "classic", 2.0, 1.0) for name in "ab"]
     records += [solve(name, "learned-driver", ours.get(name, 1.0), 1.0 if name in ours else 50.0) for name in "ab"]
-    assert profiles._speed_claim(records, 0.001, "claim", faster).status == status
+    assert figures._speed_claim(records, 0.001, "claim", faster).status == status
 
 
 def test_only_claims_that_failed_are_disagreements():
@@ -315,7 +315,7 @@ def test_an_incomplete_line_is_removed_before_the_next_is_written(tmp_path):
 
 def test_the_error_names_a_damaged_line(tmp_path):
     (tmp_path / PLAYS).write_text("{}\n")
-    with pytest.raises(ProblemError, match=r"plays.jsonl, line 1: not a line of this program"):
+    with pytest.raises(ProblemError, match=r"plays.jsonl, line 1: scenes is missing"):
         Store(tmp_path)
     assert not (tmp_path / SOLVES).exists()
 

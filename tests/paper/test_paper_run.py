@@ -10,6 +10,7 @@ import pytest
 
 from jaxba.cli.paper import run
 from jaxba.game import rollout, scene_bank
+from jaxba.paper.report import CLAIMS
 from jaxba.paper.store import PLAYS
 from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
 
@@ -97,6 +98,10 @@ def test_one_table_in_an_empty_folder(finished):
     for entry in TABLES_AND_FIGURES.values():
         assert entry.title
     assert text.count("\n## ") >= len(TABLES_AND_FIGURES)
+    claims = (finished / CLAIMS).read_text()
+    assert text.startswith(claims)
+    assert claims.count("\n## ") == 1
+    assert "Ladybug: DeepLM + ours over DeepLM" in claims
 
 
 def test_a_second_call_computes_nothing(finished, settings, capsys):

@@ -30,12 +30,13 @@ from jaxba import (
     read_problem,
 )
 from jaxba.bench import report
-from jaxba.bench.records import read_records
 from jaxba.cli.bench import run as run_bench
+from jaxba.io import json_lines
 from jaxba.problem import geometry
 from jaxba.problem.options import Coordinates, Refinement
 from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.names import parse_solver
+from jaxba.solver.record import Record
 
 pytest.importorskip("pyceres", reason="needs the extra: pip install jaxba[ceres]")
 pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
@@ -472,7 +473,7 @@ def test_jaxba_bench_runs_peers_beside_our_solvers(tmp_path, monkeypatch, capsys
     names = ["ceres", "pyceres:sparse", *(f"pyceres:dense+{name}" for name in ("ceres", "learned+refine0", "learned"))]
     argv = ["scene:tiny", "--solvers", ",".join(names), "--repeats", "1", "--out", str(tmp_path)]
     assert run_bench(argv) == 0
-    ours, *peers = read_records(tmp_path / "results.jsonl")
+    ours, *peers = json_lines.read(tmp_path / "results.jsonl", Record)
     assert [record.solver for record in peers] == names[1:]
     for record, mode in zip(peers, ("sparse", "dense", "dense", "dense"), strict=True):
         assert record.backend == backend(mode)

@@ -1,38 +1,14 @@
-"""The tables and figures of the paper, one module each."""
+"""The tables and figures of the paper."""
 
-from jaxba.paper.tables_and_figures import (
-    bal,
-    constant_schedule,
-    convergence,
-    kitti,
-    lambda_chart,
-    profiles,
-    reversed_roles,
-    rewards,
-    small,
-    state_size,
-    sub_problems,
-    synthetic,
-    zero,
-)
+from jaxba.paper.tables_and_figures import ablations, figures, real, small
 from jaxba.paper.tables_and_figures.common import TableOrFigure
 
 TABLES_AND_FIGURES: dict[str, TableOrFigure] = {
-    module.ENTRY.name: module.ENTRY
-    for module in (
-        kitti,
-        bal,
-        synthetic,
-        sub_problems,
-        zero,
-        state_size,
-        reversed_roles,
-        rewards,
-        constant_schedule,
-        small,
-        lambda_chart,
-        profiles,
-        convergence,
+    entry.name: entry
+    for entry in (
+        *(real.KITTI, real.BAL, real.SYNTHETIC, real.FAMILIES),
+        *ablations.TABLES,
+        *(small.SMALL, figures.LAMBDA, figures.PROFILES, figures.CONVERGENCE),
     )
 }
 """Tables and figures by name, in the order of the paper."""

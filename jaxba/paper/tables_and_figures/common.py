@@ -1,15 +1,13 @@
-"""Code shared by the tables and figures, mostly by the ablation tables."""
+"""What the tables and figures share: their rows, tables of rows, and phrases."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from jaxba.bench.sources import Source
-from jaxba.paper import real_problems
-from jaxba.paper.agents import OURS
-from jaxba.paper.claims import Claim
-from jaxba.paper.markdown import Line, Section, format_iterations, lines_table
+from jaxba.paper.markdown import Line, Section, lines_table
 from jaxba.paper.rows import Row
 from jaxba.paper.runner import Method, Runner, method_named
 
@@ -37,45 +35,49 @@ class TableOrFigure:
     """Makes the section of the report from the results so far."""
 
 
-def agent_lines(
-    runner: Runner, methods: Sequence[tuple[str, Method, float | None]], sources: Sequence[Source] | None
-) -> list[Line]:
-    """Rows of an ablation table.
+class Labelled(NamedTuple):
+    """A row before it is filled."""
 
-    Args:
-        runner: the run.
-        methods: label, method and the paper's iterations of each row.
-        sources: real problems; None for the scenes of the tables.
-    """
-    pick = lambda method: runner.row_on_scenes(method) if sources is None else runner.row_on(sources, method)
-    return [Line(label, pick(method), paper) for label, method, paper in methods]
+    label: str
+    method: Method
+    paper: float | None = None
+    """The paper's iterations."""
+    paper_s: float | None = None
+    """The paper's seconds."""
 
 
-def run_ablation(runner: Runner, methods: Sequence[tuple[str, Method, float | None]]) -> None:
-    """Solves the scenes of the tables and the BAL problems with all methods."""
-    for _, method, _ in methods:
-        runner.play(method)
-    runner.solve(real_problems.bal(runner.config.real), [method for _, method, _ in methods])
+def named(label: str, solver: str, paper: float | None = None, paper_s: float | None = None) -> Labelled:
+    """A row of a solver with a name of `jaxba-bench`."""
+    return Labelled(label, method_named(solver), paper, paper_s)
 
 
-def claims_on_both_sets(
-    runner: Runner,
-    methods: Sequence[tuple[str, Method, float | None]],
-    make_claims: Callable[[str, Callable[[str], Row | None]], list[Claim]],
-) -> tuple[Claim, ...]:
-    """The claims of an ablation table, on the scenes of the tables and on BAL.
+def methods(rows: Sequence[Labelled]) -> list[Method]:
+    """The methods of the rows."""
+    return [row.method for row in rows]
 
-    Args:
-        runner: the run.
-        methods: label, method and the paper's iterations of each row.
-        make_claims: makes the claims on a set of problems. Its arguments are the name of the set, and a function that
-            gives the row of a method by name (None if it was not run).
-    """
-    found = []
-    for name, sources in (("synthetic", None), ("BAL", real_problems.bal(runner.config.real))):
-        known = {line.row.method: line.row for line in agent_lines(runner, methods, sources) if line.row.solves}
-        found += make_claims(name, known.get)
-    return tuple(found)
+
+class Lines(list[Line]):
+    """Rows of a table with our numbers."""
+
+    def __init__(self, runner: Runner, rows: Sequence[Labelled], sources: Sequence[Source] | None) -> None:
+        """Fills rows from the results so far, on real problems or, if None, on the scenes of the tables."""
+        pick = lambda method: runner.row_on_scenes(method) if sources is None else runner.row_on(sources, method)
+        super().__init__(Line(one.label, pick(one.method), one.paper, one.paper_s) for one in rows)
+        self.by_name = {line.row.method: line.row for line in self}
+
+    def known(self, method: str) -> Row | None:
+        """The row of a method, None if it was not run."""
+        row = self.by_name.get(method)
+        return row if row and row.solves else None
+
+    @property
+    def any(self) -> bool:
+        """Whether any method was run."""
+        return any(line.row.solves for line in self)
+
+    def table(self, with_time: bool = False) -> str:
+        """The table in Markdown, with ratios to classic and to Ceres' rule."""
+        return lines_table(self, self.by_name.get(CLASSIC), self.by_name.get(CERES), with_time)
 
 
 def problems(count: int) -> str:
@@ -83,57 +85,6 @@ def problems(count: int) -> str:
     return f"{count} problem{'' if count == 1 else 's'}"
 
 
-def gauss_newton_comparison(runner: Runner) -> str:
-    """A sentence on the iterations of Gauss-Newton and of Ceres' rule on the scenes of the tables; empty if they were
-    not run."""
-    undamped, ceres = runner.row_on_scenes(method_named("gauss-newton")), runner.row_on_scenes(method_named(CERES))
-    if not (undamped.solves and ceres.solves):
-        return ""
-    return (
-        f"For scale: on these scenes Gauss-Newton (1e-10 throughout) takes {format_iterations(undamped.iterations)} "
-        f"iterations and Ceres' rule {format_iterations(ceres.iterations)}, without any learning."
-    )
-
-
-def ablation_body(runner: Runner, methods: Sequence[tuple[str, Method, float | None]]) -> list[str]:
-    """The tables of an ablation, on the scenes of the tables and on BAL."""
-    body = []
-    count = runner.number_of_scenes()
-    lines = agent_lines(runner, methods, None)
-    if any(line.row.solves for line in lines):
-        body.append(
-            f"**{count} synthetic scenes** of the kind that the agents train on, none of them seen in training:"
-        )
-        body.append(_table(lines))
-        body.append(gauss_newton_comparison(runner))
-    else:
-        body.append(NOT_YET)
-    reason = real_problems.reason_without_bal(runner.config.real)
-    if reason:
-        body.append(f"**BAL**: {reason}.")
-        return body
-    sources = real_problems.bal(runner.config.real)
-    lines = agent_lines(runner, methods, sources)
-    if any(line.row.solves for line in lines):
-        body.append(f"**BAL**, {problems(len(sources))} ({', '.join(source.name for source in sources)}):")
-        body.append(_table(lines))
-    return body
-
-
-def _table(lines: Sequence[Line]) -> str:
-    rows = {line.row.method: line.row for line in lines}
-    return lines_table(lines, rows.get(CLASSIC), rows.get(CERES))
-
-
-def yardsticks() -> list[tuple[str, Method, float | None]]:
-    """Rows of the paper's baseline and of Ceres' rule."""
-    return [("classic", method_named(CLASSIC), 20.0), ("Ceres' rule", method_named(CERES), None)]
-
-
-def ours(runner: Runner) -> tuple[str, Method, float | None]:
-    """Row of the agent with which each ablation is compared."""
-    return ("ours: 5 errors, -1 an iteration, bonus", runner.agent(OURS), 4.0)
-
-
-AGENTS_DIFFER = "our agents train on synthetic scenes of 10 x 10, the paper's on BAL; the test set is another one."
-"""Differences of the set-up of the ablations from the paper's."""
+def listed(sources: Sequence[Source]) -> str:
+    """Names of problems."""
+    return ", ".join(source.name for source in sources)

@@ -8,11 +8,11 @@ from jaxba.bench.sources import Source
 from jaxba.bench.tables import number
 from jaxba.damping import DampingPolicy
 from jaxba.paper import agents, claims
-from jaxba.paper.markdown import Line, Section, disagreements, lines_table
+from jaxba.paper.markdown import Section, disagreements
 from jaxba.paper.rows import Row
 from jaxba.paper.runner import Method, Runner, method_named
 from jaxba.paper.tables_and_figures import common
-from jaxba.paper.tables_and_figures.common import TableOrFigure
+from jaxba.paper.tables_and_figures.common import CERES, CLASSIC, Labelled, Lines, TableOrFigure
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.scenes import SceneConfig, random_scene
 from jaxba.solver.options import SolveOptions
@@ -59,19 +59,19 @@ def _known_lens(method: Method) -> Method:
     return replace(method, build=build)
 
 
-def _methods(runner: Runner, size: int) -> list[tuple[str, Method, float | None]]:
-    paper = size == PAPER_SIZE
+def _rows(runner: Runner, size: int) -> list[Labelled]:
+    paper = lambda iterations: iterations if size == PAPER_SIZE else None
     return [
-        ("classic", _known_lens(method_named("classic")), 5.0 if paper else None),
-        ("Ceres' rule", _known_lens(method_named("ceres")), None),
-        ("ours: agent of this run", _known_lens(runner.agent(agents.OURS)), 4.0 if paper else None),
-        ("ours: shipped policy, lambda alone", _known_lens(method_named("learned-driver")), 4.0 if paper else None),
+        Labelled("classic", _known_lens(method_named(CLASSIC)), paper(5.0)),
+        Labelled("Ceres' rule", _known_lens(method_named(CERES))),
+        Labelled("ours: agent of this run", _known_lens(runner.agent(agents.OURS)), paper(4.0)),
+        Labelled("ours: shipped policy, lambda alone", _known_lens(method_named("learned-driver")), paper(4.0)),
     ]
 
 
 def _run(runner: Runner) -> None:
     for size in runner.config.small:
-        runner.solve(_sources(runner, size), [method for _, method, _ in _methods(runner, size)], repeats=1)
+        runner.solve(_sources(runner, size), common.methods(_rows(runner, size)), repeats=1)
 
 
 def _section(runner: Runner) -> Section:
@@ -82,16 +82,14 @@ def _section(runner: Runner) -> Section:
     found = []
     for size in runner.config.small:
         sources = _sources(runner, size)
-        lines = [Line(label, runner.row_on(sources, method), paper) for label, method, paper in _methods(runner, size)]
-        rows = {line.row.method: line.row for line in lines}
-        classic, ours = rows["classic"], rows[agents.OURS.name]
+        lines = Lines(runner, _rows(runner, size), sources)
         if size == PAPER_SIZE:
-            found += _claims(ours if ours.solves else None, classic if classic.solves else None)
-        if not any(line.row.solves for line in lines):
+            found += _claims(lines.known(agents.OURS.name), lines.known(CLASSIC))
+        if not lines.any:
             body.append(f"**{size} x {size}**: {common.NOT_YET}")
             continue
         body.append(f"**{size} cameras, {size} points**, {len(sources)} scenes:")
-        body.append(lines_table(lines, classic, rows["ceres"], with_time=True))
+        body.append(lines.table(with_time=True))
     body.append(disagreements(found, WHY))
     return Section("Small problems", tuple(body), tuple(found))
 
@@ -107,4 +105,4 @@ def _claims(ours: Row | None, classic: Row | None) -> list[claims.Claim]:
     return [ratio, claims.Claim(text, paper, detail, "reproduced" if longer > 0 else "not")]
 
 
-ENTRY = TableOrFigure("small", "Table: the limit of small problems, 5 x 5", _run, _section)
+SMALL = TableOrFigure("small", "Table: the limit of small problems, 5 x 5", _run, _section)

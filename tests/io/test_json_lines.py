@@ -5,8 +5,9 @@ import math
 
 import pytest
 
-from jaxba.bench.records import Record, TracePoint, append_record, read_records, record_from_json, record_to_json
+from jaxba.io import json_lines
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.solver.record import Record, TracePoint
 
 CONTRACT_KEYS = [
     *("problem", "family", "cameras", "points", "observations", "solver", "backend", "device", "dtype", "threads"),
@@ -23,30 +24,30 @@ def make_record(repeat=0, problem="ladybug"):
 
 
 def test_a_line_has_exactly_the_documented_keys_in_order():
-    data = record_to_json(make_record())
+    data = json_lines.plain(make_record())
     assert list(data) == CONTRACT_KEYS
     assert list(data["trace"][0]) == TRACE_KEYS
 
 
 def test_round_trip_keeps_every_number_and_writes_nan_and_infinity_as_null(tmp_path):
     path = tmp_path / "results.jsonl"
-    append_record(path, make_record(0))
-    append_record(path, make_record(1))
-    first, second = read_records(path)
+    json_lines.append(path, make_record(0))
+    json_lines.append(path, make_record(1))
+    first, second = json_lines.read(path, Record)
     assert (first.repeat, second.repeat) == (0, 1)
     assert math.isnan(first.trace[0].damping)
     assert math.isnan(first.trace[0].gain_ratio)
     assert first.trace[1] == make_record().trace[1]
-    assert record_to_json(first) == record_to_json(make_record())
+    assert json_lines.plain(first) == json_lines.plain(make_record())
     assert "NaN" not in path.read_text()
     assert path.read_text().endswith("}\n")
-    infinite = record_to_json(Record(**{**vars(make_record()), "final_cost": math.inf}))
+    infinite = json_lines.plain(Record(**{**vars(make_record()), "final_cost": math.inf}))
     assert infinite["final_cost"] is None
 
 
 def test_unknown_keys_are_ignored_and_whole_numbers_serve_as_floats():
-    data = record_to_json(make_record()) | {"future": [1], "initial_cost": 8}
-    record = record_from_json(data)
+    data = json_lines.plain(make_record()) | {"future": [1], "initial_cost": 8}
+    record = json_lines.from_plain(Record, data)
     assert record.initial_cost == 8.0
     assert isinstance(record.initial_cost, float)
 
@@ -65,53 +66,53 @@ def test_unknown_keys_are_ignored_and_whole_numbers_serve_as_floats():
 )
 def test_wrong_values_are_named(change, message):
     with pytest.raises(ProblemError, match=message):
-        record_from_json(record_to_json(make_record()) | change)
+        json_lines.from_plain(Record, json_lines.plain(make_record()) | change)
 
 
 def test_half_written_last_line_is_dropped_with_a_warning(tmp_path, caplog):
     path = tmp_path / "results.jsonl"
-    append_record(path, make_record(0))
-    append_record(path, make_record(1))
+    json_lines.append(path, make_record(0))
+    json_lines.append(path, make_record(1))
     whole = path.read_bytes()
     first = whole.index(b"\n") + 1
     for end in (first + 1, first + 40, len(whole) - 2):
         caplog.clear()
         path.write_bytes(whole[:end])
-        assert [r.repeat for r in read_records(path)] == [0]
+        assert [r.repeat for r in json_lines.read(path, Record)] == [0]
         assert "line 2" in caplog.text
         assert "half-written" in caplog.text
 
 
 def test_appending_after_a_cut_leaves_a_readable_file(tmp_path):
     path = tmp_path / "results.jsonl"
-    append_record(path, make_record(0))
+    json_lines.append(path, make_record(0))
     whole = path.read_bytes()
     path.write_bytes(whole + whole[:50])
-    append_record(path, make_record(2))
-    assert [r.repeat for r in read_records(path)] == [0, 2]
+    json_lines.append(path, make_record(2))
+    assert [r.repeat for r in json_lines.read(path, Record)] == [0, 2]
     path.write_bytes(whole[:-1])  # only the newline is lost: the record stays
-    append_record(path, make_record(3))
-    assert [r.repeat for r in read_records(path)] == [0, 3]
+    json_lines.append(path, make_record(3))
+    assert [r.repeat for r in json_lines.read(path, Record)] == [0, 3]
     path.write_bytes(whole[:50])  # nothing but a half line, and one longer than a block of the search
-    append_record(path, make_record(4))
-    assert [r.repeat for r in read_records(path)] == [4]
+    json_lines.append(path, make_record(4))
+    assert [r.repeat for r in json_lines.read(path, Record)] == [4]
     path.write_bytes(whole + b'{"x": "' + b"y" * 200_000)
-    append_record(path, make_record(5))
-    assert [r.repeat for r in read_records(path)] == [0, 5]
+    json_lines.append(path, make_record(5))
+    assert [r.repeat for r in json_lines.read(path, Record)] == [0, 5]
 
 
 @pytest.mark.parametrize("bad", ['{"problem": "a"', "[]", '{"problem": "a"}', "\u00ff\u00fe"])
 def test_malformed_line_elsewhere_is_one_clear_error(tmp_path, bad):
     path = tmp_path / "results.jsonl"
-    line = json.dumps(record_to_json(make_record()))
+    line = json.dumps(json_lines.plain(make_record()))
     path.write_bytes(f"{line}\n\n".encode() + bad.encode("latin-1") + f"\n{line}\n".encode())
     with pytest.raises(ProblemError, match=r"results\.jsonl, line 3: ") as caught:
-        read_records(path)
+        json_lines.read(path, Record)
     assert "\n" not in str(caught.value)
 
 
 def test_missing_file_is_one_clear_error_and_an_empty_one_has_no_records(tmp_path):
     with pytest.raises(ProblemError, match="No such file"):
-        read_records(tmp_path / "absent.jsonl")
+        json_lines.read(tmp_path / "absent.jsonl", Record)
     (tmp_path / "empty.jsonl").write_text("")
-    assert read_records(tmp_path / "empty.jsonl") == []
+    assert json_lines.read(tmp_path / "empty.jsonl", Record) == []

@@ -13,12 +13,12 @@ import pytest
 from rich.console import Console
 
 from jaxba import BundleProblem
+from jaxba.bench import training_page
 from jaxba.bench.tables import Table
-from jaxba.cli import training_page
-from jaxba.cli.training_view import TrainingView
 from jaxba.game.episode import Episode
 from jaxba.game.evaluate import Score
 from jaxba.training.config import load
+from jaxba.training.view import TrainingView
 
 RULES = {
     "ceres": Score(6.0, 5.5, 6.0, 9.0, 0.02, 12.0, 1e-3, 8.25),
