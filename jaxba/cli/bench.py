@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import tyro
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 from jaxba.problem.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "guarded,learned,bold,classic,ceres,ceres+refine3,ceres+embedded"
@@ -30,7 +31,7 @@ _VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)
 """A variable that `os.path.expandvars` expands."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-bench`."""
 
@@ -45,7 +46,7 @@ class Arguments:
     solvers: str | None = None
     """Comma-separated names of the form [method+]policy[+refineK|+embedded][@dtype], or, with the extra `ceres`,
     pyceres:dense|sparse|iterative[+policy[+refineK|+embedded]] and pyceres:dense-inner|sparse-inner. Default:
-    learned,bold,classic,ceres,ceres+refine3,ceres+embedded."""
+    guarded,learned,bold,classic,ceres,ceres+refine3,ceres+embedded."""
 
     tolerance: float | None = None
     """tau of the performance profile: cost <= f* + tau (f0 - f*). Default: 1e-3."""
@@ -60,7 +61,7 @@ class Arguments:
     """Linear solver of the method lm; other methods have their own."""
 
     strict: bool = False
-    """Refuse problems of which a part would be left out, such as a view in a COLMAP model that names no key-point."""
+    """Fail instead of skipping invalid parts of the input."""
 
     out: str = "runs/bench"
     """Folder of the results. A second run with the same folder does only what is missing."""

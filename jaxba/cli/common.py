@@ -6,25 +6,19 @@ import _thread
 import errno
 import gc
 import os
-import re
 import shlex
 import signal
 import stat
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
-from io import StringIO
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
+from jaxba.cli.options import BAD_INPUT, Arguments, parse
 from jaxba.cli.streams import UnwritableStreamError, tolerant_streams
 from jaxba.runtime.startup import INTERRUPTED, on_early_interrupt
-
-Arguments = TypeVar("Arguments")
-
-BAD_INPUT = 2
-"""Exit status for invalid input."""
 
 TERMINATED = 128 + signal.SIGTERM
 """Exit status after SIGTERM, as shells define it."""
@@ -46,9 +40,6 @@ CACHE_VARIABLE = "JAXBA_CACHE"
 RAISE_AGAIN_S = 0.01
 """Seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended."""
 
-_COLORS = re.compile(r"\x1b\[[\d;]*m")
-"""Control sequences that colour text on a terminal."""
-
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
 
@@ -58,24 +49,30 @@ class UsageError(ValueError):
 
 
 def run_command(
-    arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
+    arguments: type[Arguments],
+    main: Callable[[Arguments], int],
+    description: str,
+    argv: Sequence[str] | None,
+    subcommand: str = "",
 ) -> int:
     """Parses the command line and runs `main`.
 
     Expected errors are printed as one line to stderr, and so is a Ctrl-C or SIGTERM that `main` does not handle.
 
     Args:
-        arguments: dataclass of the arguments, from which tyro makes the parser.
+        arguments: class of the arguments, made by `options`, in the module that has the command's name.
         main: gets the parsed arguments and returns the exit status.
         description: first line of the help.
         argv: the command line; `sys.argv[1:]` if None.
+        subcommand: for the help, if `argv` is without it.
 
     Returns:
         The exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
     """
     with catch_interrupts() as stopped, tolerant_streams():
         try:
-            status = _parse_and_run(arguments, main, description, argv)
+            program = f"jaxba-{arguments.__module__.rpartition('.')[2]} {subcommand}".strip()
+            status = _run(main, parse(arguments, description, program, argv))
             print(end="", flush=True)
             return stopped() or status if status == INTERRUPTED else status
         except (KeyboardInterrupt, Exception) as error:
@@ -95,10 +92,8 @@ def command_line(name: str, argv: Sequence[str] | None) -> str:
     return display_name(shlex.join([name, *(sys.argv[1:] if argv is None else argv)]))
 
 
-def _parse_and_run(
-    arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
-) -> int:
-    parsed = _parse(arguments, description, argv)
+def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> int:
+    """Runs a command with what `parse` has found."""
     if parsed is None:
         return 0
     if isinstance(parsed, str):
@@ -175,26 +170,6 @@ def catch_interrupts() -> Iterator[Callable[[], int]]:
         sys.unraisablehook = hook
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str | None:
-    """The parsed command line, or what is wrong with it, in one line; None after `--help`."""
-    import tyro
-
-    drawn = StringIO()
-    try:
-        with redirect_stderr(drawn):
-            return tyro.cli(arguments, args=argv, description=description)
-    except SystemExit as end:
-        if end.code != BAD_INPUT:
-            return None
-    # a box: the title, a rule, the message, a rule, help on the option or options with a similar name, a rule, and how
-    # to get help; in an encoding that has lines the title stands in the first rule, and lines are its border
-    text = _COLORS.sub("", drawn.getvalue())
-    parts = re.split(r"^(?:╭.*|[│ ]*[─-]{3,}.*)$", text, flags=re.MULTILINE)
-    message = " ".join(re.sub(r"^│|│$", "", parts[1], flags=re.MULTILINE).split()) if len(parts) > 1 else text
-    near = re.findall(r"^. {5}(--[\w-]+)", text.partition("Perhaps you meant:")[2], re.MULTILINE)
-    return f"{message}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
 
 
 def counted(count: int, noun: str) -> str:

@@ -3,49 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 
 FILE_WIDTH = 120
 """Width of the list in characters if the output is not a terminal."""
 
 
-@dataclass(frozen=True)
+@options
 class Download:
-    """Downloads problems into the cache folder. Continues interrupted downloads, and skips files that are there."""
+    """Downloads problems into the cache folder; continues interrupted downloads."""
 
-    names: Annotated[tuple[str, ...], tyro.conf.Positional]
+    names: Annotated[tuple[str, ...], "NAME ...", tyro.conf.Positional]
     """Names such as ladybug-1197, or families such as trafalgar for all of their problems."""
 
-    base_url: str | None = None
-    """URL of the folder with the families. Default: that of the data set."""
+    base_url: Annotated[str | None, "URL"] = None
+    """Folder with the families. Default: that of the data set."""
 
     checksum: bool = True
-    """Compare the checksum. --no-checksum: unpack a file and compare its header with its name instead, as for files
-    without a known checksum."""
+    """Compare the checksum; else unpack the file and compare its header with its name, as for files without a known
+    checksum."""
 
 
-@dataclass(frozen=True)
+@options
 class List:
-    """Lists the problems: name, size, file, and whether they are in the cache folder."""
+    """Lists the problems, and whether they are in the cache folder."""
 
-    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    names: Annotated[tuple[str, ...], "[NAME ...]", tyro.conf.Positional] = ()
     """Names or families. Default: all."""
 
 
-@dataclass(frozen=True)
+@options
 class PathOf:
     """Prints the path of a downloaded problem."""
 
-    name: Annotated[str, tyro.conf.Positional]
+    name: Annotated[str, "NAME", tyro.conf.Positional]
     """Name such as ladybug-1197."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-data`."""
 
@@ -63,7 +63,7 @@ def main() -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Runs the command. Exit status: 0 for success, 2 for bad input or a failed download, 130 after Ctrl-C."""
-    text = "Problems of BAL (Bundle Adjustment in the Large). The variable JAXBA_BAL names another cache folder."
+    text = "Problems of BAL (Bundle Adjustment in the Large), in the folder JAXBA_BAL."
     return common.run_command(Arguments, _data, text, argv)
 
 

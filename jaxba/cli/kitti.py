@@ -6,13 +6,14 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 
 FILE_WIDTH = 120
 """Width of tables in characters if the output is not a terminal."""
@@ -21,97 +22,96 @@ EVALUATE = "evaluate"
 """First argument of the subcommand; a folder of this name can be given as ./evaluate."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-kitti`."""
 
-    sequence: Annotated[str, tyro.conf.Positional]
+    sequence: Annotated[str, "SEQUENCE", tyro.conf.Positional]
     """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
 
-    out: str = "kitti.txt.bz2"
-    """Output file of the problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json, written
-    beside it, has the frame of each camera."""
+    out: Annotated[str, "FILE"] = "kitti.txt.bz2"
+    """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json beside it has the frame of
+    each camera."""
 
-    frames: str = ":"
-    """Range of frame numbers, first:end or first:end:step, without the end, such as 0:200."""
+    frames: Annotated[str, "A:B:STEP"] = ":"
+    """Range of frame numbers, without the end, such as 0:200."""
 
     features: Literal["sift", "orb", "klt"] = "sift"
     """sift, orb: match key-points. klt: track corners from frame to frame."""
 
     keypoints: int = 2000
-    """Largest number of key-points of a frame."""
+    """Key-points per frame at most."""
 
     reach: int = 3
-    """Match every frame with this many previous frames."""
+    """Previous frames with which each frame is matched."""
 
     min_matches: int = 40
-    """Smallest number of verified matches between two frames."""
+    """Verified matches between two frames at least."""
 
-    keyframes: str = "auto"
-    """auto: choose by parallax and by the fraction of tracks left. all: every frame. N: every N-th frame."""
+    keyframes: Annotated[str, "RULE"] = "auto"
+    """auto: by parallax and the fraction of tracks left. all: every frame. N: every N-th frame."""
 
     start: Literal["vo", "poses", "noisy-poses"] = "vo"
-    """vo: start from the poses of monocular visual odometry. poses: from --poses. noisy-poses: from --poses with
-    accumulating errors."""
+    """vo: start from monocular visual odometry. poses: from --poses. noisy-poses: from --poses with accumulating
+    errors."""
 
-    poses: str | None = None
-    """File of the true poses, 12 numbers per line, a line for every frame of the sequence from frame 0; or 13 numbers,
-    the first of them the frame. With --start vo they are only used to print the error of the start."""
+    poses: Annotated[str | None, "FILE"] = None
+    """True poses, 12 numbers per line for every frame from 0, or 13, the first of them the frame. With --start vo only
+    the error of the start is computed from them."""
 
     rotation_sigma: float = 0.1
-    """Error of noisy-poses: standard deviation of the rotation on each axis per key-frame, degrees."""
+    """Error of noisy-poses: standard deviation per axis and key-frame, degrees."""
 
     translation_sigma: float = 0.05
-    """Error of noisy-poses: standard deviation of the translation on each axis per key-frame, relative to the distance
-    from the previous key-frame."""
+    """The same per axis and key-frame, relative to the distance from the previous key-frame."""
 
     min_angle: float = 1.0
     """Smallest triangulation angle of a point, degrees."""
 
     max_error: float = 3.0
-    """Largest reprojection error of an observation, pixels; before the noise of noisy-poses."""
+    """Largest reprojection error of an observation before the noise of noisy-poses, pixels."""
 
     min_views: int = 2
-    """Smallest number of key-frames that observe a point."""
+    """Key-frames that observe a point at least."""
 
     window: int | None = None
-    """Write several problems with this many key-frames each, named NAME-FIRST-LAST by their frames."""
+    """Write several problems of this many key-frames, named NAME-FIRST-LAST by their frames."""
 
     stride: int | None = None
-    """Number of key-frames from the start of one window to the next. Default: half a window."""
+    """Key-frames from the start of one window to the next. Default: half a window."""
 
     camera: int = 0
-    """Number of the camera, 0 (image_0 and P0) to 3."""
+    """Number of the camera, from 0 (image_0 and P0) to 3."""
 
-    calibration: str | None = None
-    """File of the camera matrix, lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers.
-    Default: that of the sequence."""
+    calibration: Annotated[str | None, "FILE"] = None
+    """Camera matrix: lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers. Default: that of
+    the sequence."""
 
-    work: str | None = None
-    """Folder of intermediate results, with which an interrupted run continues. Default: NAME.work."""
+    work: Annotated[str | None, "FOLDER"] = None
+    """Intermediate results, with which an interrupted run continues. Default: NAME.work."""
 
     seed: int = 0
     """Seed of all random numbers."""
 
 
-@dataclass(frozen=True)
+@options
 class EvaluateArguments:
     """Options of `jaxba-kitti evaluate`."""
 
-    problem: Annotated[str, tyro.conf.Positional]
+    problem: Annotated[str, "PROBLEM", tyro.conf.Positional]
     """Problem written by jaxba-kitti, with its NAME.frames.json beside it."""
 
-    solutions: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    solutions: Annotated[tuple[str, ...], "[SOLUTION ...]", tyro.conf.Positional] = ()
     """Solutions of the problem by jaxba-solve, BAL files."""
 
-    poses: str | None = None
-    """File of the true poses of the whole sequence, 12 numbers per line. Without it no errors are computed."""
+    poses: Annotated[str | None, "FILE"] = None
+    """True poses of the whole sequence, 12 numbers per line. Without them no errors are computed."""
 
-    lengths: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-    """Lengths of the segments for relative errors, metres."""
+    lengths: Annotated[tuple[float, ...], "METRES ..."] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+    """Lengths of the segments for relative errors."""
 
-    out: str = "runs/kitti"
-    """Output folder of top-view.png and .svg, evaluation.json and the aligned trajectories."""
+    out: Annotated[str, "FOLDER"] = "runs/kitti"
+    """Folder of top-view.png and .svg, evaluation.json and the aligned trajectories."""
 
 
 def main() -> None:
@@ -124,8 +124,8 @@ def run(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv[:1] == [EVALUATE]:
         text = "Computes trajectory errors and draws the scene from above."
-        return common.run_command(EvaluateArguments, _evaluate, text, argv[1:])
-    text = "Makes a problem from KITTI images. 'jaxba-kitti evaluate --help': compares solutions with true poses."
+        return common.run_command(EvaluateArguments, _evaluate, text, argv[1:], EVALUATE)
+    text = "Makes a problem from KITTI images ('jaxba-kitti evaluate': compares solutions)."
     return common.run_command(Arguments, _build, text, argv)
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 
 FULL, FAST = "full", "fast"
 """Names of the presets."""
@@ -21,7 +21,7 @@ REPORT = "paper.md"
 """File of the report, unless `--report` names another."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-paper`."""
 

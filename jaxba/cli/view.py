@@ -8,13 +8,13 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 
 if TYPE_CHECKING:
     from jaxba.viewer.panel import Viewer
@@ -27,36 +27,34 @@ NAMED = 5
 """Worst images that are printed."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-view`."""
 
-    files: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Problems in any format that jaxba-solve reads, and recordings of jaxba-solve --record; more than one stand side
-    by side."""
+    files: Annotated[tuple[str, ...], "[FILE ...]", tyro.conf.Positional]
+    """Problems in any format of jaxba-solve, and recordings of jaxba-solve --record, side by side."""
 
-    images: str | None = None
-    """Folder of the images, for files that name them (COLMAP, jaxba-kitti)."""
+    images: Annotated[str | None, "FOLDER"] = None
+    """Images, for files that name them (COLMAP, jaxba-kitti)."""
 
-    poses: str | None = None
-    """KITTI's file of the true poses of the whole sequence. Default: that with which jaxba-kitti made the problem, if
-    it is there."""
+    poses: Annotated[str | None, "FILE"] = None
+    """KITTI's true poses of the whole sequence. Default: those with which jaxba-kitti made the problem, if the file
+    exists."""
 
-    policy: str | None = None
-    """Instead of files: an episode of the game, played by a policy: a file of jaxba-train, or a name."""
+    policy: Annotated[str | None, "NAME"] = None
+    """Instead of files: an episode of the game, played by this policy or file of jaxba-train."""
 
     scene: int = 0
     """Number of the random scene of --policy."""
 
-    html: str | None = None
-    """Output file: one page that opens without a server and plays the iterations. Nothing is served."""
+    html: Annotated[str | None, "FILE"] = None
+    """Write one page that opens without a server and plays the iterations. Nothing is served."""
 
     port: int = 8080
     """First port that is tried."""
 
-    host: str = "127.0.0.1"
-    """Address of this machine at which the page is reached, without a password. Default: from this machine only;
-    0.0.0.0: from every machine that reaches this one."""
+    host: Annotated[str, "ADDRESS"] = "127.0.0.1"
+    """Address at which the page is served, without a password; 0.0.0.0 for every machine that reaches this one."""
 
 
 def main() -> None:
