@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import errno
 import gc
 import os
@@ -10,7 +9,6 @@ import shlex
 import signal
 import stat
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,17 +16,7 @@ from typing import Any, NoReturn
 
 from jaxba.cli.options import BAD_INPUT, Arguments, parse
 from jaxba.cli.streams import UnwritableStreamError, tolerant_streams
-from jaxba.runtime.startup import INTERRUPTED, on_early_interrupt
-
-TERMINATED = 128 + signal.SIGTERM
-"""Exit status after SIGTERM, as shells define it."""
-
-ENDED = {INTERRUPTED: "interrupted", TERMINATED: "terminated"}
-"""Last line of a command that a signal has ended."""
-
-DEFAULTS = {signal.SIGINT: (signal.default_int_handler, on_early_interrupt), signal.SIGTERM: (signal.SIG_DFL,)}
-"""Handlers that a command may replace: Python's own, and that of a command which is starting. A signal that is ignored,
-as Ctrl-C is under `nohup`, stays so."""
+from jaxba.runtime.interrupt import ENDED, INTERRUPTED, Interrupt
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or may not be written: no fault of the program, wherever they come up."""
@@ -36,9 +24,6 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable with the folder of compiled programs; `off` disables the cache."""
 
-
-RAISE_AGAIN_S = 0.01
-"""Seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended."""
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
@@ -69,17 +54,18 @@ def run_command(
     Returns:
         The exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
     """
-    with catch_interrupts() as stopped, tolerant_streams():
+    with Interrupt() as interrupt, tolerant_streams():
         try:
             program = f"jaxba-{arguments.__module__.rpartition('.')[2]} {subcommand}".strip()
             status = _run(main, parse(arguments, description, program, argv))
             print(end="", flush=True)
-            return stopped() or status if status == INTERRUPTED else status
+            return interrupt.status or status if status == INTERRUPTED else status
         except (KeyboardInterrupt, Exception) as error:
             # inside libraries Ctrl-C may have become another error
-            if isinstance(error, KeyboardInterrupt) or stopped():
-                print(ENDED.get(stopped(), ENDED[INTERRUPTED]), file=sys.stderr)
-                return stopped() or INTERRUPTED
+            if isinstance(error, KeyboardInterrupt) or interrupt.status:
+                status = interrupt.status or INTERRUPTED
+                print(ENDED[status], file=sys.stderr)
+                return status
             if isinstance(error, UnwritableStreamError):
                 return print_error(str(error))
             raise
@@ -133,43 +119,6 @@ def _end_if_alone(error: Exception) -> None:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
-
-
-@contextmanager
-def catch_interrupts() -> Iterator[Callable[[], int]]:
-    """A context in which Ctrl-C and SIGTERM raise KeyboardInterrupt; its value gives the exit status of the last signal
-    that has come, or 0.
-
-    Nothing is changed in a thread other than the first, where signals are not handled, nor for a signal that is ignored
-    or has a handler already.
-    """
-    seen: list[int] = []
-
-    def handle(number: int, _: Any) -> None:
-        seen.append(128 + number)
-        raise KeyboardInterrupt
-
-    main_thread = threading.current_thread() is threading.main_thread()
-    ours = [number for number, known in DEFAULTS.items() if main_thread and signal.getsignal(number) in known]
-    if not ours:
-        yield lambda: 0
-        return
-
-    def again(lost: Any) -> None:
-        """Python drops an exception in a callback of the garbage collector, of which JAX has one: raise it later."""
-        if lost.exc_type is KeyboardInterrupt:
-            threading.Timer(RAISE_AGAIN_S, _thread.interrupt_main, [seen[-1] - 128]).start()
-        else:
-            hook(lost)
-
-    before, hook = {number: signal.signal(number, handle) for number in ours}, sys.unraisablehook
-    sys.unraisablehook = again
-    try:
-        yield lambda: seen[-1] if seen else 0
-    finally:
-        sys.unraisablehook = hook
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def counted(count: int, noun: str) -> str:

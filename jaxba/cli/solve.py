@@ -16,7 +16,6 @@ import tyro
 from jaxba.cli import common, processes, table, view
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import constrained
-from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.options import options
 from jaxba.cli.output import check_outputs, check_storable, write_solution
 from jaxba.cli.overwriting import policy_file
@@ -41,6 +40,7 @@ from jaxba.problem.options import (
     Scaling,
 )
 from jaxba.runtime.compilation import Compilation
+from jaxba.runtime.interrupt import Interrupt
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.covariance import covariance

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from jaxba.cli import common, processes
-from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.options import options
 from jaxba.cli.training_view import TrainingView
+from jaxba.runtime.interrupt import Interrupt
 
 if TYPE_CHECKING:
     from jaxba.bench.tables import Table
