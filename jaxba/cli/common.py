@@ -138,16 +138,20 @@ def print_line(text: str) -> None:
 
 
 @contextmanager
-def notes_printed(say: Callable[[str], object] = print_line) -> Iterator[None]:
-    """Prints the notes of what is read inside, one line each.
-
-    Args:
-        say: prints a line.
-    """
+def notes_printed(output: Callable[[str], object] = print_line) -> Iterator[None]:
+    """Prints the notes of what is read inside, one line each, by `output`."""
     from jaxba.io.notes import told
 
-    with told(lambda note: say(f"note: {note}")):
+    with told(lambda note: output(f"note: {note}")):
         yield
+
+
+def console(width: int = 120, **options: Any) -> Any:
+    """A console of rich that breaks no lines; its tables are `width` characters wide if it is no terminal."""
+    from rich.console import Console
+
+    made = Console(soft_wrap=True, highlight=False, **options)
+    return made if made.is_terminal else Console(soft_wrap=True, highlight=False, width=width, **options)
 
 
 def exit_with(status: int) -> NoReturn:
@@ -197,6 +201,12 @@ def use_compilation_cache(untraced: bool = False) -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def require(fulfilled: bool, message: str) -> None:
+    """Raises a UsageError with the message unless a condition is fulfilled."""
+    if not fulfilled:
+        raise UsageError(message)
 
 
 def check_writable(option: str, path: str | None) -> None:

@@ -10,9 +10,6 @@ import tyro
 from jaxba.cli import common
 from jaxba.cli.options import options
 
-FILE_WIDTH = 120
-"""Width of the list in characters if the output is not a terminal."""
-
 
 @options
 class Download:
@@ -79,15 +76,11 @@ def _data(args: Arguments) -> int:
 
 
 def _list(args: List) -> int:
-    from rich.console import Console
     from rich.table import Table
 
     from jaxba.datasets.bal.catalog import ENTRIES, select
     from jaxba.datasets.bal.paths import data_folder, downloaded_path
 
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=FILE_WIDTH)
     table = Table(box=None, header_style="bold", pad_edge=False)  # 80 columns wide
     for title in ("name", "cameras", "points", "file", "sha256", "here"):
         table.add_column(title, no_wrap=True, justify="right" if title in ("cameras", "points") else "left")
@@ -95,13 +88,13 @@ def _list(args: List) -> int:
         file = entry.file.partition("/")[2]
         known, here = ("known" if entry.sha256 else "no"), ("yes" if downloaded_path(entry) else "no")
         table.add_row(entry.name, str(entry.cameras), str(entry.points), file, known, here)
+    console = common.console()
     console.print(table)
-    console.print(f"folder: {data_folder()}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"folder: {data_folder()}", markup=False)
     return 0
 
 
 def _download(args: Download) -> int:
-    from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
     from jaxba.datasets.bal.catalog import select
@@ -114,7 +107,7 @@ def _download(args: Download) -> int:
         from jaxba.datasets.bal import download
     except ImportError as error:
         raise common.UsageError(str(error)) from None
-    console = Console(soft_wrap=True, highlight=False)
+    console = common.console()
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     status = 0
     with Progress(

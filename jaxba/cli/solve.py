@@ -41,6 +41,7 @@ from jaxba.problem.options import (
 )
 from jaxba.runtime.compilation import Compilation
 from jaxba.runtime.interrupt import Interrupt
+from jaxba.scenes import SceneConfig, random_scene
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.covariance import covariance
@@ -58,8 +59,8 @@ STREAM = "-"
 _STDOUT = 1
 """File descriptor of standard output."""
 
-DEFAULT_SCENE = "random scene (30 cameras, 1500 points, seed 0)"
-"""Description of the scene that is solved if no problem is given."""
+DEFAULT_SCENE = SceneConfig(cameras=30, points=1500)
+"""The scene that is solved if no problem is given, with seed 0."""
 
 OPTION_OF_FIELD = {"points": "refine_points", "scale": "loss_scale"}
 """Fields of options whose command-line option has another name."""
@@ -308,7 +309,8 @@ def _solve(args: Arguments) -> int:
     policy, options = solve_options(args)
     path, problem = _in_all_processes(args) if _is_divided(args) else _checked(args)
     common.prepare_process(untraced=not _is_divided(args))
-    name = DEFAULT_SCENE if args.problem is None else path if args.problem == STREAM else args.problem
+    scene = f"random scene ({DEFAULT_SCENE.cameras} cameras, {DEFAULT_SCENE.points} points, seed 0)"
+    name = scene if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
     watching = Watching.of(problem, path, args.record is not None, args.view)
@@ -359,7 +361,7 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     if args.view:
         view.check_extra()
     with common.notes_printed():
-        problem = _default_scene() if path is None else _read(args, path)
+        problem = random_scene(DEFAULT_SCENE, 0) if path is None else _read(args, path)
         problem = constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
@@ -394,12 +396,6 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
         arrays = ("poses", "lenses", "points", "points_given_cameras")
         np.savez_compressed(file, **{name: getattr(found, name) for name in arrays})
     common.print_line(f"wrote {path}")
-
-
-def _default_scene() -> BundleProblem:
-    from jaxba.bench.sources import default_sources
-
-    return default_sources()[0].read()
 
 
 def _iterate(

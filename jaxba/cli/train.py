@@ -167,7 +167,7 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
     together(lambda: boards.append(_board(args, folder, config)))
     board = boards[0] if boards else None  # of the first process alone
     common.prepare_process()
-    console = _console(quiet=not is_main())
+    console = common.console(FILE_WIDTH, markup=False, quiet=not is_main())
     with (
         process.single_blas_thread(),
         Interrupt("chunk", graceful=False, announce=is_main()) as interrupt,
@@ -218,15 +218,6 @@ def _check_problems(problems: Sequence[str]) -> list[str]:
     with common.notes_printed():
         read_all(paths)
     return paths
-
-
-def _console(quiet: bool) -> Any:
-    """A console for the view. Brackets in names are not interpreted as markup."""
-    from rich.console import Console
-
-    options: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False, "quiet": quiet}
-    console = Console(**options)
-    return console if console.is_terminal else Console(**options, width=FILE_WIDTH)
 
 
 def _again(folder: Path) -> str:

@@ -143,7 +143,8 @@ class SolveOptions:
         scaling = step.coordinates.scaling
         if getattr(policy, "step_options", None) is not None and scaling != trained.coordinates.scaling:
             own = trained.coordinates.scaling
-            raise ValueError(f"scaling {scaling!r} does not go with this policy, whose lambda is trained for {own!r}")
+            this = "this policy takes lambda as a factor on the diagonal"
+            raise ValueError(f"scaling must be {own!r}: {this}, not with scaling {scaling!r}")
         if step.mixed_precision and step.method is not None:
             raise ValueError("mixed types are for plain LM; methods have float64 or float32")
         return step
