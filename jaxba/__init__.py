@@ -1,8 +1,8 @@
 """Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or written."""
 
-from jaxba.runtime.startup import quiet_interrupt as _quiet_interrupt
+from jaxba.runtime import interrupt as _interrupt
 
-_quiet_interrupt()  # before the imports that take long
+_interrupt.end_at_once()  # before the imports that take long
 
 # ruff: noqa: E402
 from jaxba.damping import (

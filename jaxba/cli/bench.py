@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import tyro
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 from jaxba.problem.options import LinearSolverChoice
 
 DEFAULT_SOLVERS = "guarded,learned,bold,classic,ceres,ceres+refine3,ceres+embedded"
@@ -30,7 +31,7 @@ _VARIABLE = re.compile(r"\$\{?(\w+)\}?", re.ASCII)
 """A variable that `os.path.expandvars` expands."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-bench`."""
 
@@ -60,7 +61,7 @@ class Arguments:
     """Linear solver of the method lm; other methods have their own."""
 
     strict: bool = False
-    """Refuse problems of which a part would be left out, such as a view in a COLMAP model that names no key-point."""
+    """Fail instead of skipping invalid parts of the input."""
 
     out: str = "runs/bench"
     """Folder of the results. A second run with the same folder does only what is missing."""

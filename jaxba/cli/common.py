@@ -2,39 +2,21 @@
 
 from __future__ import annotations
 
-import _thread
 import errno
 import gc
 import os
-import re
 import shlex
 import signal
 import stat
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stderr
-from io import StringIO
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn
 
+from jaxba.cli.options import BAD_INPUT, Arguments, parse
 from jaxba.cli.streams import UnwritableStreamError, tolerant_streams
-from jaxba.runtime.startup import INTERRUPTED, on_early_interrupt
-
-Arguments = TypeVar("Arguments")
-
-BAD_INPUT = 2
-"""Exit status for invalid input."""
-
-TERMINATED = 128 + signal.SIGTERM
-"""Exit status after SIGTERM, as shells define it."""
-
-ENDED = {INTERRUPTED: "interrupted", TERMINATED: "terminated"}
-"""Last line of a command that a signal has ended."""
-
-DEFAULTS = {signal.SIGINT: (signal.default_int_handler, on_early_interrupt), signal.SIGTERM: (signal.SIG_DFL,)}
-"""Handlers that a command may replace: Python's own, and that of a command which is starting. A signal that is ignored,
-as Ctrl-C is under `nohup`, stays so."""
+from jaxba.runtime.interrupt import ENDED, INTERRUPTED, Interrupt
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or may not be written: no fault of the program, wherever they come up."""
@@ -42,12 +24,6 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 CACHE_VARIABLE = "JAXBA_CACHE"
 """Environment variable with the folder of compiled programs; `off` disables the cache."""
 
-
-RAISE_AGAIN_S = 0.01
-"""Seconds until a Ctrl-C that was lost in a callback is raised again, when the callback has ended."""
-
-_COLORS = re.compile(r"\x1b\[[\d;]*m")
-"""Control sequences that colour text on a terminal."""
 
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
@@ -58,31 +34,38 @@ class UsageError(ValueError):
 
 
 def run_command(
-    arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
+    arguments: type[Arguments],
+    main: Callable[[Arguments], int],
+    description: str,
+    argv: Sequence[str] | None,
+    subcommand: str = "",
 ) -> int:
     """Parses the command line and runs `main`.
 
     Expected errors are printed as one line to stderr, and so is a Ctrl-C or SIGTERM that `main` does not handle.
 
     Args:
-        arguments: dataclass of the arguments, from which tyro makes the parser.
+        arguments: class of the arguments, made by `options`, in the module that has the command's name.
         main: gets the parsed arguments and returns the exit status.
         description: first line of the help.
         argv: the command line; `sys.argv[1:]` if None.
+        subcommand: for the help, if `argv` is without it.
 
     Returns:
         The exit status: that of `main`, 2 after an error, 130 after Ctrl-C, or 143 after SIGTERM.
     """
-    with catch_interrupts() as stopped, tolerant_streams():
+    with Interrupt() as interrupt, tolerant_streams():
         try:
-            status = _parse_and_run(arguments, main, description, argv)
+            program = f"jaxba-{arguments.__module__.rpartition('.')[2]} {subcommand}".strip()
+            status = _run(main, parse(arguments, description, program, argv))
             print(end="", flush=True)
-            return stopped() or status if status == INTERRUPTED else status
+            return interrupt.status or status if status == INTERRUPTED else status
         except (KeyboardInterrupt, Exception) as error:
             # inside libraries Ctrl-C may have become another error
-            if isinstance(error, KeyboardInterrupt) or stopped():
-                print(ENDED.get(stopped(), ENDED[INTERRUPTED]), file=sys.stderr)
-                return stopped() or INTERRUPTED
+            if isinstance(error, KeyboardInterrupt) or interrupt.status:
+                status = interrupt.status or INTERRUPTED
+                print(ENDED[status], file=sys.stderr)
+                return status
             if isinstance(error, UnwritableStreamError):
                 return print_error(str(error))
             raise
@@ -95,10 +78,8 @@ def command_line(name: str, argv: Sequence[str] | None) -> str:
     return display_name(shlex.join([name, *(sys.argv[1:] if argv is None else argv)]))
 
 
-def _parse_and_run(
-    arguments: type[Arguments], main: Callable[[Arguments], int], description: str, argv: Sequence[str] | None
-) -> int:
-    parsed = _parse(arguments, description, argv)
+def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> int:
+    """Runs a command with what `parse` has found."""
     if parsed is None:
         return 0
     if isinstance(parsed, str):
@@ -140,63 +121,6 @@ def _end_if_alone(error: Exception) -> None:
         os._exit(status)
 
 
-@contextmanager
-def catch_interrupts() -> Iterator[Callable[[], int]]:
-    """A context in which Ctrl-C and SIGTERM raise KeyboardInterrupt; its value gives the exit status of the last signal
-    that has come, or 0.
-
-    Nothing is changed in a thread other than the first, where signals are not handled, nor for a signal that is ignored
-    or has a handler already.
-    """
-    seen: list[int] = []
-
-    def handle(number: int, _: Any) -> None:
-        seen.append(128 + number)
-        raise KeyboardInterrupt
-
-    main_thread = threading.current_thread() is threading.main_thread()
-    ours = [number for number, known in DEFAULTS.items() if main_thread and signal.getsignal(number) in known]
-    if not ours:
-        yield lambda: 0
-        return
-
-    def again(lost: Any) -> None:
-        """Python drops an exception in a callback of the garbage collector, of which JAX has one: raise it later."""
-        if lost.exc_type is KeyboardInterrupt:
-            threading.Timer(RAISE_AGAIN_S, _thread.interrupt_main, [seen[-1] - 128]).start()
-        else:
-            hook(lost)
-
-    before, hook = {number: signal.signal(number, handle) for number in ours}, sys.unraisablehook
-    sys.unraisablehook = again
-    try:
-        yield lambda: seen[-1] if seen else 0
-    finally:
-        sys.unraisablehook = hook
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _parse(arguments: type[Arguments], description: str, argv: Sequence[str] | None) -> Arguments | str | None:
-    """The parsed command line, or what is wrong with it, in one line; None after `--help`."""
-    import tyro
-
-    drawn = StringIO()
-    try:
-        with redirect_stderr(drawn):
-            return tyro.cli(arguments, args=argv, description=description)
-    except SystemExit as end:
-        if end.code != BAD_INPUT:
-            return None
-    # a box: the title, a rule, the message, a rule, help on the option or options with a similar name, a rule, and how
-    # to get help; in an encoding that has lines the title stands in the first rule, and lines are its border
-    text = _COLORS.sub("", drawn.getvalue())
-    parts = re.split(r"^(?:╭.*|[│ ]*[─-]{3,}.*)$", text, flags=re.MULTILINE)
-    message = " ".join(re.sub(r"^│|│$", "", parts[1], flags=re.MULTILINE).split()) if len(parts) > 1 else text
-    near = re.findall(r"^. {5}(--[\w-]+)", text.partition("Perhaps you meant:")[2], re.MULTILINE)
-    return f"{message}{'; perhaps you meant ' if near else ''}{' or '.join(near)}"
-
-
 def counted(count: int, noun: str) -> str:
     """The count with the noun, in the plural unless it is one."""
     return f"{count} {noun}{'s' * (count != 1)}"
@@ -214,16 +138,20 @@ def print_line(text: str) -> None:
 
 
 @contextmanager
-def notes_printed(say: Callable[[str], object] = print_line) -> Iterator[None]:
-    """Prints the notes of what is read inside, one line each.
-
-    Args:
-        say: prints a line.
-    """
+def notes_printed(output: Callable[[str], object] = print_line) -> Iterator[None]:
+    """Prints the notes of what is read inside, one line each, by `output`."""
     from jaxba.io.notes import notes_to
 
-    with notes_to(lambda note: say(f"note: {note}")):
+    with notes_to(lambda note: output(f"note: {note}")):
         yield
+
+
+def console(width: int = 120, **options: Any) -> Any:
+    """A console of rich that breaks no lines; its tables are `width` characters wide if it is no terminal."""
+    from rich.console import Console
+
+    made = Console(soft_wrap=True, highlight=False, **options)
+    return made if made.is_terminal else Console(soft_wrap=True, highlight=False, width=width, **options)
 
 
 def exit_with(status: int) -> NoReturn:
@@ -273,6 +201,12 @@ def use_compilation_cache(untraced: bool = False) -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def require(fulfilled: bool, message: str) -> None:
+    """Raises a UsageError with the message unless a condition is fulfilled."""
+    if not fulfilled:
+        raise UsageError(message)
 
 
 def check_writable(option: str, path: str | None) -> None:

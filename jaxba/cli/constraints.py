@@ -61,12 +61,15 @@ def constrained(
     for key in first:
         problem = _applied(problem, file, key, settings.pop(key), strict)
     try:
-        numbers = [one.replace("-", "_") for one in constant if one not in PARTS]
+        problem = hold(problem, numbers=[one.replace("-", "_") for one in constant if one not in PARTS])
+    except ValueError as error:
+        raise UsageError(f"--constant: {error}; or {', '.join(PARTS)}") from None
+    try:
         parts: dict[str, Any] = {part: "all" for part in PARTS[:4] if part in constant}
         for part, held in (("frames", "poses"), ("frame-rotations", "rotations")):
             if part in constant:
                 parts.setdefault(held, _with_known_places(problem))
-        problem = hold(problem, numbers=numbers, **parts)
+        problem = hold(problem, **parts)
     except ValueError as error:
         raise UsageError(f"--constant: {error}") from None
     in_file = settings.pop("gauge", "free")

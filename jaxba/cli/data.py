@@ -3,49 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
 
 from jaxba.cli import common
-
-FILE_WIDTH = 120
-"""Width of the list in characters if the output is not a terminal."""
+from jaxba.cli.options import options
 
 
-@dataclass(frozen=True)
+@options
 class Download:
-    """Downloads problems into the cache folder. Continues interrupted downloads, and skips files that are there."""
+    """Downloads problems into the cache folder; continues interrupted downloads."""
 
-    names: Annotated[tuple[str, ...], tyro.conf.Positional]
+    names: Annotated[tuple[str, ...], "NAME ...", tyro.conf.Positional]
     """Names such as ladybug-1197, or families such as trafalgar for all of their problems."""
 
-    base_url: str | None = None
-    """URL of the folder with the families. Default: that of the data set."""
+    base_url: Annotated[str | None, "URL"] = None
+    """Folder with the families. Default: that of the data set."""
 
     checksum: bool = True
-    """Compare the checksum. --no-checksum: unpack a file and compare its header with its name instead, as for files
-    without a known checksum."""
+    """Compare the checksum; else unpack the file and compare its header with its name, as for files without a known
+    checksum."""
 
 
-@dataclass(frozen=True)
+@options
 class List:
-    """Lists the problems: name, size, file, and whether they are in the cache folder."""
+    """Lists the problems, and whether they are in the cache folder."""
 
-    names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    names: Annotated[tuple[str, ...], "[NAME ...]", tyro.conf.Positional] = ()
     """Names or families. Default: all."""
 
 
-@dataclass(frozen=True)
+@options
 class PathOf:
     """Prints the path of a downloaded problem."""
 
-    name: Annotated[str, tyro.conf.Positional]
+    name: Annotated[str, "NAME", tyro.conf.Positional]
     """Name such as ladybug-1197."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-data`."""
 
@@ -63,7 +60,7 @@ def main() -> None:
 
 def run(argv: Sequence[str] | None = None) -> int:
     """Runs the command. Exit status: 0 for success, 2 for bad input or a failed download, 130 after Ctrl-C."""
-    text = "Problems of BAL (Bundle Adjustment in the Large). The variable JAXBA_BAL names another cache folder."
+    text = "Problems of BAL (Bundle Adjustment in the Large), in the folder JAXBA_BAL."
     return common.run_command(Arguments, _data, text, argv)
 
 
@@ -79,15 +76,11 @@ def _data(args: Arguments) -> int:
 
 
 def _list(args: List) -> int:
-    from rich.console import Console
     from rich.table import Table
 
     from jaxba.datasets.bal.catalog import ENTRIES, select
     from jaxba.datasets.bal.paths import data_folder, downloaded_path
 
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=FILE_WIDTH)
     table = Table(box=None, header_style="bold", pad_edge=False)  # 80 columns wide
     for title in ("name", "cameras", "points", "file", "sha256", "here"):
         table.add_column(title, no_wrap=True, justify="right" if title in ("cameras", "points") else "left")
@@ -95,13 +88,13 @@ def _list(args: List) -> int:
         file = entry.file.partition("/")[2]
         known, here = ("known" if entry.sha256 else "no"), ("yes" if downloaded_path(entry) else "no")
         table.add_row(entry.name, str(entry.cameras), str(entry.points), file, known, here)
+    console = common.console()
     console.print(table)
-    console.print(f"folder: {data_folder()}", highlight=False, markup=False, soft_wrap=True)
+    console.print(f"folder: {data_folder()}", markup=False)
     return 0
 
 
 def _download(args: Download) -> int:
-    from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
     from jaxba.datasets.bal.catalog import select
@@ -114,7 +107,7 @@ def _download(args: Download) -> int:
         from jaxba.datasets.bal import download
     except ImportError as error:
         raise common.UsageError(str(error)) from None
-    console = Console(soft_wrap=True, highlight=False)
+    console = common.console()
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     status = 0
     with Progress(

@@ -6,112 +6,125 @@ import json
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from jaxba.cli import common
-
-FILE_WIDTH = 120
-"""Width of tables in characters if the output is not a terminal."""
+from jaxba.cli.options import options
+from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
+from jaxba.datasets.kitti import evaluate
+from jaxba.datasets.kitti.assemble import Assembled, poses_of_cameras, sidecar_contents, windows
+from jaxba.datasets.kitti.sequence import files_of, read_sequence
+from jaxba.datasets.kitti.trajectory import path_length
+from jaxba.datasets.kitti.triangulate import Filters
+from jaxba.io import check_output, write_problem
+from jaxba.io.files import sidecar_path, strip_compression
+from jaxba.io.formats import FORMATS, by_ending
+from jaxba.io.frames import poses_of, read_sidecar, truth_of, write_sidecar
+from jaxba.io.poses import read_poses
+from jaxba.io.remarks import note, note_center
+from jaxba.problem import geometry
+from jaxba.problem.bundle_problem import ProblemError
+from jaxba.runtime.atomic import write_text
 
 EVALUATE = "evaluate"
 """First argument of the subcommand; a folder of this name can be given as ./evaluate."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-kitti`."""
 
-    sequence: Annotated[str, tyro.conf.Positional]
+    sequence: Annotated[str, "SEQUENCE", tyro.conf.Positional]
     """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
 
-    out: str = "kitti.txt.bz2"
-    """Output file of the problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json, written
-    beside it, has the frame of each camera."""
+    out: Annotated[str, "FILE"] = "kitti.txt.bz2"
+    """Problem in BAL format, compressed by its ending (.bz2, .gz, .xz). NAME.frames.json beside it has the frame of
+    each camera."""
 
-    frames: str = ":"
-    """Range of frame numbers, first:end or first:end:step, without the end, such as 0:200."""
+    frames: Annotated[str, "A:B:STEP"] = ":"
+    """Range of frame numbers, without the end, such as 0:200."""
 
     features: Literal["sift", "orb", "klt"] = "sift"
     """sift, orb: match key-points. klt: track corners from frame to frame."""
 
     keypoints: int = 2000
-    """Largest number of key-points of a frame."""
+    """Key-points per frame at most."""
 
     reach: int = 3
-    """Match every frame with this many previous frames."""
+    """Previous frames with which each frame is matched."""
 
     min_matches: int = 40
-    """Smallest number of verified matches between two frames."""
+    """Verified matches between two frames at least."""
 
-    keyframes: str = "auto"
-    """auto: choose by parallax and by the fraction of tracks left. all: every frame. N: every N-th frame."""
+    keyframes: Annotated[str, "RULE"] = "auto"
+    """auto: by parallax and the fraction of tracks left. all: every frame. N: every N-th frame."""
 
     start: Literal["vo", "poses", "noisy-poses"] = "vo"
-    """vo: start from the poses of monocular visual odometry. poses: from --poses. noisy-poses: from --poses with
-    accumulating errors."""
+    """vo: start from monocular visual odometry. poses: from --poses. noisy-poses: from --poses with accumulating
+    errors."""
 
-    poses: str | None = None
-    """File of the true poses, 12 numbers per line, a line for every frame of the sequence from frame 0; or 13 numbers,
-    the first of them the frame. With --start vo they are only used to print the error of the start."""
+    poses: Annotated[str | None, "FILE"] = None
+    """True poses, 12 numbers per line for every frame from 0, or 13, the first of them the frame. With --start vo only
+    the error of the start is computed from them."""
 
     rotation_sigma: float = 0.1
-    """Error of noisy-poses: standard deviation of the rotation on each axis per key-frame, degrees."""
+    """Error of noisy-poses: standard deviation per axis and key-frame, degrees."""
 
     translation_sigma: float = 0.05
-    """Error of noisy-poses: standard deviation of the translation on each axis per key-frame, relative to the distance
-    from the previous key-frame."""
+    """The same per axis and key-frame, relative to the distance from the previous key-frame."""
 
     min_angle: float = 1.0
     """Smallest triangulation angle of a point, degrees."""
 
     max_error: float = 3.0
-    """Largest reprojection error of an observation, pixels; before the noise of noisy-poses."""
+    """Largest reprojection error of an observation before the noise of noisy-poses, pixels."""
 
     min_views: int = 2
-    """Smallest number of key-frames that observe a point."""
+    """Key-frames that observe a point at least."""
 
     window: int | None = None
-    """Write several problems with this many key-frames each, named NAME-FIRST-LAST by their frames."""
+    """Write several problems of this many key-frames, named NAME-FIRST-LAST by their frames."""
 
     stride: int | None = None
-    """Number of key-frames from the start of one window to the next. Default: half a window."""
+    """Key-frames from the start of one window to the next. Default: half a window."""
 
     camera: int = 0
-    """Number of the camera, 0 (image_0 and P0) to 3."""
+    """Number of the camera, from 0 (image_0 and P0) to 3."""
 
-    calibration: str | None = None
-    """File of the camera matrix, lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers.
-    Default: that of the sequence."""
+    calibration: Annotated[str | None, "FILE"] = None
+    """Camera matrix: lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers. Default: that of
+    the sequence."""
 
-    work: str | None = None
-    """Folder of intermediate results, with which an interrupted run continues. Default: NAME.work."""
+    work: Annotated[str | None, "FOLDER"] = None
+    """Intermediate results, with which an interrupted run continues. Default: NAME.work."""
 
     seed: int = 0
     """Seed of all random numbers."""
 
 
-@dataclass(frozen=True)
+@options
 class EvaluateArguments:
     """Options of `jaxba-kitti evaluate`."""
 
-    problem: Annotated[str, tyro.conf.Positional]
+    problem: Annotated[str, "PROBLEM", tyro.conf.Positional]
     """Problem written by jaxba-kitti, with its NAME.frames.json beside it."""
 
-    solutions: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    solutions: Annotated[tuple[str, ...], "[SOLUTION ...]", tyro.conf.Positional] = ()
     """Solutions of the problem by jaxba-solve, BAL files."""
 
-    poses: str | None = None
-    """File of the true poses of the whole sequence, 12 numbers per line. Without it no errors are computed."""
+    poses: Annotated[str | None, "FILE"] = None
+    """True poses of the whole sequence, 12 numbers per line. Without them no errors are computed."""
 
-    lengths: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
-    """Lengths of the segments for relative errors, metres."""
+    lengths: Annotated[tuple[float, ...], "METRES ..."] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
+    """Lengths of the segments for relative errors."""
 
-    out: str = "runs/kitti"
-    """Output folder of top-view.png and .svg, evaluation.json and the aligned trajectories."""
+    out: Annotated[str, "FOLDER"] = "runs/kitti"
+    """Folder of top-view.png and .svg, evaluation.json and the aligned trajectories."""
 
 
 def main() -> None:
@@ -124,46 +137,39 @@ def run(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv[:1] == [EVALUATE]:
         text = "Computes trajectory errors and draws the scene from above."
-        return common.run_command(EvaluateArguments, _evaluate, text, argv[1:])
-    text = "Makes a problem from KITTI images. 'jaxba-kitti evaluate --help': compares solutions with true poses."
+        return common.run_command(EvaluateArguments, _evaluate, text, argv[1:], EVALUATE)
+    text = "Makes a problem from KITTI images ('jaxba-kitti evaluate': compares solutions)."
     return common.run_command(Arguments, _build, text, argv)
 
 
-def _build(args: Arguments) -> int:
+def _check(args: Arguments) -> None:
+    """Checks the options, and that OpenCV is installed."""
     common.check_positive(
         keypoints=args.keypoints, reach=args.reach, max_error=args.max_error, min_matches=args.min_matches
     )
     for name in ("max_error", "rotation_sigma", "translation_sigma"):
         value = getattr(args, name)
-        if not math.isfinite(value):
-            raise common.UsageError(f"--{name.replace('_', '-')} must be finite, is {value:g}")
-    if args.min_views < 2:
-        raise common.UsageError(f"--min-views must be at least 2, is {args.min_views}")
-    if not 0 <= args.min_angle < 180:
-        raise common.UsageError(f"--min-angle must lie between 0 and 180, is {args.min_angle:g}")
-    if not 0 <= args.seed < 2**31:
-        raise common.UsageError(f"--seed must lie between 0 and 2147483647, is {args.seed}")
-    if args.start != "vo" and args.poses is None:
-        raise common.UsageError(f"--start {args.start} needs --poses")
-    if args.stride is not None and args.window is None:
-        raise common.UsageError("--stride needs --window")
+        common.require(math.isfinite(value), f"--{name.replace('_', '-')} must be finite, is {value:g}")
+    common.require(args.min_views >= 2, f"--min-views must be at least 2, is {args.min_views}")
+    common.require(0 <= args.min_angle < 180, f"--min-angle must lie between 0 and 180, is {args.min_angle:g}")
+    common.require(0 <= args.seed < 2**31, f"--seed must lie between 0 and 2147483647, is {args.seed}")
+    common.require(args.start == "vo" or args.poses is not None, f"--start {args.start} needs --poses")
+    common.require(args.stride is None or args.window is not None, "--stride needs --window")
     common.check_writable("--out", args.out)
-    from jaxba.io import check_output
-    from jaxba.io.files import strip_compression
-    from jaxba.io.formats import FORMATS, by_ending
-
-    stem = Path(strip_compression(args.out))
     check_output(args.out)
-    if by_ending(args.out) not in (None, FORMATS[0]):
-        raise common.UsageError(f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
+    is_bal = by_ending(args.out) in (None, FORMATS[0])
+    common.require(is_bal, f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
     try:
         from jaxba.datasets.kitti import opencv  # noqa: F401 - the error names the package to install
     except ImportError as error:
         raise common.UsageError(str(error)) from None
+
+
+def _build(args: Arguments) -> int:
+    _check(args)
     from jaxba.datasets.kitti.build import BuildOptions, build
     from jaxba.datasets.kitti.frontend import FrontEndOptions
     from jaxba.datasets.kitti.result_cache import ResultCache
-    from jaxba.datasets.kitti.triangulate import Filters
 
     with common.notes_printed():
         sequence, poses = _inputs(args)
@@ -178,14 +184,16 @@ def _build(args: Arguments) -> int:
         Filters(args.min_angle, args.max_error),
         args.min_views,
     )
-    console = _console()
-    cache = ResultCache(Path(args.work) if args.work else stem.with_suffix(".work"))
+    console = common.console()
+    work = args.work or Path(strip_compression(args.out)).with_suffix(".work")
+    cache = ResultCache(Path(work))
     try:
         with _Progress(console) as progress:
             built = build(sequence, options, cache, poses, progress.report)
         parts = _parts(built, args)
         _check_apart([path for _, path in parts], sequence, args)
-        files = [_write(part, path, sequence, args) for part, path in parts]
+        for part, path in parts:
+            _write(part, path, sequence, args)
     except KeyboardInterrupt:
         console.print("interrupted; what is done is kept, run the same command again to continue")
         return common.INTERRUPTED
@@ -196,16 +204,12 @@ def _build(args: Arguments) -> int:
     ):
         if numbers:
             console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")
-    console.print(f"wrote {', '.join(files)}")
+    console.print(f"wrote {', '.join(path for _, path in parts)}")
     return 0
 
 
 def _check_apart(problems: Sequence[str], sequence: Any, args: Arguments) -> None:
     """Refuses a problem, or the frames beside one, in the place of a file of the sequence."""
-    from jaxba.cli.overwriting import check_apart
-    from jaxba.datasets.kitti.sequence import files_of
-    from jaxba.io.files import sidecar_path
-
     written = {"--out": [*problems, *map(sidecar_path, problems)]}
     own = [*sequence.images, *files_of(args.sequence, sequence.folder)]
     read = {"the file of --poses": [args.poses], "the file of --calibration": [args.calibration]}
@@ -215,9 +219,6 @@ def _check_apart(problems: Sequence[str], sequence: Any, args: Arguments) -> Non
 def _inputs(args: Arguments) -> tuple[Any, Any]:
     """The sequence, and its true poses as a function of the numbers of frames, or None."""
     from jaxba.datasets.kitti.images import image_size
-    from jaxba.datasets.kitti.poses import poses_of, read_poses
-    from jaxba.datasets.kitti.sequence import read_sequence
-    from jaxba.io.notes import note, note_center
 
     sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
     poses = None
@@ -227,18 +228,15 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
             whole, sequence = len(sequence), sequence.only(table.numbers)
             if len(sequence) < whole:
                 note(args.poses, f"{whole - len(sequence)} of {whole} frames left out: they have no pose")
-        poses_of(table, sequence.numbers, sequence.calibration)  # raises errors before any work is done
         poses = lambda frames: poses_of(table, frames, sequence.calibration)
+        poses(sequence.numbers)  # raises errors before any work is done
     center = (sequence.calibration.cx, sequence.calibration.cy)
     note_center(args.calibration or sequence.folder, f"camera {args.camera}", center, image_size(sequence))
     return sequence, poses
 
 
-def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
+def _parts(built: Any, args: Arguments) -> list[tuple[Assembled, str]]:
     """The problems to write, and their files."""
-    from jaxba.datasets.kitti.assemble import windows
-    from jaxba.io.files import strip_compression
-
     if args.window is None:
         return [(built.whole, args.out)]
     stride = max(args.window // 2, 1) if args.stride is None else args.stride
@@ -248,37 +246,25 @@ def _parts(built: Any, args: Arguments) -> list[tuple[Any, str]]:
     return [(part, f"{stem}-{part.frames[0]:06d}-{part.frames[-1]:06d}{ending}") for part in parts]
 
 
-def _write(part: Any, path: str, sequence: Any, args: Arguments) -> str:
+def _write(part: Assembled, path: str, sequence: Any, args: Arguments) -> None:
     """Writes the file of frames first, then the problem, so that there is never a problem without its frames."""
     from jaxba import __version__
-    from jaxba.datasets.kitti.assemble import sidecar_contents
-    from jaxba.datasets.kitti.evaluate import write_sidecar
     from jaxba.datasets.kitti.opencv import cv2
-    from jaxba.io import write_problem
 
     times = None if sequence.times is None else dict(zip(sequence.numbers, sequence.times.tolist(), strict=True))
     metadata = sidecar_contents(
         part,
         sequence.calibration,
-        times=None if times is None else [times[number] for number in part.frames],
+        times=times and [times[number] for number in part.frames],
         options=asdict(args),
         versions={"jaxba": __version__, "opencv": cv2.__version__},
     )
     write_sidecar(path, metadata)
     write_problem(part.problem, path)
-    return path
 
 
-def _build_table(parts: list[Any], built: Any, poses: Any) -> Any:
-    import numpy as np
-
-    from jaxba.datasets.kitti.assemble import poses_of_cameras
-    from jaxba.datasets.kitti.evaluate import score
-    from jaxba.problem import geometry
-    from jaxba.problem.bundle_problem import ProblemError
-
-    kept = len(built.whole.frames)
-    title = f"{built.frames} frames, {kept} key-frames, {built.tracks} tracks"
+def _build_table(parts: list[Assembled], built: Any, poses: Any) -> Any:
+    title = f"{built.frames} frames, {len(built.whole.frames)} key-frames, {built.tracks} tracks"
     table = _table(title, "frames", "key-frames", "points", "observations", "mean error (px)", "ATE of the start (m)")
     for part in parts:
         problem = part.problem
@@ -286,7 +272,8 @@ def _build_table(parts: list[Any], built: Any, poses: Any) -> Any:
         ate = "-"
         if poses is not None:
             try:
-                ate = f"{score(poses_of_cameras(problem.cameras), poses(part.frames)).absolute.rmse:.3f}"
+                found = evaluate.score(poses_of_cameras(np.asarray(problem.cameras)), poses(part.frames))
+                ate = f"{found.absolute.rmse:.3f}"
             except ProblemError:  # a straight line, or two cameras
                 ate = "undefined"
         numbers = (problem.num_cameras, problem.num_points, problem.num_observations, f"{error:.3f}", ate)
@@ -295,20 +282,17 @@ def _build_table(parts: list[Any], built: Any, poses: Any) -> Any:
 
 
 def _evaluate(args: EvaluateArguments) -> int:
-    if not args.lengths or not all(length > 0 for length in args.lengths):
-        raise common.UsageError("--lengths must be positive")
+    common.require(bool(args.lengths) and all(length > 0 for length in args.lengths), "--lengths must be positive")
     from jaxba.bench.plots import save_figure
-    from jaxba.datasets.kitti import evaluate, plots
-    from jaxba.runtime.atomic import write_text
+    from jaxba.datasets.kitti import plots
 
     _check_results_apart(args)
-    side = evaluate.read_sidecar(args.problem)
-    truth = None if args.poses is None else evaluate.truth_of(side, args.poses)
+    side = read_sidecar(args.problem)
+    truth = None if args.poses is None else truth_of(side, args.poses)
     with common.notes_printed():
         results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
-    path = None if truth is None else truth[:, :, 3]
     views = [plots.View(_caption(r), r.points, r.poses[:, :, 3]) for r in results]
-    figure = plots.plot_top_view(views, path)
+    figure = plots.plot_top_view(views, None if truth is None else truth[:, :, 3])
     folder = Path(args.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -320,7 +304,7 @@ def _evaluate(args: EvaluateArguments) -> int:
         files = save_figure(figure, folder / "top-view")
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
-    console = _console()
+    console = common.console()
     console.print(_evaluate_table(results, truth))
     console.print(f"wrote {files[0]} and {len(results) + (truth is not None) + 2} files beside it")
     return 0
@@ -328,9 +312,6 @@ def _evaluate(args: EvaluateArguments) -> int:
 
 def _check_results_apart(args: EvaluateArguments) -> None:
     """Refuses results in the place of a file that is compared."""
-    from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
-    from jaxba.io.files import strip_compression
-
     files, folder = [args.problem, *args.solutions], Path(args.out)
     names = [f"poses-{number}-{Path(strip_compression(path)).stem}.txt" for number, path in enumerate(files)]
     names += ["evaluation.json", "poses-truth.txt", "top-view.png", "top-view.svg"]
@@ -338,30 +319,29 @@ def _check_results_apart(args: EvaluateArguments) -> None:
     check_apart({"--out": [folder / name for name in names]}, read)
 
 
-def _caption(result: Any) -> str:
+def _caption(result: evaluate.Evaluated) -> str:
     ate = "" if result.scores is None else f", ATE {result.scores.absolute.rmse:.2f} m"
     return f"{result.name}{ate}"
 
 
-def _evaluate_table(results: list[Any], truth: Any) -> Any:
-    from jaxba.datasets.kitti.trajectory import path_length
-
+def _evaluate_table(results: list[evaluate.Evaluated], truth: Any) -> Any:
     title = f"{len(results[0].poses)} key-frames"
-    if truth is None:
-        table = _table(title, "file", "rms (px)")
-    else:
+    names: tuple[str, ...] = ()
+    if truth is not None:
         title += f", {path_length(truth):.1f} m of path; after similarity alignment"
         names = ("ATE (m)", "largest (m)", "RPE (m)", "RPE (deg)", "segments (%)", "(deg/m)", "number")
-        table = _table(title, "file", "rms (px)", *names)
+    table = _table(title, "file", "rms (px)", *names)
     for r in results:
         row = [r.name, f"{r.rms:.4f}"]
         if r.scores is not None:
-            s = r.scores
+            s, segments = r.scores, r.scores.segments
             row += [f"{s.absolute.rmse:.3f}", f"{s.absolute.largest:.3f}"]
             row += [f"{s.relative.translation.rmse:.4f}", f"{s.relative.rotation.rmse:.4f}"]
-            segments = s.segments
-            row += ["-"] * 3 if segments is None else [f"{segments.translation:.3f}", f"{segments.rotation:.5f}"]
-            row += [] if segments is None else [str(segments.segments)]
+            row += (
+                ["-"] * 3
+                if segments is None
+                else [f"{segments.translation:.3f}", f"{segments.rotation:.5f}", str(segments.segments)]
+            )
         table.add_row(*row)
     return table
 
@@ -374,13 +354,6 @@ def _table(title: str, first: str, *columns: str) -> Any:
     for name in columns:
         table.add_column(name, justify="right")
     return table
-
-
-def _console() -> Any:
-    from rich.console import Console
-
-    console = Console(soft_wrap=True, highlight=False)
-    return console if console.is_terminal else Console(soft_wrap=True, highlight=False, width=FILE_WIDTH)
 
 
 class _Progress:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 
 FULL, FAST = "full", "fast"
 """Names of the presets."""
@@ -21,7 +21,7 @@ REPORT = "paper.md"
 """File of the report, unless `--report` names another."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-paper`."""
 
@@ -156,8 +156,8 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
         listed = {name: seconds[name] for name in TABLES_AND_FIGURES if name in seconds}
         files = write(runner, sections, report, _command(args), listed)
     console.print(
-        f"wrote {report}, {files[1]} and {len(files) - 2} figures; {sum(wall for wall, _ in seconds.values()):.0f} s of work in "
-        f"{folder}"
+        f"wrote {report}, {files[1]} and {len(files) - 2} figures; "
+        f"{sum(wall for wall, _ in seconds.values()):.0f} s of work in {folder}"
     )
     return status
 

@@ -2,22 +2,35 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 
 
-def start(
-    coordinator: str | None, processes: int | None, process: int | None, distributed: bool, devices: int | None
-) -> list[Any]:
+@options
+class Devices:
+    """Devices and processes among which the work is divided."""
+
+    devices: int | None = None
+    """Devices of each process, among which the work is divided. On a CPU they are virtual: no speed-up. Default: 1;
+    with several processes, all of them."""
+
+    coordinator: Annotated[str | None, "HOST:PORT"] = None
+    """Address of process 0, which reads, writes and prints. Start every process with the same options but --process."""
+
+    processes: int | None = None
+    """Number of processes."""
+
+    process: int | None = None
+    """Number of this process, from 0."""
+
+    distributed: bool = False
+    """Read --coordinator, --processes and --process from Slurm, Open MPI or Kubernetes."""
+
+
+def start(args: Devices) -> list[Any]:
     """Starts JAX with other processes if options ask for them; must come before any computation.
-
-    Args:
-        coordinator: of `--coordinator`, with `processes` and `process`.
-        processes: of `--processes`.
-        process: of `--process`.
-        distributed: of `--distributed`.
-        devices: of `--devices`, in each process.
 
     Returns:
         The devices, those of all processes; none for JAX's default one, if no option is given.
@@ -25,20 +38,20 @@ def start(
     Raises:
         UsageError: bad options, or they cannot be met.
     """
-    named = [x is not None for x in (coordinator, processes, process)]
-    if not (any(named) or distributed or devices is not None):
+    named = [x is not None for x in (args.coordinator, args.processes, args.process)]
+    if not (any(named) or args.distributed or args.devices is not None):
         return []
-    from jaxba.runtime import distributed as runtime
+    from jaxba.runtime import distributed
     from jaxba.runtime.process import keep_memory
 
     if any(named) and not all(named):
         raise common.UsageError("--coordinator, --processes and --process go together")
-    if any(named) and distributed:
+    if any(named) and args.distributed:
         raise common.UsageError("--distributed finds what --coordinator, --processes and --process name: give one")
     keep_memory()  # sets how JAX starts
     try:
-        if distributed or any(named):
-            runtime.initialize(coordinator, processes, process)
-        return runtime.use_devices(devices)
-    except runtime.DistributedError as error:
+        if args.distributed or any(named):
+            distributed.initialize(args.coordinator, args.processes, args.process)
+        return distributed.use_devices(args.devices)
+    except distributed.DistributedError as error:
         raise common.UsageError(str(error)) from None

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ import tyro
 from jaxba.cli import common, processes, table, view
 from jaxba.cli.colmap_options import translated
 from jaxba.cli.constraints import constrained
-from jaxba.cli.interrupt import Interrupt
+from jaxba.cli.options import options
 from jaxba.cli.output import check_outputs, check_storable, write_solution
 from jaxba.cli.overwriting import policy_file
 from jaxba.cli.streams import whole_input
@@ -40,6 +40,7 @@ from jaxba.problem.options import (
     Scaling,
 )
 from jaxba.runtime.compilation import Compilation
+from jaxba.runtime.interrupt import Interrupt
 from jaxba.scenes import DEFAULT_SCENES, random_scene
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord, Watch
@@ -65,145 +66,139 @@ OPTION_OF_FIELD = {"points": "refine_points", "scale": "loss_scale"}
 """Fields of options whose command-line option has another name."""
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """Options of `jaxba-solve`."""
+@options
+class Problem:
+    """What is solved."""
 
-    problem: Annotated[str | None, tyro.conf.Positional] = None
-    """BAL file, Bundler .out file, VisualSFM .nvm file, or a .json or .sfm file of OpenSfM, OpenMVG or AliceVision,
-    plain or .bz2, .gz, .xz; the folder of a COLMAP model; the name of a downloaded BAL problem such as ladybug-49
-    (see jaxba-data); or - for a file on standard input. Default: a random scene."""
-
-    policy: str = DEFAULT_POLICY
-    """Damping policy, which chooses lambda: guarded (1e-8 until a step fails), learned (the shipped network for the
-    options of the step), bold (the smallest lambda that its guard allows), a .safetensors file of jaxba-train, or one
-    of the rules ceres, classic, gtsam, nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most rules take
-    the first lambda, as in classic:0.03. All may end with +embedded (all embedded iterations, as around learned) or
-    +refineK (K point iterations after each camera step, as --refine-points K)."""
-
-    method: str = DEFAULT_METHOD
-    """Method that computes a step. lm: Levenberg-Marquardt. stba: random clusters of at most 100 cameras; stba:16: of
-    at most 16. deeplm: conjugate gradients on all variables. poba: a power series."""
-
-    refine_points: int | None = None
-    """Number of embedded point iterations after each camera step, without other embedded iterations. Default: the
-    embedded iterations with which a learned policy was trained; none for a rule."""
-
-    linear_solver: LinearSolverChoice = DEFAULTS.linear_solver
-    """explicit: form and factor the reduced camera system. sparse: form it and use conjugate gradients. implicit:
-    conjugate gradients without forming it. cg: the same, with twelve iterations. auto: choose among the first three by
-    size."""
-
-    preconditioner: Preconditioner = DEFAULTS.conjugate_gradients.preconditioner
-    """Preconditioner of conjugate gradients (sparse, implicit, cg). two-level: block diagonal, and a coarse system of
-    the motion of clusters of cameras."""
-
-    dtype: Dtype = DEFAULTS.dtype
-    """Floating point type. mixed: float64, but the reduced camera system in float32."""
-
-    pad: Literal["auto", "yes", "no"] = "auto"
-    """Pad sizes to a grid, so that problems of about the same size share one compiled program, also between calls of
-    this command. auto: for at most 64 cameras and 60,000 observations, unless --compilation is full. Only for the
-    explicit solver, which auto then means; large problems, those with lenses and those for other linear solvers are not
-    padded."""
-
-    compilation: Compilation = DEFAULTS.compilation
-    """quick: compile in a third of the time, with iterations that take two to six times as long. full: compile with all
-    optimisations. auto: quick for few observations, for more an intermediate mode with half of the compilation time and
-    nearly full speed; compile again with all optimisations after as many iterations as repay it. On a GPU always
-    full."""
-
-    retriangulate: bool = False
-    """After convergence, search for points at other depths with a lower cost, continue from them, and repeat this while
-    it pays. Finds points in wrong local minima, and so a lower cost, for more iterations."""
-
-    max_iterations: int = DEFAULTS.max_iterations
-    """Limit of linear solves. 0: only compute the cost, and write the problem as it is."""
-
-    ftol: float = DEFAULTS.tolerances.ftol
-    """Converged when the relative decrease of the cost by an accepted step is below this."""
-
-    xtol: float = DEFAULTS.tolerances.xtol
-    """Converged when the norm of an accepted step, relative to that of the parameters, is below this."""
-
-    gtol: float = DEFAULTS.tolerances.gtol
-    """Converged when the largest gradient entry is below this."""
-
-    scaling: Scaling | None = None
-    """Matrix that lambda multiplies. diagonal: the diagonal of the Hessian. identity: the unit matrix, as in the
-    paper's equation. Default: as a learned policy was trained; the diagonal for a rule."""
-
-    rotation: Rotation | None = None
-    """Coordinates of rotation steps. angle-axis: those of the file, as in Ceres. manifold: multiplication by
-    exp(step). Default: as a learned policy was trained; those of the file for a rule."""
+    problem: Annotated[str | None, "[PROBLEM]", tyro.conf.Positional] = None
+    """BAL, Bundler (.out) or VisualSFM (.nvm) file, or a .json or .sfm file of OpenSfM, OpenMVG or AliceVision, plain
+    or .bz2, .gz, .xz; folder of a COLMAP model; name of a downloaded BAL problem such as ladybug-49 (see jaxba-data);
+    or - for a file on standard input. Default: a random scene."""
 
     intrinsics: Intrinsics = DEFAULTS.intrinsics
-    """free: optimise focal length and distortion of every camera, as in BAL, or of every lens, as in COLMAP. fixed:
-    keep them, for calibrated cameras; the linear solver must be explicit."""
+    """fixed: for calibrated cameras."""
 
     refine_principal_point: bool = False
     """Optimise principal points of a COLMAP model, too."""
 
-    constant: tuple[str, ...] = ()
-    """What stays as it is: poses, rotations, points, focal, distortion, principal-point, numbers of lenses such as k2;
-    of rigs extrinsics, frames (their poses, not where cameras are in them) and frame-rotations."""
+    constant: Annotated[tuple[str, ...], "PART ..."] = ()
+    """Parts that stay as they are: poses, rotations, points, focal, distortion, principal-point, or numbers of lenses
+    such as k2; of rigs extrinsics, frames (their poses) and frame-rotations."""
 
     gauge: Gauge | None = None
-    """Fix position, orientation and scale. two-cameras: the pose of one camera, and a number of another's translation.
-    three-points: three points. Default: free, or what --constraints says."""
+    """Fix position, orientation and scale. Default: free, or the gauge of --constraints."""
 
-    constraints: str | None = None
-    """YAML file of constants and priors by the model's own names and ids, with the keys constant_poses,
-    constant_rotations, constant_points, constant_cameras, constant_numbers, position_priors and gauge."""
+    constraints: Annotated[str | None, "FILE"] = None
+    """YAML file of constants, priors and gauge by the model's own names and ids."""
 
     loss: Literal["squared", "huber", "soft_l1", "cauchy", "tukey"] = "squared"
-    """Robust loss function of the squared residual."""
+    """Robust loss function."""
 
     loss_scale: float = DEFAULTS.loss.scale
-    """Scale of the robust loss, pixels: residuals well below it count quadratically."""
-
-    output: str | None = None
-    """Output file in BAL format, compressed by its ending, .out for Bundler's format, or .ply for a viewer; - is
-    standard output. A folder that is there, or a name that ends in /, becomes a COLMAP model. If the problem is one:
-    every name does, unless it ends in .txt, .bal, .out, .ply, .bz2, .gz or .xz."""
+    """Width of its quadratic part, pixels."""
 
     strict: bool = False
-    """Refuse a problem of which a part would be left out, such as a view in a COLMAP model that names no key-point; and
-    positions in --constraints of images that are not in the problem."""
+    """Fail instead of skipping invalid parts of the input."""
 
-    covariance: str | None = None
-    """Output file (.npz) of covariances: poses, lenses, points, points_given_cameras. It needs a gauge, constants or
-    priors that fix position, orientation and scale."""
 
-    record: str | None = None
-    """Output file (.npz) of the parameters after every step, for jaxba-view; of more than 20,000 points an even
-    choice."""
+@options
+class Step:
+    """How a step is computed."""
+
+    policy: Annotated[str, "NAME"] = DEFAULT_POLICY
+    """Damping policy, which chooses lambda: guarded (1e-8 until a step fails), learned (the shipped network), bold (the
+    smallest lambda that its guard allows), a .safetensors file of jaxba-train, or a rule: ceres, classic, gtsam,
+    nielsen, stba, theseus, schedule, gauss-newton, constant:1e-4. Most rules take the first lambda, as in
+    classic:0.03. A suffix +embedded adds all embedded iterations, +refineK is --refine-points K."""
+
+    method: Annotated[str, "NAME"] = DEFAULT_METHOD
+    """lm: Levenberg-Marquardt. stba, stba:16: random clusters of at most 100 or 16 cameras. ddlm, ddlm:16: clusters in
+    parallel. deeplm: conjugate gradients on all variables. poba: a power series."""
+
+    refine_points: int | None = None
+    """Point iterations after each camera step. Default: the embedded iterations of a learned policy; none for a
+    rule."""
+
+    linear_solver: LinearSolverChoice = DEFAULTS.linear_solver
+    """explicit: factor the reduced camera system. sparse: form it for conjugate gradients. implicit: do not form it.
+    cg: twelve iterations of that. auto: by size."""
+
+    preconditioner: Preconditioner = DEFAULTS.conjugate_gradients.preconditioner
+    """Of conjugate gradients. two-level: with a coarse system of the motion of clusters."""
+
+    scaling: Scaling | None = None
+    """Matrix that lambda multiplies. Default: that of a learned policy; diagonal for a rule."""
+
+    rotation: Rotation | None = None
+    """angle-axis: steps of the file's numbers, as in Ceres. manifold: multiplication by exp(step). Default: that of a
+    learned policy; angle-axis for a rule."""
+
+    dtype: Dtype = DEFAULTS.dtype
+    """mixed: float64, but the reduced camera system in float32."""
+
+    pad: Literal["auto", "yes", "no"] = "auto"
+    """Pad sizes, so that similar problems share a compiled program, also between calls; for the explicit solver without
+    lenses. auto: up to 64 cameras and 60,000 observations, unless --compilation is full."""
+
+    compilation: Compilation = DEFAULTS.compilation
+    """quick: compile in a third of the time, for iterations that take two to six times as long. full: the contrary.
+    auto: full once that pays; on a GPU always."""
+
+
+@options
+class Stop:
+    """When the solve ends."""
+
+    max_iterations: int = DEFAULTS.max_iterations
+    """Limit of linear solves. 0: compute the cost, and write the problem as it is."""
+
+    ftol: float = DEFAULTS.tolerances.ftol
+    """Stop when an accepted step lowers the cost by less, relatively."""
+
+    xtol: float = DEFAULTS.tolerances.xtol
+    """Stop when an accepted step is shorter, relative to the parameters."""
+
+    gtol: float = DEFAULTS.tolerances.gtol
+    """Stop at this largest gradient entry."""
+
+    retriangulate: bool = False
+    """After convergence, move points to depths with a lower cost and go on."""
+
+
+@options
+class Output:
+    """What is written and shown."""
+
+    output: Annotated[str | None, "FILE"] = None
+    """Solution in BAL format, compressed by its ending; .out: Bundler's format; .ply: for a viewer; -: standard output.
+    An existing folder or NAME/ becomes a COLMAP model; so does any name if the problem is one, except *.txt, *.bal,
+    *.out, *.ply, *.bz2, *.gz and *.xz."""
+
+    covariance: Annotated[str | None, "FILE"] = None
+    """Covariances (.npz): poses, lenses, points, points_given_cameras. Needs a gauge, or constants or priors that fix
+    position, orientation and scale."""
+
+    record: Annotated[str | None, "FILE"] = None
+    """Parameters after every step (.npz), for jaxba-view. At most 20,000 points are recorded, evenly sampled."""
 
     view: bool = False
-    """Watch the solve in the browser while it runs (extra view)."""
+    """Watch the solve in the browser (extra view)."""
 
-    log: str | None = None
-    """Output file of a JSON record of the solve, compressed by its ending; - is standard output."""
+    log: Annotated[str | None, "FILE"] = None
+    """JSON record of the solve, compressed by its ending; -: standard output."""
+
+
+@options
+class Devices(processes.Devices):
+    """Where the solve runs."""
 
     device: Literal["auto", "cpu"] = "auto"
-    """cpu: the CPU, also where JAX has a GPU."""
+    """cpu: even where JAX has a GPU."""
 
-    devices: int | None = None
-    """Devices of each process, among which points are divided. On a CPU virtual ones, which gain nothing. Default: one;
-    with several processes all that there are."""
 
-    coordinator: str | None = None
-    """HOST:PORT of the first of several processes, which prints, reads and writes for all. Each is started with the
-    same options but --process."""
-
-    processes: int | None = None
-    """Number of processes."""
-
-    process: int | None = None
-    """Number of this process, from 0."""
-
-    distributed: bool = False
-    """Find the last three under Slurm, Open MPI or Kubernetes."""
+@options
+class Arguments(Problem, Step, Stop, Output, Devices):
+    """Options of `jaxba-solve`."""
 
 
 def main() -> None:
@@ -284,7 +279,7 @@ def _run(args: Arguments) -> int:
         import jax
 
         jax.config.update("jax_platforms", "cpu")
-    several = processes.start(args.coordinator, args.processes, args.process, args.distributed, args.devices)
+    several = processes.start(args)
     if not several:
         return _run_main(args)
     if (args.record is not None or args.view) and (args.processes is not None or args.distributed):
@@ -365,7 +360,7 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     if args.view:
         view.check_extra()
     with common.notes_printed():
-        problem = _default_scene() if path is None else _read(args, path)
+        problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
         problem = constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)
     if args.strict and len(away := facing_away(problem)):
         raise ProblemError(aside_text(problem, away))
@@ -400,10 +395,6 @@ def _write_covariance(path: str, problem: BundleProblem, loss: Loss) -> None:
         arrays = ("poses", "lenses", "points", "points_given_cameras")
         np.savez_compressed(file, **{name: getattr(found, name) for name in arrays})
     common.print_line(f"wrote {path}")
-
-
-def _default_scene() -> BundleProblem:
-    return random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0)
 
 
 def _iterate(

@@ -5,14 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from jaxba.cli import common, processes
-from jaxba.cli.interrupt import Interrupt
+from jaxba.cli.options import options
+from jaxba.runtime.interrupt import Interrupt
 from jaxba.training.view import TrainingView
 
 if TYPE_CHECKING:
@@ -41,54 +41,44 @@ FILE_WIDTH = 160
 """Width of the table in characters if the output is not a terminal."""
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """Options of `jaxba-train`."""
+@options
+class Run:
+    """What is trained, and where."""
 
-    config: str | None = None
-    """A preset (default, plain, driver, fast, paper; bal and kitti with --problems) or the path of a YAML file. A
-    resumed run has its configuration in its folder."""
+    config: Annotated[str | None, "NAME"] = None
+    """Preset (default, plain, driver, fast, paper; bal and kitti with --problems) or YAML file. A resumed run has its
+    configuration in its folder."""
 
     overrides: Annotated[
-        tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="set", metavar="KEY=VALUE ...")
+        tuple[tuple[str, ...], ...],
+        tyro.conf.UseAppendAction,
+        tyro.conf.arg(name="set", metavar="KEY=VALUE ...", prefix_name=False),
     ] = ()
     """Settings that replace those of the configuration, such as sac.width=128 seed=3; values are YAML."""
 
-    out: str | None = None
+    out: Annotated[str | None, "FOLDER"] = None
     """Folder of the run. Default: runs/NAME for the configuration NAME."""
 
     seeds: int | None = None
-    """Agents that are trained side by side from other random numbers, the setting of this name. Each has a policy file;
-    the policy of the best one on training scenes is written once more."""
+    """Agents that are trained side by side from other random numbers. Each has a policy file; the one that is best on
+    training scenes is written once more."""
 
-    problems: tuple[str, ...] = ()
+    problems: Annotated[tuple[str, ...], "FILE ..."] = ()
     """Real problems to train on: BAL files, COLMAP models, output of jaxba-kitti. Scenes are windows of neighbouring
-    cameras, the last fifth of every problem held out. With a configuration that has classes of the family windows these
-    are cut; else all its classes are."""
+    cameras; the last fifth of every problem is held out. They replace the configuration's classes of windows, or all
+    classes if it has none."""
 
-    wandb: str | None = None
-    """Project at Weights & Biases that gets the log, too; needs the extra `wandb`."""
+    wandb: Annotated[str | None, "PROJECT"] = None
+    """Write the log to this project at Weights & Biases, too (extra wandb)."""
 
     resume: bool = False
-    """Continue the run in the folder from its last checkpoint, with the same results as without the interruption: bit
-    for bit on the same number of devices, to rounding on another."""
+    """Continue the run in the folder from its last checkpoint. The results are those of an uninterrupted run, bit for
+    bit on the same number of devices."""
 
-    devices: int | None = None
-    """Devices of each process, among which agents are divided if their number is a multiple, else environments and
-    batches. On a CPU virtual ones, which gain nothing. Default: one; with several processes all that there are."""
 
-    coordinator: str | None = None
-    """HOST:PORT of the first of several processes, which prints, reads and writes for all. Each is started with the
-    same options but --process."""
-
-    processes: int | None = None
-    """Number of processes."""
-
-    process: int | None = None
-    """Number of this process, from 0."""
-
-    distributed: bool = False
-    """Find the last three under Slurm, Open MPI or Kubernetes."""
+@options
+class Arguments(Run, processes.Devices):
+    """Options of `jaxba-train`."""
 
 
 def main() -> None:
@@ -110,7 +100,7 @@ def _train(args: Arguments, command: str) -> int:
     from jaxba.runtime.distributed import MainFailedError, is_main
 
     jax.config.update("jax_enable_x64", True)  # the game uses float64, the agent's networks float32
-    devices = processes.start(args.coordinator, args.processes, args.process, args.distributed, args.devices)
+    devices = processes.start(args)
     try:
         return _run(args, devices, command)
     except MainFailedError:
@@ -177,7 +167,7 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
     together(lambda: boards.append(_board(args, folder, config)))
     board = boards[0] if boards else None  # of the first process alone
     common.prepare_process()
-    console = _console(quiet=not is_main())
+    console = common.console(FILE_WIDTH, markup=False, quiet=not is_main())
     with (
         process.single_blas_thread(),
         Interrupt("chunk", graceful=False, announce=is_main()) as interrupt,
@@ -228,15 +218,6 @@ def _check_problems(problems: Sequence[str]) -> list[str]:
     with common.notes_printed():
         read_all(paths)
     return paths
-
-
-def _console(quiet: bool) -> Any:
-    """A console for the view. Brackets in names are not interpreted as markup."""
-    from rich.console import Console
-
-    options: dict[str, Any] = {"soft_wrap": True, "highlight": False, "markup": False, "quiet": quiet}
-    console = Console(**options)
-    return console if console.is_terminal else Console(**options, width=FILE_WIDTH)
 
 
 def _again(folder: Path) -> str:

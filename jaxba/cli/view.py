@@ -1,93 +1,97 @@
-"""`jaxba-view`: problems and recorded solves in the browser."""
+"""`jaxba-view`: problems and recorded solves in the browser; `jaxba.cli.episode` adds episodes of the game."""
 
 from __future__ import annotations
 
+import functools
 import os
 import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from jaxba.cli import common
+from jaxba.cli.options import options
 
 if TYPE_CHECKING:
     from jaxba.viewer.panel import Viewer
-    from jaxba.viewer.sources import Shown
+    from jaxba.viewer.recording import Recording
 
-LARGEST_EPISODE = 40
-"""Most iterations of an episode: those of the training presets."""
+    Play = Callable[[str, int], Recording]
 
 NAMED = 5
 """Worst images that are printed."""
 
 
-@dataclass(frozen=True)
+@options
 class Arguments:
     """Options of `jaxba-view`."""
 
-    files: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Problems in any format that jaxba-solve reads, and recordings of jaxba-solve --record; more than one stand side
-    by side."""
+    files: Annotated[tuple[str, ...], "[FILE ...]", tyro.conf.Positional]
+    """Problems in any format of jaxba-solve, and recordings of jaxba-solve --record, side by side."""
 
-    images: str | None = None
-    """Folder of the images, for files that name them (COLMAP, jaxba-kitti)."""
+    images: Annotated[str | None, "FOLDER"] = None
+    """Images, for files that name them (COLMAP, jaxba-kitti)."""
 
-    poses: str | None = None
-    """KITTI's file of the true poses of the whole sequence. Default: that with which jaxba-kitti made the problem, if
-    it is there."""
+    poses: Annotated[str | None, "FILE"] = None
+    """KITTI's true poses of the whole sequence. Default: those with which jaxba-kitti made the problem, if the file
+    exists."""
 
-    policy: str | None = None
-    """Instead of files: an episode of the game, played by a policy: a file of jaxba-train, or a name."""
+    policy: Annotated[str | None, "NAME"] = None
+    """Instead of files: an episode of the game, played by this policy or file of jaxba-train."""
 
     scene: int = 0
     """Number of the random scene of --policy."""
 
-    html: str | None = None
-    """Output file: one page that opens without a server and plays the iterations. Nothing is served."""
+    html: Annotated[str | None, "FILE"] = None
+    """Write one page that opens without a server and plays the iterations. Nothing is served."""
 
     port: int = 8080
     """First port that is tried."""
 
-    host: str = "127.0.0.1"
-    """Address of this machine at which the page is reached, without a password. Default: from this machine only;
-    0.0.0.0: from every machine that reaches this one."""
+    host: Annotated[str, "ADDRESS"] = "127.0.0.1"
+    """Address at which the page is served, without a password; 0.0.0.0 for every machine that reaches this one."""
 
 
 def main() -> None:
-    """Entry point of `jaxba-view`."""
+    """Entry point without episodes of the game."""
     common.exit_with(run())
 
 
-def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0, or 2 for bad input."""
-    return common.run_command(Arguments, _run, "Look at problems and recorded solves in the browser.", argv)
+def run(argv: Sequence[str] | None = None, play: Play | None = None) -> int:
+    """Runs the command. Exit status: 0, or 2 for bad input.
+
+    Args:
+        argv: the command line; `sys.argv[1:]` if None.
+        play: makes the recording of `--policy` and `--scene`.
+    """
+    show = functools.partial(_run, play=play)
+    return common.run_command(Arguments, show, "Look at problems and recorded solves in the browser.", argv)
 
 
-def _run(args: Arguments) -> int:
-    if not args.files and args.policy is None:
-        raise common.UsageError("name a problem or a recording, or a policy by --policy")
-    if args.files and args.policy is not None:
-        raise common.UsageError("--policy plays a random scene, not a file")
-    if args.scene < 0:
-        raise common.UsageError(f"--scene must not be negative, is {args.scene}")
-    if not 0 < args.port < 65536:
-        raise common.UsageError(f"--port must lie between 1 and 65535, is {args.port}")
-    if args.images is not None and not os.path.isdir(args.images):
-        raise common.UsageError(f"--images {args.images}: is no folder")
+def _run(args: Arguments, play: Play | None) -> int:
+    common.require(bool(args.files or args.policy), "name a problem or a recording, or a policy by --policy")
+    common.require(not (args.files and args.policy), "--policy plays a random scene, not a file")
+    common.require(args.scene >= 0, f"--scene must not be negative, is {args.scene}")
+    common.require(0 < args.port < 65536, f"--port must lie between 1 and 65535, is {args.port}")
+    common.require(args.images is None or os.path.isdir(args.images), f"--images {args.images}: is no folder")
     _check_host(args.host)
     common.check_writable("--html", args.html)
     _check_apart(args)
     check_extra()
-    from jaxba.viewer.sources import open_all
+    from jaxba.viewer import sources
 
     with common.notes_printed():
-        shown = open_all(args.files, args.images, args.poses) if args.policy is None else [_episode(args)]
+        if args.policy is None:
+            shown = sources.open_all(args.files, args.images, args.poses)
+        else:
+            if play is None:
+                raise common.UsageError("--policy needs the game: use jaxba-view")
+            shown = [sources.shown(play(args.policy, args.scene), f"scene {args.scene}, {args.policy}")]
     if args.html:
         from jaxba.viewer.page import write_page
 
@@ -130,38 +134,6 @@ def _check_apart(args: Arguments) -> None:
     images = [] if args.images is None else [one for one in Path(args.images).rglob("*") if one.suffix != ".html"]
     read = {PROBLEM: files, "the file of --poses": [args.poses], "an image": images}
     check_apart({"--html": [args.html]}, {**read, "the file of --policy": [policy_file(args.policy or "")]})
-
-
-def _episode(args: Arguments) -> Shown:
-    """An episode on a scene of the game's default class."""
-    import jax
-    import numpy as np
-
-    import jaxba
-    from jaxba.game.episode import draw
-    from jaxba.game.random_scenes import SceneClass
-    from jaxba.viewer.recording import Recording
-    from jaxba.viewer.sources import shown
-
-    assert args.policy is not None
-    jax.config.update("jax_enable_x64", True)  # the game's type
-    policy = jaxba.make_policy(args.policy)
-    options = jaxba.trained_step(policy)
-    played = draw(SceneClass(), jax.random.key(0), args.scene, policy, options, LARGEST_EPISODE)
-    start = np.array([np.nan])
-    recording = Recording(
-        problem=played.problem,
-        whole=played.problem.num_points,
-        cameras=played.cameras,
-        points=played.points,
-        state=np.arange(len(played.cost)),
-        cost=played.cost,
-        damping=np.concatenate([start, played.damping]),
-        gain_ratio=np.concatenate([start, played.gain_ratio]),
-        time_s=played.paid,
-        unit="plain steps paid",
-    )
-    return shown(recording, f"scene {args.scene}, {args.policy}")
 
 
 def check_extra() -> None:

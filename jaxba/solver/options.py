@@ -142,7 +142,9 @@ class SolveOptions:
         )
         scaling = step.coordinates.scaling
         if getattr(policy, "step_options", None) is not None and scaling != trained.coordinates.scaling:
-            raise ValueError(f"this policy takes lambda as a factor on the diagonal, not with scaling {scaling!r}")
+            own = trained.coordinates.scaling
+            this = "this policy takes lambda as a factor on the diagonal"
+            raise ValueError(f"scaling must be {own!r}: {this}, not with scaling {scaling!r}")
         if step.mixed_precision and step.method is not None:
             raise ValueError("mixed types are for plain LM; methods have float64 or float32")
         return step

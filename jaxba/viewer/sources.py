@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxba.datasets.bal.paths import resolve
-from jaxba.datasets.kitti.evaluate import Sidecar, read_sidecar, truth_of
-from jaxba.datasets.kitti.poses import read_poses
 from jaxba.io import is_colmap, read_problem
 from jaxba.io.colmap.problem import Looks, read_colmap_with_looks
 from jaxba.io.files import StrPath, display_name, sidecar_path
+from jaxba.io.frames import Sidecar, read_sidecar, truth_of
+from jaxba.io.poses import read_poses
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.similarity import umeyama
 from jaxba.viewer import geometry

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from jaxba.cli import common
-from jaxba.cli.interrupt import Interrupt
 from jaxba.cli.solve import run
 from jaxba.cli.streams import tolerant_streams
+from jaxba.runtime.interrupt import Interrupt
 
 COMMANDS = ("solve", "bench", "train", "data", "kitti", "paper")
 START = "import sys; sys.argv[0] = 'jaxba-{0}'; {1}from jaxba.cli.{0} import main; main()"
@@ -102,7 +102,7 @@ def test_sigterm_is_handled_as_ctrl_c_with_its_own_status(command, monkeypatch, 
 def test_a_signal_that_is_ignored_stays_ignored():
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with common.catch_interrupts() as stopped, Interrupt("iteration", graceful=True) as interrupt:
+        with Interrupt() as outer, Interrupt("iteration", graceful=True) as interrupt:
             signal.raise_signal(signal.SIGINT)
             assert not interrupt.requested
             assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
@@ -110,7 +110,7 @@ def test_a_signal_that_is_ignored_stays_ignored():
             assert interrupt.requested
             with pytest.raises(KeyboardInterrupt):
                 signal.raise_signal(signal.SIGTERM)
-            assert stopped() == 143
+            assert outer.status == 143
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -149,10 +149,10 @@ def test_an_interrupt_lost_in_a_destructor_is_raised_again(capsys):
         for _ in range(10**9):
             time.monotonic()
 
-    with common.catch_interrupts() as stopped:
+    with Interrupt() as interrupt:
         with pytest.raises(KeyboardInterrupt):
             drop()
-        assert stopped() == 130
+        assert interrupt.status == 130
     assert capsys.readouterr().err == ""
 
 

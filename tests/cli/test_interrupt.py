@@ -8,13 +8,13 @@ import sys
 
 import pytest
 
-from jaxba.cli.interrupt import EXIT_DELAY_S
+from jaxba.runtime.interrupt import EXIT_DELAY_S
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to another process")
 
 BUSY = """
 import hashlib
-from jaxba.cli.interrupt import Interrupt
+from jaxba.runtime.interrupt import Interrupt
 with Interrupt("iteration", graceful=True):
     print("ready", flush=True)
     hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)  # many minutes in one call in which Python handles no signals

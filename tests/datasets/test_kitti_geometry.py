@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.datasets.kitti import keyframes
 from jaxba.datasets.kitti.assemble import assemble, poses_of_cameras, windows
-from jaxba.datasets.kitti.calibration import Calibration
 from jaxba.datasets.kitti.initial_poses import drift
 from jaxba.datasets.kitti.odometry import Odometry, visual_odometry
 from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.datasets.kitti.triangulate import Filters, Observations, Views, triangulate, triangulate_robustly
+from jaxba.io.frames import Calibration
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 

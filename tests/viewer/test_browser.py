@@ -255,7 +255,7 @@ def test_the_command_says_what_is_missing(tmp_path, capsys):
 
 def test_an_episode_of_the_game_is_written_as_a_page(tmp_path):
     page = tmp_path / "episode.html"
-    from jaxba.cli.view import run
+    from jaxba.cli.episode import run
 
     assert run(["--policy", "guarded", "--scene", "1", "--html", str(page)]) == 0
     assert page.stat().st_size > 500_000

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.calibration import Calibration
 from jaxba.datasets.kitti.tracks import Tracks
 from jaxba.datasets.kitti.triangulate import Filters, Observations, Views, triangulate_robustly
+from jaxba.io.frames import Calibration
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, camera_centers, rotation_matrices
 

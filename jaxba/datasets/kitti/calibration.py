@@ -12,14 +12,14 @@ Source: Geiger et al. 2013, "Vision meets robotics: the KITTI dataset"; the read
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.text_files import lines_of, numbers_of
 from jaxba.io.files import StrPath, display_name
+from jaxba.io.frames import Calibration
+from jaxba.io.poses import lines_of, numbers_of
 from jaxba.problem.bundle_problem import ProblemError
 
 FILES = ("calib.txt", "K.txt", "calib_cam_to_cam.txt", "perspective.txt")
@@ -27,35 +27,6 @@ FILES = ("calib.txt", "K.txt", "calib_cam_to_cam.txt", "perspective.txt")
 
 ABOVE = ("calib_cam_to_cam.txt",)
 """Those that are also searched in the folder above: KITTI's raw data have one file for all drives of a day."""
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """A pinhole camera without distortion, as rectified images have it."""
-
-    fx: float
-    """Focal length in pixels, horizontally."""
-
-    fy: float
-    """The same, vertically."""
-
-    cx: float
-    """Principal point in pixels relative to the centre of the first pixel, to the right."""
-
-    cy: float
-    """The same, downwards."""
-
-    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Position of camera 0 in the frame of this camera, metres: `K^-1` times the last column of `P`."""
-
-    @property
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """The matrix K."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
-
-    def rays(self, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Directions `(X / Z, Y / Z)` of pixels; x to the right, y down, z forward."""
-        return (np.asarray(pixels, np.float64) - [self.cx, self.cy]) / [self.fx, self.fy]
 
 
 def calibration_files(folder: Path) -> list[Path]:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,28 +11,12 @@ from jaxtyping import Float
 
 from jaxba.datasets.kitti import trajectory
 from jaxba.datasets.kitti.assemble import poses_of_cameras
-from jaxba.datasets.kitti.calibration import Calibration
-from jaxba.datasets.kitti.poses import poses_of, read_poses
 from jaxba.io import read_problem
-from jaxba.io.encoding import decode
-from jaxba.io.files import StrPath, display_name, open_output, reason, sidecar_path, strip_compression
+from jaxba.io.files import StrPath, display_name, open_output, strip_compression
+from jaxba.io.frames import Sidecar
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.similarity import Similarity, umeyama
-
-
-@dataclass(frozen=True)
-class Sidecar:
-    """Data of a problem that are not in its arrays."""
-
-    frames: tuple[int, ...]
-    """Frame number of every camera."""
-
-    calibration: Calibration
-    """Calibration of the images."""
-
-    contents: Mapping[str, Any]
-    """The whole file."""
 
 
 class Scores(NamedTuple):
@@ -55,35 +37,6 @@ class Evaluated(NamedTuple):
     points: Float[np.ndarray, "points 3"]  # the same
     rms: float  # reprojection error, pixels
     scores: Scores | None
-
-
-def write_sidecar(path: StrPath, contents: Mapping[str, Any]) -> None:
-    """Writes the sidecar file of a problem. Raises ProblemError."""
-    with open_output(sidecar_path(path)) as file:
-        file.write((json.dumps(contents, indent=1, allow_nan=False) + "\n").encode())
-
-
-def read_sidecar(path: StrPath) -> Sidecar:
-    """Reads the sidecar file of a problem.
-
-    Raises:
-        ProblemError: there is none, or it was not written by `jaxba-kitti`.
-    """
-    side = sidecar_path(path)
-    try:
-        contents = json.loads(decode(side.read_bytes()))
-        calibration = Calibration(**{**contents["calibration"], "offset": tuple(contents["calibration"]["offset"])})
-        frames = tuple(int(number) for number in contents["frames"])
-    except OSError as error:
-        raise ProblemError(f"{display_name(side)}: cannot be read: {reason(error)}; jaxba-kitti writes it") from None
-    except (ValueError, KeyError, TypeError):
-        raise ProblemError(f"{display_name(side)}: is not a sidecar file of jaxba-kitti") from None
-    return Sidecar(frames, calibration, contents)
-
-
-def truth_of(side: Sidecar, path: StrPath) -> Float[np.ndarray, "cameras 3 4"]:
-    """True poses of a problem's cameras, from the file of the whole sequence. Raises ProblemError."""
-    return poses_of(read_poses(path), side.frames, side.calibration)
 
 
 def score(

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.datasets.kitti.calibration import Calibration
 from jaxba.datasets.kitti.features import epipolar_inliers
 from jaxba.datasets.kitti.opencv import cv2
+from jaxba.io.frames import Calibration
 
 WINDOW = 21
 """Side of the tracked window, pixels. Source: OpenCV's default."""

@@ -9,20 +9,26 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.calibration import Calibration, calibration_files, read_calibration
-from jaxba.datasets.kitti.poses import read_times
+from jaxba.datasets.kitti.calibration import calibration_files, read_calibration
 from jaxba.io.files import StrPath, display_name, visible
+from jaxba.io.frames import Calibration
+from jaxba.io.poses import lines_of, numbers_of
 from jaxba.problem.bundle_problem import ProblemError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
 CAMERAS = range(4)
 """KITTI's cameras: 0 and 1 are grey, 2 and 3 coloured."""
+
+
+_STAMP = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(\.\d+)?")
+"""A time of the raw data, such as 2011-09-26 13:02:25.964389445."""
 
 
 @dataclass(frozen=True)
@@ -146,3 +152,33 @@ def _range(frames: str, name: str, count: int) -> range:
     if end is not None and end > count:
         raise ProblemError(f"{name}: --frames {frames} ends after the last frame, {count - 1}")
     return range(*slice(first, end, step).indices(count))
+
+
+def read_times(path: Path, numbers: list[int]) -> Float[np.ndarray, " frames"]:
+    """Times of frames, seconds: line N of a file is that of frame N, seconds or a date with a time.
+
+    Dates are counted from the first line, so that no digits are lost.
+
+    Raises:
+        ProblemError: the file cannot be read, has too few lines, or one of them is no time.
+    """
+    lines = lines_of(path)
+    if max(numbers) >= len(lines):
+        raise ProblemError(f"{display_name(path)}: has no time for frame {max(numbers)}")
+    where = lambda at: f"{display_name(path)} line {lines[at][0]}"
+    if not _STAMP.fullmatch(lines[0][1]):
+        return np.array([numbers_of(lines[at][1], 1, where(at))[0] for at in numbers])
+    start, fraction = _stamp(lines[0][1], where(0))
+    stamps = [_stamp(lines[at][1], where(at)) for at in numbers]
+    return np.array([(time - start).total_seconds() + (part - fraction) for time, part in stamps])
+
+
+def _stamp(text: str, where: str) -> tuple[datetime, float]:
+    """Whole seconds of a date with a time, and the fraction of the last one."""
+    match = _STAMP.fullmatch(text)
+    try:
+        if match is not None:
+            return datetime.fromisoformat(match[1]), float(match[2] or 0)
+    except ValueError:  # a thirteenth month
+        pass
+    raise ProblemError(f"{where}: is no date and time")

@@ -1,0 +1,105 @@
+"""Text files of camera poses, and of numbers by lines.
+
+A line of poses has 12 numbers, a 3 x 4 matrix row by row; line 0 is frame 0 (KITTI's odometry benchmark). Lines of 13
+or 17 numbers begin with the frame and have 3 x 4 or 4 x 4 numbers (KITTI-360's `poses.txt`, `cam0_to_world.txt`);
+frames may be missing. Source: the readmes of both development kits.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxba.io.encoding import decode
+from jaxba.io.files import StrPath, display_name, reason
+from jaxba.io.text import number
+from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.geometry import are_rotations
+
+
+class Poses(NamedTuple):
+    """Camera-to-world poses of frames."""
+
+    numbers: Int[np.ndarray, " frames"]
+    """Number of each frame, ascending."""
+
+    matrices: Float[np.ndarray, "frames 3 4"]
+    """`[R | c]` of each, metres."""
+
+    name: str
+    """Of the file, for messages."""
+
+    one_a_line: bool = True
+    """Whether the lines of the file are the frames, so that none can be missing before the last."""
+
+
+def read_poses(path: StrPath) -> Poses:
+    """Poses of camera 0, camera to world, in metres.
+
+    Raises:
+        ProblemError: the file cannot be read, a line is malformed or holds no rotation, or a frame comes twice.
+    """
+    name = display_name(path)
+    lines = lines_of(Path(path))
+    if not lines:
+        raise ProblemError(f"{name}: holds no poses")
+    width = len(lines[0][1].split())
+    width = width if width in (13, 17) else 12
+    table = np.array([numbers_of(line, width, f"{name} line {at}") for at, line in lines])
+    numbers, matrices = np.arange(len(table)), table
+    if width > 12:
+        whole = (table[:, 0] == np.floor(table[:, 0])) & (table[:, 0] >= 0) & (table[:, 0] < 2**31)
+        last = np.ones(len(table), bool) if width == 13 else (table[:, 13:] == [0, 0, 0, 1]).all(axis=1)
+        for bad, complaint in (
+            (~whole, "the first of 13 or 17 numbers is no number of a frame"),
+            (~last, "the last row of the matrix is not 0 0 0 1"),
+        ):
+            if bad.any():
+                raise ProblemError(f"{name} line {lines[bad.argmax()][0]}: {complaint}")
+        numbers, matrices = table[:, 0].astype(np.int64), table[:, 1:13]
+    poses = matrices.reshape(-1, 3, 4)
+    bad = np.flatnonzero(~are_rotations(poses[:, :, :3]))
+    if bad.size:
+        raise ProblemError(f"{name} line {lines[bad[0]][0]}: the left 3 x 3 numbers are no rotation")
+    order = np.argsort(numbers, kind="stable")
+    twice = np.flatnonzero(np.diff(numbers[order]) == 0)
+    if twice.size:
+        raise ProblemError(f"{name}: has two poses for frame {numbers[order][twice[0]]}")
+    u, _, vt = np.linalg.svd(poses[order, :, :3])  # to full precision
+    return Poses(numbers[order], np.concatenate([u @ vt, poses[order, :, 3:]], axis=2), name, width == 12)
+
+
+def lines_of(path: Path) -> list[tuple[int, str]]:
+    """Lines of a text file that are not blank, each with its number from 1.
+
+    Raises:
+        ProblemError: the file cannot be read, or is no text.
+    """
+    try:
+        text = decode(path.read_bytes())
+    except (OSError, ValueError) as error:
+        if isinstance(error, UnicodeDecodeError):
+            raise ProblemError(f"{display_name(path)}: is no text") from None
+        raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
+    return [(at, line.strip()) for at, line in enumerate(text.split("\n"), 1) if line.strip()]
+
+
+def numbers_of(text: str, count: int, where: str) -> np.ndarray:
+    """The finite numbers of a line, shape (count,).
+
+    Raises:
+        ProblemError: there are not so many, or one is none; the message begins with `where`.
+    """
+    words = text.split()
+    try:
+        numbers = np.array([number(word) for word in words])
+    except ValueError:
+        raise ProblemError(f"{where}: holds something that is no number") from None
+    if len(numbers) != count:
+        raise ProblemError(f"{where}: has {len(numbers)} numbers instead of {count}")
+    if not np.isfinite(numbers).all():
+        raise ProblemError(f"{where}: holds a number that is not finite")
+    return numbers

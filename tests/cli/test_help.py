@@ -1,0 +1,59 @@
+"""The help of the commands: short, in plain lines, and in their own names."""
+
+from __future__ import annotations
+
+import importlib
+from itertools import pairwise
+
+import pytest
+
+LINES = {
+    "solve": 130,
+    "bench": 44,
+    "data": 20,
+    "data download": 26,
+    "data list": 15,
+    "kitti": 65,
+    "kitti evaluate": 24,
+    "paper": 26,
+    "train": 52,
+    "view": 30,
+}
+"""Most lines of the help of each command on 80 columns."""
+
+
+@pytest.mark.parametrize("command", LINES)
+def test_help_is_short_and_names_the_command(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    module, *subcommand = command.split()
+    assert importlib.import_module(f"jaxba.cli.{module}").run([*subcommand, "--help"]) == 0
+    usage, *lines = capsys.readouterr().out.splitlines()
+    assert usage.startswith(f"usage: jaxba-{command} [-h] ")
+    assert len(lines) < LINES[command]
+    assert max(map(len, lines)) <= 80
+    assert not [line for line in lines if "None" in line]
+
+
+def test_a_text_is_reflowed(capsys, monkeypatch):
+    """Each line but the last of a text ends where the next word would not fit."""
+    monkeypatch.setenv("COLUMNS", "80")
+    importlib.import_module("jaxba.cli.solve").run(["--help"])
+    lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
+    first = next(k for k, line in enumerate(lines) if line.startswith("--policy"))
+    text = lines[first + 1 : next(k for k, line in enumerate(lines) if line.startswith("--method"))]
+    assert len(text) > 3
+    assert all(len(line) + 1 + len(after.split()[0]) > 50 for line, after in pairwise(text))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "names"),
+    [
+        (["--policy", "learned", "--scaling", "identity"], ["--scaling"]),
+        (["--constant", "fokal"], ["--constant", "'fokal'", "focal", "k1", "poses", "points", "extrinsics"]),
+    ],
+)
+def test_an_error_names_the_option_and_what_it_may_be(arguments, names, capsys):
+    assert importlib.import_module("jaxba.cli.solve").run(arguments) == 2
+    printed = capsys.readouterr().err
+    assert printed.count("\n") == 1
+    assert [name for name in names if name not in printed] == []
