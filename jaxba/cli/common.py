@@ -105,8 +105,8 @@ def _parse_and_run(
         return print_error(parsed)
     from jaxba.damping.policy_file import PolicyFileError
     from jaxba.damping.registry import UnknownPolicyError
-    from jaxba.methods.registry import UnknownMethodError
     from jaxba.problem.bundle_problem import ProblemError
+    from jaxba.solver.methods import UnknownMethodError
     from jaxba.solver.names import SolverNameError
 
     names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
