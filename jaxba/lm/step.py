@@ -32,7 +32,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
-from jaxba.refinement.acceptance import Candidate
+from jaxba.refinement.acceptance import Candidate, comparison
 from jaxba.refinement.candidates import best_candidate
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.conventions import components_first
@@ -45,7 +45,7 @@ class Proposal(NamedTuple):
 
     step: Step
     reference: Reference
-    weightless: Bool[Array, ""] | None = None  # see `StepInfo`; None: no
+    weightless: Bool[Array, ""]  # see `StepInfo`
 
 
 @for_traces
@@ -142,8 +142,8 @@ def try_step(
     effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
-    candidate = best_candidate(layout, *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
-    return take_step(layout, state, damping, proposal, candidate, options)
+    against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    return take_step(layout, state, damping, proposal, best_candidate(against), options)
 
 
 def take_step(
@@ -176,7 +176,7 @@ def take_step(
         forcing=step.forcing,
         step_fraction=candidate.step_fraction,
         damping_fraction=jnp.clip(safe_divide(step.damped, step.slope), 0, 1),
-        weightless=jnp.zeros((), bool) if proposal.weightless is None else proposal.weightless,
+        weightless=proposal.weightless,
         **candidate.work._asdict(),
     )
 
