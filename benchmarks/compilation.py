@@ -29,7 +29,6 @@ import numpy as np
 
 from jaxba.bench.sources import sources
 from jaxba.lm import step
-from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.options import LinearSolverChoice
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.candidates import first_search, has_repairs
@@ -38,6 +37,7 @@ from jaxba.runtime.compilation import Level, compiler_options, uses_older_emitte
 from jaxba.runtime.fusion import fast_compilation
 from jaxba.solver.candidate_loop import try_candidate
 from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import parse_solver
 from jaxba.structure.layout import layout_for
 

@@ -32,10 +32,10 @@ from jaxba.io import (
     write_problem,
 )
 from jaxba.linear.step import Effort
+from jaxba.lm.method import StepMethod
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.methods.registry import METHODS, Method, make_method
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.camera_models import CAMERA_MODELS, CameraModel, register_camera_model
 from jaxba.problem.constants import Constants
@@ -52,6 +52,7 @@ from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.covariance import Covariance, covariance
 from jaxba.solver.implicit import SolveInputs, differentiable_solve, inputs_of
 from jaxba.solver.loop import Carry, History, solve_loop
+from jaxba.solver.methods import METHODS, make_method
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Prepared, prepare
 from jaxba.solver.retriangulate import Retriangulation, retriangulate
@@ -86,7 +87,6 @@ __all__ = [
     "LearnedPolicy",
     "Lenses",
     "Loss",
-    "Method",
     "Prepared",
     "ProblemError",
     "ProblemInfo",
@@ -100,6 +100,7 @@ __all__ = [
     "SolveInputs",
     "SolveOptions",
     "StepInfo",
+    "StepMethod",
     "StepOptions",
     "Termination",
     "Tolerances",

@@ -18,8 +18,8 @@ import pytest
 
 import jaxba
 from jaxba.damping import registry as policies
-from jaxba.methods import registry as methods
 from jaxba.problem import camera_models
+from jaxba.solver import methods
 
 PACKAGE = Path(jaxba.__file__).resolve().parent
 REFERENCE = PACKAGE.parent / "docs" / "reference" / "api"
@@ -152,6 +152,7 @@ def test_help_starts_no_backend():
 
 
 UNNEEDED = (
+    "jaxba.methods",
     *("flax", "optax", "orbax", "matplotlib", "PIL", "yaml", "rich", "pycolmap", "pyceres", "scipy.linalg"),
     *(
         "scipy.sparse",

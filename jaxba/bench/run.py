@@ -20,13 +20,13 @@ from jaxba.damping.registry import SUFFIX
 from jaxba.io import json_lines
 from jaxba.io.files import visible
 from jaxba.lm.termination import Tolerances
-from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.peers import require
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.process import out_of_memory, threads
 from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, SolverNameError, parse_solver
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.record import Record, record_of

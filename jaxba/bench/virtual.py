@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from jaxba.bench.profile import NEVER, Reach
 from jaxba.damping import is_learned
-from jaxba.methods.registry import DEFAULT_METHOD
+from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, parse_solver
 from jaxba.solver.options import SolveOptions
 

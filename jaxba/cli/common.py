@@ -86,8 +86,8 @@ def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> in
         return print_error(parsed)
     from jaxba.damping.policy_file import PolicyFileError
     from jaxba.damping.registry import UnknownPolicyError
-    from jaxba.methods.registry import UnknownMethodError
     from jaxba.problem.bundle_problem import ProblemError
+    from jaxba.solver.methods import UnknownMethodError
     from jaxba.solver.names import SolverNameError
 
     names = (UnknownPolicyError, UnknownMethodError, SolverNameError)

@@ -26,7 +26,6 @@ from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_colmap, read_problem
 from jaxba.io.files import open_output, stream_number
 from jaxba.lm.termination import Tolerances
-from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constraints import Gauge, hold
 from jaxba.problem.facing import aside_text, facing_away
@@ -45,6 +44,7 @@ from jaxba.scenes import DEFAULT_SCENES, random_scene
 from jaxba.solver.alternation import solve_and_retriangulate
 from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.covariance import covariance
+from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.solver.prepare import DEFAULT_POLICY
@@ -238,8 +238,6 @@ def solve_options(args: Arguments) -> tuple[DampingPolicy, SolveOptions]:
         UsageError: a number out of range, or options that do not go together; the message names the option.
         UnknownPolicyError, PolicyFileError, UnknownMethodError: as `make_policy` and `make_method`.
     """
-    if args.method != DEFAULT_METHOD and args.linear_solver != "auto":
-        raise common.UsageError(f"--linear-solver is for --method {DEFAULT_METHOD}; {args.method} has its own")
     try:
         policy, options = solver_name(args).build()
         trained = options.step_options(policy).coordinates

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from jaxba.cli.common import counted
-from jaxba.methods.registry import DEFAULT_METHOD
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.facing import NAMED, views_behind, without_views_of
@@ -20,6 +19,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK
 from jaxba.runtime.compilation import Part, compiler_options, stages
 from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import split_refinement
 from jaxba.solver.retriangulate import Retriangulation
 from jaxba.solver.solve import Solution

@@ -12,7 +12,7 @@ With cameras c and points p:
     [   E^T     C + D_p ] [ d_p ] = - [ g_p ]
 
     1. S   = B + D_c - E (C + D_p)^-1 E^T            linear/schur.py: eliminate the points
-    2. d_c = S^-1 (-g_c + E (C + D_p)^-1 g_p)        linear/reduced_system.py, or a method of jaxba.methods
+    2. d_c = S^-1 (-g_c + E (C + D_p)^-1 g_p)        a method (lm/method.py)
     3. d_p = -(C + D_p)^-1 (g_p + E^T d_c)           linear/schur.py: back-substitution
 
 Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", sections 4 and 6.
@@ -20,13 +20,12 @@ Source: Triggs et al. 2000, "Bundle Adjustment - A Modern Synthesis", sections 4
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.linear.reduced_system import solve_reduced
 from jaxba.linear.schur import (
     CameraSystem,
     PointSystem,
@@ -38,9 +37,7 @@ from jaxba.linear.schur import (
     largest_gradient,
 )
 from jaxba.linear.step import Step
-from jaxba.linear.two_level import Anchor
-from jaxba.lm.method import DampedSystem, MethodStep, StepMethod
-from jaxba.model import camera
+from jaxba.lm.method import DampedSystem, method_of
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
 from jaxba.structure.conventions import components_first
@@ -57,7 +54,7 @@ def solve_step(
     damping: Float[Array, ""],
     options: StepOptions,
     iteration: int | Int[Array, ""] = 0,
-    previous: Float[Array, "steps parameters cameras"] | None = None,
+    method_state: Any = (),
 ) -> Step:
     """Solves `(H + D) d = -g` for cameras and points.
 
@@ -69,26 +66,18 @@ def solve_step(
         damping: lambda, dimensionless for diagonal scaling.
         options: linear solver or method, scaling and coordinates.
         iteration: number of the iteration; selects the random clusters of methods that use them.
-        previous: last changes of the cameras, if the step is to be optimal in the span that includes them.
+        method_state: state of the method (`StepMethod.begin`).
 
     Returns:
         The step. It is non-finite if a factorisation failed; the caller rejects such a step.
     """
-    truncated = options.truncated
-    forcing = options.conjugate_gradients.forcing if truncated is None else truncated.forcing
+    forcing = (options.truncated or options.conjugate_gradients).forcing
     coordinates = RotationCoordinates.of(cameras, options)
     eliminated = eliminate_points(layout, linear, damping, options)
     reduced = camera_system(layout, linear, eliminated, coordinates, damping, options)
-    if options.method is None:
-        frames = camera.frames(cameras)
-        anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
-        solved = solve_reduced(layout, linear, eliminated, reduced, anchor, options, forcing)
-        solution = MethodStep(solved[0], None, solved[1], residual_orthogonal=True)
-    else:
-        if previous is not None and layout.unknowns is not None:
-            previous = jnp.asarray(layout.unknowns.restricted(previous))
-        system = DampedSystem(layout, linear, eliminated, reduced, damping, cameras, iteration, forcing, previous)
-        solution = cast(StepMethod, options.method).solve(system, options)
+    at = cameras, points
+    system = DampedSystem(layout, linear, eliminated, reduced, damping, at, iteration, forcing, method_state)
+    solution = method_of(options).solve(system, options)
     manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
     point_step = solution.points
     if point_step is None:
@@ -107,7 +96,7 @@ def solve_step(
         damped,
         largest_gradient(layout, eliminated, reduced, coordinates),
         solution.iterations,
-        jnp.asarray(0.0 if truncated is None else forcing, cameras.dtype),
+        jnp.asarray(forcing if options.truncated else 0.0, cameras.dtype),
     )
 
 

@@ -1,17 +1,23 @@
-"""The interface of methods that replace the plain Levenberg-Marquardt step (STBA, DeepLM, PoBA).
+"""The interface of methods, each a way to compute the step of an iteration, and plain Levenberg-Marquardt.
 
-`lm_step` calls `StepMethod.solve`. `jaxba.methods.registry` lists the implementations. A method is a frozen dataclass,
-so that it can be a field of the static `StepOptions`.
+`lm_step` calls `StepMethod.solve`. A method is a frozen dataclass, so that it can be a field of the static
+`StepOptions`; its other properties are attributes of the class. `solver/methods.py` finds methods by name.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, cast
 
+import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxba.linear.reduced_system import solve_reduced
 from jaxba.linear.schur import CameraSystem, PointSystem
+from jaxba.linear.two_level import Anchor
+from jaxba.model import camera
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import MethodTraits, StepOptions
 from jaxba.structure.layout import Layout
@@ -35,8 +41,8 @@ class DampedSystem(NamedTuple):
     damping: Float[Array, ""]
     """Lambda."""
 
-    parameters: Float[Array, "parameters cameras"]
-    """Current cameras."""
+    parameters: tuple[Float[Array, "parameters cameras"], Float[Array, "3 points"]]
+    """Current cameras and points."""
 
     iteration: int | Int[Array, ""]
     """Number of the iteration, from 0."""
@@ -44,8 +50,8 @@ class DampedSystem(NamedTuple):
     forcing: float | Float[Array, ""]
     """Forcing term of truncated conjugate gradients, where they are used."""
 
-    previous_steps: Float[Array, "steps parameters cameras"] | None
-    """Last changes of the cameras, newest first; None unless they are part of the search space."""
+    state: Any
+    """State of the method, see `StepMethod.begin`."""
 
 
 class MethodStep(NamedTuple):
@@ -57,10 +63,20 @@ class MethodStep(NamedTuple):
     residual_orthogonal: bool  # whether the residual of the damped system is orthogonal to the step
 
 
-@runtime_checkable
-class StepMethod(MethodTraits, Protocol):
-    """A method that solves the damped linear system in its own way."""
+class StepMethod(MethodTraits, ABC):
+    """A way to compute the step of an iteration."""
 
+    description: str
+    """One line for the user."""
+
+    rule: str = "ceres"
+    """Name of the damping rule that the method was published with."""
+
+    def options(self, base: StepOptions) -> StepOptions:
+        """Step options for this method, which keep everything of `base` that the method does not decide."""
+        return replace(base, method=self)
+
+    @abstractmethod
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """The camera step, and the point step if the method computes it too.
 
@@ -68,4 +84,63 @@ class StepMethod(MethodTraits, Protocol):
             system: the damped system.
             options: static options of the step.
         """
-        ...
+
+    def begin(self, cameras: Float[Array, "parameters cameras"], options: StepOptions) -> Any:
+        """State of the method before the first iteration, a pytree; empty for a method without one."""
+        return ()
+
+    def advance(self, state: Any, change: Float[Array, "parameters cameras"], options: StepOptions) -> Any:
+        """State of the method after an accepted change of the cameras; a rejected one leaves it as it is."""
+        return state
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardt(StepMethod):
+    """The method `lm`, which options without a method mean."""
+
+    name = "lm"
+    description = "Levenberg-Marquardt: one reduced camera system, factored or by conjugate gradients"
+
+    def options(self, base: StepOptions) -> StepOptions:
+        """See `StepMethod`."""
+        return replace(base, method=None)
+
+    def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
+        """See `StepMethod`."""
+        cameras, points = system.parameters
+        frames = camera.frames(cameras)
+        anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
+        step, iterations = solve_reduced(*system[:4], anchor, options, system.forcing)
+        return MethodStep(step, None, iterations, residual_orthogonal=True)
+
+
+PLAIN = LevenbergMarquardt()
+
+
+def method_of(options: StepOptions) -> StepMethod:
+    """The method of step options."""
+    return cast(StepMethod, options.method or PLAIN)
+
+
+def check_plain(options: StepOptions, error: type[ValueError] = ValueError, **asked: bool) -> None:
+    """Refuses another method than plain LM for what only plain LM has.
+
+    Args:
+        options: of the step.
+        error: kind of the error.
+        asked: which keys of `PLAIN_ONLY` a problem or a solve has.
+    """
+    for what, wanted in asked.items():
+        if wanted and options.method:
+            raise error(PLAIN_ONLY[what].format(options.solver_name))
+
+
+PLAIN_ONLY = {
+    "rigs": "rigs need plain LM, not {}",
+    "shared_lenses": "shared lenses need plain LM, not {}",
+    "priors": "priors need plain LM, not {}",
+    "devices": "several devices are for plain LM, not for {}",
+    "mixed": "mixed types are for plain LM; methods have float64 or float32",
+    "linear_solver": "linear_solver is for method lm; {} has its own",
+}
+"""What only plain LM has, with the message of its refusal for the name of another method."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jax import Array
 from jaxtyping import Bool, Float, Int
@@ -20,8 +20,8 @@ class LMState(NamedTuple):
     cost: Float[Array, ""]
     """Pixels^2."""
 
-    previous_steps: Float[Array, "steps parameters cameras"] | None = None
-    """Last changes of the cameras, newest first; None if they are not used."""
+    method_state: Any = ()
+    """State of the method (`lm.method.StepMethod`), a pytree."""
 
 
 class StepInfo(NamedTuple):

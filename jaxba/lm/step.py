@@ -18,19 +18,21 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.linear.step import Effort, Step
 from jaxba.lm.damped_step import solve_step
+from jaxba.lm.method import check_plain, method_of
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.model.linearize import Reference, cost, is_weightless, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
-from jaxba.refinement.acceptance import Candidate
+from jaxba.refinement.acceptance import Candidate, comparison
 from jaxba.refinement.candidates import best_candidate
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.conventions import components_first
@@ -43,7 +45,7 @@ class Proposal(NamedTuple):
 
     step: Step
     reference: Reference
-    weightless: Bool[Array, ""] | None = None  # see `StepInfo`; None: no
+    weightless: Bool[Array, ""]  # see `StepInfo`
 
 
 @for_traces
@@ -53,7 +55,7 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
     Args:
         layout: made from the same problem.
         problem: start of the optimisation.
-        options: the loss, and the number of previous steps to keep.
+        options: the loss and the method.
         dtype: floating point type of the solve; that of the problem's arrays if None.
     """
     check_x64(problem.cameras.dtype if dtype is None else dtype)
@@ -72,10 +74,8 @@ def state_at(
     cost: Float[Array, ""],
     options: StepOptions,
 ) -> LMState:
-    """The state before the first iteration, with zeros for the previous steps."""
-    if not options.kept_steps:
-        return LMState(cameras, points, cost)
-    return LMState(cameras, points, cost, jnp.zeros((options.kept_steps, *cameras.shape), cameras.dtype))
+    """The state before the first iteration."""
+    return LMState(cameras, points, cost, method_of(options).begin(cameras, options))
 
 
 @for_traces
@@ -107,8 +107,8 @@ def lm_step(
         The next state (unchanged after a rejection) and the record of the iteration.
 
     Raises:
-        ValueError: cameras share lenses, and the options have another method than plain LM; or the state is float64,
-            and 64 bits are not enabled in JAX.
+        ValueError: the method does not support the problem (`lm.method.PLAIN_ONLY`); or the state is float64, and 64
+            bits are not enabled in JAX.
     """
     check_x64(state.cost.dtype)
     proposal = propose(layout, state, damping, options, iteration)
@@ -127,7 +127,7 @@ def propose(
     damping = jnp.asarray(damping, state.cost.dtype)
     linear = linearize(layout, state.cameras, state.points, options.loss)
     linear = only_free(layout, linear, options.intrinsics)
-    step = solve_step(layout, linear, state.cameras, state.points, damping, options, iteration, state.previous_steps)
+    step = solve_step(layout, linear, state.cameras, state.points, damping, options, iteration, state.method_state)
     return Proposal(step, linear.reference, is_weightless(layout, linear, state.cost, options.loss))
 
 
@@ -141,22 +141,23 @@ def try_step(
     effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
-    candidate = best_candidate(layout, *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
-    return take_step(layout, state, damping, proposal, candidate)
+    against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    return take_step(layout, state, damping, proposal, best_candidate(against), options)
 
 
 def take_step(
-    layout: Layout, state: LMState, damping: Float[Array, ""], proposal: Proposal, candidate: Candidate
+    layout: Layout,
+    state: LMState,
+    damping: Float[Array, ""],
+    proposal: Proposal,
+    candidate: Candidate,
+    options: StepOptions,
 ) -> tuple[LMState, StepInfo]:
     """End of `try_step`: the state after the accept decision on a candidate, and the record. Arguments as there."""
     step = proposal.step
+    advanced = method_of(options).advance(state.method_state, candidate.cameras - state.cameras, options)
     choose = lambda new, old: jnp.where(candidate.accepted, new, old)
-    previous = state.previous_steps
-    if previous is not None:
-        latest = candidate.cameras - state.cameras
-        previous = choose(jnp.concatenate([latest[None], previous[:-1]]), previous)
-    cameras, points, new_cost = (choose(*pair) for pair in zip(candidate[:3], state[:3], strict=True))
-    after = LMState(cameras, points, new_cost, previous)
+    after = jax.tree.map(choose, LMState(*candidate[:3], advanced), state)
     tried = candidate.step_fraction * step.cameras, candidate.points - state.points
     moved, size = sum_over_devices(layout, (jnp.sum(tried[1] ** 2), jnp.sum(state.points**2)))
     return after, StepInfo(
@@ -174,7 +175,7 @@ def take_step(
         forcing=step.forcing,
         step_fraction=candidate.step_fraction,
         damping_fraction=jnp.clip(safe_divide(step.damped, step.slope), 0, 1),
-        weightless=jnp.zeros((), bool) if proposal.weightless is None else proposal.weightless,
+        weightless=proposal.weightless,
         **candidate.work._asdict(),
     )
 
@@ -186,8 +187,5 @@ def _check_lenses(layout: Layout, options: StepOptions) -> None:
         apart = options.refinement.camera_rounds or options.refinement.pattern_moves
         if options.coordinates.rotation != "manifold" or apart:
             raise ValueError("rigs need rotation='manifold', and no camera rounds and pattern moves")
-    if options.method is None or unknowns is None:
-        return
-    if unknowns.shared or unknowns.priors is not None:
-        what = "shared lenses" if unknowns.shared else "priors"
-        raise ValueError(f"{what} need plain LM, not {options.solver_name}")
+    if unknowns is not None:
+        check_plain(options, shared_lenses=unknowns.shared, priors=unknowns.priors is not None)

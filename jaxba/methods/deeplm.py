@@ -11,7 +11,7 @@ damping, where we clamp the diagonal as Ceres does; and they recompute the resid
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import jax.numpy as jnp
 from jax import Array
@@ -21,7 +21,7 @@ from jaxba.linear.conjugate_gradients import conjugate_gradients
 from jaxba.linear.preconditioners import block_inverse
 from jaxba.linear.schur import CameraSystem, PointSystem, jacobian_product
 from jaxba.lm.method import DampedSystem, MethodStep
-from jaxba.methods.subspace import best_in_span
+from jaxba.methods.subspace import SubspaceMethod, best_in_span
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.structure.layout import Layout
@@ -29,7 +29,7 @@ from jaxba.structure.segment_sums import as_rows, point_sums, tree_sum
 
 
 @dataclass(frozen=True)
-class GlobalConjugateGradients:
+class GlobalConjugateGradients(SubspaceMethod):
     """The method `deeplm`."""
 
     conjugate_gradients: ConjugateGradients = field(
@@ -37,24 +37,14 @@ class GlobalConjugateGradients:
     )
     """Stopping rule; the preconditioner field is ignored. Source of 1e-3 and 150: the authors' code."""
 
-    name: str = field(default="deeplm", init=False)
-    description: str = field(
-        default="DeepLM's global solver: conjugate gradients on cameras and points together", init=False
-    )
-    rule: str = field(default="ceres", init=False)
-    forms_reduced_system: bool = field(default=False, init=False)
-    cluster_cameras: None = field(default=None, init=False)
-    uses_previous_steps: bool = field(default=True, init=False)
-
-    def options(self, base: StepOptions) -> StepOptions:
-        """See `Method`."""
-        return replace(base, method=self)
+    name = "deeplm"
+    description = "DeepLM's global solver: conjugate gradients on cameras and points together"
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
         rule = self.conjugate_gradients
         step, points, iterations = solve_normal(*system[:4], rule, system.forcing)
-        if system.previous_steps is not None:
+        if options.kept_steps:
             step, points = best_in_span(system, step), None  # the point step follows by back-substitution
         return MethodStep(step, points, iterations, True)
 

@@ -12,7 +12,7 @@ Source: Weber et al. 2023, "Power Bundle Adjustment for Large-Scale 3D Reconstru
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import jax.numpy as jnp
 from jax import Array
@@ -21,43 +21,31 @@ from jaxtyping import Float
 from jaxba.linear.preconditioners import block_inverse
 from jaxba.linear.schur import CameraSystem, apply_reduced
 from jaxba.lm.method import DampedSystem, MethodStep
-from jaxba.methods.subspace import best_in_span
+from jaxba.methods.subspace import SubspaceMethod, best_in_span
 from jaxba.problem.options import StepOptions, check_count
 from jaxba.runtime import loops
 
 
 @dataclass(frozen=True)
-class PowerSeries:
+class PowerSeries(SubspaceMethod):
     """The method `poba`."""
 
     order: int = 20
     """Order of the series: the highest power. Source: Weber et al. 2023, section 5."""
 
-    name: str = field(default="poba", init=False)
-    description: str = field(
-        default="power bundle adjustment: a power series for the inverse of the reduced camera system", init=False
-    )
-    rule: str = field(default="ceres", init=False)
-    forms_reduced_system: bool = field(default=False, init=False)
-    cluster_cameras: None = field(default=None, init=False)
-    conjugate_gradients: None = field(default=None, init=False)
-    uses_previous_steps: bool = field(default=True, init=False)
+    name = "poba"
+    description = "power bundle adjustment: a power series for the inverse of the reduced camera system"
 
     def __post_init__(self) -> None:
         check_count("order", self.order, 0)
-
-    def options(self, base: StepOptions) -> StepOptions:
-        """See `Method`."""
-        return replace(base, method=self)
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
         product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
         inverse = block_inverse(system.cameras.blocks)
         step = series(product, system.cameras, inverse, system.cameras.right, self.order)
-        improved = system.previous_steps is not None
-        if improved:
-            step = best_in_span(system, step)
+        improved = options.kept_steps > 0
+        step = best_in_span(system, step) if improved else step
         return MethodStep(step, None, jnp.asarray(self.order, jnp.int32), improved)
 
 

@@ -16,7 +16,7 @@ and the authors' code.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -29,7 +29,7 @@ from jaxba.linear.cholesky3 import Cholesky3, cholesky3
 from jaxba.linear.preconditioners import block_inverse
 from jaxba.linear.reduced_system import reduced_blocks
 from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, damping_diagonal
-from jaxba.lm.method import DampedSystem, MethodStep
+from jaxba.lm.method import DampedSystem, MethodStep, StepMethod
 from jaxba.model.linearize import Linearization, normal_entries
 from jaxba.problem.options import StepOptions, check_count
 from jaxba.runtime import loops
@@ -51,7 +51,7 @@ class SplitSystem(NamedTuple):
 
 
 @dataclass(frozen=True)
-class StochasticClusters:
+class StochasticClusters(StepMethod):
     """The method `stba`."""
 
     cluster_cameras: int = 100
@@ -60,23 +60,14 @@ class StochasticClusters:
     repairs: int = 4
     """Richardson iterations on the true system after the clusters' solution. Source: the authors' code."""
 
-    name: str = field(default="stba", init=False)
-    description: str = field(
-        default="stochastic bundle adjustment: random clusters of cameras, then four Richardson iterations",
-        init=False,
-    )
-    rule: str = field(default="stba", init=False)
-    forms_reduced_system: bool = field(default=True, init=False)
-    conjugate_gradients: None = field(default=None, init=False)
-    uses_previous_steps: bool = field(default=False, init=False)
+    name = "stba"
+    description = "stochastic bundle adjustment: random clusters of cameras, then four Richardson iterations"
+    rule = "stba"
+    forms_reduced_system = True
 
     def __post_init__(self) -> None:
         check_count("cluster_cameras", self.cluster_cameras, 1)
         check_count("repairs", self.repairs, 0)
-
-    def options(self, base: StepOptions) -> StepOptions:
-        """See `Method`."""
-        return replace(base, method=self)
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""

@@ -17,6 +17,7 @@ Knyazev 2001 for conjugate gradients as the optimum in a plane.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 from jax import Array
@@ -24,30 +25,42 @@ from jaxtyping import Float
 
 from jaxba.linear.cholesky import solve_positive
 from jaxba.linear.schur import apply_reduced
-from jaxba.lm.method import DampedSystem
+from jaxba.lm.method import DampedSystem, StepMethod
 from jaxba.model import camera
+from jaxba.problem.options import StepOptions
 
 RIDGE = 64.0
 """Machine epsilons added to the unit diagonal of the scaled Gram matrix, whose vectors may be nearly parallel."""
+
+
+class SubspaceMethod(StepMethod):
+    """A method with the last `Refinement.previous_steps` accepted changes of the cameras as its state, newest first."""
+
+    uses_previous_steps = True
+
+    def begin(self, cameras: Float[Array, "parameters cameras"], options: StepOptions) -> Any:
+        """Zeros. See `StepMethod`."""
+        return jnp.zeros((options.kept_steps, *cameras.shape), cameras.dtype)
+
+    def advance(self, state: Any, change: Float[Array, "parameters cameras"], options: StepOptions) -> Any:
+        """See `StepMethod`."""
+        return jnp.concatenate([change[None], state])[: options.kept_steps]
 
 
 def best_in_span(system: DampedSystem, step: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
     """The minimum of the damped linear model over the span of a camera step and of the previous steps of the system.
 
     Args:
-        system: the damped system, points eliminated, with previous steps; these are zero where there are none yet.
+        system: the damped system of a `SubspaceMethod`.
         step: the inexact step, in manifold coordinates.
 
     Returns:
         A camera step in manifold coordinates.
-
-    Raises:
-        ValueError: the system has no previous steps.
     """
-    if system.previous_steps is None:
-        raise ValueError("this system has no previous steps")
+    unknowns = system.layout.unknowns
+    changes = system.state if unknowns is None else jnp.asarray(unknowns.restricted(system.state))
     product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
-    return with_previous(product, system.cameras.right, step, on_manifold(system.parameters, system.previous_steps))
+    return with_previous(product, system.cameras.right, step, on_manifold(system.parameters[0], changes))
 
 
 def with_previous(

@@ -163,5 +163,5 @@ def _evaluate(
     residual, change = jnp.stack(linear.residual), jnp.stack(jacobian_product(layout, linear, cameras.T, points))
     slope = -jnp.sum(residual * change)
     damped = slope - jnp.sum(change * change)
-    proposal = Proposal(Step(cameras, points, slope, damped, *reported), linear.reference)
+    proposal = Proposal(Step(cameras, points, slope, damped, *reported), linear.reference, jnp.zeros((), bool))
     return try_step(layout, state, damping, proposal, options, min_gain)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Any, Literal, get_args
 
 from jaxba.problem.losses import Loss
 from jaxba.typing import LARGEST_COUNT
@@ -124,34 +124,23 @@ class Coordinates:
             raise ValueError(f"camera_damping must be positive and finite, is {self.camera_damping}")
 
 
-@runtime_checkable
-class MethodTraits(Protocol):
-    """Properties of a method that replaces the plain LM step (`jaxba.methods`), for layout and compilation."""
+class MethodTraits:
+    """What layout and compilation know of a method that computes the step (`lm.method.StepMethod`)."""
 
-    @property
-    def name(self) -> str:
-        """Name in `jaxba.METHODS`."""
-        ...
+    name: str
+    """Name in commands, tables and files."""
 
-    @property
-    def forms_reduced_system(self) -> bool:
-        """Whether it forms the reduced camera system, so that the layout must list pairs of observations."""
-        ...
+    forms_reduced_system: bool = False
+    """Whether it forms the reduced camera system, so that the layout must list pairs of observations."""
 
-    @property
-    def cluster_cameras(self) -> int | None:
-        """Largest number of cameras in a random cluster; None for a method without clusters."""
-        ...
+    cluster_cameras: int | None = None
+    """Largest number of cameras in a random cluster; None for a method without clusters."""
 
-    @property
-    def conjugate_gradients(self) -> ConjugateGradients | None:
-        """Stopping rule if it solves by truncated conjugate gradients, else None."""
-        ...
+    conjugate_gradients: ConjugateGradients | None = None
+    """Stopping rule if it solves by truncated conjugate gradients, else None."""
 
-    @property
-    def uses_previous_steps(self) -> bool:
-        """Whether it can use previous camera steps (`Refinement.previous_steps`)."""
-        ...
+    uses_previous_steps: bool = False
+    """Whether it can use previous camera steps (`Refinement.previous_steps`)."""
 
 
 @dataclass(frozen=True)
@@ -192,42 +181,42 @@ class StepOptions:
     @property
     def solver_name(self) -> str:
         """Name of the linear solver, or of the method that replaces it."""
-        return self.linear_solver if self.method is None else self.method.name
+        return self.method.name if self.method else self.linear_solver
 
     @property
     def factors_reduced_system(self) -> bool:
         """Whether the whole reduced camera system is factored."""
-        return self.method is None and self.linear_solver == "explicit"
+        return not self.method and self.linear_solver == "explicit"
 
     @property
     def forms_reduced_system(self) -> bool:
         """Whether blocks of the reduced camera system are formed, so that the layout must list pairs."""
-        if self.method is not None:
+        if self.method:
             return self.method.forms_reduced_system
         return self.linear_solver in ("explicit", "sparse")
 
     @property
     def cluster_cameras(self) -> int | None:
         """Largest number of cameras in a random cluster; None if the layout needs no random clusters."""
-        return None if self.method is None else self.method.cluster_cameras
+        return self.method.cluster_cameras if self.method else None
 
     @property
     def truncated(self) -> ConjugateGradients | None:
         """Conjugate gradients that stop by a forcing term (inexact Newton); None if the step does not use them."""
-        if self.method is not None:
+        if self.method:
             return self.method.conjugate_gradients
         return None if self.linear_solver == "explicit" else self.conjugate_gradients
 
     @property
     def kept_steps(self) -> int:
         """Number of previous camera steps that are kept for the next step."""
-        return self.refinement.previous_steps if self.method is not None and self.method.uses_previous_steps else 0
+        return self.refinement.previous_steps if self.method and self.method.uses_previous_steps else 0
 
     @property
     def uses_camera_clusters(self) -> bool:
         """Whether the layout needs camera clusters, for the two-level preconditioner."""
-        truncated = self.truncated if self.method is None else None
-        return truncated is not None and truncated.preconditioner == "two-level"
+        exact = self.method or self.linear_solver == "explicit"
+        return not exact and self.conjugate_gradients.preconditioner == "two-level"
 
 
 def _check_known(name: str, value: str, kind: Any) -> None:

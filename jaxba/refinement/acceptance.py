@@ -12,7 +12,7 @@ Jeong et al. 2012, "Pushing the Envelope of Modern Methods for Bundle Adjustment
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -99,9 +99,6 @@ class Comparison(NamedTuple):
     cameras: Float[Array, "parameters cameras"]
     """Cameras before the step."""
 
-    points: Float[Array, "3 points"]
-    """Points before the step, scene units."""
-
     cost: Float[Array, ""]
     """Cost before the step, pixels^2."""
 
@@ -110,7 +107,7 @@ class Comparison(NamedTuple):
     of sums cancels in float32."""
 
     previous: PreviousPoints
-    """Where diverged points return to."""
+    """Points before the step; diverged ones return there."""
 
     step: Step
     """The full step."""
@@ -142,7 +139,19 @@ def comparison(
     min_gain: float | Float[Array, ""],
     effort: Effort | None,
 ) -> Comparison:
-    """The `Comparison` of a step. Arguments as for `best_candidate`."""
+    """The `Comparison` of a step.
+
+    Args:
+        layout: the problem's observations.
+        cameras: current cameras.
+        points: current points.
+        cost: their cost, pixels^2.
+        reference: costs and depths of the slots at the current parameters.
+        step: solution of the damped system.
+        options: static options of the step.
+        min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
+        effort: overrides the number of point iterations of the options.
+    """
     point_iterations = options.refinement.points
     if effort is not None:
         point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
@@ -157,7 +166,6 @@ def comparison(
     return Comparison(
         layout=layout,
         cameras=cameras,
-        points=points,
         cost=cost,
         terms=terms,
         previous=previous,
@@ -218,6 +226,6 @@ def _refined(
     return points, with_prior_costs(layout, cameras, costs)
 
 
-def select(which: Bool[Array, ""], new: Candidate, old: Candidate) -> Candidate:
-    """The new candidate if `which`, else the old one."""
+def select(which: Bool[Array, ""], new: Any, old: Any) -> Any:
+    """A pytree if `which`, else another one."""
     return jax.tree.map(lambda *pair: jnp.where(which, *pair), new, old)

@@ -24,17 +24,15 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Effort, Step
-from jaxba.model.linearize import Reference
+from jaxba.linear.step import Step
 from jaxba.problem.options import StepOptions
-from jaxba.refinement.acceptance import Candidate, Comparison, Work, assess, comparison, select
+from jaxba.refinement.acceptance import Candidate, Comparison, Work, assess, select
 from jaxba.refinement.backtracking import SHORTER, should_backtrack
 from jaxba.refinement.camera_rounds import should_refine_cameras
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.pattern_move import should_extend, should_repeat
 from jaxba.refinement.retraction import keep_focal_signs, move_cameras, step_between
 from jaxba.runtime import loops
-from jaxba.structure.layout import Layout
 
 
 class Search(NamedTuple):
@@ -68,43 +66,22 @@ class Search(NamedTuple):
     """Whether it has another camera round, before there is a next candidate."""
 
 
-def best_candidate(
-    layout: Layout,
-    cameras: Float[Array, "parameters cameras"],
-    points: Float[Array, "3 points"],
-    cost: Float[Array, ""],
-    reference: Reference,
-    step: Step,
-    options: StepOptions,
-    min_gain: float | Float[Array, ""],
-    effort: Effort | None = None,
-) -> Candidate:
+def best_candidate(against: Comparison) -> Candidate:
     """Evaluates a step: the candidate of the iteration, with the accept decision.
 
     It is the first accepted candidate, possibly extended by pattern moves, or the last rejected one.
-
-    Args:
-        layout: the problem's observations.
-        cameras: current cameras.
-        points: current points.
-        cost: their cost, pixels^2.
-        reference: costs and depths of the slots at the current parameters.
-        step: solution of the damped system.
-        options: static options of the step.
-        min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
-        effort: overrides the number of point iterations of the options.
     """
-    against = comparison(layout, cameras, points, cost, reference, step, options, min_gain, effort)
-    start = jax.tree.map(jnp.asarray, first_search(cameras, points, cost, step))
+    options = against.options
+    start = first_search(against.cameras, against.previous.points, against.cost, against.step)
+    start = jax.tree.map(jnp.asarray, start)
     if not has_repairs(options):
         return _assess_next(against, start, start.cameras)
 
     def advance(search: Search) -> Search:
-        if not options.refinement.camera_rounds:
-            return next_search(against, search, search.cameras)
-        last = search.candidate
-        refine = lambda cameras, points: refine_cameras(layout, cameras, points, options)
-        refined = loops.run_if(search.refining, refine, (last.cameras, last.points), last.cameras)
+        last, refined = search.candidate, search.cameras
+        if options.refinement.camera_rounds:
+            refine = lambda cameras, points: refine_cameras(against.layout, cameras, points, options)
+            refined = loops.run_if(search.refining, refine, (last.cameras, last.points), last.cameras)
         return next_search(against, search, refined)
 
     # full step, shorter steps, pattern moves and camera rounds are iterations of one loop, so that the program contains
@@ -151,15 +128,12 @@ def _assess_next(against: Comparison, search: Search, refined: Float[Array, "par
     fraction = jnp.where(best.accepted, best.step_fraction, search.length)
     full_step = _is_full_step(search) & search.active
     work = best.work._replace(repairs=best.work.repairs + 1)
-    if against.options.refinement.camera_rounds:
-        last, refining = search.candidate, search.refining
-        cameras = jnp.where(refining, refined, cameras)
-        points = jnp.where(refining, last.points, points)
-        fraction = jnp.where(refining, last.step_fraction, fraction)
-        again = last.work._replace(repairs=last.work.repairs + 1, camera_rounds=last.work.camera_rounds + 1)
-        work = jax.tree.map(lambda *pair: jnp.where(refining, *pair), again, work)
-        full_step = full_step & ~refining
-    return assess(against, cameras, points, fraction, work, full_step)
+    last, refining = search.candidate, search.refining
+    again = last.work._replace(repairs=last.work.repairs + 1, camera_rounds=last.work.camera_rounds + 1)
+    cameras, points, fraction, work = select(
+        refining, (refined, last.points, last.step_fraction, again), (cameras, points, fraction, work)
+    )
+    return assess(against, cameras, points, fraction, work, full_step & ~refining)
 
 
 def _is_full_step(search: Search) -> Bool[Array, ""]:
@@ -175,14 +149,11 @@ def next_search(against: Comparison, search: Search, refined: Float[Array, "para
         refined: the cameras after a camera round of `search.candidate`, where `search.refining`; else any.
     """
     candidate = _assess_next(against, search, refined)
-    if not against.options.refinement.camera_rounds:
-        return _after_candidate(against, search._replace(candidate=candidate))
     rounds = jnp.where(search.refining, search.rounds + 1, 0)
     full_step = _is_full_step(search)
     refining = should_refine_cameras(against, candidate, search.best, full_step, rounds) & search.active
     same = search._replace(candidate=candidate, rounds=rounds, refining=refining)
-    choose = lambda new, old: jnp.where(refining, old, new)
-    return jax.tree.map(choose, _after_candidate(against, same), same)
+    return select(refining, same, _after_candidate(against, same))
 
 
 def _after_candidate(against: Comparison, search: Search) -> Search:
@@ -190,24 +161,18 @@ def _after_candidate(against: Comparison, search: Search) -> Search:
     best, candidate = search.best, search.candidate
     first = candidate.accepted & ~best.accepted
     better = candidate.accepted & best.accepted & (candidate.cost < best.cost)
-    spent = jax.tree.map(lambda *pair: jnp.where(search.active, *pair), candidate.work, best.work)
-    tried = best._replace(work=spent)
+    tried = best._replace(work=select(search.active, candidate.work, best.work))
     best_now = select(search.active & (better | ~best.accepted), candidate, tried)
     shorter = should_backtrack(against, candidate, search.length)
-    if not against.options.refinement.pattern_moves:
-        return search._replace(best=best_now, length=SHORTER * search.length, active=search.active & shorter)
     further = should_extend(against, better, search.length)
     continues = jnp.where(first, should_repeat(against, candidate), jnp.where(best.accepted, further, shorter))
-    starts_pattern = search.active & first
-    change = step_between(against.cameras, best_now.cameras, against.options), best_now.points - against.points
+    change = step_between(against.cameras, best_now.cameras, against.options), best_now.points - against.previous.points
+    origin = select(best_now.accepted, (best_now.cameras, best_now.points), (against.cameras, against.previous.points))
     return search._replace(
         best=best_now,
-        cameras=jnp.where(best_now.accepted, best_now.cameras, against.cameras),
-        points=jnp.where(best_now.accepted, best_now.points, against.points),
-        direction=(
-            jnp.where(starts_pattern, change[0], search.direction[0]),
-            jnp.where(starts_pattern, change[1], search.direction[1]),
-        ),
+        cameras=origin[0],
+        points=origin[1],
+        direction=select(search.active & first, change, search.direction),
         length=jnp.where(first, 1, jnp.where(best.accepted, 2, SHORTER) * search.length),
         active=search.active & continues,
     )

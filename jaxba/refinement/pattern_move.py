@@ -30,7 +30,7 @@ def should_repeat(against: Comparison, first: Candidate) -> Bool[Array, ""]:
         & (first.work.repairs == 0)
         & (step.damped <= SMALL_DAMPING_FRACTION * step.slope)
     )
-    return against.matters & ~predicted
+    return bool(against.options.refinement.pattern_moves) & against.matters & ~predicted
 
 
 def should_extend(against: Comparison, better: Bool[Array, ""], length: Float[Array, ""]) -> Bool[Array, ""]:

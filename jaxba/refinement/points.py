@@ -74,8 +74,16 @@ class PreviousPoints(NamedTuple):
         """From the positions of points and the reference of every slot there."""
         return cls(points, reference.inverse_depth < 0, *point_sums(layout, [reference.inverse_depth, reference.costs]))
 
+    @classmethod
+    def unknown(cls, layout: Layout, points: Float[Array, "3 points"]) -> PreviousPoints:
+        """None that a point could return to: in front of no camera, so that no point counts as diverged."""
+        zero = jnp.zeros_like(points[0])
+        return cls(points, jnp.zeros(layout.num_slots, bool), zero, zero)
 
-class _Carry(NamedTuple):
+
+class _Search(NamedTuple):
+    """The iterations of all points, between two passes over the observations."""
+
     points: Float[Array, "3 points"]  # best so far
     costs: Float[Array, " points"]
     system: Float[Array, "9 points"]  # lower triangle of `J_p^T J_p` and gradient at `points`
@@ -84,8 +92,7 @@ class _Carry(NamedTuple):
     inverse_depth_sum: Float[Array, " points"]  # at the start
     delayed: Bool[Array, " points"]  # whether the point was reset, and so is a pass behind the others
     passes: Int[Array, ""]
-    late: Bool[Array, ""]  # whether any point is delayed
-    converged: Bool[Array, ""]  # whether the last pass lowered the cost too little for another one
+    more: Bool[Array, ""]  # whether there is another pass
 
 
 def refine_points(
@@ -116,72 +123,65 @@ def refine_points(
         reset points is the previous position.
     """
     one_pass = point_passes(layout, frames)
-    fronts = () if previous is None else (previous.front,)
-
-    def terms(views: Views, *front: Array) -> list[Array]:
-        found = point_terms(views, loss)
-        return [*found, *((seen & (found[-1] > 0)).astype(points.dtype) for seen in front)]
-
+    before = previous or PreviousPoints.unknown(layout, points)
     free = None if layout.unknowns is None else layout.unknowns.free_points
+    constant = () if free is None else (jnp.asarray(free),)
 
-    def propose(best: _Carry) -> Float[Array, "3 points"]:
-        def moved(points: Array, system: Array, damping: Array, *free: Array) -> list[Array]:
-            matrix = [entry * (1 + damping) if k in (0, 2, 5) else entry for k, entry in enumerate(system[:6])]
-            factor = cholesky3(matrix)
-            after = [x - d for x, d in zip(points, factor.backward(factor.forward(list(system[6:]))), strict=True)]
-            return [
-                jnp.where(moves, new, old) for moves in free for new, old in zip(after, points, strict=True)
-            ] or after
+    def terms(views: Views, front: Array) -> list[Array]:
+        found = point_terms(views, loss)
+        return [*found, (front & (found[-1] > 0)).astype(points.dtype)]
 
-        constant = () if free is None else (jnp.asarray(free),)
-        return jnp.stack(compute_in_one_loop(moved, best.points, best.system, best.damping, *constant))
-
-    def body(carry: _Carry) -> _Carry:
-        *system, costs, inverse_depth_sum = (found := one_pass(carry.trial, terms, *fronts))[:11]
-        diverged, delayed = jnp.zeros_like(carry.delayed), carry.delayed
-        if previous is not None:
-            diverged = (carry.passes == 0) & (
-                (found[11] > 0) | has_receded(inverse_depth_sum, previous.inverse_depth_sum)
-            )
-            delayed = delayed | diverged
-        start = jnp.where(jnp.isinf(carry.costs), inverse_depth_sum, carry.inverse_depth_sum)
-        active = ~diverged & (delayed | (carry.passes <= iterations))
-        accepted = (costs < carry.costs) & ~has_receded(inverse_depth_sum, start) & active
-        grown = jnp.maximum(REJECTED_DAMPING, carry.damping * DAMPING_FACTOR)
-        damping = jnp.where(accepted, carry.damping / DAMPING_FACTOR, grown)
-        least = jnp.where(accepted, costs, carry.costs)
-        lowered = jnp.sum(jnp.where(accepted, carry.costs - costs, 0))
-        counts = lowered, jnp.sum(least), jnp.any(delayed).astype(jnp.int32)
+    def next_pass(now: _Search) -> _Search:
+        *system, costs, inverse_depth_sum, lost = one_pass(now.trial, terms, before.front)
+        diverged = (now.passes == 0) & ((lost > 0) | has_receded(inverse_depth_sum, before.inverse_depth_sum))
+        delayed = now.delayed | diverged
+        start = jnp.where(jnp.isinf(now.costs), inverse_depth_sum, now.inverse_depth_sum)
+        active = ~diverged & (delayed | (now.passes <= iterations))
+        accepted = (costs < now.costs) & ~has_receded(inverse_depth_sum, start) & active
+        least = jnp.where(accepted, costs, now.costs)
+        counts = jnp.sum(jnp.where(accepted, now.costs - costs, 0)), jnp.sum(least), jnp.any(delayed).astype(jnp.int32)
         lowered, left, late = sum_over_devices(layout, counts)
-        best = _Carry(
-            points=jnp.where(accepted, carry.trial, carry.points),
+        converged = lowered <= jnp.minimum(min_decrease, SMALL_DECREASE * left)
+        grown = jnp.maximum(REJECTED_DAMPING, now.damping * DAMPING_FACTOR)
+        damping = jnp.where(diverged, now.damping, jnp.where(accepted, now.damping / DAMPING_FACTOR, grown))
+        best = jnp.where(accepted, now.trial, now.points)
+        system = jnp.where(accepted, jnp.stack(system), now.system)
+        trial = jnp.stack(compute_in_one_loop(_moved, best, system, damping, *constant))
+        return _Search(
+            points=jnp.where(diverged, before.points, best),
             costs=least,
-            system=jnp.where(accepted, jnp.stack(system), carry.system),
-            damping=jnp.where(diverged, carry.damping, damping),
-            trial=carry.trial,
+            system=system,
+            damping=damping,
+            trial=jnp.where(diverged, before.points, trial),
             inverse_depth_sum=start,
             delayed=delayed,
-            passes=carry.passes + 1,
-            late=late > 0,
-            converged=lowered <= jnp.minimum(min_decrease, SMALL_DECREASE * left),
-        )
-        best = best._replace(trial=propose(best))
-        if previous is None:
-            return best
-        return best._replace(
-            points=jnp.where(diverged, previous.points, best.points),
-            trial=jnp.where(diverged, previous.points, best.trial),
+            passes=now.passes + 1,
+            more=(now.passes + 1 <= iterations + (late > 0)) & ~converged,
         )
 
     # start and end are passes like the others, with infinite initial costs: the program contains a pass only once
-    infinite = jnp.full_like(points[0], jnp.inf)
-    damping = jnp.full_like(infinite, DAMPING_FACTOR * INITIAL_DAMPING)
-    not_delayed, zero, no = jnp.zeros(infinite.shape, bool), jnp.zeros_like(infinite), jnp.zeros((), bool)
-    system = jnp.zeros((9, *infinite.shape), points.dtype)
-    carry = _Carry(points, infinite, system, damping, points, zero, not_delayed, jnp.zeros((), jnp.int32), no, no)
-    more = lambda c: (c.passes <= iterations + c.late) & ~c.converged
-    carry = loops.while_loop(more, body, carry)
-    return carry.points, carry.costs
+    zero = jnp.zeros_like(points[0])
+    search = _Search(
+        points=points,
+        costs=jnp.full_like(zero, jnp.inf),
+        system=jnp.zeros((9, *zero.shape), points.dtype),
+        damping=jnp.full_like(zero, DAMPING_FACTOR * INITIAL_DAMPING),
+        trial=points,
+        inverse_depth_sum=zero,
+        delayed=jnp.zeros(zero.shape, bool),
+        passes=jnp.zeros((), jnp.int32),
+        more=jnp.ones((), bool),
+    )
+    search = loops.while_loop(lambda search: search.more, next_pass, search)
+    return search.points, search.costs
+
+
+def _moved(points: Array, system: Array, damping: Array, *free: Array) -> list[Array]:
+    """Points after a damped step of their own systems; those that are not free stay."""
+    matrix = [entry * (1 + damping) if k in (0, 2, 5) else entry for k, entry in enumerate(system[:6])]
+    factor = cholesky3(matrix)
+    after = [x - d for x, d in zip(points, factor.backward(factor.forward(list(system[6:]))), strict=True)]
+    return [jnp.where(moves, new, old) for moves in free for new, old in zip(after, points, strict=True)] or after
 
 
 def has_receded(inverse_depth_sum: Float[Array, " points"], before: Float[Array, " points"]) -> Bool[Array, " points"]:

@@ -84,4 +84,4 @@ def try_step_by_parts(
             break
         if int(following) == Next.CAMERA_ROUND:
             refined = call(part(camera_round), layout, search.candidate, options)
-    return call(program(take_step, level="quick"), layout, state, damping, proposal, search.best)
+    return call(program(take_step, "options", level="quick"), layout, state, damping, proposal, search.best, options)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from jaxba.lm.method import check_plain
 from jaxba.lm.records import Prices
 from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemError
 from jaxba.problem.intrinsics import POSE_SIZE
@@ -267,34 +268,26 @@ def choose_linear_solver(
         devices: among which observations are divided.
 
     Raises:
-        ValueError: a linear solver is requested by name for a method.
         ProblemError: a method is asked for that does not support the problem; or a step needs more memory than the
             device or the machine has.
     """
     _check_device_memory(problem, devices)
-    if options.method is not None and asked != "auto":
-        raise ValueError(f"linear solver {asked!r} is for plain LM steps; {options.method.name} has its own")
-    if options.method is not None:
-        _check_method(problem, options)
+    if options.method:
+        lenses = problem.lenses
+        shared = lenses is not None and lenses.shared and np.asarray(lenses.free).any()
+        check_plain(
+            options,
+            ProblemError,
+            rigs=problem.rigs is not None,
+            shared_lenses=bool(shared) and options.intrinsics == "free",
+            priors=problem.priors is not None,
+        )
         return options
     if asked == "auto":
         return replace(options, linear_solver=choose(problem, observations))  # `choose` respects MAX_BYTES
     if asked == "explicit":
         _check_memory(problem, observations)
     return replace(options, linear_solver=asked)
-
-
-def _check_method(problem: BundleProblem, options: StepOptions) -> None:
-    """Raises a `ProblemError` if a method does not support a problem."""
-    assert options.method is not None
-    lenses, name = problem.lenses, options.method.name
-    if problem.rigs is not None:
-        raise ProblemError(f"rigs need plain LM, not {name}")
-    shared = lenses is not None and lenses.shared and np.asarray(lenses.free).any()
-    if shared and options.intrinsics == "free":
-        raise ProblemError(f"shared lenses need plain LM, not {name}")
-    if problem.priors is not None:
-        raise ProblemError(f"priors need plain LM, not {name}")
 
 
 def device_memory() -> float | None:

@@ -14,8 +14,8 @@ from jaxba.damping import DampingPolicy, brings_embedded, make_policy
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.policy import trained_step
 from jaxba.damping.registry import BOLD, BOLD_DRIVER, BOLD_PLAIN, LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
-from jaxba.methods.registry import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
 from jaxba.problem.options import Refinement, StepOptions
+from jaxba.solver.methods import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
 from jaxba.solver.options import Dtype, SolveOptions
 
 DTYPES = get_args(Dtype)

@@ -7,8 +7,8 @@ from typing import Literal, get_args
 
 from jaxba.damping import DampingPolicy
 from jaxba.damping.policy import trained_step
+from jaxba.lm.method import StepMethod, check_plain
 from jaxba.lm.termination import Tolerances
-from jaxba.methods.registry import DEFAULT_METHOD, Method, make_method
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import (
     ConjugateGradients,
@@ -20,6 +20,7 @@ from jaxba.problem.options import (
     check_count,
 )
 from jaxba.runtime.compilation import Compilation
+from jaxba.solver.methods import DEFAULT_METHOD, make_method
 
 MAX_ITERATIONS = 100
 """Limit of iterations. Source: the experiments of the paper on learned damping, where a solve that takes more has
@@ -49,8 +50,8 @@ _GROUPS = {
 class SolveOptions:
     """Options of `solve`. The command `jaxba-solve` has the same defaults, and an option for most of these."""
 
-    method: str | Method = DEFAULT_METHOD
-    """Optimisation method: an entry of `jaxba.METHODS` or its name."""
+    method: str | StepMethod = DEFAULT_METHOD
+    """Method that computes the step: an entry of `jaxba.METHODS` or its name."""
 
     linear_solver: LinearSolverChoice = "auto"
     """Solver of the reduced camera system in plain LM; other methods have their own. `auto` chooses by a cost model
@@ -109,7 +110,7 @@ class SolveOptions:
                 raise ValueError(f"{name} must be made with jaxba.{kind.__name__}, is {value!r}")
         if isinstance(self.method, str):
             make_method(self.method)
-        elif not isinstance(self.method, Method):
+        elif not isinstance(self.method, StepMethod):
             raise ValueError(f"method must be an entry of jaxba.METHODS or its name, is {self.method!r}")
         for name, known in _CHOICES.items():
             if getattr(self, name) not in get_args(known):
@@ -145,8 +146,7 @@ class SolveOptions:
             own = trained.coordinates.scaling
             this = "this policy takes lambda as a factor on the diagonal"
             raise ValueError(f"scaling must be {own!r}: {this}, not with scaling {scaling!r}")
-        if step.mixed_precision and step.method is not None:
-            raise ValueError("mixed types are for plain LM; methods have float64 or float32")
+        check_plain(step, mixed=step.mixed_precision, linear_solver=self.linear_solver != "auto")
         return step
 
 

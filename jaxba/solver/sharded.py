@@ -19,6 +19,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy
+from jaxba.lm.method import check_plain
 from jaxba.lm.records import LMState, Prices, StepInfo
 from jaxba.lm.termination import Tolerances
 from jaxba.model.linearize import cost
@@ -61,8 +62,7 @@ class Shards:
         Raises:
             ProblemError: the method of the options works on one device only, or there are too few points.
         """
-        if options.method is not None:
-            raise ProblemError(f"several devices are for plain LM, not for {options.solver_name}")
+        check_plain(options, ProblemError, devices=True)
         self._options, self._devices = options, devices
         self._mesh = Mesh(np.array(devices), (AXIS,))
         tracks = np.bincount(problem.point_index, minlength=problem.num_points)

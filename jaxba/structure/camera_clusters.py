@@ -14,7 +14,9 @@ from jaxtyping import Bool, Int
 
 from jaxba.structure.agreement import Agreement, size_of
 from jaxba.structure.covisibility import PairLayout, pair_layout
+from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
+from jaxba.structure.track_buckets import Slots
 from jaxba.typing import AnyArray, register_pytree
 
 CLUSTER_CAMERAS = 8
@@ -52,13 +54,8 @@ class ClusterLayout:
 
 
 def cluster_layout(
-    camera: Int[np.ndarray, " observations"],
-    point: Int[np.ndarray, " observations"],
-    slot: Int[np.ndarray, " observations"],
-    cameras: int,
-    points: int,
-    slot_point: Int[np.ndarray, " slots"],
-    empty: int,
+    observations: ObservationOrder,
+    slots: Slots,
     shared_lens: Bool[np.ndarray, "cameras lenses"] | None = None,
     agreement: Agreement | None = None,
 ) -> ClusterLayout:
@@ -67,18 +64,15 @@ def cluster_layout(
     Clusters are split by shared lenses, unless that makes more than twice `MAX_CLUSTERS`.
 
     Args:
-        camera: camera of each observation; observations are sorted by point, then by camera.
-        point: point of each observation.
-        slot: slot of each observation.
-        cameras: number of cameras.
-        points: number of points.
-        slot_point: point of each slot, in layout order.
-        empty: an empty slot.
+        observations: the sorted observations of the problem.
+        slots: their slots.
         shared_lens: which cameras have which lens of those that several have.
         agreement: with the other shards of a problem, which have the same clusters.
     """
     from jaxba.structure.agglomeration import agglomerate, shared_points  # SciPy: its import takes 0.2 s
 
+    camera, point = observations.camera, observations.point
+    cameras, points = observations.num_cameras, len(observations.tracks)
     num_clusters = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
     shared = shared_points(camera, point, cameras, points)[0]
     shared = shared if agreement is None else agreement.total("shared points", shared)
@@ -101,13 +95,13 @@ def cluster_layout(
     part = lambda name: None if agreement is None else agreement.within(name)
     width = size_of(agreement, "width", fitting_width(counts))
     counts = np.append(counts, np.zeros(count + 1 - len(keys), counts.dtype))
-    slots = np.append(slot[order][first], np.full(count + 1 - len(keys), empty))
+    firsts = np.append(slots.slot[order][first], np.full(count + 1 - len(keys), slots.empty))
     keyed = (keys % clusters, coarse, seen_by, start, clusters, count)
     return ClusterLayout(
         label=label.astype(np.int32),
         members=cluster_members(label, clusters, int(np.bincount(label).max())),
-        levels=sum_tree(slot[order], counts, empty, width, agreement=part("slots")),
-        point=slot_point[slots],
+        levels=sum_tree(slots.slot[order], counts, slots.empty, width, agreement=part("slots")),
+        point=slots.point[firsts],
         pairs=pair_layout(*keyed, factor=True, banded=False, agreement=part("pairs")),
         tied=tied,
     )

@@ -214,14 +214,11 @@ def build_layout(
     if partitions is not None:
         if pair_lists is None:
             raise ValueError("partitions need pairs that are listed: pairs=True, factor=False")
-        drawn_partitions = partition_layout(
-            camera, point, slot, cameras, len(tracks), slot_point, empty, pair_lists, largest=partitions
-        )
+        drawn_partitions = partition_layout(observations, assignment, pair_lists, partitions)
     camera_clusters = None
     if clusters:
         shared = None if unknowns is None or unknowns.members is None else np.asarray(unknowns.members)
-        sorted_observations = camera, point, slot, cameras, len(tracks), slot_point, empty
-        camera_clusters = cluster_layout(*sorted_observations, shared, part("clusters"))
+        camera_clusters = cluster_layout(observations, assignment, shared, part("clusters"))
     return Layout(
         slot_camera=in_slots(camera.astype(np.int32)),
         slot_point=slot_point,

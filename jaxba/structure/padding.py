@@ -152,7 +152,7 @@ def with_padded_solver(
     Returns:
         The capacity (None if another solver or a method is requested) and the linear solver to use.
     """
-    if options.method is not None or asked not in ("auto", "explicit"):
+    if options.method or asked not in ("auto", "explicit"):
         return None, asked
     return capacity, asked if capacity is None else "explicit"
 

@@ -20,7 +20,9 @@ from jaxtyping import Int
 
 from jaxba.structure.camera_clusters import cluster_members
 from jaxba.structure.covisibility import PairLayout
-from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
+from jaxba.structure.observation_order import ObservationOrder
+from jaxba.structure.sum_trees import TREE_WIDTH, Room, sum_tree
+from jaxba.structure.track_buckets import Slots
 from jaxba.typing import AnyArray, register_pytree
 
 PARTITIONS = 16
@@ -58,65 +60,43 @@ class Partition:
         return jax.tree.map(lambda x: x[iteration % count], arrays)
 
 
-def partition_layout(
-    camera: Int[np.ndarray, " observations"],
-    point: Int[np.ndarray, " observations"],
-    slot: Int[np.ndarray, " observations"],
-    cameras: int,
-    points: int,
-    slot_point: Int[np.ndarray, " slots"],
-    empty: int,
-    pairs: PairLayout,
-    largest: int,
-    count: int = PARTITIONS,
-) -> Partition:
-    """Draws partitions of a problem.
+def partition_layout(observations: ObservationOrder, slots: Slots, pairs: PairLayout, largest: int) -> Partition:
+    """Draws partitions of a problem; only one if all cameras fit in one cluster.
 
     Args:
-        camera: camera of each observation; observations are sorted by point, then by camera.
-        point: point of each observation.
-        slot: slot of each observation.
-        cameras: number of cameras.
-        points: number of points.
-        slot_point: point of each slot, in layout order.
-        empty: an empty slot.
+        observations: the sorted observations of the problem.
+        slots: their slots.
         pairs: pairs of the same problem, not banded.
         largest: largest number of cameras in a cluster.
-        count: number of partitions; only one is drawn if all cameras fit in one cluster.
     """
     from jaxba.structure.louvain import camera_graph, clusterings  # SciPy: its import takes 0.2 s
 
-    graph = camera_graph(camera, point, cameras, points)
-    if cameras <= largest:
-        labels = np.zeros((1, cameras), int)
-    else:
+    camera, point, cameras = observations.camera, observations.point, observations.num_cameras
+    labels = np.zeros((1, cameras), int)
+    if cameras > largest:
+        graph = camera_graph(camera, point, cameras, len(observations.tracks))
         drawn = clusterings(graph, largest, np.random.default_rng(SEED))
-        labels = np.stack(list(itertools.islice(drawn, count)))
+        labels = np.stack(list(itertools.islice(drawn, PARTITIONS)))
     clusters = int(labels.max()) + 1
-    sizes = np.stack([np.bincount(label, minlength=clusters) for label in labels])
-    replicas = [_point_replicas(label[camera], point, clusters) for label in labels]
+    size = max(int(np.bincount(label).max()) for label in labels)
+    tables = [cluster_members(label, clusters, size) for label in labels]
+    # replicas of points are numbered by point and cluster
+    keys = (point.astype(np.int64) * clusters + label[camera] for label in labels)
+    replicas = [np.unique(key, return_inverse=True, return_counts=True)[1:] for key in keys]
     most = max(len(counts) for _, counts in replicas) + 1
-    trees, slot_replica = [], []
-    for which, counts in replicas:
-        counts = np.append(counts, np.zeros(most - len(counts), int))
-        order = np.argsort(which, kind="stable")
-        trees.append(sum_tree(slot[order], counts, empty, TREE_WIDTH))
-        slot_replica.append(np.full(len(slot_point), most - 1, np.int32))
-        slot_replica[-1][slot] = which
-    tables = [cluster_members(label, clusters, int(sizes.max())) for label in labels]
+    room = Room(len(camera), max(int(counts.max()) for _, counts in replicas))  # for trees of equal shapes
+    trees, slot_replica = [], np.full((len(labels), len(slots.point)), most - 1, np.int32)
+    for number, (which, counts) in enumerate(replicas):
+        items = slots.slot[np.argsort(which, kind="stable")]
+        trees.append(sum_tree(items, np.pad(counts, (0, most - len(counts))), slots.empty, TREE_WIDTH, room))
+        slot_replica[number, slots.slot] = which
     return Partition(
         label=labels.astype(np.int32),
         members=np.stack(tables),
         blocks=np.stack([_blocks(table, label, pairs) for table, label in zip(tables, labels, strict=True)]),
-        slot_replica=np.stack(slot_replica),
-        levels=_stack(trees, empty),
+        slot_replica=slot_replica,
+        levels=tuple(map(np.stack, zip(*trees, strict=True))),
     )
-
-
-def _point_replicas(label: np.ndarray, point: np.ndarray, clusters: int) -> tuple[np.ndarray, np.ndarray]:
-    """The replica of each observation, numbered by point and cluster, and the number of observations of each."""
-    _, which, counts = np.unique(point.astype(np.int64) * clusters + label, return_inverse=True, return_counts=True)
-    return which, counts
 
 
 def _blocks(members: np.ndarray, label: np.ndarray, pairs: PairLayout) -> np.ndarray:
@@ -133,25 +113,3 @@ def _blocks(members: np.ndarray, label: np.ndarray, pairs: PairLayout) -> np.nda
     cluster, rank = np.nonzero(members == len(label))
     table[cluster, rank, rank] = zero + 1
     return table
-
-
-def _stack(trees: list[tuple[np.ndarray, ...]], empty: int) -> tuple[np.ndarray, ...]:
-    """Stacks summation trees, padded to equal shapes: missing levels are identities, missing rows and columns empty."""
-    depth = max(len(tree) for tree in trees)
-    levels = []
-    for number in range(depth):
-        parts = [_level(tree, number) for tree in trees]
-        rows, width = (max(part.shape[axis] for part in parts) for axis in (0, 1))
-        table = []
-        for tree, part in zip(trees, parts, strict=True):
-            below = _level(tree, number - 1).shape[0] - 1 if number else empty
-            padded = np.full((rows, width), below, np.int32)
-            padded[: part.shape[0], : part.shape[1]] = part
-            table.append(padded)
-        levels.append(np.stack(table))
-    return tuple(levels)
-
-
-def _level(tree: tuple[np.ndarray, ...], number: int) -> np.ndarray:
-    """A level of a tree; past the last level an identity."""
-    return tree[number] if number < len(tree) else np.arange(len(tree[-1]), dtype=np.int32)[:, None]

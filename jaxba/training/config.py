@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from jaxba import settings
 from jaxba.damping.agent_config import AgentConfig
@@ -16,11 +17,13 @@ from jaxba.damping.features import observation_size
 from jaxba.damping.policy_file import LARGEST_FILE
 from jaxba.game.env import GameConfig
 from jaxba.game.scene_bank import BankConfig
-from jaxba.methods.registry import DEFAULT_METHOD, MethodName, make_method
 from jaxba.problem.options import StepOptions
 from jaxba.settings import SettingsError, configurations
+from jaxba.solver.methods import make_method
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig
+
+MethodName = Literal["lm", "stba", "deeplm", "poba"]
 
 METADATA_BYTES = 1 << 14
 """Reserved for the metadata of a policy file, of which the configuration takes 3 kB."""
@@ -53,7 +56,7 @@ class TrainConfig:
     """Environments of each class of scenes."""
 
     method: MethodName = "lm"
-    """How a step is computed (jaxba/methods/registry.py). Scenes are solved and selected with plain LM."""
+    """How a step is computed (jaxba/solver/methods.py). Scenes are solved and selected with plain LM."""
 
     cluster_cameras: int = 4
     """Largest number of cameras in a cluster, for methods with clusters; the default for real problems is too large for
@@ -75,10 +78,8 @@ class TrainConfig:
     def step_options(self) -> StepOptions:
         """Options of the method's steps, without embedded iterations."""
         plain = StepOptions(intrinsics=self.bank.intrinsics)
-        if self.method == DEFAULT_METHOD:
-            return plain
         method = make_method(self.method)
-        if method.options(plain).cluster_cameras is not None:
+        if method.cluster_cameras is not None:
             method = make_method(f"{self.method}:{self.cluster_cameras}")
         return method.options(plain)
 

@@ -24,10 +24,10 @@ from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Ratio, Runs, Score, amounts, best_costs, evaluate, paired_ratio, play_all, scores
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks, select
-from jaxba.methods.registry import DEFAULT_METHOD, make_method
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.atomic import atomic_write
+from jaxba.solver.methods import DEFAULT_METHOD, make_method
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig
 from jaxba.training.driver import TrainError

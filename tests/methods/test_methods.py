@@ -19,7 +19,6 @@ from jaxba import METHODS, BundleProblem, StepOptions, make_method, make_policy,
 from jaxba.linear.schur import RotationCoordinates, apply_reduced, camera_system, eliminate_points
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.methods.poba import PowerSeries
-from jaxba.methods.registry import UnknownMethodError
 from jaxba.methods.stba import (
     StochasticClusters,
     clustered_step,
@@ -32,6 +31,7 @@ from jaxba.methods.stba import (
 from jaxba.model.linearize import linearize
 from jaxba.problem.options import ConjugateGradients, Coordinates
 from jaxba.runtime.compilation import CompileClock
+from jaxba.solver.methods import UnknownMethodError
 from jaxba.structure.layout import partition_of
 
 CLUSTERED = StepOptions(method=StochasticClusters(cluster_cameras=2))

@@ -84,16 +84,16 @@ def test_changes_of_the_file_are_turned_to_the_manifold():
 def test_accepted_changes_of_the_cameras_are_kept_and_refused_ones_are_not():
     problem = support.tiny()
     layout, first = start(problem, SERIES)
-    np.testing.assert_array_equal(first.previous_steps, np.zeros((2, *first.cameras.shape)))
+    np.testing.assert_array_equal(first.method_state, np.zeros((2, *first.cameras.shape)))
     second, info = step(layout, first, 1e-2, SERIES)
     assert info.accepted
-    np.testing.assert_array_equal(second.previous_steps[0], second.cameras - first.cameras)
+    np.testing.assert_array_equal(second.method_state[0], second.cameras - first.cameras)
     third, info = step(layout, second, 1e-3, SERIES)
     assert info.accepted
-    np.testing.assert_array_equal(third.previous_steps, [third.cameras - second.cameras, second.previous_steps[0]])
+    np.testing.assert_array_equal(third.method_state, [third.cameras - second.cameras, second.method_state[0]])
     same, info = step(layout, third, 1e-3, SERIES, 1e9)
     assert not info.accepted
-    np.testing.assert_array_equal(same.previous_steps, third.previous_steps)
+    np.testing.assert_array_equal(same.method_state, third.method_state)
 
 
 def test_a_step_with_previous_ones_predicts_what_its_own_linear_model_says():
@@ -117,7 +117,7 @@ def test_a_step_with_previous_ones_predicts_what_its_own_linear_model_says():
 def test_other_solvers_keep_no_steps(options):
     _, state = start(support.tiny(), StepOptions(**options, refinement=Refinement(previous_steps=1)))
     assert isinstance(state, LMState)
-    assert state.previous_steps is None
+    assert state.method_state == ()
 
 
 @pytest.mark.slow

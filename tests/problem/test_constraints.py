@@ -27,9 +27,9 @@ from jaxba import (
     with_position_priors,
     with_rotation_priors,
 )
-from jaxba.methods.registry import make_method
 from jaxba.problem import geometry
 from jaxba.problem.options import ConjugateGradients, Coordinates
+from jaxba.solver.methods import make_method
 from jaxba.solver.prepare import prepare
 
 EXACT = ConjugateGradients(forcing=0.0, tolerance=1e-13)

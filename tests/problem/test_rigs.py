@@ -25,10 +25,10 @@ from jaxba import (
     with_position_priors,
     with_rotation_priors,
 )
-from jaxba.methods.registry import make_method
 from jaxba.problem import geometry
 from jaxba.problem.frames import in_frames, out_of_frames
 from jaxba.problem.options import ConjugateGradients, Coordinates
+from jaxba.solver.methods import make_method
 
 FRAME = np.array([0, 1, 0, 2, 1, 3], np.int32)
 MANIFOLD = Coordinates(rotation="manifold")

@@ -25,7 +25,7 @@ from jaxba.model.linearize import cost, linearize
 from jaxba.problem import geometry
 from jaxba.problem.options import Coordinates, Refinement
 from jaxba.refinement import camera_rounds
-from jaxba.refinement.acceptance import NEGLIGIBLE
+from jaxba.refinement.acceptance import NEGLIGIBLE, comparison
 from jaxba.refinement.backtracking import SHORTER
 from jaxba.refinement.camera_rounds import GOOD_GAIN, MAX_COST_RATIO, MIN_GAINS, ROUNDS_OF_LATER_CANDIDATES
 from jaxba.refinement.cameras import DAMPINGS, refine_cameras
@@ -240,7 +240,9 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
     assert saved >= 3
 
 
-_best_candidate = jax.jit(best_candidate, static_argnames=("options", "min_gain"))
+@functools.partial(jax.jit, static_argnames=("options", "min_gain"))
+def _best_candidate(layout, cameras, points, cost, reference, whole, options, min_gain):
+    return best_candidate(comparison(layout, cameras, points, cost, reference, whole, options, min_gain, None))
 
 
 def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():
