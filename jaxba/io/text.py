@@ -209,6 +209,11 @@ class NumberReader:
             self.fail(int(ordinals[bad[0]]), complaint)
         return values.astype(np.int32)
 
+    def need(self, count: int) -> None:
+        """Raises a `ProblemError` if there are fewer numbers than `count` that were read and not yet taken."""
+        if count > self._size:
+            self.missing()
+
     def missing(self) -> NoReturn:
         """Raises a `ProblemError` that says why there are no more numbers than those that were read."""
         ordinal = self._taken + self._size

@@ -68,8 +68,7 @@ def read_nvm(path: StrPath) -> BundleProblem:
         images = _images(lines, header)
         reader = NumberReader(lines.rest(), name, lambda _: "number of points", line=lines.line + 1)
         values = reader.peek_all()
-        if not values.size:
-            reader.missing()
+        reader.need(1)
         count = int(reader.integers([0], values[:1], 0, LARGEST_COUNT)[0])
         if not count:
             raise ProblemError(f"{name}: its first model has no points")
