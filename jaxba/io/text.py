@@ -17,6 +17,9 @@ MAX_WORD_BYTES = 1 << 16
 """Longest word that may be cut by the end of a block. No number needs more than about 1100 characters; without the
 bound a large file without whitespace would be collected in memory as one word."""
 
+SHOWN = 40
+"""Characters of a wrong word that a message shows."""
+
 _WORD = re.compile(rb"[^ \t\n\r\v\f]+")
 _NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?", re.IGNORECASE)
 _NOT_FINITE = re.compile(
@@ -43,6 +46,12 @@ def number(word: str) -> float:
     if _NOT_FINITE.fullmatch(text):
         return float("nan")
     raise ValueError(f"{word!r} is no number")
+
+
+def shown_word(word: bytes) -> str:
+    """A word for a message, shortened."""
+    text = word.decode("latin-1")
+    return ascii(text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}...")
 
 
 def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: str) -> list[float]:
@@ -226,8 +235,7 @@ class NumberReader:
         piece = next(piece for piece in reversed(self._pieces) if piece.ordinal <= ordinal)
         offset = int(np.flatnonzero(_word_starts(_spaces(piece.text)))[ordinal - piece.ordinal])
         line = piece.line + piece.text.count(b"\n", 0, offset)
-        word = piece.text[offset : offset + 41].split(None, 1)[0].decode("latin-1")
-        shown = ascii(word if len(word) <= 40 else word[:37] + "...")
+        shown = shown_word(piece.text[offset : offset + SHOWN + 1].split(None, 1)[0])
         field = self.field(ordinal) if field is None else field
         raise ProblemError(f"{self.name} line {line}: {shown} {complaint}" + (f" ({field})" if field else ""))
 
