@@ -44,7 +44,7 @@ def read_bundler(path: StrPath) -> BundleProblem:
     name = display_name(path)
     with open_text(path) as blocks:
         lines = LineReader(blocks, name)
-        header = lines.next_filled()
+        header = lines.next()
         if header != HEADER:
             shown = ascii(header[:40].decode("latin-1"))
             complaint = f"{shown} is not the header {HEADER.decode()!r} of a Bundler file"

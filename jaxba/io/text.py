@@ -89,35 +89,29 @@ class LineReader:
         self._text = b""
         self._at = 0  # where in it the next line begins
 
-    def next(self) -> bytes | None:
-        """The next line without blanks at its ends; None at the end of the text.
+    def next(self) -> bytes:
+        """The next line that is not blank, without blanks at its ends; empty at the end of the text.
 
         Raises:
             ProblemError: the line is longer than any can be, or the data cannot be decompressed.
         """
-        while (end := self._text.find(b"\n", self._at)) < 0:
-            self._text, self._at = self._text[self._at :], 0
-            if len(self._text) > MAX_WORD_BYTES:
-                raise ProblemError(f"{self.name} line {self.line + 1}: is longer than {MAX_WORD_BYTES} characters")
-            try:
-                block = next(self._blocks, None)
-            except READ_ERRORS as error:
-                raise ProblemError(f"{self.name} line {self.line + 1}: cannot read on: {reason(error)}") from error
-            if block is None:
-                if not self._text:
-                    return None
-                end = len(self._text)
-                break
-            self._text += block
-        line, self._at = self._text[self._at : end], end + 1
-        self.line += 1
-        return line.strip()
-
-    def next_filled(self) -> bytes:
-        """The next line that is not blank, empty at the end of the text. Raises ProblemError as `next` does."""
-        while (line := self.next()) == b"":
-            pass
-        return line or b""
+        line = b""
+        while not line:
+            while (end := self._text.find(b"\n", self._at)) < 0:
+                self._text, self._at = self._text[self._at :], 0
+                where = f"{self.name} line {self.line + 1}"
+                if len(self._text) > MAX_WORD_BYTES:
+                    raise ProblemError(f"{where}: is longer than {MAX_WORD_BYTES} characters")
+                try:
+                    block = next(self._blocks, None)
+                except READ_ERRORS as error:
+                    raise ProblemError(f"{where}: cannot read on: {reason(error)}") from error
+                if block is None and not self._text:
+                    return b""
+                self._text += b"\n" if block is None else block
+            line, self._at = self._text[self._at : end].strip(), end + 1
+            self.line += 1
+        return line
 
     def rest(self) -> Iterator[bytes]:
         """The blocks after the lines that were read."""

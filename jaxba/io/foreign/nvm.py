@@ -103,7 +103,7 @@ def _distortion(r: float) -> Distortion:
 
 def _header(lines: LineReader) -> tuple[bool, list[float] | None]:
     """Whether poses are rotation matrices and translations, and fx cx fy cy r of all images."""
-    words = lines.next_filled().split()
+    words = lines.next().split()
     where = f"{lines.name} line {max(lines.line, 1)}"
     if not words or words[0] not in HEADERS:
         shown = ascii(b" ".join(words)[:40].decode("latin-1"))
@@ -117,7 +117,7 @@ def _header(lines: LineReader) -> tuple[bool, list[float] | None]:
 
 def _images(lines: LineReader, matrices: bool) -> Float[np.ndarray, "images numbers"]:
     """The numbers of the images' lines."""
-    line = lines.next_filled()
+    line = lines.next()
     where = f"{lines.name} line {max(lines.line, 1)}"
     if not line:
         raise ProblemError(f"{where}: the file ends before the number of images")
@@ -127,7 +127,7 @@ def _images(lines: LineReader, matrices: bool) -> Float[np.ndarray, "images numb
     fields = _FIELDS_R9T if matrices else _FIELDS
     rows = []
     for image in range(int(count)):
-        words = lines.next_filled().rsplit(maxsplit=len(fields))  # names may have blanks
+        words = lines.next().rsplit(maxsplit=len(fields))  # names may have blanks
         where = f"{lines.name} line {max(lines.line, 1)}"
         if not words:
             raise ProblemError(f"{where}: the file ends before image {image} of {count:g}")
