@@ -13,10 +13,11 @@ import numpy as np
 from jaxba.damping import make_policy
 from jaxba.damping.learned import LearnedPolicy
 from jaxba.damping.policy_file import save_policy
-from jaxba.io import configurations, write_problem
+from jaxba.io import write_problem
 from jaxba.io.colmap.write import write_colmap
 from jaxba.problem import geometry
 from jaxba.scenes import SceneConfig, random_scene
+from jaxba.settings import configurations
 
 SCENE = random_scene(SceneConfig(6, 40, 160), 0)
 IMAGES, IMAGE_SIZE, FOCAL, SPEED = 4, (160, 96), 120.0, 0.15

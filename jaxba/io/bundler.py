@@ -16,7 +16,7 @@ from jaxba.io.files import StrPath, display_name, open_output
 from jaxba.io.notes import note_origin
 from jaxba.io.ply import POINT_COLOUR
 from jaxba.io.text import LineReader, NumberReader
-from jaxba.io.tracks import read_tracks
+from jaxba.io.tracks import numbered, read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import angle_axis, are_rotations, rotation_matrices
 from jaxba.problem.labels import part_name
@@ -44,7 +44,7 @@ def read_bundler(path: StrPath) -> BundleProblem:
     name = display_name(path)
     with open_text(path) as blocks:
         lines = LineReader(blocks, name)
-        header = lines.next_filled()
+        header = lines.next()
         if header != HEADER:
             shown = ascii(header[:40].decode("latin-1"))
             complaint = f"{shown} is not the header {HEADER.decode()!r} of a Bundler file"
@@ -78,7 +78,7 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
         raise ProblemError(f"cannot write {display_name(path)}: {name} has focal length 0")
     order = np.argsort(valid.point_index, kind="stable")
     views = np.bincount(np.asarray(valid.point_index), minlength=valid.num_points).tolist()
-    keys, pixels = _keys(camera_index)[order].tolist(), valid.observations[order].tolist()
+    keys, pixels = numbered(camera_index)[order].tolist(), valid.observations[order].tolist()
     rows = zip(camera_index[order].tolist(), keys, pixels, strict=True)
     colour = " ".join(map(str, POINT_COLOUR))
     with open_output(path) as file:
@@ -91,27 +91,13 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
             file.write(f"{point[0]} {point[1]} {point[2]}\n{colour}\n{count}{seen}\n".encode())
 
 
-def _keys(camera_index: np.ndarray) -> np.ndarray:
-    """A number for every observation that no other of the same camera has, from 0 in the order of the problem."""
-    order = np.argsort(camera_index, kind="stable")
-    counts = np.bincount(camera_index)
-    keys = np.empty(len(camera_index), np.int64)
-    keys[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return keys
-
-
 def _read(reader: NumberReader) -> BundleProblem:
     values = reader.peek_all()
-
-    def need(end: int) -> None:
-        if end > values.size:
-            reader.missing()
-
-    need(2)
+    reader.need(2)
     num_cameras, num_points = reader.integers(range(2), values[:2], 1, LARGEST_COUNT).tolist()
     reader.field = partial(_field, num_cameras)
     position = 2 + len(_CAMERA) * num_cameras
-    need(position)
+    reader.need(position)
     cameras = values[2:position].reshape(-1, len(_CAMERA))
     tracks = read_tracks(reader, position, num_points, num_cameras, reader.field)
     registered = _check_cameras(reader, cameras, tracks.camera_index)

@@ -73,15 +73,11 @@ def utf8(blocks: Iterator[bytes], name: str) -> Iterator[bytes]:
     while len(head) < _LONGEST_MARK and (block := next(blocks, None)) is not None:
         head += block
     mark = next((mark for mark in MARKS if head.startswith(mark)), b"")
-    blocks = chain([head[len(mark) :]], blocks)
     encoding = MARKS.get(mark, "utf-8")
-    if encoding == "utf-8":
-        yield from blocks
-        return
     decoder = codecs.getincrementaldecoder(encoding)()
     try:
-        for block in blocks:
-            yield decoder.decode(block).encode()
+        for block in chain([head[len(mark) :]], blocks):
+            yield block if encoding == "utf-8" else decoder.decode(block).encode()
         yield decoder.decode(b"", final=True).encode()
     except UnicodeError:
         raise ProblemError(f"{name}: is not the text that its byte order mark announces ({encoding})") from None

@@ -17,6 +17,9 @@ MAX_WORD_BYTES = 1 << 16
 """Longest word that may be cut by the end of a block. No number needs more than about 1100 characters; without the
 bound a large file without whitespace would be collected in memory as one word."""
 
+SHOWN = 40
+"""Characters of a wrong word that a message shows."""
+
 _WORD = re.compile(rb"[^ \t\n\r\v\f]+")
 _NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?", re.IGNORECASE)
 _NOT_FINITE = re.compile(
@@ -43,6 +46,12 @@ def number(word: str) -> float:
     if _NOT_FINITE.fullmatch(text):
         return float("nan")
     raise ValueError(f"{word!r} is no number")
+
+
+def shown_word(word: bytes) -> str:
+    """A word for a message, shortened."""
+    text = word.decode("latin-1")
+    return ascii(text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}...")
 
 
 def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: str) -> list[float]:
@@ -80,35 +89,29 @@ class LineReader:
         self._text = b""
         self._at = 0  # where in it the next line begins
 
-    def next(self) -> bytes | None:
-        """The next line without blanks at its ends; None at the end of the text.
+    def next(self) -> bytes:
+        """The next line that is not blank, without blanks at its ends; empty at the end of the text.
 
         Raises:
             ProblemError: the line is longer than any can be, or the data cannot be decompressed.
         """
-        while (end := self._text.find(b"\n", self._at)) < 0:
-            self._text, self._at = self._text[self._at :], 0
-            if len(self._text) > MAX_WORD_BYTES:
-                raise ProblemError(f"{self.name} line {self.line + 1}: is longer than {MAX_WORD_BYTES} characters")
-            try:
-                block = next(self._blocks, None)
-            except READ_ERRORS as error:
-                raise ProblemError(f"{self.name} line {self.line + 1}: cannot read on: {reason(error)}") from error
-            if block is None:
-                if not self._text:
-                    return None
-                end = len(self._text)
-                break
-            self._text += block
-        line, self._at = self._text[self._at : end], end + 1
-        self.line += 1
-        return line.strip()
-
-    def next_filled(self) -> bytes:
-        """The next line that is not blank, empty at the end of the text. Raises ProblemError as `next` does."""
-        while (line := self.next()) == b"":
-            pass
-        return line or b""
+        line = b""
+        while not line:
+            while (end := self._text.find(b"\n", self._at)) < 0:
+                self._text, self._at = self._text[self._at :], 0
+                where = f"{self.name} line {self.line + 1}"
+                if len(self._text) > MAX_WORD_BYTES:
+                    raise ProblemError(f"{where}: is longer than {MAX_WORD_BYTES} characters")
+                try:
+                    block = next(self._blocks, None)
+                except READ_ERRORS as error:
+                    raise ProblemError(f"{where}: cannot read on: {reason(error)}") from error
+                if block is None and not self._text:
+                    return b""
+                self._text += b"\n" if block is None else block
+            line, self._at = self._text[self._at : end].strip(), end + 1
+            self.line += 1
+        return line
 
     def rest(self) -> Iterator[bytes]:
         """The blocks after the lines that were read."""
@@ -209,6 +212,11 @@ class NumberReader:
             self.fail(int(ordinals[bad[0]]), complaint)
         return values.astype(np.int32)
 
+    def need(self, count: int) -> None:
+        """Raises a `ProblemError` if there are fewer numbers than `count` that were read and not yet taken."""
+        if count > self._size:
+            self.missing()
+
     def missing(self) -> NoReturn:
         """Raises a `ProblemError` that says why there are no more numbers than those that were read."""
         ordinal = self._taken + self._size
@@ -221,8 +229,7 @@ class NumberReader:
         piece = next(piece for piece in reversed(self._pieces) if piece.ordinal <= ordinal)
         offset = int(np.flatnonzero(_word_starts(_spaces(piece.text)))[ordinal - piece.ordinal])
         line = piece.line + piece.text.count(b"\n", 0, offset)
-        word = piece.text[offset : offset + 41].split(None, 1)[0].decode("latin-1")
-        shown = ascii(word if len(word) <= 40 else word[:37] + "...")
+        shown = shown_word(piece.text[offset : offset + SHOWN + 1].split(None, 1)[0])
         field = self.field(ordinal) if field is None else field
         raise ProblemError(f"{self.name} line {line}: {shown} {complaint}" + (f" ({field})" if field else ""))
 

@@ -55,19 +55,15 @@ def read_tracks(
         point = bisect_right(starts, ordinal) - 1
         return other_field(ordinal) if point < 0 else _point_field(point, ordinal - starts[point])
 
-    def need(end: int) -> None:
-        if end > values.size:
-            reader.missing()
-
     reader.field = field
     for _ in range(count):
         starts.append(position)
-        need(position + len(POINT_FIELDS))
+        reader.need(position + len(POINT_FIELDS))
         views = float(values[position + 6])
         if not 0 <= views <= LARGEST_COUNT or not views.is_integer():
             reader.integers([position + 6], values[position + 6 : position + 7], 0, LARGEST_COUNT)
         position += len(POINT_FIELDS) + len(VIEW_FIELDS) * int(views)
-        need(position)
+        reader.need(position)
     first_view = np.array(starts, dtype=np.int64) + len(POINT_FIELDS)
     views = values[first_view - 1].astype(np.int64)
     before = np.cumsum(views) - views
@@ -84,3 +80,11 @@ def _point_field(point: int, at: int) -> str:
         return f"{POINT_FIELDS[at]} of point {point}"
     view, part = divmod(at - len(POINT_FIELDS), len(VIEW_FIELDS))
     return f"{VIEW_FIELDS[part]} of view {view} of point {point}"
+
+
+def numbered(index: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """For each entry how many of the same value stand before it: numbers of key-points, from an index of cameras."""
+    order, counts = np.argsort(index, kind="stable"), np.bincount(index)
+    numbers = np.empty(len(index), np.int64)
+    numbers[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return numbers

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.problem.checks import plain_array, real_numbers
+from jaxba.problem.checks import inverse_roots, plain_array, real_numbers
 from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
@@ -142,25 +142,22 @@ class BundleProblem(ArrayRecord):
             )
             count = problem.num_observations
             whitening = _whitening(covariance, weight, count)
+            if count == 0:
+                raise ProblemError("the problem has no observations")
+            for name in ("camera_index", "point_index"):
+                if len(getattr(problem, name)) != count:
+                    raise ProblemError(f"{name} has {len(getattr(problem, name))} entries for {count} observations")
+            if lenses is not None:
+                lenses = checked_lenses(lenses, cameras)
+            if constants is not None:
+                constants = checked_constants(constants, len(cameras), len(points))
+            if rigs is not None:
+                rigs = checked_rigs(rigs, cameras, lenses)
+            if priors is not None:
+                of_lenses = len(cameras) if lenses is None else len(lenses.free)
+                priors = checked_priors(priors, len(cameras), of_lenses, lens_size(lenses))
         except ValueError as error:
             raise error if isinstance(error, ProblemError) else ProblemError(str(error)) from None
-        if count == 0:
-            raise ProblemError("the problem has no observations")
-        for name in ("camera_index", "point_index"):
-            if len(getattr(problem, name)) != count:
-                raise ProblemError(f"{name} has {len(getattr(problem, name))} entries for {count} observations")
-        try:
-            if lenses is not None:
-                lenses = checked_lenses(lenses, np.asarray(problem.cameras))
-            if constants is not None:
-                constants = checked_constants(constants, problem.num_cameras, problem.num_points)
-            if rigs is not None:
-                rigs = checked_rigs(rigs, np.asarray(problem.cameras), lenses)
-            if priors is not None:
-                count = problem.num_cameras
-                priors = checked_priors(priors, count, count if lenses is None else len(lenses.free), lens_size(lenses))
-        except ValueError as error:
-            raise ProblemError(str(error)) from None
         return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
 
     def __repr__(self) -> str:
@@ -187,6 +184,12 @@ class BundleProblem(ArrayRecord):
     def replace(self, **changes: Any) -> BundleProblem:
         """The same problem with some fields replaced, without new checks."""
         return replace(self, **changes)
+
+    def of_observations(self, kept: Any) -> BundleProblem:
+        """The same problem with a subset of its observations; cameras and points keep their places."""
+        names = ("observations", "camera_index", "point_index", "whitening")
+        arrays = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: np.asarray(x)[kept] for name, x in arrays.items() if x is not None})
 
 
 def _floats(name: str, values: Any, width: int) -> np.ndarray:
@@ -225,10 +228,7 @@ def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:
     covariance = real_numbers("covariance", covariance)
     if covariance.shape != (count, 2, 2) or not np.isfinite(covariance).all():
         raise ProblemError(f"covariance must be finite, of shape ({count}, 2, 2), not {covariance.shape}")
-    values, vectors = np.linalg.eigh(covariance)
-    bad = np.flatnonzero(
-        (values[:, 0] <= 0) | (np.abs(covariance[:, 0, 1] - covariance[:, 1, 0]) > 1e-9 * values[:, 1])
-    )
+    roots, bad = inverse_roots(covariance)
     if bad.size:
         raise ProblemError(f"covariance[{bad[0]}] is not symmetric positive definite")
-    return (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return roots

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba.runtime.numerics import TRACED
 
@@ -77,3 +77,14 @@ def finite(what: str, value: Any, *shapes: tuple[int, ...]) -> Float[np.ndarray,
     if not np.isfinite(array).all():
         raise ValueError(f"{what} must be finite")
     return np.ascontiguousarray(array, np.float64).reshape(array.shape)
+
+
+def inverse_roots(
+    covariances: Float[np.ndarray, "n k k"], least: float = 0.0
+) -> tuple[Float[np.ndarray, "n k k"], Int[np.ndarray, " bad"]]:
+    """`Sigma^(-1/2)` of covariances, and which of them are not symmetric with eigenvalues above the least one."""
+    values, vectors = np.linalg.eigh(covariances)
+    asymmetry = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2), initial=0.0)
+    good = (values[:, 0] > least) & (asymmetry <= 1e-9 * np.abs(values).max(axis=1, initial=0.0))
+    scaled = vectors / np.sqrt(np.where(good[:, None], values, 1.0))[:, None, :]
+    return scaled @ vectors.transpose(0, 2, 1), np.flatnonzero(~good)

@@ -254,6 +254,7 @@ def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "
         if name not in GROUPS and not any(of_models):
             known = dict.fromkeys(parameter for model in lenses.models for parameter in model.parameters)
             raise ValueError(f"no lens has a number {shown(name)}; there are {', '.join([*GROUPS, *known])}")
-        for lens in range(len(free)):
-            meant[lens, list(of_models[0 if lenses.model is None else int(lenses.model[lens])])] = True
+        for number, columns in enumerate(of_models):
+            own = np.zeros(len(free), int) == number if lenses.model is None else np.asarray(lenses.model) == number
+            meant[np.ix_(own, columns)] = True
     return meant

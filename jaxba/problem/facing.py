@@ -17,13 +17,12 @@ from jaxtyping import Bool, Int
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemWarning
-from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.labels import part_names
 
 NAMED = 3
 """Most images that a message names."""
 
-_OFF_AXIS = 0.1, 0.2, 1.0
+_OFF_AXIS = np.array([0.1, 0.2, 1.0])
 
 
 def views_behind(problem: BundleProblem) -> Bool[np.ndarray, " observations"]:
@@ -66,30 +65,14 @@ def aside_text(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> str:
 
 def without_views_of(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> BundleProblem:
     """The problem without the observations of some cameras. Cameras and points keep their places."""
-    if not len(away):
-        return problem
-    keep = ~np.isin(problem.camera_index, away)
-    return problem.replace(
-        observations=np.asarray(problem.observations)[keep],
-        camera_index=np.asarray(problem.camera_index)[keep],
-        point_index=np.asarray(problem.point_index)[keep],
-        whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
-    )
+    return problem.of_observations(~np.isin(problem.camera_index, away)) if len(away) else problem
 
 
 def _sees_mirrored(problem: BundleProblem) -> Bool[np.ndarray, " cameras"]:
     """Cameras whose lens has the same pixel for a point and its mirror image."""
-    lenses = problem.lenses
-    found = np.ones(problem.num_cameras, bool)
-    if lenses is None or lenses.all_bal:
-        return found
-    numbers = np.asarray(problem.cameras, np.float64)[:, POSE_SIZE:]
-    index = np.asarray(lenses.index)
-    model_of = np.zeros(len(index), int) if lenses.model is None else np.asarray(lenses.model)[index]
-    for number, model in enumerate(lenses.models):
-        own = np.flatnonzero(model_of == number)
-        lens = list(numbers[own, : len(model)].T)
-        with np.errstate(all="ignore"):
-            front, back = (model.project(lens, *(np.full(len(own), s * x) for x in _OFF_AXIS)) for s in (1, -1))
-        found[own] = (front[0] == back[0]) & (front[1] == back[1])
-    return found
+    every = np.arange(problem.num_cameras)
+    if problem.lenses is None or problem.lenses.all_bal:
+        return np.ones(len(every), bool)
+    with np.errstate(all="ignore"):
+        front, back = (geometry.pixels(problem, every, np.tile(sign * _OFF_AXIS, (len(every), 1))) for sign in (1, -1))
+    return np.asarray((front == back).all(axis=1))

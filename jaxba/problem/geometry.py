@@ -10,9 +10,10 @@ from collections.abc import Iterator
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.camera_models import BAL
 
 Array = np.ndarray | jax.Array
 """Arrays of a problem; every result here is a NumPy array."""
@@ -116,11 +117,25 @@ def radial_distortion(square: np.ndarray | float, k1: np.ndarray | float, k2: np
     return 1 + square * (k1 + square * k2)
 
 
-def distort(plane: Float[np.ndarray, "n 2"], intrinsics: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-    """Pixels of image plane coordinates p under the intrinsics `(f, k1, k2)`: `f (1 + k1 |p|^2 + k2 |p|^4) p`."""
-    square = np.einsum("ni,ni->n", plane, plane)
-    focal, k1, k2 = intrinsics.T
-    return (focal * radial_distortion(square, k1, k2))[:, None] * plane
+def pixels(
+    problem: BundleProblem, camera: Int[np.ndarray, " n"], local: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 2"]:
+    """Pixels of points in the frames of cameras, by the models of their lenses.
+
+    Args:
+        problem: whose cameras they are.
+        camera: of each point.
+        local: the points, in COLMAP's axes (x right, y down, z forwards).
+    """
+    numbers, lenses = np.asarray(problem.cameras, dtype=np.float64)[:, 6:][camera], problem.lenses
+    models = (BAL,) if lenses is None else lenses.models
+    own, result = [np.arange(len(camera))], np.empty((len(camera), 2))
+    if lenses is not None and lenses.model is not None:
+        model_of = np.asarray(lenses.model)[np.asarray(lenses.index)[camera]]
+        own = [np.flatnonzero(model_of == number) for number in range(len(models))]
+    for model, at in zip(models, own, strict=False):
+        result[at] = np.stack(model.project(list(numbers[at, : len(model)].T), *local[at].T), axis=1)
+    return result
 
 
 def project(problem: BundleProblem) -> Float[np.ndarray, "observations 2"]:
@@ -130,21 +145,9 @@ def project(problem: BundleProblem) -> Float[np.ndarray, "observations 2"]:
     not finite.
     """
     predicted = np.empty((problem.num_observations, 2))
-    intrinsics = np.asarray(problem.cameras, dtype=np.float64)[:, 6:]
-    lenses = problem.lenses
-    for part, camera, local in _camera_frames(problem):
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            if lenses is None or lenses.all_bal:
-                predicted[part] = distort(-perspective(local), intrinsics[camera])
-                continue
-            model_of = np.zeros(len(camera), int)
-            if lenses.model is not None:
-                model_of = np.asarray(lenses.model)[np.asarray(lenses.index)[camera]]
-            for number, model in enumerate(lenses.models):
-                own = model_of == number
-                numbers = list(intrinsics[camera[own], : len(model)].T)
-                pixels = model.project(numbers, *(local[own] * COLMAP_FLIP).T)
-                predicted[part.start : part.start + len(own)][own] = np.stack(pixels, axis=1)
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        for part, camera, local in _camera_frames(problem):
+            predicted[part] = pixels(problem, camera, local * COLMAP_FLIP)
     return predicted
 
 

@@ -34,18 +34,15 @@ class Labels(ArrayRecord):
         Raises:
             ValueError: there is no such image; one line.
         """
-        by_name = {name: at for at, name in enumerate(self.names)}
-        by_id = {int(number): at for at, number in enumerate(self.images)}
-        found = [(by_name if isinstance(one, str) else by_id).get(one, -1) for one in wanted]  # type: ignore[call-overload]
-        return _positions(list(wanted), found, "image")
+        return _at({**_by_id(self.images), **{name: at for at, name in enumerate(self.names)}}, wanted, "image")
 
     def lenses_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
         """Positions of lenses by id. Raises as `images_at`."""
-        return _positions(list(wanted), _found(self.lenses, wanted), "camera")
+        return _at(_by_id(self.lenses), wanted, "camera")
 
     def points_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
         """Positions of points by id. Raises as `images_at`."""
-        return _positions(list(wanted), _found(self.points, wanted), "point")
+        return _at(_by_id(self.points), wanted, "point")
 
 
 Part = Literal["image", "lens", "point"]
@@ -66,14 +63,14 @@ def part_names(labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"], 
     return ", ".join(part_name(labels, kind, at) for at in which[:named]) + more
 
 
-def _found(ids: Integer[np.ndarray, " n"], wanted: Iterable[int | str]) -> list[int]:
-    by_id = {int(number): at for at, number in enumerate(ids)}
-    return [-1 if isinstance(one, bool) else by_id.get(one, -1) for one in wanted]  # type: ignore[call-overload]
+def _by_id(ids: Integer[np.ndarray, " n"]) -> dict[int | str, int]:
+    return {int(number): at for at, number in enumerate(ids)}
 
 
-def _positions(wanted: list, found: list[int], what: str) -> np.ndarray:
-    missing = [one for one, at in zip(wanted, found, strict=True) if at < 0]
+def _at(known: dict[int | str, int], wanted: Iterable[int | str], what: str) -> np.ndarray:
+    wanted = list(wanted)
+    missing = [one for one in wanted if isinstance(one, bool) or one not in known]
     if missing:
         more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ValueError(f"there is no {what} {missing[0]!r}{more}")
-    return np.array(found, np.int64)
+    return np.array([known[one] for one in wanted], np.int64)

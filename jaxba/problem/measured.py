@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from jaxba.problem.alignment import aligned
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.checks import finite, shown
+from jaxba.problem.checks import finite, inverse_roots, shown
 from jaxba.problem.constraints import every_lens, number_columns, positions_of
 from jaxba.problem.losses import Loss
 from jaxba.problem.priors import Priors
@@ -58,7 +58,7 @@ def with_position_priors(
         raise ValueError("positions need either a covariance or a stddev")
     if stddev is not None:
         covariance = _variances(stddev, len(at))
-    covariances = _covariances(problem, "position", covariance, at)
+    covariances, roots = _covariances(problem, "position", covariance, at)
     if not isinstance(loss, Loss | None):
         raise ValueError(f"loss must be a jaxba.Loss, not {shown(loss)}")
     if align:
@@ -67,7 +67,7 @@ def with_position_priors(
         problem = aligned(problem, measured, covariances, at)
     priors = priors_of(problem)
     places, weights = np.array(priors.positions), np.array(priors.position_whitening)
-    places[at], weights[at] = measured, _inverse_roots(covariances)
+    places[at], weights[at] = measured, roots
     return problem.replace(
         priors=replace(priors, positions=places, position_whitening=weights, position_loss=loss or Loss())
     )
@@ -91,7 +91,7 @@ def with_rotation_priors(
     measured = finite("rotations", rotations, (len(at), 3))
     priors = priors_of(problem)
     known, weights = np.array(priors.rotations), np.array(priors.rotation_whitening)
-    known[at], weights[at] = measured, _inverse_roots(_covariances(problem, "rotation", covariance, at))
+    known[at], weights[at] = measured, _covariances(problem, "rotation", covariance, at)[1]
     return problem.replace(priors=replace(priors, rotations=known, rotation_whitening=weights))
 
 
@@ -157,8 +157,10 @@ def _variances(stddev: Any, count: int) -> Float[np.ndarray, "n 3 3"]:
     return np.broadcast_to(spread**2, (count, 3))[:, :, None] * np.eye(3)
 
 
-def _covariances(problem: BundleProblem, what: str, covariance: Any, at: np.ndarray) -> Float[np.ndarray, "n 3 3"]:
-    """A covariance for each image.
+def _covariances(
+    problem: BundleProblem, what: str, covariance: Any, at: np.ndarray
+) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3 3"]]:
+    """A covariance for each image, and its inverse root.
 
     Raises:
         ValueError: shapes; one line.
@@ -166,15 +168,8 @@ def _covariances(problem: BundleProblem, what: str, covariance: Any, at: np.ndar
     """
     given = finite(f"the covariance of a {what}", covariance, (3, 3), (len(at), 3, 3))
     matrices = np.broadcast_to(given, (len(at), 3, 3))
-    values = np.linalg.eigvalsh(matrices)
-    symmetric = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2)) <= 1e-9 * np.abs(values).max(axis=1)
-    bad = np.flatnonzero(~((values[:, 0] > LEAST_VARIANCE) & symmetric))
+    roots, bad = inverse_roots(matrices, LEAST_VARIANCE)
     if len(bad):
         where = _name(problem, int(at[bad[0]]))
         raise ProblemError(f"the covariance of the {what} of {where} is not symmetric positive definite")
-    return matrices
-
-
-def _inverse_roots(matrices: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 3"]:
-    values, vectors = np.linalg.eigh(matrices)
-    return (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    return matrices, roots

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -53,23 +54,15 @@ def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
     spread = float(_upper_median(np.abs(points - middle).sum(axis=1)))
     if spread == 0:
         raise ProblemError("the scene has no extent: half of its points are at one place")
-    scale = size / spread
-    cameras = np.array(problem.cameras, dtype=np.float64)
-    # c' = s (c - m) with t = -R c gives t' = s (t + R m).
-    cameras[:, 3:6] = scale * (cameras[:, 3:6] + rotation_matrices(cameras[:, :3]) @ middle)
-    rigs, priors = problem.rigs, problem.priors
+    scale, rigs = size / spread, problem.rigs
+    moved = _shifted(problem, -middle, slice(None), slice(None))
+    cameras, priors = np.array(moved.cameras), moved.priors
+    cameras[:, 3:6] *= scale
     if priors is not None:
-        priors = dataclasses.replace(
-            priors,
-            positions=scale * (np.asarray(priors.positions) - middle),
-            position_whitening=np.asarray(priors.position_whitening) / scale,
-        )
-    return problem.replace(
-        cameras=cameras,
-        points=scale * (points - middle),
-        rigs=None if rigs is None else rigs.scaled(scale),
-        priors=priors,
-    )
+        whitening = np.asarray(priors.position_whitening) / scale
+        priors = dataclasses.replace(priors, positions=scale * priors.positions, position_whitening=whitening)
+    rigs = None if rigs is None else rigs.scaled(scale)
+    return moved.replace(cameras=cameras, points=scale * moved.points, rigs=rigs, priors=priors)
 
 
 def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"]:
@@ -112,8 +105,12 @@ def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProbl
     """
     if not np.any(offset):
         return problem
+    return _shifted(problem, offset, *observed(problem))
+
+
+def _shifted(problem: BundleProblem, offset: Float[np.ndarray, "3"], seen: Any, placed: Any) -> BundleProblem:
+    """As `shift`, of the cameras and points that the last two arguments choose."""
     cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
-    seen, placed = observed(problem)
     cameras[seen, 3:6] -= rotation_matrices(cameras[seen, :3]) @ offset  # t = -R c
     points[placed] += offset
     priors = problem.priors
@@ -187,12 +184,9 @@ def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> B
         raise ProblemError(f"no point is seen by two cameras from at least {min_depth} away: nothing would be left")
     used = tracks >= MIN_TRACK
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return problem.replace(
+    return problem.of_observations(keep).replace(
         points=np.asarray(problem.points)[used],
-        observations=np.asarray(problem.observations)[keep],
-        camera_index=np.asarray(problem.camera_index)[keep],
         point_index=number[point_index[keep]],
-        whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
         constants=None if problem.constants is None else problem.constants.of(points=used),
         labels=None,
     )

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import support
 
-pytest.importorskip("pooch", reason="the extra `data` is not installed")
+pytest.importorskip("requests", reason="the extra `data` is not installed")
 
 from jaxba import read_bal
 from jaxba.cli.data import run

@@ -159,13 +159,13 @@ def test_list_of_some_names(folder, capsys):
     check_one_line(capsys.readouterr().err, "final-93")
 
 
-def test_download_without_names_and_without_pooch_are_one_line(folder, capsys, monkeypatch):
+def test_download_without_names_and_without_requests_are_one_line(folder, capsys, monkeypatch):
     assert data.run(["download"]) == 2
     check_one_line(capsys.readouterr().err, "name a problem or a family")
     for module in ("jaxba.datasets.bal.download", "jaxba.datasets.bal.transfer"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.delattr(sys.modules["jaxba.datasets.bal"], "download", raising=False)
-    monkeypatch.setitem(sys.modules, "pooch", None)
+    monkeypatch.setitem(sys.modules, "requests", None)
     assert data.run(["download", "ladybug-49"]) == 2
     check_one_line(capsys.readouterr().err, "pip install jaxba[data]")
 

@@ -1,27 +1,21 @@
-"""Downloads of BAL problems into the cache folder. Needs the extra `data`.
-
-pooch finds what is missing, compares the checksum and moves the file to its final name; `transfer` resumes interrupted
-downloads, which pooch cannot.
-"""
+"""Downloads of BAL problems into the cache folder. Needs the extra `data`."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
 
 from jaxba.datasets.bal.catalog import Entry
 from jaxba.io.files import open_input, reason
 from jaxba.problem.bundle_problem import ProblemError
 
 try:
-    import pooch
-
     from jaxba.datasets.bal.transfer import DownloadError, Report, UnreachableError, download_rest
 except ModuleNotFoundError:
-    raise ImportError("this needs pooch: pip install jaxba[data]") from None
+    raise ImportError("this needs requests: pip install jaxba[data]") from None
 try:
     import fcntl
 except ModuleNotFoundError:  # not a POSIX system: there two processes must not download the same file
@@ -55,32 +49,33 @@ def fetch(
     Raises:
         DownloadError: the download failed; one line.
     """
-    known = f"sha256:{entry.sha256}" if use_checksum and entry.sha256 else None
-    registry: dict[str, Any] = {entry.file: known}  # pooch compares nothing where it finds None
-    cache = pooch.Pooch(path=folder, base_url=base_url.rstrip("/") + "/", registry=registry)
-    pooch.get_logger().setLevel("ERROR")
-    target, partial, requested = folder / entry.file, partial_path(entry, folder), []
-
-    def downloader(url: str, output_file: Any, _: Any) -> None:
-        requested.append(url)
-        download_rest(url, partial, report)
-        if known is None:
-            _check(partial, entry)
-        os.replace(partial, output_file)
-
+    url, target, partial = f"{base_url.rstrip('/')}/{entry.file}", folder / entry.file, partial_path(entry, folder)
+    checksum = entry.sha256 if use_checksum else None
     try:
-        if not (target.is_file() and (known is None or pooch.file_hash(str(target)) == entry.sha256)):
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with _locked(partial):
-                cache.fetch(entry.file, downloader=cast(Any, downloader))
-    except DownloadError:
-        raise
-    except ValueError as error:  # pooch raises it for a wrong checksum
-        message = f"{cache.get_url(entry.file)}: the file has a wrong checksum and was removed"
-        raise DownloadError(message) from error
+        if _is_there(target, checksum):
+            return target, False
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with _locked(partial):
+            if _is_there(target, checksum):  # another process had the lock
+                return target, False
+            download_rest(url, partial, report)
+            if checksum is None:
+                _check(partial, entry)
+            elif not _is_there(partial, checksum):
+                partial.unlink()
+                raise DownloadError(f"{url}: the file has a wrong checksum and was removed")
+            os.replace(partial, target)
     except OSError as error:
         raise DownloadError(f"cannot write to {folder}: {reason(error)}") from error
-    return target, bool(requested)
+    return target, True
+
+
+def _is_there(path: Path, checksum: str | None) -> bool:
+    """Whether there is a file, with this checksum if one is known."""
+    if checksum is None or not path.is_file():
+        return path.is_file()
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest() == checksum
 
 
 def partial_path(entry: Entry, folder: Path) -> Path:
@@ -97,9 +92,8 @@ def _check(partial: Path, entry: Entry) -> None:
             for block in blocks:
                 head = head or block[:100]
     except ProblemError as error:
-        why = reason(error.__cause__) if error.__cause__ else "it is no bz2 file"
-        head = b""
-    if [*head.split(b"\n", 1)[0].split()[:2]] != [b"%d" % entry.cameras, b"%d" % entry.points]:
+        head, why = b"", reason(error.__cause__) if error.__cause__ else "it is no bz2 file"
+    if head.split(b"\n", 1)[0].split()[:2] != [b"%d" % entry.cameras, b"%d" % entry.points]:
         partial.unlink()
         raise DownloadError(f"{entry.name}: what came is not the problem and was removed: {why}")
 

@@ -46,11 +46,9 @@ def download_rest(url: str, partial: Path, report: Report) -> None:
     have = partial.stat().st_size if partial.exists() else 0
     with requests.Session() as session, ExitStack() as stack:
         response = stack.enter_context(_request(session, url, have))
-        if have and not _continues(response, have):
-            if (
-                response.status_code == requests.codes.requested_range_not_satisfiable
-                and _range_total(response) == have
-            ):
+        start, total = _range(response)
+        if have and not (response.status_code == requests.codes.partial_content and start == have):
+            if response.status_code == requests.codes.requested_range_not_satisfiable and total == have:
                 return  # nothing is missing
             have = 0
             if response.status_code != requests.codes.ok:
@@ -71,22 +69,18 @@ def _request(session: requests.Session, url: str, have: int) -> requests.Respons
         raise UnreachableError(message) from error
 
 
-def _continues(response: requests.Response, have: int) -> bool:
-    """Whether the response holds the part from byte `have` on."""
-    span = re.match(r"bytes (\d+)-", response.headers.get("Content-Range", ""))
-    return response.status_code == requests.codes.partial_content and span is not None and int(span[1]) == have
-
-
-def _range_total(response: requests.Response) -> int | None:
-    total = response.headers.get("Content-Range", "").rpartition("/")[2]
-    return int(total) if total.isdecimal() else None
+def _range(response: requests.Response) -> tuple[int | None, int | None]:
+    """The first byte of the part that a response holds, and the size of the whole file, if it says so."""
+    found = re.match(r"bytes (?:(\d+)-\d+|\*)/(\d+)?", response.headers.get("Content-Range", ""))
+    start, total = found.groups() if found else (None, None)
+    return int(start) if start else None, int(total) if total else None
 
 
 def _append(response: requests.Response, partial: Path, have: int, report: Report) -> None:
     if response.status_code not in (requests.codes.ok, requests.codes.partial_content):
         raise DownloadError(f"{response.url}: the server answers {response.status_code} {response.reason}")
     length = response.headers.get("Content-Length", "")
-    total = have + int(length) if length.isdecimal() else _range_total(response)
+    total = have + int(length) if length.isdecimal() else _range(response)[1]
     broken: Exception | None = None
     try:
         with open(partial, "r+b" if have else "wb") as file:

@@ -41,7 +41,10 @@ class _Bytes(Source):
         return values
 
     def take(self, fields: Fields, what: str = "") -> tuple[Any, ...]:
-        values = self.unpack(fields.struct, f"the parameters of {self.about} ({what})" if what else self.about)
+        if what and self.left < fields.struct.size:
+            wanted = f"the parameters of {self.about} ({what}) should have {len(fields.names)}"
+            self.fail(f"is cut short: {wanted}, and {self.left} bytes follow")
+        values = self.unpack(fields.struct, self.about)
         if not self._named:
             self.about, self._named = f"{self.record} {values[0]}", True
         if fields.kinds is not None:
@@ -52,9 +55,10 @@ class _Bytes(Source):
 
     def count(self, field: str, each: Fields) -> int:
         (count,) = self.unpack(fields.COUNT.struct, self.about)
+        what = f"{field.removeprefix('number of ')} of {self.about}"
         if count * each.struct.size > self.left:
-            what = f"{field.removeprefix('number of ')} of {self.about}"
             self.fail(f"is cut short: {count} {what} do not fit into {self.left} bytes")
+        self.about = f"the {what}"
         return count
 
     def string(self) -> bytes:

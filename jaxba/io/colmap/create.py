@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 
 from jaxba.io.colmap.model import CAMERA_MODELS, KEY, POINT, TRACK, Camera, Image, Model, Points
 from jaxba.io.colmap.poses import colmap_poses
+from jaxba.io.tracks import numbered
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constraints import every_lens
@@ -44,15 +45,13 @@ def create_model(problem: BundleProblem, target: str) -> Model:
         raise ProblemError(f"cannot write {target}: a pixel is {half.max():g} from the centre of its image")
     keys = np.empty(len(pixels), KEY)
     keys["xy"], keys["point"] = pixels + (half[lens[camera_index]] if lenses.all_bal else 0.0), point_index + 1
-    by_image, image_ends = _grouped(camera_index, len(cameras))
-    by_point, point_ends = _grouped(point_index, len(valid.points))
-    key_number = np.empty(len(pixels), np.int64)
-    key_number[by_image] = np.arange(len(pixels)) - np.append(0, image_ends)[camera_index[by_image]]
+    by_image, by_point = (np.argsort(index, kind="stable") for index in (camera_index, point_index))
+    image_ends = np.cumsum(np.bincount(camera_index, minlength=len(cameras)))
     tracks = np.empty(len(pixels), TRACK)
-    tracks["image"], tracks["key"] = camera_index[by_point] + 1, key_number[by_point]
+    tracks["image"], tracks["key"] = camera_index[by_point] + 1, numbered(camera_index)[by_point]
     heads = np.zeros(len(valid.points), POINT)
     heads["id"], heads["xyz"] = np.arange(1, len(heads) + 1), valid.points
-    heads["length"] = np.diff(point_ends, prepend=0)
+    heads["length"] = np.bincount(point_index, minlength=len(heads))
     heads["error"] = mean_errors(geometry.residuals(valid), point_index, len(heads))
     digits = max(_NAME_DIGITS, len(str(len(cameras))))
     rows = zip(colmap_poses(cameras), lens.tolist(), np.split(keys[by_image], image_ends[:-1]), strict=True)
@@ -92,8 +91,3 @@ def _camera(number: int, lenses: Lenses, lens: int, numbers: np.ndarray, half: n
     if k1 or free1:
         return Camera(number, "SIMPLE_RADIAL", *size, (f, x, y, k1))
     return Camera(number, "SIMPLE_PINHOLE", *size, (f, x, y))
-
-
-def _grouped(index: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Order of numbers below `count`, and where each ends in it."""
-    return np.argsort(index, kind="stable"), np.cumsum(np.bincount(index, minlength=count))

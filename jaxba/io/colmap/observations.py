@@ -53,15 +53,6 @@ class Views(NamedTuple):
         return Views(self.image[chosen], self.key[chosen], self.point[chosen])
 
 
-class _Tracks(NamedTuple):
-    """Elements of all tracks, with positions in an `Ordered`."""
-
-    views: Views
-    registered: Bool[np.ndarray, " elements"]
-    in_range: Bool[np.ndarray, " elements"]
-    agree: Bool[np.ndarray, " elements"]
-
-
 def ordered(model: Model, images: list[Image]) -> Ordered:
     """Sorts the points and joins the key-points of the registered images, which are sorted by id."""
     keys = [image.keys for image in images]
@@ -78,38 +69,42 @@ def ordered(model: Model, images: list[Image]) -> Ordered:
 
 def find_views(table: Ordered) -> tuple[Views, list[str]]:
     """Views, sorted by point and then as in the tracks, and notes on what was mended or left out, one line each."""
-    tracks = _read_tracks(table)
-    stated = tracks.views.of(tracks.agree)
+    heads, elements = table.model.points.heads, table.model.points.tracks
+    point = np.repeat(np.argsort(table.order), heads["length"].astype(np.int64))
+    image, registered = _positions(np.array([image.id for image in table.images], np.uint32), elements["image"])
+    first, index = np.append(table.first_key, 0), elements["key"].astype(np.int64)
+    in_range = registered & (index < first[image + 1] - first[image])
+    tracks = Views(image, np.where(in_range, first[image] + index, 0), point)
+    agree = in_range.copy()
+    agree[in_range] = table.keys["point"][tracks.key[in_range]] == table.points["id"][point[in_range]]
+    stated, wrong = tracks.of(agree), registered & ~agree
     once = np.zeros(len(stated.key), bool)
     once[np.unique(stated.key, return_index=True)[1]] = True
     claims = _other_claims(table, stated.key)
-    wrong = tracks.registered & ~tracks.agree
     pair = lambda views: views.image * max(len(table.points), 1) + views.point
-    without = (np.bincount(tracks.views.point, minlength=len(table.points)) == 0)[claims.point]
-    mends = np.isin(pair(claims), pair(tracks.views.of(wrong)))
-    mended = wrong & np.isin(pair(tracks.views), pair(claims.of(mends)))
-    repeated = np.flatnonzero(tracks.agree)[~once]
-    notes = [
-        *_track_notes(table, tracks, mended, wrong & ~mended, repeated),
-        *_key_notes(table, claims.of(without), claims.of(~(mends | without))),
-    ]
+    without = (np.bincount(point, minlength=len(table.points)) == 0)[claims.point]
+    mends = np.isin(pair(claims), pair(tracks.of(wrong)))
+    mended = wrong & np.isin(pair(tracks), pair(claims.of(mends)))
+    absent = ~np.isin(elements["image"], np.array(list(table.model.images), np.uint32))
+
+    def name(at: int) -> str:
+        seen = table.images[image[at]] if registered[at] else None
+        where = f"image {elements['image'][at]}" if seen is None else str(seen)
+        size = f", which has {len(seen.keys)}" if seen is not None and not in_range[at] else ""
+        return f"{table.point_name(int(point[at]))}: key-point {elements['key'][at]} of {where}{size}"
+
+    images, points = (table.model.file(part) for part in ("images", "points3D"))
+    found = (
+        (np.flatnonzero(mended), f"with a wrong key-point, where {images} is believed"),
+        (np.flatnonzero(wrong & ~mended), "left out, of a key-point that is of another point or none"),
+        (np.flatnonzero(absent), f"left out, of an image that {images} does not have"),
+        (np.flatnonzero(agree)[~once], "left out, there twice"),
+    )
+    notes = [line for at, what in found for line in counted(points, at, "track element", what, name)]
+    notes += _key_notes(table, claims.of(without), claims.of(~(mends | without)))
     parts = zip(stated.of(once), claims.of(mends | without), strict=True)
     views = Views(*(np.concatenate(part) for part in parts))
     return views.of(np.argsort(views.point, kind="stable")), notes
-
-
-def _read_tracks(table: Ordered) -> _Tracks:
-    heads, tracks = table.model.points.heads, table.model.points.tracks
-    rank = np.empty(len(table.order), np.int64)
-    rank[table.order] = np.arange(len(rank))
-    point = np.repeat(rank, heads["length"].astype(np.int64))
-    image, registered = _positions(np.array([image.id for image in table.images], np.uint32), tracks["image"])
-    first, index = np.append(table.first_key, 0), tracks["key"].astype(np.int64)
-    in_range = registered & (index < first[image + 1] - first[image])
-    key = np.where(in_range, first[image] + index, 0)
-    agree = in_range.copy()
-    agree[in_range] = table.keys["point"][key[in_range]] == table.points["id"][point[in_range]]
-    return _Tracks(Views(image, key, point), registered, in_range, agree)
 
 
 def _other_claims(table: Ordered, used: Int[np.ndarray, " used"]) -> Views:
@@ -119,34 +114,6 @@ def _other_claims(table: Ordered, used: Int[np.ndarray, " used"]) -> Views:
     key = np.flatnonzero(exists)
     image = np.repeat(np.arange(len(table.images)), np.diff(table.first_key))
     return Views(image[key], key, point[key])
-
-
-def _track_notes(
-    table: Ordered,
-    tracks: _Tracks,
-    mended: Bool[np.ndarray, " elements"],
-    stray: Bool[np.ndarray, " elements"],
-    repeated: Int[np.ndarray, " repeated"],
-) -> list[str]:
-    model, elements = table.model, table.model.points.tracks
-    absent = ~np.isin(elements["image"], np.array(list(model.images), np.uint32))
-
-    def name(at: int) -> str:
-        image, _, point = (int(part[at]) for part in tracks.views)
-        registered = tracks.registered[at]
-        where = str(table.images[image]) if registered else f"image {elements['image'][at]}"
-        beyond = registered and not tracks.in_range[at]
-        size = f", which has {len(table.images[image].keys)}" if beyond else ""
-        return f"{table.point_name(point)}: key-point {elements['key'][at]} of {where}{size}"
-
-    images = model.file("images")
-    found = (
-        (np.flatnonzero(mended), f"with a wrong key-point, where {images} is believed"),
-        (np.flatnonzero(stray), "left out, of a key-point that is of another point or none"),
-        (np.flatnonzero(absent), f"left out, of an image that {images} does not have"),
-        (repeated, "left out, there twice"),
-    )
-    return [line for at, what in found for line in counted(model.file("points3D"), at, "track element", what, name)]
 
 
 def _key_notes(table: Ordered, untracked: Views, lost: Views) -> list[str]:

@@ -6,6 +6,7 @@ follows the ninth field of its line. Numbers are written with as many digits as 
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
@@ -17,7 +18,7 @@ from jaxba.io.colmap.fields import Fields, Source
 from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model, Points
 from jaxba.io.colmap.poses import pose_of
 from jaxba.io.encoding import utf8
-from jaxba.io.text import number
+from jaxba.io.text import number, shown_word
 from jaxba.problem.bundle_problem import ProblemError
 
 _UNIT = 0.1  # how far the norm of a quaternion may be from 1, if that is to tell a pose from pixels
@@ -71,7 +72,7 @@ class _Line(Source):
         if values and (min(values) < 0 or max(values) > high):
             if min(values) < -1 or max(values) > high:
                 bad = next(word for word, value in zip(words, values, strict=True) if not -1 <= value <= high)
-                self.fail(f"{_shown(bad)} is outside 0..{high} ({field})")
+                self.fail(f"{shown_word(bad)} is outside 0..{high} ({field})")
             values = [high if value < 0 else value for value in values]
         return values
 
@@ -101,7 +102,7 @@ class _Line(Source):
         try:
             return number(word.decode("latin-1"))
         except ValueError:
-            self.fail(f"{_shown(word)} is not a number ({field})")
+            self.fail(f"{shown_word(word)} is not a number ({field})")
 
     def _integer(self, word: bytes, field: str) -> int:
         try:
@@ -109,26 +110,16 @@ class _Line(Source):
         except ValueError:
             value = self._float(word, field)
         if not value.is_integer():
-            self.fail(f"{_shown(word)} is not an integer ({field})")
+            self.fail(f"{shown_word(word)} is not an integer ({field})")
         return int(value)
-
-
-def _shown(word: bytes) -> str:
-    text = word.decode("latin-1")
-    return ascii(text if len(text) <= 40 else text[:37] + "...")
 
 
 def _lines(data: bytes, name: str, record: str, *, empty: bool = False) -> Iterator[_Line]:
     """Lines of a file that are no comments, without blanks at their ends; also `empty` ones if asked for."""
-    data = b"".join(utf8(iter([data]), name))
-    start, number = 0, 0
-    while start < len(data):
-        end = data.find(b"\n", start)
-        end = len(data) if end < 0 else end
-        text = data[start:end].strip()
-        start, number = end + 1, number + 1
+    for at, line in enumerate(io.BytesIO(b"".join(utf8(iter([data]), name))), 1):
+        text = line.strip()
         if (text or empty) and not text.startswith(b"#"):
-            yield _Line(f"{name} line {number}", text, record)
+            yield _Line(f"{name} line {at}", text, record)
 
 
 def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
@@ -144,7 +135,7 @@ def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
     found = {}
     for line, record in _images(lines) if part == "images" else ((one, fields.READERS[part][1](one)) for one in lines):
         if line.rest:
-            line.fail(f"{_shown(line.rest[0])} is left over")
+            line.fail(f"{shown_word(line.rest[0])} is left over")
         if record.id in found:
             line.fail("is there twice")
         found[record.id] = record

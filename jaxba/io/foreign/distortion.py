@@ -105,21 +105,13 @@ class Distortion:
 
     def _factor(self, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`s = r' / r`, and `ds/dr / r`."""
-        if not self.fisheye:
-            square = radius * radius
-            factor, rate = np.ones_like(square), np.zeros_like(square)
-            for power, k in enumerate(self.radial, 1):
-                factor = factor + k * square**power
-                rate = rate + 2 * power * k * square ** (power - 1)
-            return factor, rate
-        near = radius < 1e-6  # the series of atan r / r and the polynomial, to double precision
+        near = radius < 1e-6  # the series, to double precision
         r = np.where(near, 1.0, radius)
-        angle = np.arctan(r)
-        moved, slope = self._along(angle)
+        moved, slope = self._along(np.arctan(r) if self.fisheye else r)
         factor = moved / r
-        rate = (slope / (1 + r * r) - factor) / (r * r)
+        rate = ((slope / (1 + r * r) if self.fisheye else slope) - factor) / (r * r)
         k1 = self.radial[0] if self.radial else 0.0
-        return np.where(near, 1.0, factor), np.where(near, 2 * (k1 - 1 / 3), rate)
+        return np.where(near, 1.0, factor), np.where(near, 2 * (k1 - 1 / 3 if self.fisheye else k1), rate)
 
     def _along(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`t (1 + k1 t^2 + ...)` of a radius or an angle, and its derivative."""

@@ -12,9 +12,8 @@ Multicore Bundle Adjustment, `SetNormalizedMeasurementDistortion` and `LoadNVM`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
+from jaxtyping import Float, Int
 
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name
@@ -32,18 +31,6 @@ HEADERS = (b"NVM_V3", b"NVM_V3_R9T")
 
 _FIELDS = ("f", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "r", "0")
 _FIELDS_R9T = ("f", *(f"R{row}{column}" for row in "123" for column in "123"), "tx", "ty", "tz", "r", "0")
-
-
-class _Header(NamedTuple):
-    matrices: bool  # whether poses are rotation matrices and translations
-    calibration: tuple[float, ...] | None  # fx cx fy cy r of all images
-
-
-class _Images(NamedTuple):
-    focal: np.ndarray  # (n,)
-    rotations: np.ndarray  # (n, 3, 3)
-    translations: np.ndarray  # (n, 3)
-    distortion: np.ndarray  # (n,)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
@@ -64,84 +51,91 @@ def read_nvm(path: StrPath) -> BundleProblem:
     name = display_name(path)
     with open_text(path) as blocks:
         lines = LineReader(blocks, name)
-        header = _header(lines)
-        images = _images(lines, header)
+        matrices, calibration = _header(lines)
+        images = _images(lines, matrices)
         reader = NumberReader(lines.rest(), name, lambda _: "number of points", line=lines.line + 1)
         values = reader.peek_all()
-        if not values.size:
-            reader.missing()
+        reader.need(1)
         count = int(reader.integers([0], values[:1], 0, LARGEST_COUNT)[0])
         if not count:
             raise ProblemError(f"{name}: its first model has no points")
-        tracks = read_tracks(reader, 1, count, len(images.focal), reader.field)
+        tracks = read_tracks(reader, 1, count, len(images), reader.field)
         if tracks.end < values.size and values[tracks.end] > 0:  # the number of images of the next model, or 0
             note(path, "only the first model of the file is read")
     note_origin(path, tracks.pixels)
-    lenses, lens_of = _lenses(header, images)
-    poses = images.rotations, images.translations
-    return assemble(
-        path, lenses, lens_of, *poses, tracks.points, tracks.pixels, tracks.camera_index, tracks.point_index
-    )
+    lenses, lens_of = _lenses(images, calibration)
+    seen = tracks.points, tracks.pixels, tracks.camera_index, tracks.point_index
+    return assemble(path, lenses, lens_of, *_poses(images, matrices), *seen)
 
 
-def _lenses(header: _Header, images: _Images) -> tuple[list[ForeignLens], np.ndarray]:
+def _lenses(
+    images: Float[np.ndarray, "images numbers"], calibration: list[float] | None
+) -> tuple[list[ForeignLens], Int[np.ndarray, " images"]]:
     """The lenses, and that of each image."""
-    if header.calibration is not None:
-        fx, _, fy, _, r = header.calibration
+    if calibration is not None:
+        fx, _, fy, _, r = calibration
         lens = ForeignLens("FixedK", (fx, fy), distortion=_distortion(r), free=FIXED)
-        return [lens], np.zeros(len(images.focal), np.int64)
+        return [lens], np.zeros(len(images), np.int64)
     lenses = [
         ForeignLens(f"image {image}", (f, f), distortion=_distortion(r), free=(True, r == 0, r == 0))
-        for image, (f, r) in enumerate(zip(images.focal.tolist(), images.distortion.tolist(), strict=True))
+        for image, (f, *_, r, _) in enumerate(images.tolist())
     ]
     return lenses, np.arange(len(lenses))
+
+
+def _poses(
+    images: Float[np.ndarray, "images numbers"], matrices: bool
+) -> tuple[Float[np.ndarray, "images 3 3"], Float[np.ndarray, "images 3"]]:
+    """Rotations and translations of images."""
+    if matrices:
+        return images[:, 1:10].reshape(-1, 3, 3), images[:, 10:13]
+    from scipy.spatial.transform import Rotation
+
+    quaternions = images[:, [2, 3, 4, 1]]
+    largest = np.abs(quaternions).max(axis=1, keepdims=True)  # without it squares overflow
+    rotations = Rotation.from_quat(quaternions / largest).as_matrix()
+    return rotations, translations(rotations, images[:, 5:8])
 
 
 def _distortion(r: float) -> Distortion:
     return Distortion(radial=(r,), inverse=True) if r else Distortion()
 
 
-def _header(lines: LineReader) -> _Header:
-    words = lines.next_filled().split()
+def _header(lines: LineReader) -> tuple[bool, list[float] | None]:
+    """Whether poses are rotation matrices and translations, and fx cx fy cy r of all images."""
+    words = lines.next().split()
     where = f"{lines.name} line {max(lines.line, 1)}"
     if not words or words[0] not in HEADERS:
         shown = ascii(b" ".join(words)[:40].decode("latin-1"))
         raise ProblemError(f"{where}: {shown} is not the header 'NVM_V3' of a VisualSFM file")
     if len(words) == 1:
-        return _Header(words[0] == HEADERS[1], None)
+        return words[0] == HEADERS[1], None
     if words[1] != b"FixedK" or len(words) != 7:
         raise ProblemError(f"{where}: after {words[0].decode()} there must be nothing, or FixedK and fx cx fy cy r")
-    return _Header(words[0] == HEADERS[1], tuple(finite_numbers(words[2:], ("fx", "cx", "fy", "cy", "r"), where)))
+    return words[0] == HEADERS[1], finite_numbers(words[2:], ("fx", "cx", "fy", "cy", "r"), where)
 
 
-def _images(lines: LineReader, header: _Header) -> _Images:
-    line = lines.next_filled()
+def _images(lines: LineReader, matrices: bool) -> Float[np.ndarray, "images numbers"]:
+    """The numbers of the images' lines."""
+    line = lines.next()
     where = f"{lines.name} line {max(lines.line, 1)}"
     if not line:
         raise ProblemError(f"{where}: the file ends before the number of images")
     count = finite_numbers([line], ("number of images",), where)[0]
     if not count.is_integer() or not 1 <= count <= LARGEST_COUNT:
         raise ProblemError(f"{where}: {count:g} is no number of images of a model")
-    fields = _FIELDS_R9T if header.matrices else _FIELDS
+    fields = _FIELDS_R9T if matrices else _FIELDS
     rows = []
     for image in range(int(count)):
-        words = lines.next_filled().rsplit(maxsplit=len(fields))  # names may have blanks
+        words = lines.next().rsplit(maxsplit=len(fields))  # names may have blanks
         where = f"{lines.name} line {max(lines.line, 1)}"
         if not words:
             raise ProblemError(f"{where}: the file ends before image {image} of {count:g}")
         if len(words) != len(fields) + 1:
             raise ProblemError(f"{where}: image {image} has {len(words)} fields instead of {len(fields) + 1}")
         rows.append(finite_numbers(words[1:], fields, f"{where}: image {image}"))
-        if header.matrices and not are_rotations(np.array(rows[-1][1:10]).reshape(1, 3, 3))[0]:
+        if matrices and not are_rotations(np.array(rows[-1][1:10]).reshape(1, 3, 3))[0]:
             raise ProblemError(f"{where}: image {image}: R11 to R33 are no rotation")
-        if not header.matrices and not any(rows[-1][1:5]):
+        if not matrices and not any(rows[-1][1:5]):
             raise ProblemError(f"{where}: image {image}: qw to qz are no rotation")
-    table = np.array(rows)
-    if header.matrices:
-        return _Images(table[:, 0], table[:, 1:10].reshape(-1, 3, 3), table[:, 10:13], table[:, 13])
-    from scipy.spatial.transform import Rotation
-
-    quaternions = table[:, [2, 3, 4, 1]]
-    largest = np.abs(quaternions).max(axis=1, keepdims=True)  # without it squares overflow
-    rotations = Rotation.from_quat(quaternions / largest).as_matrix()
-    return _Images(table[:, 0], rotations, translations(rotations, table[:, 5:8]), table[:, 8])
+    return np.array(rows)
