@@ -31,7 +31,7 @@ ENDING = ".npz"
 
 @dataclass(frozen=True)
 class Recording:
-    """A solve, iteration by iteration. Entry 0 of what is told of iterations is the start."""
+    """A solve, iteration by iteration. Entry 0 of the per-iteration arrays is the start."""
 
     problem: BundleProblem
     """The start, thinned."""

@@ -73,12 +73,11 @@ def evaluate(
             counts = f"{problem.num_cameras} cameras, the sidecar file names {len(side.frames)} frames"
             raise ProblemError(f"{display_name(path)}: has {counts}")
         poses, points = poses_of_cameras(np.asarray(problem.cameras)), np.asarray(problem.points)
-        scores = None
-        if truth is not None:
-            similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
-            scores = score(poses, truth, lengths)
-        else:
+        scores = None if truth is None else score(poses, truth, lengths)
+        if truth is None:
             similarity = Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
+        else:
+            similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
         rms = float(np.sqrt(2 * geometry.cost(problem) / problem.num_observations))
         if not np.isfinite([rms, *(() if scores is None else _numbers(scores))]).all():
             raise ProblemError(f"{display_name(path)}: an error is not finite: a camera or point lies where it cannot")
