@@ -16,7 +16,21 @@ import jaxba
 
 ORDER = (
     *("typing", "runtime", "problem", "structure", "model", "linear", "refinement", "lm", "methods", "damping"),
-    *("solver", "io", "scenes", "datasets", "viewer", "jaxba", "game", "training", "peers", "bench", "paper", "cli"),
+    *(
+        "solver",
+        "io",
+        "scenes",
+        "datasets",
+        "viewer",
+        "jaxba",
+        "kitti",
+        "game",
+        "training",
+        "peers",
+        "bench",
+        "paper",
+        "cli",
+    ),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
 
@@ -25,6 +39,7 @@ NO_MORE_THAN = {
     "io": {"typing", "runtime", "problem"},
     "scenes": {"typing", "runtime", "problem"},
     "datasets": {"typing", "runtime", "problem", "io"},
+    "kitti": {"typing", "runtime", "problem", "io"},
 }
 """Rooms that know less than all that stand before them."""
 

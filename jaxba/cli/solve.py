@@ -76,7 +76,7 @@ class Problem:
     or - for a file on standard input. Default: a random scene."""
 
     intrinsics: Intrinsics = DEFAULTS.intrinsics
-    """fixed: for calibrated cameras."""
+    """fixed: keep focal lengths and distortion."""
 
     refine_principal_point: bool = False
     """Optimise principal points of a COLMAP model, too."""

@@ -17,13 +17,13 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxba.datasets.kitti.features import essential
-from jaxba.datasets.kitti.frontend import MIN_MATCHES
-from jaxba.datasets.kitti.keyframes import parallax, relative_rotation
-from jaxba.datasets.kitti.opencv import cv2
-from jaxba.datasets.kitti.tracks import Tracks
-from jaxba.datasets.kitti.triangulate import Filters, Observations, Triangulated, Views, triangulate
 from jaxba.io.frames import Calibration
+from jaxba.kitti.features import essential
+from jaxba.kitti.frontend import MIN_MATCHES
+from jaxba.kitti.keyframes import parallax, relative_rotation
+from jaxba.kitti.opencv import cv2
+from jaxba.kitti.tracks import Tracks
+from jaxba.kitti.triangulate import Filters, Observations, Triangulated, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import perspective, translations
 
