@@ -156,7 +156,7 @@ def _nvm(folder: Path) -> None:
 
 def _kitti(folder: Path) -> None:
     """A textured plane, oblique to the camera, which drives towards it."""
-    from jaxba.datasets.kitti.opencv import cv2
+    from jaxba.kitti.opencv import cv2
 
     rng = np.random.default_rng(0)
     texture = cv2.GaussianBlur(rng.uniform(0, 255, (600, 600)), (0, 0), 1.5)

@@ -16,8 +16,8 @@ import jaxba
 
 ORDER = (
     *("typing", "runtime", "problem", "structure", "model", "linear", "refinement", "lm", "damping", "solver"),
-    *("io", "settings", "scenes", "datasets", "viewer", "jaxba", "methods", "game", "training", "peers", "bench"),
-    *("paper", "cli"),
+    *("io", "settings", "scenes", "datasets", "viewer", "jaxba", "methods", "kitti", "game", "training", "peers"),
+    *("bench", "paper", "cli"),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
 
@@ -27,6 +27,7 @@ NO_MORE_THAN = {
     "settings": {"typing", "runtime", "problem", "io"},
     "scenes": {"typing", "runtime", "problem"},
     "datasets": {"typing", "runtime", "problem", "io"},
+    "kitti": {"typing", "runtime", "problem", "io"},
 }
 """Rooms that know less than all that stand before them."""
 

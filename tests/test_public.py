@@ -163,7 +163,7 @@ UNNEEDED = (
         "jaxba.game",
         "jaxba.training",
     ),
-    *("jaxba.training", "jaxba.paper", "jaxba.peers.ceres", "jaxba.structure.louvain", "jaxba.datasets.kitti"),
+    *("jaxba.training", "jaxba.paper", "jaxba.peers.ceres", "jaxba.structure.louvain", "jaxba.kitti"),
 )
 """Modules that a solve of a BAL file with the default options does without. Together they would take longer to import
 than many a problem takes to solve."""

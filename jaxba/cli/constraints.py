@@ -57,9 +57,8 @@ def constrained(
         ProblemError: as the functions of `jaxba` that do it.
     """
     settings = {} if file is None else _read(file)
-    first = [key for key in settings if key == "position_priors"]  # the scene is aligned before anything is constant
-    for key in first:
-        problem = _applied(problem, file, key, settings.pop(key), strict)
+    if (first := "position_priors") in settings:  # the scene is aligned before anything is constant
+        problem = _applied(problem, file, first, settings.pop(first), strict)
     try:
         problem = hold(problem, numbers=[one.replace("-", "_") for one in constant if one not in PARTS])
     except ValueError as error:
@@ -151,10 +150,9 @@ def _with_positions(
     labels = problem.labels
     ids = range(problem.num_cameras) if labels is None else set(labels.images.tolist())
     wanted = _meant(given.images, names)
-    ours = [at for at, image in enumerate(wanted) if image in names or image in ids]
-    others = [
-        image for image, meant in zip(given.images, wanted, strict=True) if meant not in names and meant not in ids
-    ]
+    known = [one in names or one in ids for one in wanted]
+    ours = np.flatnonzero(known)
+    others = [image for image, ok in zip(given.images, known, strict=True) if not ok]
     if not len(ours):
         raise ValueError(f"none of the images is in the problem: {names_of(others) or 'no positions'}")
     if others:

@@ -16,17 +16,17 @@ import tyro
 from jaxba.cli import common
 from jaxba.cli.options import options
 from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
-from jaxba.datasets.kitti import evaluate
-from jaxba.datasets.kitti.assemble import Assembled, poses_of_cameras, sidecar_contents, windows
-from jaxba.datasets.kitti.sequence import files_of, read_sequence
-from jaxba.datasets.kitti.trajectory import path_length
-from jaxba.datasets.kitti.triangulate import Filters
 from jaxba.io import check_output, write_problem
 from jaxba.io.files import sidecar_path, strip_compression
 from jaxba.io.formats import FORMATS, by_ending
 from jaxba.io.frames import poses_of, read_sidecar, truth_of, write_sidecar
 from jaxba.io.poses import read_poses
 from jaxba.io.remarks import note, note_center
+from jaxba.kitti import evaluate
+from jaxba.kitti.assemble import Assembled, sidecar_contents, windows
+from jaxba.kitti.sequence import files_of, read_sequence
+from jaxba.kitti.trajectory import path_length
+from jaxba.kitti.triangulate import Filters
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import write_text
@@ -160,16 +160,16 @@ def _check(args: Arguments) -> None:
     is_bal = by_ending(args.out) in (None, FORMATS[0])
     common.require(is_bal, f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
     try:
-        from jaxba.datasets.kitti import opencv  # noqa: F401 - the error names the package to install
+        from jaxba.kitti import opencv  # noqa: F401 - the error names the package to install
     except ImportError as error:
         raise common.UsageError(str(error)) from None
 
 
 def _build(args: Arguments) -> int:
     _check(args)
-    from jaxba.datasets.kitti.build import BuildOptions, build
-    from jaxba.datasets.kitti.frontend import FrontEndOptions
-    from jaxba.datasets.kitti.result_cache import ResultCache
+    from jaxba.kitti.build import BuildOptions, build
+    from jaxba.kitti.frontend import FrontEndOptions
+    from jaxba.kitti.result_cache import ResultCache
 
     with common.notes_printed():
         sequence, poses = _inputs(args)
@@ -218,7 +218,7 @@ def _check_apart(problems: Sequence[str], sequence: Any, args: Arguments) -> Non
 
 def _inputs(args: Arguments) -> tuple[Any, Any]:
     """The sequence, and its true poses as a function of the numbers of frames, or None."""
-    from jaxba.datasets.kitti.images import image_size
+    from jaxba.kitti.images import image_size
 
     sequence = read_sequence(args.sequence, args.frames, args.camera, args.calibration)
     poses = None
@@ -249,7 +249,7 @@ def _parts(built: Any, args: Arguments) -> list[tuple[Assembled, str]]:
 def _write(part: Assembled, path: str, sequence: Any, args: Arguments) -> None:
     """Writes the file of frames first, then the problem, so that there is never a problem without its frames."""
     from jaxba import __version__
-    from jaxba.datasets.kitti.opencv import cv2
+    from jaxba.kitti.opencv import cv2
 
     times = None if sequence.times is None else dict(zip(sequence.numbers, sequence.times.tolist(), strict=True))
     metadata = sidecar_contents(
@@ -272,7 +272,7 @@ def _build_table(parts: list[Assembled], built: Any, poses: Any) -> Any:
         ate = "-"
         if poses is not None:
             try:
-                found = evaluate.score(poses_of_cameras(np.asarray(problem.cameras)), poses(part.frames))
+                found = evaluate.score(geometry.camera_poses(problem.cameras), poses(part.frames))
                 ate = f"{found.absolute.rmse:.3f}"
             except ProblemError:  # a straight line, or two cameras
                 ate = "undefined"
@@ -284,7 +284,7 @@ def _build_table(parts: list[Assembled], built: Any, poses: Any) -> Any:
 def _evaluate(args: EvaluateArguments) -> int:
     common.require(bool(args.lengths) and all(length > 0 for length in args.lengths), "--lengths must be positive")
     from jaxba.bench.plots import save_figure
-    from jaxba.datasets.kitti import plots
+    from jaxba.kitti import plots
 
     _check_results_apart(args)
     side = read_sidecar(args.problem)

@@ -50,7 +50,10 @@ def options(cls: type[Arguments]) -> type[Arguments]:
 
 def _texts(cls: type) -> dict[str, str]:
     """The text below each field of a class, in one line."""
-    body: Any = ast.parse(dedent(inspect.getsource(cls))).body[0]
+    try:
+        body: Any = ast.parse(dedent(inspect.getsource(cls))).body[0]
+    except OSError:  # installed without source
+        return {}
     pairs = pairwise(body.body)
     fields = [pair for pair in pairs if isinstance(pair[0], ast.AnnAssign) and isinstance(pair[1], ast.Expr)]
     return {name.target.id: " ".join(text.value.value.split()) for name, text in fields}

@@ -83,22 +83,18 @@ def write_solution(output: str, problem: BundleProblem, source: str | None) -> N
     Raises:
         UsageError: the solution cannot be written.
     """
-    lost = ""
-    model = is_model(output, source)
+    model, like = is_model(output, source), _is_like_source(output, source)
     try:
-        if _is_like_source(output, source):
+        if like:
             write_colmap(problem, output, like=source)
-        elif model:
-            write_problem(problem, output)
-            lost = table.lost_in_new_model(problem)
-            common.print_line("note: names and sizes of images, and so principal points, are made up in that model")
         else:
             write_problem(problem, output)
-            lost = table.lost_in_file(problem)
     except OSError as error:
         raise common.UsageError(f"--output {output}: {error.strerror or error}") from None
+    if model and not like:
+        common.print_line("note: names and sizes of images, and so principal points, are made up in that model")
     common.print_line(f"wrote {output}")
     if formats.ending(output) and formats.by_ending(output) is None and not model:
         common.print_line(f"note: {output} is a BAL file; {formats.formats_written()}")
-    if lost:
+    if not like and (lost := table.lost_in(problem, model)):
         common.print_line(f"note: that {'model' if model else 'file'} cannot store: {lost}")

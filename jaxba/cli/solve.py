@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout
+from contextlib import nullcontext, redirect_stdout
 from dataclasses import replace
 from typing import Annotated, Literal
 
@@ -76,7 +76,7 @@ class Problem:
     or - for a file on standard input. Default: a random scene."""
 
     intrinsics: Intrinsics = DEFAULTS.intrinsics
-    """fixed: for calibrated cameras."""
+    """fixed: keep focal lengths and distortion."""
 
     refine_principal_point: bool = False
     """Optimise principal points of a COLMAP model, too."""
@@ -295,32 +295,28 @@ def _run(args: Arguments) -> int:
 
 
 def _run_main(args: Arguments) -> int:
-    if _STDOUT not in [stream_number(path or "") for path in (args.output, args.log)]:
-        return _solve(args)
-    with redirect_stdout(sys.stderr):  # stdout has only the output file
+    taken = _STDOUT in [stream_number(path or "") for path in (args.output, args.log)]
+    with redirect_stdout(sys.stderr) if taken else nullcontext():  # stdout has only the output file
         return _solve(args)
 
 
 def _solve(args: Arguments) -> int:
-    if args.problem == "":
-        raise common.UsageError("the name of the problem is empty")
+    common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
     path, problem = _in_all_processes(args) if _is_divided(args) else _checked(args)
     common.prepare_process(untraced=not _is_divided(args))
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
-    watching = Watching.of(problem, path, args.record is not None, args.view)
-    solution, steps = _iterate(args, problem, policy, options, watching and watching.watch)
+    watching = Watching(problem, path, args.record, args.view)
+    solution, steps = _iterate(args, problem, policy, options, watching.watch)
     common.print_line(table.summary(problem, solution, options.loss))
     if (args.pad == "yes" and not _is_divided(args)) or solution.capacity is not None:
         common.print_line(table.padding(problem, solution))
     if args.output:
         write_solution(args.output, solution.problem, path)
     if args.covariance:
-        solved = solution.problem
-        if args.intrinsics == "fixed":
-            solved = hold(solved, lenses="all")
+        solved = hold(solution.problem, lenses="all") if args.intrinsics == "fixed" else solution.problem
         _write_covariance(args.covariance, solved, options.loss)
     if args.log:
         from jaxba.io import json_lines
@@ -330,8 +326,7 @@ def _solve(args: Arguments) -> int:
         with open_output(args.log) as file:
             file.write(json.dumps(json_lines.plain(record), allow_nan=False).encode() + b"\n")
         common.print_line(f"wrote {args.log}")
-    if watching:
-        watching.end(args.record)
+    watching.end()
     return 0
 
 
@@ -350,8 +345,8 @@ def _in_all_processes(args: Arguments) -> tuple[str | None, BundleProblem]:
 def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     """The path of the problem and the problem, after all checks of files."""
     path = _path(args.problem)
-    if args.record is not None and not args.record.endswith(".npz"):
-        raise common.UsageError(f"--record {args.record}: a recording ends in .npz")
+    named = args.record is None or args.record.endswith(".npz")
+    common.require(named, f"--record {args.record}: a recording ends in .npz")
     outputs = {"--log": args.log, "--covariance": args.covariance, "--record": args.record}
     read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
     check_outputs(args.output, outputs, path, read)
@@ -380,8 +375,7 @@ def _path(problem: str | None) -> str | None:
 
 def _read(args: Arguments, path: str) -> BundleProblem:
     if args.refine_principal_point:
-        if not is_colmap(path):
-            raise common.UsageError("--refine-principal-point is for COLMAP models")
+        common.require(is_colmap(path), "--refine-principal-point is for COLMAP models")
         return read_colmap(path, strict=args.strict, refine_principal_point=True)
     return read_problem(path, strict=args.strict)
 

@@ -30,21 +30,18 @@ _COLUMNS = "iter      cost      cost_change  |gradient|   |step|    gain      la
 
 def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) -> str:
     """Size of the problem, and the policy and options of the solve."""
-    refine = f" + {counted(options.refinement.points, 'point iteration')}" if options.refinement.points else ""
-    if refine and options.refinement.starts == "rays":
-        refine += " from the better of step and rays"
-    if options.refinement.camera_rounds:
-        refine += f", up to {counted(options.refinement.camera_rounds, 'camera round')}"
-    if options.refinement.trials > 1:
-        refine += f", up to {options.refinement.trials} trials"
-    if options.refinement.pattern_moves:
-        refine += f", up to {counted(options.refinement.pattern_moves, 'pattern move')}"
-    if options.coordinates.lens_step == "pixels":
-        refine += ", distortion per pixel"
-    if options.kept_steps:
-        refine += f", {counted(options.kept_steps, 'previous step')}"
-    if options.coordinates.camera_damping != 1:
-        refine += f", cameras damped by {options.coordinates.camera_damping:g} lambda"
+    work, coordinates = options.refinement, options.coordinates
+    start = " from the better of step and rays" if work.starts == "rays" else ""
+    parts = {
+        f" + {counted(work.points, 'point iteration')}{start}": work.points,
+        f", up to {counted(work.camera_rounds, 'camera round')}": work.camera_rounds,
+        f", up to {work.trials} trials": work.trials > 1,
+        f", up to {counted(work.pattern_moves, 'pattern move')}": work.pattern_moves,
+        ", distortion per pixel": coordinates.lens_step == "pixels",
+        f", {counted(options.kept_steps, 'previous step')}": options.kept_steps,
+        f", cameras damped by {coordinates.camera_damping:g} lambda": coordinates.camera_damping != 1,
+    }
+    refine = "".join(text for text, present in parts.items() if present)
     solver = f"linear solver {args.linear_solver}" if args.method == DEFAULT_METHOD else f"method {args.method}"
     counts = ("camera", problem.num_cameras), ("point", problem.num_points), ("observation", problem.num_observations)
     sizes = ", ".join(counted(count, noun) for noun, count in counts)
@@ -164,24 +161,18 @@ def _how_compiled(solution: Solution) -> str:
     return f" ({which} with quickly compiled programs, see --compilation)"
 
 
-def lost_in_file(problem: BundleProblem) -> str:
-    """Properties of a problem that a BAL or Bundler file cannot store, as text; empty if there are none."""
+def lost_in(problem: BundleProblem, model: bool) -> str:
+    """What a new COLMAP model, or else a BAL or Bundler file, cannot store of a problem, as text; may be empty."""
     lenses = problem.lenses
-    shared = ["which images share a lens"] if lenses is not None and lenses.shared else []
-    return ", ".join([*shared, *filter(None, [lost_in_new_model(problem)])])
-
-
-def lost_in_new_model(problem: BundleProblem) -> str:
-    """Properties of a problem that a COLMAP model cannot store, as text; empty if there are none."""
-    lenses = problem.lenses
-    lost = [
-        (lenses is not None and not np.asarray(lenses.free).all(), "which numbers of a lens are constant"),
-        (problem.constants is not None, "which poses and points are constant"),
-        (problem.rigs is not None, "rigs"),
-        (problem.priors is not None, "priors"),
-        (problem.whitening is not None, "weights of observations"),
-    ]
-    return ", ".join(what for is_lost, what in lost if is_lost)
+    lost = {
+        "which images share a lens": not model and lenses is not None and lenses.shared,
+        "which numbers of a lens are constant": lenses is not None and not np.asarray(lenses.free).all(),
+        "which poses and points are constant": problem.constants is not None,
+        "rigs": problem.rigs is not None,
+        "priors": problem.priors is not None,
+        "weights of observations": problem.whitening is not None,
+    }
+    return ", ".join(what for what, is_lost in lost.items() if is_lost)
 
 
 def padding(problem: BundleProblem, solution: Solution) -> str:

@@ -2,62 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from jaxba.cli import common, view
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.solver.callback_loop import Watch
 
-if TYPE_CHECKING:
-    from jaxba.viewer.live import Watcher
-    from jaxba.viewer.panel import Viewer
-    from jaxba.viewer.recording import Recorder
 
-
-@dataclass(frozen=True)
 class Watching:
-    """A solve that is recorded or watched."""
+    """A solve that is recorded or watched; nothing is done without either."""
 
-    recorder: Recorder
-    watch: Watch
-    viewer: Viewer | None = None
-    watcher: Watcher | None = None
+    watch: Watch | None = None
+    """For `jaxba.solve`."""
 
-    @classmethod
-    def of(cls, problem: BundleProblem, path: str | None, record: bool, show: bool) -> Watching | None:
-        """What the options ask for; None for nothing.
+    def __init__(self, problem: BundleProblem, path: str | None, record: str | None, show: bool) -> None:
+        """Opens the page.
 
         Args:
             problem: the start.
             path: where it was read.
-            record: whether it is recorded.
-            show: whether a page shows it.
+            record: file of the recording.
+            show: whether a page shows the solve.
         """
-        if not (record or show):
-            return None
+        self._record, self._viewer = record, None
+        if record is None and not show:
+            return
         from jaxba.viewer.recording import Recorder
 
-        recorder = Recorder(problem, path or "")
+        self.watch = self._recorder = Recorder(problem, path or "")
         if not show:
-            return cls(recorder, recorder)
+            return
         from jaxba.viewer.live import Watcher
         from jaxba.viewer.panel import Viewer
         from jaxba.viewer.sources import shown
 
-        viewer = Viewer([shown(recorder.recording(), Path(path).name if path else "random scene")])
-        view.announce(viewer)
-        watcher = Watcher(viewer, recorder)
-        return cls(recorder, watcher, viewer, watcher)
+        self._viewer = Viewer([shown(self._recorder.recording(), Path(path).name if path else "random scene")])
+        view.announce(self._viewer)
+        self.watch = self._watcher = Watcher(self._viewer, self._recorder)
 
-    def end(self, path: str | None) -> None:
+    def end(self) -> None:
         """Writes the recording, and serves the page until Ctrl-C."""
-        if path is not None:
+        if self._record is not None:
             from jaxba.viewer.recording import write_recording
 
-            write_recording(self.recorder.recording(), path)
-            common.print_line(f"wrote {path}")
-        if self.viewer is not None and self.watcher is not None:
-            self.watcher.draw()
-            view.wait(self.viewer)
+            write_recording(self._recorder.recording(), self._record)
+            common.print_line(f"wrote {self._record}")
+        if self._viewer is not None:
+            self._watcher.draw()
+            view.wait(self._viewer)

@@ -1,1 +1,1 @@
-"""Published data sets: BAL problems by name, KITTI images to a problem."""
+"""Published data sets: BAL problems by name."""

@@ -98,6 +98,12 @@ def camera_centers(cameras: Float[Array, "cameras parameters"]) -> Float[np.ndar
     return -np.einsum("nji,nj->ni", rotation_matrices(cameras[:, :3]), cameras[:, 3:6])
 
 
+def camera_poses(cameras: Float[Array, "cameras parameters"]) -> Float[np.ndarray, "cameras 3 4"]:
+    """Camera-to-world poses `[R | c]` in COLMAP's and KITTI's axes: x to the right, y downwards, z forwards."""
+    rotation = np.diag(COLMAP_FLIP) @ rotation_matrices(np.asarray(cameras)[:, :3])
+    return np.concatenate([rotation.transpose(0, 2, 1), camera_centers(cameras)[:, :, None]], axis=2)
+
+
 def translations(rotations: Float[np.ndarray, "n 3 3"], centers: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Translations `t = -R c` of cameras with given rotations and centres."""
     return -np.einsum("nij,nj->ni", rotations, centers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -121,26 +121,19 @@ def check(config: SceneConfig) -> None:
     low, high = 2 * config.points, config.cameras * config.points
     if not low <= config.total <= high:
         raise ProblemError(f"observations must be {low} to {high} for these cameras and points, not {config.total}")
-    _check_signs(config)
-    _check_ranges(config)
-
-
-def _check_signs(config: SceneConfig) -> None:
     positive = ("step", "lap", "min_depth", "image_width", "image_height")
-    for name in positive:
-        if getattr(config, name) <= 0:
-            raise ProblemError(f"{name} must be positive, not {getattr(config, name)}")
-    zero_or_more = ("position_jitter", "rotation_jitter", "noise", "outlier_size", "start_rotation", "start_center")
-    for name in (*zero_or_more, "start_point", "start_focal", "start_drift"):
-        if getattr(config, name) < 0:
-            raise ProblemError(f"{name} must not be negative, got {getattr(config, name)}")
-    for name in ("gap_share", "revisit_share", "outlier_share"):
-        if not 0 <= getattr(config, name) <= 1:
-            raise ProblemError(f"{name} must be between 0 and 1, not {getattr(config, name)}")
-
-
-def _check_ranges(config: SceneConfig) -> None:
-    if config.trajectory not in ("forward", "lateral", "orbit", "photos"):
+    shares = ("gap_share", "revisit_share", "outlier_share")
+    sigmas = ("position_jitter", "rotation_jitter", "noise", "outlier_size")
+    starts = ("start_rotation", "start_center", "start_point", "start_focal", "start_drift")
+    for names, fits, what in (
+        (positive, lambda value: value > 0, "be positive, not"),
+        ((*sigmas, *starts), lambda value: value >= 0, "not be negative, got"),
+        (shares, lambda value: 0 <= value <= 1, "be between 0 and 1, not"),
+    ):
+        for name in names:
+            if not fits(getattr(config, name)):
+                raise ProblemError(f"{name} must {what} {getattr(config, name)}")
+    if config.trajectory not in get_args(Trajectory):
         raise ProblemError(f"trajectory must be forward, lateral, orbit or photos, not {config.trajectory}")
     ranges = {"depth": (config.min_depth, config.max_depth), "focal": config.focal, "k1": config.k1, "k2": config.k2}
     for name, (low, high) in ranges.items():

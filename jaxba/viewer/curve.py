@@ -55,7 +55,7 @@ class CostCurve:
         self._chart.data, self._chart.visible = data, len(data[0]) > 1
 
     def _data(self) -> tuple[np.ndarray, ...]:
-        """Rows: iteration; per stage its cost (last value repeated), and the shown iteration's cost, NaN elsewhere."""
+        """Rows: iteration; per stage its cost (last value repeated); the shown iteration's cost, NaN elsewhere."""
         iterations = np.arange(max(stage.shown.recording.last for stage in self._stages) + 1.0)
         found = [iterations]
         for stage in self._stages:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.camera_models import BAL
-from jaxba.problem.geometry import COLMAP_FLIP, camera_centers, rotation_matrices
+from jaxba.problem.geometry import COLMAP_FLIP, camera_poses
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.similarity import Similarity
 
@@ -90,16 +90,10 @@ def _reach(problem: BundleProblem, center: Float[np.ndarray, "cameras 2"]) -> Fl
     return np.maximum(reach, np.where(center.any(axis=1, keepdims=True), np.abs(center), np.median(reach, axis=0)))
 
 
-def poses_of(cameras: Float[np.ndarray, "cameras parameters"]) -> Float[np.ndarray, "cameras 3 4"]:
-    """Camera-to-world poses `[R | c]` of cameras that look along +z with y downwards."""
-    rotation = (np.diag(COLMAP_FLIP) @ rotation_matrices(cameras[:, :3])).transpose(0, 2, 1)
-    return np.concatenate([rotation, camera_centers(cameras)[:, :, None]], axis=2)
-
-
 def to_page(problem: BundleProblem) -> Similarity:
     """The similarity to a scene whose middle is the origin, of a size of about one, with the mean of the cameras'
     upward directions along +z."""
-    poses, points = poses_of(np.asarray(problem.cameras)), np.asarray(problem.points)
+    poses, points = camera_poses(problem.cameras), np.asarray(problem.points)
     places = np.concatenate([poses[:, :, 3], points])
     places = places[np.isfinite(places).all(axis=1)]
     middle = np.median(points, axis=0)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -17,8 +18,8 @@ from jaxba.io.files import StrPath, display_name, sidecar_path
 from jaxba.io.frames import Sidecar, read_sidecar, truth_of
 from jaxba.io.poses import read_poses
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import camera_centers
 from jaxba.problem.similarity import umeyama
-from jaxba.viewer import geometry
 from jaxba.viewer.recording import ENDING, Recording, read_recording, still
 
 LARGEST_SIDE = 480
@@ -56,27 +57,27 @@ class Shown:
 
     def size(self, camera: int) -> tuple[float, float]:
         """Width and height of an image, pixels; 0 if it is not at hand."""
-        if self.images is None or self.names is None:
-            return 0.0, 0.0
-        from PIL import Image
-
-        try:
-            with Image.open(self.images / self.names[camera]) as image:
-                return float(image.width), float(image.height)
-        except (OSError, ValueError):
-            return 0.0, 0.0
+        return self._opened(camera, lambda image: (float(image.width), float(image.height))) or (0.0, 0.0)
 
     def image(self, camera: int) -> UInt8[np.ndarray, "height width 3"] | None:
         """A small version of an image; None if it is not at hand."""
+
+        def small(image: Any) -> np.ndarray:
+            image.draft("RGB", (2 * LARGEST_SIDE, 2 * LARGEST_SIDE))  # of a JPEG no more than is needed
+            image.thumbnail((LARGEST_SIDE, LARGEST_SIDE))
+            return np.asarray(image.convert("RGB"))
+
+        return self._opened(camera, small)
+
+    def _opened(self, camera: int, use: Callable[[Any], Any]) -> Any:
+        """What `use` makes of an image; None if it is not at hand."""
         if self.images is None or self.names is None:
             return None
         from PIL import Image
 
         try:
             with Image.open(self.images / self.names[camera]) as image:
-                image.draft("RGB", (2 * LARGEST_SIDE, 2 * LARGEST_SIDE))  # of a JPEG no more than is needed
-                image.thumbnail((LARGEST_SIDE, LARGEST_SIDE))
-                return np.asarray(image.convert("RGB"))
+                return use(image)
         except (OSError, ValueError):
             return None
 
@@ -160,5 +161,5 @@ def _truth(one: Shown, side: Sidecar | None, poses: StrPath) -> Float[np.ndarray
     else:
         has = f"{len(table.numbers)} poses for {count} cameras"
         raise ProblemError(f"{display_name(poses)}: has {has}, and no .frames.json says which are meant")
-    centers = geometry.poses_of(np.asarray(one.recording.at(one.recording.last).cameras))[:, :, 3]
+    centers = camera_centers(one.recording.at(one.recording.last).cameras)
     return umeyama(path, centers).points(path)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.problem.bundle_problem import BundleProblem
+from jaxba.problem.geometry import camera_centers, camera_poses
 from jaxba.viewer import geometry
 from jaxba.viewer.extra import viser
 from jaxba.viewer.layers import Layers
@@ -166,7 +167,7 @@ class Stage:
     def _draw(self) -> None:
         layers, problem, measures, similarity = self._layers, self.problem, self.measures, self._similarity
         points = similarity.points(np.asarray(problem.points)[self.points])
-        poses = similarity.poses(geometry.poses_of(np.asarray(problem.cameras)))
+        poses = similarity.poses(camera_poses(problem.cameras))
         with self._server.atomic():
             layers.cloud("points", points, self._colours(measures)[self.points], POINT_SIZE)
             shown = set(self.frusta.tolist()) | ({self.chosen} if self.chosen is not None else set())
@@ -194,7 +195,7 @@ class Stage:
 
     def _size_of_frusta(self, problem: BundleProblem) -> float:
         """Such that neighbours do not cover each other."""
-        centers = self._similarity.points(geometry.poses_of(np.asarray(problem.cameras))[self.frusta][:, :, 3])
+        centers = self._similarity.points(camera_centers(problem.cameras)[self.frusta])
         if len(centers) < 2:
             return 0.15
         distance = np.linalg.norm(centers[:, None] - centers[None], axis=2)
@@ -226,7 +227,7 @@ class Stage:
 
     def _draw_start(self) -> None:
         start = self.shown.problem
-        poses = self._similarity.poses(geometry.poses_of(np.asarray(start.cameras)))[self.frusta]
+        poses = self._similarity.poses(camera_poses(start.cameras))[self.frusta]
         corners = self._corners(poses, self.image_planes.half[self.frusta])
         apex = np.broadcast_to(poses[:, None, :, 3], corners.shape)
         around = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)

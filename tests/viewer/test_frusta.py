@@ -8,7 +8,7 @@ import pytest
 import jaxba
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.viewer.geometry import depth_of_image, frusta_of, poses_of, residual_segments, to_page
+from jaxba.viewer.geometry import depth_of_image, frusta_of, residual_segments, to_page
 from jaxba.viewer.measures import measure
 
 CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], float)
@@ -31,7 +31,7 @@ def pinhole_problem(model: str) -> BundleProblem:
 @pytest.mark.parametrize("model", ["BAL", "PINHOLE"])
 def test_corners_of_a_frustum_project_to_the_corners_of_the_image(model):
     problem = pinhole_problem(model)
-    frusta, poses = frusta_of(problem), poses_of(np.asarray(problem.cameras))
+    frusta, poses = frusta_of(problem), geometry.camera_poses(np.asarray(problem.cameras))
     depth = depth_of_image(frusta.half, 0.2)
     plane = np.concatenate([CORNERS * frusta.half[:, None], np.ones((2, 4, 1))], axis=2) * depth[:, None, None]
     corners = np.einsum("nij,nkj->nki", poses[:, :, :3], plane) + poses[:, None, :, 3]
@@ -57,7 +57,7 @@ def test_a_segment_runs_from_the_measured_towards_the_predicted_pixel(model):
 def test_on_the_page_cameras_stand_upright_around_the_origin():
     problem = jaxba.random_scene(jaxba.SceneConfig(cameras=6, points=60), 3)
     similarity = to_page(problem)
-    poses = similarity.poses(poses_of(np.asarray(problem.cameras)))
+    poses = similarity.poses(geometry.camera_poses(np.asarray(problem.cameras)))
     np.testing.assert_allclose(np.linalg.det(poses[:, :, :3]), 1.0)
     up = -poses[:, :, 1].mean(axis=0)
     np.testing.assert_allclose(up / np.linalg.norm(up), [0, 0, 1], atol=1e-12)

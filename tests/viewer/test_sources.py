@@ -7,10 +7,10 @@ import pytest
 
 import jaxba
 from jaxba.cli import solve, view
-from jaxba.datasets.kitti.evaluate import write_poses
 from jaxba.io.colmap.problem import read_colmap_with_looks
+from jaxba.kitti.evaluate import write_poses
+from jaxba.problem.geometry import camera_poses
 from jaxba.problem.similarity import Similarity
-from jaxba.viewer.geometry import poses_of
 from jaxba.viewer.sources import open_all
 
 
@@ -55,7 +55,7 @@ def test_colours_and_sizes_are_those_that_pycolmap_reads(model, tmp_path):
 
 def test_a_true_path_in_another_frame_lies_on_the_cameras(model, tmp_path):
     (shown,) = open_all([model])
-    poses = poses_of(np.asarray(shown.problem.cameras))
+    poses = camera_poses(np.asarray(shown.problem.cameras))
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     moved = Similarity(3.0, turn, np.array([1.0, 2, 3])).poses(poses)
     write_poses(tmp_path / "poses.txt", moved)

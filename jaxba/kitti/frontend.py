@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxba.datasets.kitti.features import Features, KeyPoints, Verified, detect, epipolar_inliers, match
-from jaxba.datasets.kitti.images import image_reader, spare_bits, stamp
-from jaxba.datasets.kitti.klt import TrackedPoints, detect_corners, track
-from jaxba.datasets.kitti.opencv import cv2
-from jaxba.datasets.kitti.result_cache import ResultCache, digest
-from jaxba.datasets.kitti.sequence import Sequence
-from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
+from jaxba.kitti.features import Features, KeyPoints, Verified, detect, epipolar_inliers, match
+from jaxba.kitti.images import image_reader, spare_bits, stamp
+from jaxba.kitti.klt import TrackedPoints, detect_corners, track
+from jaxba.kitti.opencv import cv2
+from jaxba.kitti.result_cache import ResultCache, digest
+from jaxba.kitti.sequence import Sequence
+from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.problem.bundle_problem import ProblemError
 
 Report = Callable[[str, int, int], None]

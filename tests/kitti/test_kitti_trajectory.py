@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from jaxba.datasets.kitti import trajectory
-from jaxba.datasets.kitti.trajectory import absolute_errors, align, relative_errors, segment_errors
+from jaxba.kitti import trajectory
+from jaxba.kitti.trajectory import absolute_errors, align, relative_errors, segment_errors
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.similarity import umeyama
 

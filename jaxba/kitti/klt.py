@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.datasets.kitti.features import epipolar_inliers
-from jaxba.datasets.kitti.opencv import cv2
 from jaxba.io.frames import Calibration
+from jaxba.kitti.features import epipolar_inliers
+from jaxba.kitti.opencv import cv2
 
 WINDOW = 21
 """Side of the tracked window, pixels. Source: OpenCV's default."""

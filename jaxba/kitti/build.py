@@ -9,14 +9,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.assemble import Assembled, assemble
-from jaxba.datasets.kitti.frontend import FrontEndOptions, Report, link
-from jaxba.datasets.kitti.initial_poses import drift
-from jaxba.datasets.kitti.keyframes import choose
-from jaxba.datasets.kitti.odometry import views_of_poses, visual_odometry
-from jaxba.datasets.kitti.result_cache import ResultCache
-from jaxba.datasets.kitti.sequence import Sequence
-from jaxba.datasets.kitti.triangulate import Filters
+from jaxba.kitti.assemble import Assembled, assemble
+from jaxba.kitti.frontend import FrontEndOptions, Report, link
+from jaxba.kitti.initial_poses import drift
+from jaxba.kitti.keyframes import choose
+from jaxba.kitti.odometry import views_of_poses, visual_odometry
+from jaxba.kitti.result_cache import ResultCache
+from jaxba.kitti.sequence import Sequence
+from jaxba.kitti.triangulate import Filters
 
 Start = Literal["vo", "poses", "noisy-poses"]
 

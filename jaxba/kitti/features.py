@@ -7,8 +7,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.datasets.kitti.opencv import cv2
 from jaxba.io.frames import Calibration
+from jaxba.kitti.opencv import cv2
 
 Features = Literal["sift", "orb", "klt"]
 

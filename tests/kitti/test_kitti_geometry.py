@@ -7,13 +7,13 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxba.datasets.kitti import keyframes
-from jaxba.datasets.kitti.assemble import assemble, poses_of_cameras, windows
-from jaxba.datasets.kitti.initial_poses import drift
-from jaxba.datasets.kitti.odometry import Odometry, visual_odometry
-from jaxba.datasets.kitti.tracks import Tracks, join_matches, make_tracks
-from jaxba.datasets.kitti.triangulate import Filters, Observations, Views, triangulate, triangulate_robustly
 from jaxba.io.frames import Calibration
+from jaxba.kitti import keyframes
+from jaxba.kitti.assemble import assemble, windows
+from jaxba.kitti.initial_poses import drift
+from jaxba.kitti.odometry import Odometry, visual_odometry
+from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
+from jaxba.kitti.triangulate import Filters, Observations, Views, triangulate, triangulate_robustly
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 
@@ -348,7 +348,7 @@ def test_the_problem_reprojects_exactly_through_bals_camera():
 def test_cameras_and_poses_are_the_same_thing():
     poses, views, points = street()
     made = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(6)), NEARLY_ALL, 2)
-    np.testing.assert_allclose(poses_of_cameras(np.asarray(made.problem.cameras)), poses, atol=1e-9)
+    np.testing.assert_allclose(geometry.camera_poses(np.asarray(made.problem.cameras)), poses, atol=1e-9)
 
 
 def test_points_drift_with_the_first_camera_that_sees_them():
@@ -360,7 +360,7 @@ def test_points_drift_with_the_first_camera_that_sees_them():
     inverse = noisy[:, :, :3].transpose(0, 2, 1)
     start = Views(inverse, -np.einsum("nij,nj->ni", inverse, noisy[:, :, 3]))
     made = assemble(tracks, views, CALIBRATION, tuple(range(6)), NEARLY_ALL, 2, start).problem
-    np.testing.assert_allclose(poses_of_cameras(np.asarray(made.cameras)), noisy, atol=1e-9)
+    np.testing.assert_allclose(geometry.camera_poses(np.asarray(made.cameras)), noisy, atol=1e-9)
     error = np.linalg.norm(geometry.residuals(made), axis=1)
     first = np.where(np.asarray(made.point_index) % 2, 2, 0) == made.camera_index
     assert error[first].max() < 1e-6

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxba.datasets.kitti.tracks import Tracks
-from jaxba.datasets.kitti.triangulate import Filters, Observations, Views, triangulate_robustly
 from jaxba.io.frames import Calibration
+from jaxba.kitti.tracks import Tracks
+from jaxba.kitti.triangulate import Filters, Observations, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, camera_centers, rotation_matrices
+from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 
 FLIP = np.diag(COLMAP_FLIP)
 """From axes x right, y down, z forward (KITTI, as COLMAP) to x right, y up, z backward (BAL)."""
@@ -79,12 +78,6 @@ def assemble(
     pixels = calibration.fx * rays[keep] * [1, -1]
     problem = BundleProblem.create(cameras, points, pixels, tracks.image[keep], point_index)
     return Assembled(problem, frames)
-
-
-def poses_of_cameras(cameras: Float[np.ndarray, "cameras 9"]) -> Float[np.ndarray, "cameras 3 4"]:
-    """Camera-to-world poses in KITTI's axes (x right, y down, z forward) of BAL cameras."""
-    rotation = (FLIP @ rotation_matrices(cameras[:, :3])).transpose(0, 2, 1)
-    return np.concatenate([rotation, camera_centers(cameras)[:, :, None]], axis=2)
 
 
 def windows(whole: Assembled, size: int, stride: int, min_views: int) -> list[Assembled]:

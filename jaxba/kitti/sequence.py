@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.calibration import calibration_files, read_calibration
 from jaxba.io.files import StrPath, display_name, visible
 from jaxba.io.frames import Calibration
 from jaxba.io.poses import lines_of, numbers_of
+from jaxba.kitti.calibration import calibration_files, read_calibration
 from jaxba.problem.bundle_problem import ProblemError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")

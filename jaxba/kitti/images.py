@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxba.datasets.kitti.sequence import Sequence
 from jaxba.io.files import StrPath, display_name, reason
+from jaxba.kitti.sequence import Sequence
 from jaxba.problem.bundle_problem import ProblemError
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -70,7 +70,7 @@ def spare_bits(sequence: Sequence) -> int:
 
 def _decode(path: Path) -> np.ndarray:
     """Grey image of a file, shape (height, width), uint8 or uint16."""
-    from jaxba.datasets.kitti.opencv import cv2
+    from jaxba.kitti.opencv import cv2
 
     try:
         data = path.read_bytes()

@@ -15,12 +15,12 @@ from kitti_scene import OTHER, SMALL, Camera, cv2, render, textures, write_seque
 from jaxba import BundleProblem, read_bal
 from jaxba.cli.kitti import run
 from jaxba.cli.solve import run as solve
-from jaxba.datasets.kitti import frontend, klt
-from jaxba.datasets.kitti.features import KeyPoints, detect, essential, match
-from jaxba.datasets.kitti.images import image_reader
-from jaxba.datasets.kitti.sequence import read_sequence
 from jaxba.io import write_problem
 from jaxba.io.frames import Calibration
+from jaxba.kitti import frontend, klt
+from jaxba.kitti.features import KeyPoints, detect, essential, match
+from jaxba.kitti.images import image_reader
+from jaxba.kitti.sequence import read_sequence
 from jaxba.problem import geometry
 
 DATA = os.environ.get("JAXBA_DATA")

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti.tracks import Tracks
 from jaxba.io.frames import Calibration
+from jaxba.kitti.tracks import Tracks
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import perspective
 

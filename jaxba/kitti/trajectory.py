@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from jaxba.problem.similarity import Poses, umeyama
 
@@ -62,7 +63,7 @@ def relative_errors(aligned: Poses, truth: Poses) -> RelativeErrors:
 
     The estimate must have the truth's scale (`align`); its rotation and position do not matter.
     """
-    error = _product(_inverse(_motion(truth[:-1], truth[1:])), _motion(aligned[:-1], aligned[1:]))
+    error = _motion(_motion(truth[:-1], truth[1:]), _motion(aligned[:-1], aligned[1:]))
     return RelativeErrors(_statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error)))
 
 
@@ -88,7 +89,7 @@ def segment_errors(
         return None
     first, last = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
     length = np.array([pair[2] for pair in pairs])
-    error = _product(_inverse(_motion(aligned[first], aligned[last])), _motion(truth[first], truth[last]))
+    error = _motion(_motion(aligned[first], aligned[last]), _motion(truth[first], truth[last]))
     translation = np.linalg.norm(error[:, :, 3], axis=1) / length
     rotation = _angles(error) / length
     return SegmentErrors(100 * float(translation.mean()), float(rotation.mean()), len(pairs))
@@ -106,21 +107,12 @@ def _statistics(errors: np.ndarray) -> Errors:
 
 
 def _motion(first: Poses, second: Poses) -> Poses:
-    return _product(_inverse(first), second)
-
-
-def _inverse(poses: Poses) -> Poses:
-    rotation = poses[:, :, :3].transpose(0, 2, 1)
-    return np.concatenate([rotation, -rotation @ poses[:, :, 3:]], axis=2)
-
-
-def _product(a: Poses, b: Poses) -> Poses:
-    rotation = a[:, :, :3] @ b[:, :, :3]
-    return np.concatenate([rotation, a[:, :, :3] @ b[:, :, 3:] + a[:, :, 3:]], axis=2)
+    """`first^-1 second` of every pair."""
+    last = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(first), 1, 4))
+    square = [np.concatenate([poses, last], axis=1) for poses in (first, second)]
+    return np.linalg.solve(*square)[:, :3]
 
 
 def _angles(poses: Poses) -> Float[np.ndarray, " poses"]:
-    """Rotation angles in degrees. From sine and cosine: the arc cosine alone loses half of the digits near zero."""
-    r = poses[:, :, :3]
-    skew = np.stack([r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]], axis=1)
-    return np.rad2deg(np.arctan2(np.linalg.norm(skew, axis=1), np.trace(r, axis1=1, axis2=2) - 1))
+    """Rotation angles in degrees."""
+    return np.rad2deg(Rotation.from_matrix(poses[:, :, :3]).magnitude())

@@ -9,11 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.datasets.kitti import trajectory
-from jaxba.datasets.kitti.assemble import poses_of_cameras
 from jaxba.io import read_problem
 from jaxba.io.files import StrPath, display_name, open_output, strip_compression
 from jaxba.io.frames import Sidecar
+from jaxba.kitti import trajectory
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.similarity import Similarity, umeyama
@@ -72,13 +71,12 @@ def evaluate(
         if problem.num_cameras != len(side.frames):
             counts = f"{problem.num_cameras} cameras, the sidecar file names {len(side.frames)} frames"
             raise ProblemError(f"{display_name(path)}: has {counts}")
-        poses, points = poses_of_cameras(np.asarray(problem.cameras)), np.asarray(problem.points)
-        scores = None
-        if truth is not None:
-            similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
-            scores = score(poses, truth, lengths)
-        else:
+        poses, points = geometry.camera_poses(problem.cameras), np.asarray(problem.points)
+        scores = None if truth is None else score(poses, truth, lengths)
+        if truth is None:
             similarity = Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
+        else:
+            similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
         rms = float(np.sqrt(2 * geometry.cost(problem) / problem.num_observations))
         if not np.isfinite([rms, *(() if scores is None else _numbers(scores))]).all():
             raise ProblemError(f"{display_name(path)}: an error is not finite: a camera or point lies where it cannot")

@@ -17,15 +17,15 @@ from jaxtyping import Float
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from jaxba.datasets.kitti.features import essential
-from jaxba.datasets.kitti.frontend import MIN_MATCHES
-from jaxba.datasets.kitti.keyframes import parallax, relative_rotation
-from jaxba.datasets.kitti.opencv import cv2
-from jaxba.datasets.kitti.tracks import Tracks
-from jaxba.datasets.kitti.triangulate import Filters, Observations, Triangulated, Views, triangulate
 from jaxba.io.frames import Calibration
+from jaxba.kitti.features import essential
+from jaxba.kitti.frontend import MIN_MATCHES
+from jaxba.kitti.keyframes import parallax, relative_rotation
+from jaxba.kitti.opencv import cv2
+from jaxba.kitti.tracks import Tracks
+from jaxba.kitti.triangulate import Filters, Observations, Triangulated, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError
-from jaxba.problem.geometry import perspective
+from jaxba.problem.geometry import perspective, translations
 
 BOOTSTRAP_ANGLE = 2.0
 """Median angle in degrees between the rays of the points of the first two views that is enough."""
@@ -354,4 +354,4 @@ def _speed(scene: _Map, near: int, names: tuple[int, ...]) -> float:
 def views_of_poses(poses: Float[np.ndarray, "views 3 4"]) -> Views:
     """World-to-camera views of camera-to-world poses."""
     rotation = poses[:, :, :3].transpose(0, 2, 1)
-    return Views(rotation, -np.einsum("nij,nj->ni", rotation, poses[:, :, 3]))
+    return Views(rotation, translations(rotation, poses[:, :, 3]))
