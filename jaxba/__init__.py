@@ -48,10 +48,11 @@ from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_star
 from jaxba.problem.rigs import Rigs
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
 from jaxba.solver.alternation import solve_and_retriangulate
-from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.compiled import solve_loop
 from jaxba.solver.covariance import Covariance, covariance
 from jaxba.solver.implicit import SolveInputs, differentiable_solve, inputs_of
-from jaxba.solver.loop import Carry, History, solve_loop
+from jaxba.solver.iteration import Carry
+from jaxba.solver.loop import IterationRecord
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Prepared, prepare
 from jaxba.solver.retriangulate import Retriangulation, retriangulate
@@ -79,7 +80,6 @@ __all__ = [
     "DampingPolicy",
     "Effort",
     "Geometric",
-    "History",
     "IterationRecord",
     "LMState",
     "Layout",

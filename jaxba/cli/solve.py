@@ -41,8 +41,8 @@ from jaxba.problem.options import (
 )
 from jaxba.runtime.compilation import Compilation
 from jaxba.solver.alternation import solve_and_retriangulate
-from jaxba.solver.callback_loop import IterationRecord, Watch
 from jaxba.solver.covariance import covariance
+from jaxba.solver.loop import IterationRecord, Watch
 from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.solver.prepare import DEFAULT_POLICY

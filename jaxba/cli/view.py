@@ -156,8 +156,8 @@ def _episode(args: Arguments) -> Shown:
         points=played.points,
         state=np.arange(len(played.cost)),
         cost=played.cost,
-        damping=np.concatenate([start, played.damping]),
-        gain_ratio=np.concatenate([start, played.gain_ratio]),
+        damping=np.concatenate([start, played.steps.damping]),
+        gain_ratio=np.concatenate([start, played.steps.gain_ratio]),
         time_s=played.paid,
         unit="plain steps paid",
     )

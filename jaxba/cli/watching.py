@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from jaxba.cli import common, view
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.solver.callback_loop import Watch
+from jaxba.solver.loop import Watch
 
 if TYPE_CHECKING:
     from jaxba.viewer.live import Watcher

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, ProblemInfo
-from jaxba.lm.records import StepInfo
+from jaxba.lm.records import KINDS, StepInfo
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.peers.acceptance import ReportedByCeres, StepAcceptance
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
@@ -28,7 +28,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.loop import after_step
+from jaxba.solver.iteration import after_step
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution
 
@@ -200,9 +200,7 @@ def _update_policy(
     policy: DampingPolicy, state: Any, step: StepInfo, iteration: int, tolerances: Any, limit: int
 ) -> Any:
     """`after_step` with all arguments as arrays of fixed types, so that it is compiled once."""
-    kinds = {"accepted": np.bool_, "weightless": np.bool_}
-    kinds |= dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), np.int32)
-    arrays = StepInfo(**{k: jnp.asarray(x, kinds.get(k, np.float64)) for k, x in step._asdict().items()})
+    arrays = StepInfo(**{k: jnp.asarray(x, KINDS.get(k, float)) for k, x in step._asdict().items()})
     limits = Tolerances(*(np.float64(x) for x in tolerances))
     return _after_step(policy, state, arrays, np.int32(iteration), limits, np.int32(limit))
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -26,7 +25,8 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.jit import jit
-from jaxba.solver.loop import Carry, History, begin, iterate, loop_from, problem_info
+from jaxba.solver.compiled import loop_from
+from jaxba.solver.iteration import Carry, begin, iterate, problem_info
 from jaxba.structure.devices import AXIS
 from jaxba.structure.layout import Layout
 from jaxba.structure.shards import deal_points, shard_of, sharded_layout
@@ -45,7 +45,10 @@ class Shards:
     """Layouts of all shards, of equal shapes, along a leading axis that is divided among the devices."""
 
     first: Layout
-    """The layout of this process's first shard, on the host, with the points of all shards one after the other."""
+    """The layout of this process's first shard, on the host."""
+
+    order: Int[np.ndarray, " points"]
+    """The point of the problem at each position of all shards in layout order; the number of points for padding."""
 
     def __init__(
         self, problem: BundleProblem, options: StepOptions, devices: Sequence[jax.Device], dtype: np.dtype[Any]
@@ -71,11 +74,10 @@ class Shards:
             raise ProblemError(f"{len(devices)} devices are more than there are observed points")
         own = [shard_of(problem, points) for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
         layouts = sharded_layout(own, options, distributed.gather)
-        self.layout = self._placed(layouts)
+        self.layout, self.first = self._placed(layouts), layouts[0]
         here = [points for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
         orders = [_order(layout, points, problem) for layout, points in zip(layouts, here, strict=True)]
-        order = distributed.to_host(self._placed(orders)).reshape(-1)
-        self.first = replace(layouts[0], points=order)
+        self.order = distributed.to_host(self._placed(orders)).reshape(-1)
         known = np.append(np.asarray(problem.points, dtype), np.zeros((1, 3), dtype), axis=0)
         self._points = self._placed([np.ascontiguousarray(known[order].T) for order in orders])
         cameras = np.ascontiguousarray(np.asarray(problem.cameras, dtype).T)
@@ -100,8 +102,8 @@ class Shards:
 
     def run(
         self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""], length: int
-    ) -> tuple[Carry, History]:
-        """The whole loop; histories have the given length."""
+    ) -> tuple[Carry, StepInfo]:
+        """The whole loop; the record has the given length."""
         given = self.layout, carry, policy, tolerances, limit
         return _run(*given, mesh=self._mesh, options=self._options, length=length)
 
@@ -179,7 +181,7 @@ def _run(
     mesh: Mesh,
     options: StepOptions,
     length: int,
-) -> tuple[Carry, History]:
+) -> tuple[Carry, StepInfo]:
     whole = lambda layout, carry, policy, tolerances, limit: loop_from(
         layout, carry, policy, tolerances, options, length, limit
     )

@@ -32,7 +32,7 @@ from jaxba.runtime.compilation import (
     program,
     stages,
 )
-from jaxba.solver.candidate_loop import try_step_by_parts
+from jaxba.solver.stepwise import try_step_by_parts
 
 pytestmark = pytest.mark.step
 
