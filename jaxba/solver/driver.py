@@ -91,6 +91,6 @@ class OnDevices(Driver):
         return self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit, self.length)
 
     def iterate(self) -> tuple[StepInfo, Termination]:
-        self.carry, step = self._shards.iterate(self.carry, self.setup.policy, self.tolerances, self.limit)
+        self.carry, step = self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit)
         step = jax.tree.map(lambda x: x.item(), jax.device_get(step))
         return step, Termination(int(self.carry.termination))

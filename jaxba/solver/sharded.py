@@ -101,17 +101,11 @@ class Shards:
         return _begin(*given, mesh=self._mesh, options=self._options)
 
     def run(
-        self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""], length: int
+        self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""], length: int = 0
     ) -> tuple[Carry, StepInfo]:
-        """The whole loop; the record has the given length."""
+        """The whole loop, with a record of the given length; without a length one iteration."""
         given = self.layout, carry, policy, tolerances, limit
         return _run(*given, mesh=self._mesh, options=self._options, length=length)
-
-    def iterate(
-        self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""]
-    ) -> tuple[Carry, StepInfo]:
-        """One iteration."""
-        return _iterate(self.layout, carry, policy, tolerances, limit, mesh=self._mesh, options=self._options)
 
 
 def _is_here(device: jax.Device) -> bool:
@@ -155,21 +149,6 @@ def _begin(
     return on_all(layout, cameras, points, policy, limit, prices)
 
 
-@functools.partial(jit, static_argnames=("mesh", "options"))
-def _iterate(
-    layout: Layout,
-    carry: Carry,
-    policy: DampingPolicy,
-    tolerances: Tolerances,
-    limit: Int[Array, ""],
-    *,
-    mesh: Mesh,
-    options: StepOptions,
-) -> tuple[Carry, StepInfo]:
-    one = lambda layout, carry, policy, tolerances, limit: iterate(layout, carry, policy, tolerances, options, limit)
-    return _on_all(mesh, one)(layout, carry, policy, tolerances, limit)
-
-
 @functools.partial(jit, static_argnames=("mesh", "options", "length"))
 def _run(
     layout: Layout,
@@ -182,18 +161,11 @@ def _run(
     options: StepOptions,
     length: int,
 ) -> tuple[Carry, StepInfo]:
-    whole = lambda layout, carry, policy, tolerances, limit: loop_from(
-        layout, carry, policy, tolerances, options, length, limit
-    )
-    return _on_all(mesh, whole)(layout, carry, policy, tolerances, limit)
-
-
-def _on_all(mesh: Mesh, function: Callable[..., tuple[Carry, Any]]) -> Callable[..., tuple[Carry, Any]]:
-    """A function of a device's layout, a carry, and what is everywhere, on all devices."""
-
-    def on_one(layout: Layout, carry: Carry, *everywhere: Any) -> tuple[Carry, Any]:
-        carry, found = function(_own(layout), _divided(carry, lambda x: x[0]), *everywhere)
+    def on_one(layout: Layout, carry: Carry, policy: Any, tolerances: Tolerances, limit: Array) -> tuple[Carry, Any]:
+        given = _own(layout), _divided(carry, lambda x: x[0]), policy, tolerances, options
+        carry, found = loop_from(*given, length, limit) if length else iterate(*given, limit)
         return _divided(carry, lambda x: x[None]), found
 
     places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
-    return jax.shard_map(on_one, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
+    on_all = jax.shard_map(on_one, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
+    return on_all(layout, carry, policy, tolerances, limit)
