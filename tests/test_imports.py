@@ -16,7 +16,21 @@ import jaxba
 
 ORDER = (
     *("typing", "runtime", "problem", "structure", "model", "linear", "refinement", "lm", "methods", "damping"),
-    *("solver", "io", "scenes", "datasets", "viewer", "jaxba", "game", "training", "peers", "bench", "paper", "cli"),
+    *(
+        "solver",
+        "results",
+        "io",
+        "scenes",
+        "datasets",
+        "viewer",
+        "jaxba",
+        "game",
+        "training",
+        "peers",
+        "bench",
+        "paper",
+        "cli",
+    ),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
 

@@ -39,9 +39,9 @@ from jaxba.problem.options import (
     Rotation,
     Scaling,
 )
+from jaxba.results.alternation import solve_and_retriangulate
+from jaxba.results.covariance import covariance
 from jaxba.runtime.compilation import Compilation
-from jaxba.solver.alternation import solve_and_retriangulate
-from jaxba.solver.covariance import covariance
 from jaxba.solver.loop import IterationRecord, Watch
 from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions

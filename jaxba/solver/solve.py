@@ -61,7 +61,7 @@ class Solution(ArrayRecord):
     """Seconds for compilation; nearly zero if the compiled program was cached."""
 
     total_s: float
-    """Seconds for the iterations, and for retriangulations between them (solver/alternation.py)."""
+    """Seconds for the iterations, and for retriangulations between them (results/alternation.py)."""
 
     capacity: Capacity | None = None
     """Sizes to which the problem was padded; None if it was not."""

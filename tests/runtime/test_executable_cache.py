@@ -28,9 +28,9 @@ from jaxba import Loss, make_policy, register_pytree
 from jaxba.io import write_problem
 from jaxba.lm.step import try_step
 from jaxba.problem.options import Refinement, StepOptions
+from jaxba.results.retriangulate import retriangulate
 from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import ParallelCompilation, Stage, compile_and_run, program
-from jaxba.solver.retriangulate import retriangulate
 
 pytestmark = [
     pytest.mark.xla,
