@@ -22,7 +22,8 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.cost_model import choose_linear_solver, prices
+from jaxba.solver.choose import choose_linear_solver
+from jaxba.solver.cost_model import prices
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
