@@ -56,7 +56,7 @@ def problem_info(
     count = lambda n: jnp.asarray(n, jnp.int32)
     tracks = point_sum(layout, jnp.asarray(layout.slot_mask, state.cost.dtype)[None])
     observations, points = sum_over_devices(layout, (jnp.sum(layout.slot_mask), jnp.sum(tracks > 0)))
-    info = ProblemInfo(
+    return ProblemInfo(
         cost=state.cost,
         observations=count(observations),
         cameras=count(jnp.sum(layout.camera_seen)),
@@ -66,7 +66,6 @@ def problem_info(
         max_iterations=count(max_iterations),
         prices=Prices(*(jnp.asarray(x, state.cost.dtype) for x in prices)),
     )
-    return info
 
 
 def begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> Carry:
@@ -76,37 +75,6 @@ def begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> Carry:
     return Carry(state, policy_state, damping, count(0), count(Termination.RUNNING))
 
 
-def after_step(
-    policy: DampingPolicy,
-    policy_state: Any,
-    step: StepInfo,
-    iteration: Int[Array, ""],
-    tolerances: Tolerances,
-    max_iterations: Any,
-    partitions: Any = 1,
-) -> tuple[Any, Float[Array, ""], Int[Array, ""]]:
-    """The policy's update and the stopping rules after a step.
-
-    Args:
-        policy: the damping policy.
-        policy_state: its state before the step.
-        step: record of the iteration.
-        iteration: number of iterations so far, this one included.
-        tolerances: convergence tests.
-        max_iterations: limit of iterations.
-        partitions: number of random partitions (`layout.num_partitions`); with several, a step from the same state and
-            lambda differs from the one before.
-
-    Returns:
-        The next state of the policy, the next lambda, and the integer of a `Termination`.
-    """
-    after, damping = policy.propose(policy_state, step)
-    # same policy state and lambda after a rejection: the same step would be rejected forever
-    same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (policy_state, after)), strict=True)]
-    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping) & (jnp.asarray(partitions) == 1)
-    return after, damping, termination_of(step, stuck, iteration, tolerances, max_iterations)
-
-
 def advance(
     carry: Carry,
     state: Any,
@@ -114,14 +82,27 @@ def advance(
     policy: DampingPolicy,
     tolerances: Tolerances,
     max_iterations: Any,
-    partitions: Any,
+    partitions: Any = 1,
 ) -> Carry:
-    """The carry after a step. `state` is passed on unseen, and may be None; other arguments as for `after_step`."""
+    """The carry after a step: the policy's update, and the stopping rules.
+
+    Args:
+        carry: before the step.
+        state: after it; it is passed on unseen, and may be None.
+        step: record of the iteration.
+        policy: the damping policy.
+        tolerances: convergence tests.
+        max_iterations: limit of iterations.
+        partitions: number of random partitions (`layout.num_partitions`); with several, a step from the same state and
+            lambda differs from the one before.
+    """
     iteration = carry.iteration + 1
-    policy_state, damping, end = after_step(
-        policy, carry.policy, step, iteration, tolerances, max_iterations, partitions
-    )
-    return Carry(state, policy_state, damping, iteration, end)
+    after, damping = policy.propose(carry.policy, step)
+    # same policy state and lambda after a rejection: the same step would be rejected forever
+    same = [jnp.all(old == new) for old, new in zip(*map(jax.tree.leaves, (carry.policy, after)), strict=True)]
+    stuck = functools.reduce(jnp.logical_and, same, damping == step.damping) & (jnp.asarray(partitions) == 1)
+    end = termination_of(step, stuck, iteration, tolerances, max_iterations)
+    return Carry(state, after, damping, iteration, end)
 
 
 def iterate(
