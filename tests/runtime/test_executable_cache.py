@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib
 import json
 import os
 import pickle
@@ -320,7 +319,7 @@ def test_a_program_from_the_cache_of_jax_is_not_written(folder, tmp_path):
 
 
 def test_programs_of_both_levels_are_stored(folder, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("quick", 1),))
+    monkeypatch.setattr("jaxba.solver.stepwise.stages", lambda part, _: (Stage("quick", 1),))
     once = lambda: solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
     first = once()
     assert first.quick_iterations == 1
