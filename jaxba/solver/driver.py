@@ -37,8 +37,8 @@ class Driver:
 
     def __init__(self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock) -> None:
         self.setup, self.tolerances, self.clock = setup, tolerances, clock
-        self.limit = np.asarray(max_iterations, np.int32)  # a conversion by JAX is a program
-        self.length = max(MIN_LENGTH, 1 << max(0, max_iterations - 1).bit_length())
+        self.limit = np.asarray(max(1, max_iterations), np.int32)  # a conversion by JAX is a program
+        self.length = max(MIN_LENGTH, 1 << int(self.limit - 1).bit_length())
 
     def compile_s(self) -> float:
         """Seconds of compilation so far."""
@@ -84,7 +84,7 @@ class OnDevices(Driver):
         self._shards = shards
 
     def begin(self) -> LMState:
-        self.carry = self._shards.begin(self.setup.policy, np.maximum(self.limit, 1), self.setup.prices)
+        self.carry = self._shards.begin(self.setup.policy, self.limit, self.setup.prices)
         return jax.block_until_ready(self.carry.state)
 
     def _all(self) -> tuple[Carry, StepInfo]:
