@@ -24,7 +24,8 @@ from benchmarks.suite import LARGE_SCENES, real_problems
 from jaxba.bench.sources import sources
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
-from jaxba.solver.cost_model import SECONDS, Work, choose, work
+from jaxba.solver.choose import choose
+from jaxba.solver.cost_model import SECONDS, Work, work
 from jaxba.solver.names import parse_solver
 
 

@@ -35,10 +35,10 @@ from jaxba.refinement.candidates import first_search, has_repairs
 from jaxba.runtime import process
 from jaxba.runtime.compilation import Level, compiler_options, uses_older_emitters
 from jaxba.runtime.fusion import fast_compilation
-from jaxba.solver.candidate_loop import try_candidate
-from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import parse_solver
+from jaxba.solver.stepwise import try_candidate
 from jaxba.structure.layout import layout_for
 
 LONGEST = 10.0

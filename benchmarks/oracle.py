@@ -32,7 +32,7 @@ from jaxba.damping.learned import LearnedPolicy
 from jaxba.game.oracle import GRID, WIDTH
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
-from jaxba.solver.cost_model import choose_linear_solver
+from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.names import parse_solver
 from jaxba.structure.layout import layout_for
 

@@ -170,7 +170,7 @@ def iteration_seconds(problem: BundleProblem, repeats: int, method: str = "lm") 
 def _layout_seconds(problem: BundleProblem, repeats: int) -> float:
     """Median seconds on the host to make the layout for the linear solver that `auto` chooses."""
     from jaxba import StepOptions
-    from jaxba.solver.cost_model import choose_linear_solver
+    from jaxba.solver.choose import choose_linear_solver
     from jaxba.structure.layout import layout_for
 
     options = choose_linear_solver(problem, StepOptions(), "auto")

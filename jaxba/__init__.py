@@ -46,16 +46,17 @@ from jaxba.problem.measured import with_lens_priors, with_position_priors, with_
 from jaxba.problem.options import ConjugateGradients, Coordinates, Refinement, StepOptions
 from jaxba.problem.preprocess import drop_invalid, normalize, perturb, poba_start
 from jaxba.problem.rigs import Rigs
+from jaxba.results.alternation import solve_and_retriangulate
+from jaxba.results.covariance import Covariance, covariance
+from jaxba.results.derivatives import SolveInputs, differentiable_solve, inputs_of
+from jaxba.results.retriangulate import Retriangulation, retriangulate
 from jaxba.scenes import SceneConfig, random_scene, random_scene_with_truth, scene_like
-from jaxba.solver.alternation import solve_and_retriangulate
-from jaxba.solver.callback_loop import IterationRecord
-from jaxba.solver.covariance import Covariance, covariance
-from jaxba.solver.implicit import SolveInputs, differentiable_solve, inputs_of
-from jaxba.solver.loop import Carry, History, solve_loop
+from jaxba.solver.compiled import solve_loop
+from jaxba.solver.iteration import Carry
+from jaxba.solver.loop import IterationRecord
 from jaxba.solver.methods import METHODS, make_method
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Prepared, prepare
-from jaxba.solver.retriangulate import Retriangulation, retriangulate
 from jaxba.solver.solve import Solution, solve
 from jaxba.structure.layout import Layout, build_layout
 from jaxba.typing import register_pytree
@@ -80,7 +81,6 @@ __all__ = [
     "DampingPolicy",
     "Effort",
     "Geometric",
-    "History",
     "IterationRecord",
     "LMState",
     "Layout",

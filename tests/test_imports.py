@@ -16,8 +16,8 @@ import jaxba
 
 ORDER = (
     *("typing", "runtime", "problem", "structure", "model", "linear", "refinement", "lm", "damping", "solver"),
-    *("io", "settings", "scenes", "datasets", "viewer", "jaxba", "methods", "kitti", "game", "training", "peers"),
-    *("bench", "paper", "cli"),
+    *("results", "io", "settings", "scenes", "datasets", "viewer", "jaxba", "methods", "kitti", "game", "training"),
+    *("peers", "bench", "paper", "cli"),
 )
 """Rooms from bottom to top; `jaxba` is the package's own `__init__.py`. Each may import itself and all before it."""
 

@@ -25,7 +25,7 @@ from benchmarks import sac
 from benchmarks.phases import HEADING, bandwidth, measure, timed
 from jaxba.bench.sources import sources
 from jaxba.problem.options import Refinement, StepOptions
-from jaxba.solver.cost_model import choose
+from jaxba.solver.choose import choose
 from jaxba.solver.options import SolveOptions
 from jaxba.structure.layout import layout_for
 from jaxba.training.sac import SacConfig

@@ -169,7 +169,7 @@ def _episode_charts(episodes: Sequence[Episode]) -> list[Chart]:
             color, symbol = COLOURS[k % len(COLOURS)], page.SYMBOLS[MARKERS[k % len(MARKERS)]]
             numbers = [float(v) for v in y(one)]
             x = [i + starts for i in range(len(numbers))]
-            filled = [True] * (1 - starts) + [bool(ok) for ok in one.accepted]
+            filled = [True] * (1 - starts) + [bool(ok) for ok in one.steps.accepted]
             symbols = [symbol if ok else f"{symbol}-open" for ok in filled]
             traces.append(
                 {"x": x, "y": numbers, "name": f"scene {k + 1}", "mode": "lines+markers", "meta": ""}
@@ -181,9 +181,9 @@ def _episode_charts(episodes: Sequence[Episode]) -> list[Chart]:
 
     log = {"type": "log", "exponentformat": "power", "minorloglabels": "none"}
     return [
-        chart("damping λ", lambda one: one.damping, log, 1),
-        chart("embedded point iterations", lambda one: one.point_iterations, {"rangemode": "tozero"}, 1),
-        chart("repairs", lambda one: one.repairs, {"rangemode": "tozero"}, 1),
+        chart("damping λ", lambda one: one.steps.damping, log, 1),
+        chart("embedded point iterations", lambda one: one.steps.point_iterations, {"rangemode": "tozero"}, 1),
+        chart("repairs", lambda one: one.steps.repairs, {"rangemode": "tozero"}, 1),
         chart("price paid, in plain steps", lambda one: one.paid, {"rangemode": "tozero"}, 0),
         chart("cost (pixels²)", lambda one: one.cost, log, 0),
     ]

@@ -38,12 +38,12 @@ from jaxba.problem.options import (
     Rotation,
     Scaling,
 )
+from jaxba.results.alternation import solve_and_retriangulate
+from jaxba.results.covariance import covariance
 from jaxba.runtime.compilation import Compilation
 from jaxba.runtime.interrupt import Interrupt
 from jaxba.scenes import DEFAULT_SCENES, random_scene
-from jaxba.solver.alternation import solve_and_retriangulate
-from jaxba.solver.callback_loop import IterationRecord, Watch
-from jaxba.solver.covariance import covariance
+from jaxba.solver.loop import IterationRecord, Watch
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions

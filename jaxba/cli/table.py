@@ -17,11 +17,11 @@ from jaxba.problem.labels import part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK
+from jaxba.results.retriangulate import Retriangulation
 from jaxba.runtime.compilation import Part, compiler_options, stages
-from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.loop import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import split_refinement
-from jaxba.solver.retriangulate import Retriangulation
 from jaxba.solver.solve import Solution
 from jaxba.structure.padding import capacity_of
 

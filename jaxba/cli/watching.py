@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jaxba.cli import common, view
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.solver.callback_loop import Watch
+from jaxba.solver.loop import Watch
 
 
 class Watching:

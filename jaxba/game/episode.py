@@ -10,19 +10,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
+from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, worth_solving
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, Prices, StepInfo
-from jaxba.lm.step import lm_step, state_at
-from jaxba.lm.termination import converged_in_cost
+from jaxba.lm.step import state_at
+from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, for_traces
+from jaxba.solver.iteration import Carry, begin, iterate
 
 TRIES = 64
 """Scenes of which `draw` takes the first that is worth solving; 85% of the default class are."""
@@ -46,20 +47,8 @@ class Episode(NamedTuple):
     paid: Float[np.ndarray, " states"]
     """Price of all iterations so far (`Prices`), in plain steps."""
 
-    damping: Float[np.ndarray, " iterations"]
-    """Lambda of each iteration, one fewer than states."""
-
-    gain_ratio: Float[np.ndarray, " iterations"]
-    """Actual over predicted decrease."""
-
-    accepted: Bool[np.ndarray, " iterations"]
-    """Whether the step was accepted."""
-
-    point_iterations: Int[np.ndarray, " iterations"]
-    """Embedded point iterations of all candidates."""
-
-    repairs: Int[np.ndarray, " iterations"]
-    """Camera rounds, backtracking trials and pattern moves."""
+    steps: StepInfo
+    """Record of the iterations, one fewer than states."""
 
     converged: bool
     """Whether the convergence test ended it, and not the limit."""
@@ -136,20 +125,16 @@ def _played(
     ftol: Float[Array, ""],
 ) -> _Played:
     layout = with_scene(class_layout(kind, options), scene.pixels, scene.mask)
-    memory, damping = policy.init(info)
     start = state_at(scene.cameras, scene.points, initial, options)
 
-    def body(carry: Any, iteration: Array) -> tuple[Any, Any]:
-        state, memory, damping, live = carry
-        effort = effort_of(policy, memory)
-        after, step = lm_step(layout, state, damping, options, policy.min_gain, iteration, effort)
-        memory, damping = policy.propose(memory, step)
+    def body(loop: tuple[Carry, Array], _: None) -> tuple[Any, Any]:
+        carry, live = loop
+        carry, step = iterate(layout, carry, policy, Tolerances(), options, limit)
         ended = converged_in_cost(step, ftol)
-        return (after, memory, damping, live & ~ended), (after, step, live, ended)
+        return (carry, live & ~ended), (carry.state, step, live, ended)
 
-    _, (states, steps, live, ended) = lax.scan(
-        body, (start, memory, damping, jnp.asarray(True)), jnp.arange(limit, dtype=jnp.int32)
-    )
+    first = begin(info, policy, start), jnp.asarray(True)
+    _, (states, steps, live, ended) = lax.scan(body, first, length=limit)
     return _Played(start, states, steps, live, jnp.any(live & ended))
 
 
@@ -166,17 +151,12 @@ def _episode(kind: SceneClass, scene: Scenes, info: ProblemInfo, played: _Played
     problem = BundleProblem.create(
         all_cameras[0], all_points[0], pixels[:, cameras[camera], points[point]].T, camera, point
     )
-    own = lambda name: np.asarray(getattr(played.steps, name))[:count]
     return Episode(
         problem,
         all_cameras,
         all_points,
         whole(played.start.cost, played.steps.cost),
         np.concatenate([[0.0], np.cumsum(price)]),
-        own("damping"),
-        own("gain_ratio"),
-        own("accepted"),
-        own("point_iterations"),
-        own("repairs"),
+        jax.tree.map(lambda column: np.asarray(column)[:count], played.steps),
         bool(played.converged),
     )

@@ -16,15 +16,16 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping import DampingPolicy, effort_of
+from jaxba.damping import DampingPolicy
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.records import LMState, Prices, StepInfo
-from jaxba.lm.step import lm_step, state_at
-from jaxba.lm.termination import converged_in_cost
+from jaxba.lm.records import Prices, StepInfo
+from jaxba.lm.step import state_at
+from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, for_traces
+from jaxba.solver.iteration import Carry, begin, iterate
 
 T = TypeVar("T")
 
@@ -103,10 +104,7 @@ class Trajectories(NamedTuple):
 
 class _Lane(NamedTuple):
     scene: Int[Array, " lanes"]
-    state: LMState
-    policy: Any
-    damping: Float[Array, " lanes"]
-    iteration: Int[Array, " lanes"]
+    carry: Carry
 
 
 class _Loop(NamedTuple):
@@ -153,27 +151,25 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
     def fresh(scene: Int[Array, ""]) -> _Lane:
         at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)  # idle lanes repeat the last
         start = at(bank.scenes)
-        policy_state, damping = policy.init(at(bank.info))
         state = state_at(start.cameras, start.points, at(bank.initial_cost), options)
-        return _Lane(scene, state, policy_state, damping, jnp.zeros((), jnp.int32))
+        return _Lane(scene, begin(at(bank.info), policy, state))
 
     def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:
         row = jnp.minimum(lane.scene, count - 1)
         seen = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
-        effort = effort_of(policy, lane.policy)
-        state, step = lm_step(seen, lane.state, lane.damping, options, policy.min_gain, lane.iteration, effort)
-        policy_state, damping = policy.propose(lane.policy, step)
-        return _Lane(lane.scene, state, policy_state, damping, lane.iteration + 1), step
+        carry, step = iterate(seen, lane.carry, policy, Tolerances(), options, limit)
+        return _Lane(lane.scene, carry), step
 
     def body(loop: _Loop) -> _Loop:
         lane, step = step_groups(advance, loop.lane)
         row = jnp.minimum(lane.scene, count)  # idle lanes write to an extra row that is dropped
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, ftol)
-        done = converged | (lane.iteration >= limit)
-        costs = loop.costs.at[row, lane.iteration - 1].set(step.cost)
-        dampings = loop.dampings.at[row, lane.iteration - 1].set(step.damping)
+        iteration = lane.carry.iteration
+        done = converged | (iteration >= limit)
+        costs = loop.costs.at[row, iteration - 1].set(step.cost)
+        dampings = loop.dampings.at[row, iteration - 1].set(step.damping)
         prices = jax.tree.map(lambda x: x[jnp.minimum(lane.scene, count - 1)], bank.info.prices)
-        paid = loop.paid.at[row, lane.iteration - 1].set(jax.vmap(Prices.of)(prices, step).astype(loop.paid.dtype))
+        paid = loop.paid.at[row, iteration - 1].set(jax.vmap(Prices.of)(prices, step).astype(loop.paid.dtype))
         upcoming = loop.next_scene + jnp.cumsum(done) - 1
         new = jax.vmap(fresh)(upcoming.astype(jnp.int32))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
@@ -182,7 +178,7 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
             (loop.next_scene + jnp.sum(done)).astype(jnp.int32),
             costs,
             dampings,
-            loop.iterations.at[row].set(lane.iteration),
+            loop.iterations.at[row].set(iteration),
             loop.converged.at[row].set(converged),
             paid,
         )

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
+
+from jaxba.typing import differ, outline, same
 
 
 class LMState(NamedTuple):
@@ -25,7 +29,10 @@ class LMState(NamedTuple):
 
 
 class StepInfo(NamedTuple):
-    """Record of one iteration. A damping policy sees this and nothing else of the solve."""
+    """Record of one iteration. A damping policy sees this and nothing else of the solve.
+
+    That of all iterations of a solve has an array for each field, with an entry for each iteration.
+    """
 
     cost: Float[Array, ""]
     """Accepted cost after the iteration, pixels^2."""
@@ -80,6 +87,20 @@ class StepInfo(NamedTuple):
 
     point_iterations: Int[Array, ""]
     """Embedded point iterations of all candidates, as many as each might make."""
+
+    @classmethod
+    def stacked(cls, steps: Sequence[StepInfo]) -> StepInfo:
+        """The records of several iterations as one, of NumPy arrays."""
+        column = lambda name: np.array([getattr(step, name) for step in steps], KINDS.get(name, float))
+        columns: dict[str, Any] = {name: column(name) for name in cls._fields}
+        return cls(**columns)
+
+    __eq__, __ne__, __repr__, __hash__ = same, differ, outline, None  # pyright: ignore[reportAssignmentType]
+
+
+KINDS: dict[str, Any] = {"accepted": bool, "weightless": bool}
+KINDS |= dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), np.int32)
+"""Types of the fields of a record that are no floating point numbers."""
 
 
 class Prices(NamedTuple):

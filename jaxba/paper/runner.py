@@ -28,7 +28,7 @@ from jaxba.peers import require
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import LinearSolverChoice, StepOptions
 from jaxba.runtime import process
-from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.loop import IterationRecord
 from jaxba.solver.names import SolverName, SolverNameError, parse_solver
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.record import Record

@@ -134,7 +134,7 @@ class StepAcceptance:
     def bundle(self) -> BundleProblem:
         """The problem at the current state."""
         start = self.run.colmap.start
-        return Placed(start, np.zeros(3), start).after(self.layout, self.state, self.options)
+        return Placed(start, np.zeros(3), start).after(self.layout, self.layout.points, self.state, self.options)
 
 
 @functools.partial(jit, static_argnames="options")

@@ -20,9 +20,8 @@ from jaxba.peers.colmap import SMALLEST_DEPTH, pyceres
 from jaxba.peers.colmap_problem import ColmapProblem
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.solver.callback_loop import IterationRecord
 from jaxba.solver.diagnosis import explain_start
-from jaxba.solver.loop import History
+from jaxba.solver.loop import IterationRecord
 from jaxba.solver.names import INNER
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution
@@ -132,7 +131,7 @@ class Run:
             iterations=len(self.steps),
             accepted=accepted,
             termination=termination,
-            history=History(*(np.array([getattr(step, name) for step in self.steps]) for name in History._fields)),
+            history=StepInfo.stacked(self.steps),
             linear_solver=linear_solver,
             setup_s=self.setup_s,
             compile_s=compile_s,

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.damping import DampingPolicy, ProblemInfo
-from jaxba.lm.records import StepInfo
+from jaxba.lm.records import KINDS, StepInfo
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.peers.acceptance import ReportedByCeres, StepAcceptance
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
@@ -28,7 +28,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.loop import after_step
+from jaxba.solver.iteration import Carry, advance, begin
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.solve import Solution
 
@@ -39,8 +39,7 @@ REJECTED_DAMPING_FRACTION = 0.0
 """Assumed `damping_fraction` of a rejected step, which Ceres does not return. Steps are rejected for too little
 damping, so that it is near 0: for jaxba's own steps it was 0.0003 to 0.006 on Ladybug-49 and kittistereo00s."""
 
-_after_step = jit(after_step)
-_init = jit(lambda policy, info: policy.init(info))
+_advance, _begin = jit(advance), jit(begin)
 
 
 class _SummaryRecorder(pyceres.IterationCallback):
@@ -109,7 +108,8 @@ def drive_ceres(
     options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
     with numerics(np.float64), CompileClock() as clock:
         started = time.perf_counter()
-        state, damping = _init(policy, _problem_info(problem, run.initial_cost, max_iterations))
+        carry = _begin(_problem_info(problem, run.initial_cost, max_iterations), policy, None)
+        damping = float(carry.damping)
         # everything is compiled before the clock starts
         same = run.colmap.parameters()
         if embedded is None:
@@ -118,20 +118,19 @@ def drive_ceres(
             iterate = functools.partial(_iterate_under_ceres_rule, run, options, recorder.summaries, observations, mode)
         else:
             acceptance = StepAcceptance(run, embedded, policy.min_gain)
-            jax.block_until_ready(acceptance.evaluate(same, float(damping), ReportedByCeres.empty()))
+            jax.block_until_ready(acceptance.evaluate(same, damping, ReportedByCeres.empty()))
             iterate = functools.partial(_iterate_under_jaxba_rule, run, options, recorder.summaries, acceptance, mode)
-        null_step = _null_step(run.cost, float(damping))
+        null_step = _null_step(run.cost, damping)
         # twice, since the state that a policy returns may differ in type from its initial state
-        warm, _, _ = _update_policy(policy, state, null_step, 1, tolerances, max_iterations)
-        jax.block_until_ready(_update_policy(policy, warm, null_step, 1, tolerances, max_iterations))
+        warm = _after_step(policy, carry, null_step, tolerances, max_iterations)
+        jax.block_until_ready(_after_step(policy, warm, null_step, tolerances, max_iterations))
         run.setup_s += max(0.0, time.perf_counter() - started - clock.seconds)
         run.start()
-        end, iteration = Termination.RUNNING, 0
+        end = Termination.RUNNING
         while end == Termination.RUNNING:
-            iteration += 1
-            step = iterate(float(damping))
-            state, damping, answer = _update_policy(policy, state, step, iteration, tolerances, max_iterations)
-            end = Termination(int(answer))
+            step = iterate(float(carry.damping))
+            carry = _after_step(policy, carry, step, tolerances, max_iterations)
+            end = Termination(int(carry.termination))
             if run.record(step) and end == Termination.RUNNING:
                 end = Termination.STOPPED
     return run.solution(end, mode, clock.seconds)
@@ -196,15 +195,11 @@ def _null_step(cost: float, damping: float, gradient_max: float = np.nan) -> Ste
     return step_info(cost, damping, gradient_max=gradient_max, **fields)
 
 
-def _update_policy(
-    policy: DampingPolicy, state: Any, step: StepInfo, iteration: int, tolerances: Any, limit: int
-) -> Any:
-    """`after_step` with all arguments as arrays of fixed types, so that it is compiled once."""
-    kinds = {"accepted": np.bool_, "weightless": np.bool_}
-    kinds |= dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), np.int32)
-    arrays = StepInfo(**{k: jnp.asarray(x, kinds.get(k, np.float64)) for k, x in step._asdict().items()})
+def _after_step(policy: DampingPolicy, carry: Carry, step: StepInfo, tolerances: Any, limit: int) -> Carry:
+    """`advance` with all arguments as arrays of fixed types, so that it is compiled once."""
+    arrays = StepInfo(**{k: jnp.asarray(x, KINDS.get(k, float)) for k, x in step._asdict().items()})
     limits = Tolerances(*(np.float64(x) for x in tolerances))
-    return _after_step(policy, state, arrays, np.int32(iteration), limits, np.int32(limit))
+    return _advance(carry, None, arrays, policy, limits, np.int32(limit))
 
 
 def _problem_info(problem: BundleProblem, cost: float, max_iterations: int) -> ProblemInfo:

@@ -1,1 +1,1 @@
-"""A complete solve: preparation, choice of the linear solver, the loop, retriangulation, solver names."""
+"""A complete solve: preparation, choice of the linear solver, the loop, solver names."""

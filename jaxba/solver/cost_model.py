@@ -1,4 +1,4 @@
-"""Choice of the solver of the reduced camera system, by a cost model with measured constants.
+"""Predicted time and memory of an iteration with each solver of the reduced camera system, from measured constants.
 
 The time of an iteration is a sum of amounts of work (observations, pairs, cubes of unknowns, ...) times fitted seconds
 per unit. Only ratios matter for the choice, and they differ little between machines.
@@ -6,18 +6,14 @@ per unit. Only ratios matter for the choice, and they differ little between mach
 
 from __future__ import annotations
 
-import os
-from dataclasses import replace
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
-from jaxba.lm.method import check_plain
 from jaxba.lm.records import Prices
-from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.problem.options import LinearSolver, LinearSolverChoice, StepOptions
+from jaxba.problem.options import StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.camera_ordering import camera_order, is_banded
 from jaxba.structure.density import has_dense_shape, has_small_capacitance
@@ -242,94 +238,6 @@ def count_pairs(problem: BundleProblem, observations: ObservationOrder | None = 
     return PairCounts(pairs, len(rows), camera_order(rows, columns, cameras)[1])
 
 
-def choose(problem: BundleProblem, observations: ObservationOrder | None = None) -> LinearSolver:
-    """The linear solver with the lowest predicted time to convergence. Arguments as for `work`."""
-    times = {
-        name: time if name == "explicit" else INEXACT_ITERATIONS * time
-        for name, time in predict(problem, observations)._asdict().items()
-    }
-    return min(times, key=lambda name: times[name])  # type: ignore[return-value]
-
-
-def choose_linear_solver(
-    problem: BundleProblem,
-    options: StepOptions,
-    asked: LinearSolverChoice,
-    observations: ObservationOrder | None = None,
-    devices: int = 1,
-) -> StepOptions:
-    """The step options with the requested linear solver.
-
-    Args:
-        problem: determines the choice of `auto`.
-        options: options of the step.
-        asked: `auto` or a name. Methods have their own solver.
-        observations: the sorted observations of the problem, if they are known already.
-        devices: among which observations are divided.
-
-    Raises:
-        ProblemError: a method is asked for that does not support the problem; or a step needs more memory than the
-            device or the machine has.
-    """
-    _check_device_memory(problem, devices)
-    if options.method:
-        lenses = problem.lenses
-        shared = lenses is not None and lenses.shared and np.asarray(lenses.free).any()
-        check_plain(
-            options,
-            ProblemError,
-            rigs=problem.rigs is not None,
-            shared_lenses=bool(shared) and options.intrinsics == "free",
-            priors=problem.priors is not None,
-        )
-        return options
-    if asked == "auto":
-        return replace(options, linear_solver=choose(problem, observations))  # `choose` respects MAX_BYTES
-    if asked == "explicit":
-        _check_memory(problem, observations)
-    return replace(options, linear_solver=asked)
-
-
-def device_memory() -> float | None:
-    """Bytes of memory of the default device, if it has its own."""
-    device = jax.local_devices()[0]
-    stats = None if device.platform == "cpu" else device.memory_stats()
-    return None if not stats else float(stats.get("bytes_limit", 0)) or None
-
-
-def _check_device_memory(problem: BundleProblem, devices: int) -> None:
-    """Raises a `ProblemError` if the observations alone do not fit the memory of a GPU, whatever the linear solver."""
-    available = device_memory()
-    needed = 0.5 * BYTES_PER_OBSERVATION * problem.num_observations / devices  # in float32
-    if available is not None and needed > available:
-        raise ProblemError(
-            f"{problem.num_observations} observations take {2 * needed / 1e9:.1f} GB of a device in float64 and "
-            f"{needed / 1e9:.1f} in float32, more than its {available / 1e9:.1f} GB: "
-            "divide them among more (--devices) or take the CPU (--device cpu)"
-        )
-
-
-def _check_memory(problem: BundleProblem, observations: ObservationOrder | None) -> None:
-    """Raises a `ProblemError` if a factorisation needs more memory than the machine has."""
-    try:
-        available = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return
-    width = _width(problem)
-    observations = observations or ObservationOrder.of(problem)
-    most = observations.num_pairs
-    needed = DENSE_MATRICES * 8.0 * (width * problem.num_cameras) ** 2
-    needed += _bytes_of_blocks(PairCounts(most, min(most, problem.num_cameras**2), 0), width)
-    if needed > available:  # an upper bound: count blocks and look for a band
-        counts = count_pairs(problem, observations)
-        needed = _factoring(observations, counts, _bytes_of_blocks(counts, width), width, problem.rigs is not None)[1]
-    if needed > available:
-        raise ProblemError(
-            f"{problem.num_cameras} cameras take some {needed / 1e9:.0f} GB to "
-            f"solve by a factorisation, more than the {available / 1e9:.0f} GB of this machine"
-        )
-
-
 def _bytes_of_blocks(counts: PairCounts, width: int) -> float:
     """Memory of the blocks and of the index arrays that form them."""
     return counts.pairs * BYTES_PER_PAIR + counts.blocks * MATRICES_PER_BLOCK * 8.0 * width**2
@@ -341,3 +249,16 @@ def _width(problem: BundleProblem) -> int:
     extrinsics = 0 if rigs is None or rigs.free is None else EXTRINSICS_SIZE
     own = CAMERA_SIZE if lenses is None else POSE_SIZE + int(np.asarray(lenses.free).any(axis=0).sum())
     return own + extrinsics
+
+
+def most_bytes(problem: BundleProblem, observations: ObservationOrder) -> float:
+    """Upper bound of the memory of a factorisation."""
+    width, most = _width(problem), observations.num_pairs
+    blocks = _bytes_of_blocks(PairCounts(most, min(most, problem.num_cameras**2), 0), width)
+    return DENSE_MATRICES * 8.0 * (width * problem.num_cameras) ** 2 + blocks
+
+
+def factoring_bytes(problem: BundleProblem, observations: ObservationOrder) -> float:
+    """Memory of a factorisation."""
+    width, counts = _width(problem), count_pairs(problem, observations)
+    return _factoring(observations, counts, _bytes_of_blocks(counts, width), width, problem.rigs is not None)[1]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxba.solver.loop import History
+from jaxba.lm.records import StepInfo
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -17,7 +17,7 @@ COLOURS = ("#000000", "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#5
 COST, DAMPING, REJECTED = COLOURS[1], COLOURS[2], COLOURS[-1]
 
 
-def plot_history(history: History, initial_cost: float) -> Figure:
+def plot_history(history: StepInfo, initial_cost: float) -> Figure:
     """Cost above and lambda below, over the iterations, on logarithmic axes; steps that were rejected are grey.
 
     Args:

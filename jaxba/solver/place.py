@@ -21,6 +21,7 @@ from jaxba.runtime import process
 from jaxba.runtime.numerics import refuse_traces
 from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout
+from jaxba.typing import AnyArray
 
 NOBODY = np.zeros(0, int)
 """No cameras."""
@@ -38,12 +39,15 @@ class Placed(NamedTuple):
     here: BundleProblem
     """The same problem near the origin, `in_frames` if it has rigs."""
 
-    def after(self, layout: Layout, state: LMState, options: StepOptions) -> BundleProblem:
+    def after(
+        self, layout: Layout, order: Int[AnyArray, " points"], state: LMState, options: StepOptions
+    ) -> BundleProblem:
         """The counted problem with the parameters of a state; what was not optimised is copied exactly.
 
         Args:
-            layout: of `here`.
-            state: parameters in layout order; points of several shards one shard after the other.
+            layout: of `here`, or of a shard of it.
+            order: the point of the problem at each position of `state.points`.
+            state: parameters in layout order.
             options: whether intrinsics were fixed.
         """
         problem = shift(self.counted, -self.offset)
@@ -65,7 +69,7 @@ class Placed(NamedTuple):
             cameras[:, 6:] = np.where(np.asarray(lenses.free)[lens], cameras[:, 6:], problem.cameras[:, 6:])
         if rigs is not None:
             cameras = with_unseen_of_frames(rigs, cameras, seen)
-        order = np.asarray(layout.points)
+        order = np.asarray(order)
         real = order < problem.num_points
         points[order[real]] = items_first(np.asarray(state.points, np.float64))[real]
         found, constants = problem.replace(cameras=cameras, points=points, rigs=rigs), problem.constants

@@ -22,7 +22,8 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.cost_model import choose_linear_solver, prices
+from jaxba.solver.choose import choose_linear_solver
+from jaxba.solver.cost_model import prices
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
@@ -58,7 +59,7 @@ class Setup(ArrayRecord):
     """The problem that is solved, where it is computed."""
 
     layout: Layout
-    """Observations and index arrays, on the device; of shards that of the first one, with the points of all."""
+    """Observations and index arrays, on the device; of shards that of the first one."""
 
     options: StepOptions
     """Step options, with the chosen linear solver; static and hashable."""
@@ -97,7 +98,8 @@ class Setup(ArrayRecord):
     def problem_at(self, state: LMState) -> BundleProblem:
         """The problem with the parameters of a state, as NumPy float64; what is not optimised is copied exactly."""
         points = np.moveaxis(distributed.to_host(state.points), -2, 0).reshape(3, -1)  # of several shards
-        found = self.placed.after(self.layout, state._replace(points=points), self.options)
+        order = self.layout.points if self.shards is None else self.shards.order
+        found = self.placed.after(self.layout, order, state._replace(points=points), self.options)
         return self.problem.replace(cameras=found.cameras, points=found.points, rigs=found.rigs)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import jax
@@ -27,7 +26,8 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.jit import jit
-from jaxba.solver.loop import Carry, History, begin, iterate, loop_from, problem_info
+from jaxba.solver.compiled import loop_from
+from jaxba.solver.iteration import Carry, begin, iterate, problem_info
 from jaxba.structure.devices import AXIS
 from jaxba.structure.layout import Layout
 from jaxba.structure.shards import deal_points, shard_of, sharded_layout
@@ -46,7 +46,10 @@ class Shards:
     """Layouts of all shards, of equal shapes, along a leading axis that is divided among the devices."""
 
     first: Layout
-    """The layout of this process's first shard, on the host, with the points of all shards one after the other."""
+    """The layout of this process's first shard, on the host."""
+
+    order: Int[np.ndarray, " points"]
+    """The point of the problem at each position of all shards in layout order; the number of points for padding."""
 
     def __init__(
         self, problem: BundleProblem, options: StepOptions, devices: Sequence[jax.Device], dtype: np.dtype[Any]
@@ -71,11 +74,10 @@ class Shards:
             raise ProblemError(f"{len(devices)} devices are more than there are observed points")
         own = [shard_of(problem, points) for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
         layouts = sharded_layout(own, options, distributed.gather)
-        self.layout = self._placed(layouts)
+        self.layout, self.first = self._placed(layouts), layouts[0]
         here = [points for points, device in zip(dealt, devices, strict=True) if _is_here(device)]
         orders = [_order(layout, points, problem) for layout, points in zip(layouts, here, strict=True)]
-        order = distributed.to_host(self._placed(orders)).reshape(-1)
-        self.first = replace(layouts[0], points=order)
+        self.order = distributed.to_host(self._placed(orders)).reshape(-1)
         known = np.append(np.asarray(problem.points, dtype), np.zeros((1, 3), dtype), axis=0)
         self._points = self._placed([np.ascontiguousarray(known[order].T) for order in orders])
         cameras = np.ascontiguousarray(np.asarray(problem.cameras, dtype).T)
@@ -99,17 +101,11 @@ class Shards:
         return _begin(*given, mesh=self._mesh, options=self._options)
 
     def run(
-        self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""], length: int
-    ) -> tuple[Carry, History]:
-        """The whole loop; histories have the given length."""
+        self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""], length: int = 0
+    ) -> tuple[Carry, StepInfo]:
+        """The whole loop, with a record of the given length; without a length one iteration."""
         given = self.layout, carry, policy, tolerances, limit
         return _run(*given, mesh=self._mesh, options=self._options, length=length)
-
-    def iterate(
-        self, carry: Carry, policy: DampingPolicy, tolerances: Tolerances, limit: Int[np.ndarray, ""]
-    ) -> tuple[Carry, StepInfo]:
-        """One iteration."""
-        return _iterate(self.layout, carry, policy, tolerances, limit, mesh=self._mesh, options=self._options)
 
 
 def _is_here(device: jax.Device) -> bool:
@@ -153,21 +149,6 @@ def _begin(
     return on_all(layout, cameras, points, policy, limit, prices)
 
 
-@functools.partial(jit, static_argnames=("mesh", "options"))
-def _iterate(
-    layout: Layout,
-    carry: Carry,
-    policy: DampingPolicy,
-    tolerances: Tolerances,
-    limit: Int[Array, ""],
-    *,
-    mesh: Mesh,
-    options: StepOptions,
-) -> tuple[Carry, StepInfo]:
-    one = lambda layout, carry, policy, tolerances, limit: iterate(layout, carry, policy, tolerances, options, limit)
-    return _on_all(mesh, one)(layout, carry, policy, tolerances, limit)
-
-
 @functools.partial(jit, static_argnames=("mesh", "options", "length"))
 def _run(
     layout: Layout,
@@ -179,19 +160,12 @@ def _run(
     mesh: Mesh,
     options: StepOptions,
     length: int,
-) -> tuple[Carry, History]:
-    whole = lambda layout, carry, policy, tolerances, limit: loop_from(
-        layout, carry, policy, tolerances, options, length, limit
-    )
-    return _on_all(mesh, whole)(layout, carry, policy, tolerances, limit)
-
-
-def _on_all(mesh: Mesh, function: Callable[..., tuple[Carry, Any]]) -> Callable[..., tuple[Carry, Any]]:
-    """A function of a device's layout, a carry, and what is everywhere, on all devices."""
-
-    def on_one(layout: Layout, carry: Carry, *everywhere: Any) -> tuple[Carry, Any]:
-        carry, found = function(_own(layout), _divided(carry, lambda x: x[0]), *everywhere)
+) -> tuple[Carry, StepInfo]:
+    def on_one(layout: Layout, carry: Carry, policy: Any, tolerances: Tolerances, limit: Array) -> tuple[Carry, Any]:
+        given = _own(layout), _divided(carry, lambda x: x[0]), policy, tolerances, options
+        carry, found = loop_from(*given, length, limit) if length else iterate(*given, limit)
         return _divided(carry, lambda x: x[None]), found
 
     places = _DIVIDED, _CARRY, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
-    return jax.shard_map(on_one, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
+    on_all = jax.shard_map(on_one, mesh=mesh, in_specs=places, out_specs=(_CARRY, _EVERYWHERE), check_vma=False)
+    return on_all(layout, carry, policy, tolerances, limit)

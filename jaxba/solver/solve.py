@@ -1,43 +1,28 @@
-"""`solve`: bundle adjustment of a problem with a damping policy, until convergence.
-
-Without a callback and with full optimisation the loop is one compiled program (solver/loop.py). Otherwise the same
-iterations are run from Python (solver/callback_loop.py).
-"""
+"""`solve`: bundle adjustment of a problem with a damping policy, until convergence."""
 
 from __future__ import annotations
 
-import functools
-import sys
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
-from jaxba.lm.termination import Termination, Tolerances
+from jaxba.lm.records import StepInfo
+from jaxba.lm.termination import Termination
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.options import StepOptions
 from jaxba.runtime import process
-from jaxba.runtime.compilation import CompileClock, Stage, compile_and_run, compiler_options, stages
 from jaxba.runtime.numerics import numerics
-from jaxba.solver.callback_loop import IterationRecord, Run, Watch, parts_of, run_stepwise
 from jaxba.solver.diagnosis import cost_of_rounding
-from jaxba.solver.loop import Carry, History, history_of, solve_loop
+from jaxba.solver.loop import Callback, Watch, run
 from jaxba.solver.options import SolveOptions, checked_options
-from jaxba.solver.prepare import DEFAULT_POLICY, Setup, set_up
+from jaxba.solver.prepare import DEFAULT_POLICY, set_up
 from jaxba.structure.padding import Capacity
 from jaxba.typing import ArrayRecord
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-MIN_HISTORY = 128
-"""Smallest length of the histories of the compiled loop, so that all lower limits use one program; larger limits are
-rounded up to a power of two."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,8 +48,8 @@ class Solution(ArrayRecord):
     termination: Termination
     """Why it ended; `termination.converged` is true for a success."""
 
-    history: History
-    """Records of the iterations, arrays of length `iterations`."""
+    history: StepInfo
+    """Record of the iterations, arrays of length `iterations`."""
 
     linear_solver: str
     """Name of the linear solver, or of the method that replaced it."""
@@ -76,7 +61,7 @@ class Solution(ArrayRecord):
     """Seconds for compilation; nearly zero if the compiled program was cached."""
 
     total_s: float
-    """Seconds for the iterations, and for retriangulations between them (solver/alternation.py)."""
+    """Seconds for the iterations, and for retriangulations between them (results/alternation.py)."""
 
     capacity: Capacity | None = None
     """Sizes to which the problem was padded; None if it was not."""
@@ -104,7 +89,7 @@ def solve(
     policy: str | DampingPolicy = DEFAULT_POLICY,
     options: SolveOptions | None = None,
     *,
-    callback: Callable[[IterationRecord], bool | None] | None = None,
+    callback: Callback | None = None,
     watch: Watch | None = None,
 ) -> Solution:
     """Minimises the reprojection cost over cameras and points.
@@ -149,44 +134,31 @@ def solve_without(
     policy: str | DampingPolicy,
     options: SolveOptions | None,
     *,
-    callback: Callable[[IterationRecord], bool | None] | None,
+    callback: Callback | None,
     watch: Watch | None,
 ) -> Solution:
     """`solve` where it is known which images face away; None: it is not."""
     options = checked_options(options)
     setup = set_up(problem, policy, options, away)
-    problem = setup.placed.counted
+    counted = setup.placed.counted
     with numerics(setup.dtype):
-        stages_of_parts = _stages(options.compilation, problem, setup.options)
-        run = functools.partial(
-            run_stepwise, callback=callback or (lambda _: None), stages=stages_of_parts, watch=watch
-        )
-        if callback is None and watch is None and not any(stages_of_parts.values()):
-            run = _run_compiled
-        if setup.shards is not None:
-            run = functools.partial(_run_sharded, callback=callback, watch=watch)
-        if options.max_iterations == 0:
-            run = _run_nothing
-        carry, history, initial_cost, quick_iterations, compile_s, total_s = run(
-            setup, options.tolerances, options.max_iterations
+        state, steps, termination, initial_cost, quick_iterations, compile_s, total_s = run(
+            setup, options, callback, watch
         )
         if compile_s > 0:
             process.release_programs()  # see above: too many programs end a process
-        count = int(carry.iteration)
-        history = History(*(np.asarray(field)[:count] for field in history))
-        final_cost = float(carry.state.cost)
-        termination = Termination(int(carry.termination))
+        count, final_cost = len(steps.cost), float(state.cost)
         gave_up = termination in (Termination.DAMPING_LIMIT, Termination.STALLED)
-        if gave_up and final_cost <= cost_of_rounding(problem, setup.dtype):
+        if gave_up and final_cost <= cost_of_rounding(counted, setup.dtype):
             termination = Termination.ROUNDING
         return Solution(
-            problem=setup.problem_at(carry.state) if count else _unchanged(problem),
+            problem=setup.problem_at(state) if count else _unchanged(counted),
             initial_cost=initial_cost,
             final_cost=final_cost,
             iterations=count,
-            accepted=int(np.sum(history.accepted)),
+            accepted=int(np.sum(steps.accepted)),
             termination=termination,
-            history=history,
+            history=steps,
             linear_solver=setup.options.solver_name,
             setup_s=setup.setup_s,
             compile_s=compile_s,
@@ -201,84 +173,3 @@ def _unchanged(problem: BundleProblem) -> BundleProblem:
     """The problem itself, its parameters as NumPy float64."""
     cameras, points = (np.asarray(one, np.float64) for one in (problem.cameras, problem.points))
     return problem.replace(cameras=cameras, points=points)
-
-
-def _stages(compilation: str, problem: BundleProblem, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
-    """The stages of compilation of each part of a step, before it is fully optimised."""
-    parts = parts_of(options)
-    if compilation == "full" or not compiler_options("quick"):
-        return dict.fromkeys(parts, ())
-    if compilation == "quick":
-        return dict.fromkeys(parts, (Stage("quick", sys.maxsize),))
-    return {name: stages(part, problem.num_observations) for name, part in parts.items()}
-
-
-def _run_sharded(
-    setup: Setup,
-    tolerances: Tolerances,
-    max_iterations: int,
-    *,
-    callback: Callable[[IterationRecord], bool | None] | None,
-    watch: Watch | None,
-) -> Run:
-    """Runs the loop on several devices: as one program, or an iteration at a time for a callback."""
-    assert setup.shards is not None
-    started = time.perf_counter()
-    limit = np.asarray(max_iterations, np.int32)
-    history: Any = None
-    with CompileClock() as clock:
-        carry = jax.block_until_ready(setup.shards.begin(setup.policy, limit, setup.prices))
-        initial_cost = float(carry.state.cost)
-        setup.check_cost(carry.state)
-        if callback is None and watch is None:
-            length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
-            found = setup.shards.run(carry, setup.policy, tolerances, limit, length)
-            carry, history = jax.block_until_ready(found)
-        else:
-            records = []
-            while int(carry.termination) == Termination.RUNNING:
-                carry, step = setup.shards.iterate(carry, setup.policy, tolerances, limit)
-                step = jax.device_get(step)
-                records.append(history_of(step))
-                time_s = time.perf_counter() - started - clock.seconds
-                record = IterationRecord(len(records), time_s, jax.tree.map(lambda x: x.item(), step))
-                if watch is not None:
-                    began = time.perf_counter()
-                    watch(record, functools.partial(setup.problem_at, carry.state))
-                    started += time.perf_counter() - began
-                if callback is not None and callback(record) and int(carry.termination) == Termination.RUNNING:
-                    carry = carry._replace(termination=np.asarray(Termination.STOPPED, np.int32))
-            history = jax.tree.map(lambda *rows: np.stack(rows), *records)
-    total_s = time.perf_counter() - started - clock.seconds
-    return Run(carry, history, initial_cost, 0, clock.seconds, total_s)
-
-
-def _run_nothing(setup: Setup, tolerances: Tolerances, max_iterations: int) -> Run:
-    """Runs no iteration: computes the cost of the start."""
-    started = time.perf_counter()
-    with CompileClock() as clock:
-        if setup.shards is None:
-            state = jax.block_until_ready(setup.initial(compile_and_run))
-        else:
-            state = setup.shards.begin(setup.policy, np.asarray(1, np.int32), setup.prices).state
-        setup.check_cost(state)
-    nothing = History(*(np.empty(0, setup.dtype) for _ in History._fields))
-    history = nothing._replace(accepted=np.empty(0, bool), cg_iterations=np.empty(0, np.int32))
-    counts = np.asarray(0, np.int32), np.asarray(Termination.MAX_ITERATIONS, np.int32)
-    carry = Carry(state, None, *jax.device_put((np.asarray(np.nan, setup.dtype), *counts)))
-    total_s = time.perf_counter() - started - clock.seconds
-    return Run(carry, history, float(state.cost), 0, clock.seconds, total_s)
-
-
-def _run_compiled(setup: Setup, tolerances: Tolerances, max_iterations: int) -> Run:
-    """Runs the loop as one optimised program."""
-    started = time.perf_counter()
-    with CompileClock() as clock:
-        state = jax.block_until_ready(setup.initial(compile_and_run))
-        setup.check_cost(state)
-        length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
-        limit = np.asarray(max_iterations, np.int32)  # a conversion by JAX is a program
-        result = solve_loop(setup.layout, state, setup.policy, tolerances, setup.options, length, limit, setup.prices)
-        carry, history = jax.block_until_ready(result)
-    total_s = time.perf_counter() - started - clock.seconds
-    return Run(carry, history, float(state.cost), 0, clock.seconds, total_s)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.solver.callback_loop import IterationRecord
+from jaxba.solver.loop import IterationRecord
 from jaxba.viewer.panel import Viewer
 from jaxba.viewer.recording import Recorder
 

@@ -29,9 +29,9 @@ def test_an_episode_is_that_of_the_bank_and_its_parameters_have_its_costs():
     for scene in range(3):
         one = replay(KIND, bank, scene, policy, options, LIMIT)
         count = int(runs.iterations[scene])
-        assert len(one.damping) == count == len(one.cost) - 1
+        assert len(one.steps.damping) == count == len(one.cost) - 1
         np.testing.assert_allclose(one.cost, runs.costs[scene, : count + 1], rtol=1e-9)
-        np.testing.assert_allclose(one.damping, runs.dampings[scene, :count], rtol=1e-9)
+        np.testing.assert_allclose(one.steps.damping, runs.dampings[scene, :count], rtol=1e-9)
         np.testing.assert_allclose(one.paid, runs.paid[scene, : count + 1])
         assert one.converged == runs.converged[scene]
         assert one.problem.num_observations == problem_of(KIND, bank.scenes, scene).num_observations

@@ -12,7 +12,7 @@ import pytest
 from support import arrays, tiny
 
 from jaxba import BundleProblem, Constants, Lenses, ProblemError, hold, inputs_of, make_policy
-from jaxba.solver.loop import History
+from jaxba.lm.records import StepInfo
 
 NAMES = ("cameras", "points", "observations", "camera_index", "point_index")
 
@@ -60,7 +60,7 @@ def test_problems_are_equal_where_all_their_arrays_are():
 
 
 def test_nan_is_equal_to_nan():
-    history = History(*[np.array([1.0, np.nan])] * len(History._fields))
+    history = StepInfo(*[np.array([1.0, np.nan])] * len(StepInfo._fields))
     assert history == copy.deepcopy(history)
     assert history != history._replace(cost=np.array([2.0, np.nan]))
 
@@ -69,7 +69,7 @@ def shown() -> dict[str, object]:
     problem = hold(tiny(), poses=[0], numbers=["k1"])
     assert isinstance(problem.lenses, Lenses)
     assert isinstance(problem.constants, Constants)
-    history = History(*[np.arange(9.0)] * len(History._fields))
+    history = StepInfo(*[np.arange(9.0)] * len(StepInfo._fields))
     policy = make_policy("learned")
     return {"problem": problem, "inputs": inputs_of(problem), "history": history, "policy": policy} | {
         field.name: getattr(problem, field.name) for field in dataclasses.fields(problem)[6:8]

@@ -22,11 +22,11 @@ from jaxba import (
 )
 from jaxba.cli.solve import run
 from jaxba.cli.table import remarks
+from jaxba.lm.records import StepInfo
 from jaxba.problem import geometry
 from jaxba.problem.camera_models import CAMERA_MODELS
 from jaxba.problem.facing import facing_away, views_behind
 from jaxba.problem.labels import Labels, part_names
-from jaxba.solver.loop import History
 
 BACK = np.diag([-1.0, 1.0, -1.0])
 """Half a turn about the y axis of a camera."""
@@ -52,7 +52,7 @@ def unseen(problem: BundleProblem, image: int) -> BundleProblem:
 
 def unmoved(problem: BundleProblem) -> Solution:
     """A solve without an iteration."""
-    nothing = History(*[np.zeros(0)] * len(History._fields))
+    nothing = StepInfo(*[np.zeros(0)] * len(StepInfo._fields))
     return Solution(problem, 0.0, 0.0, 0, 0, Termination.MAX_ITERATIONS, nothing, "explicit", 0.0, 0.0, 0.0)
 
 

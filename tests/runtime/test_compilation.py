@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import time
 from typing import get_args
 
@@ -32,7 +31,7 @@ from jaxba.runtime.compilation import (
     program,
     stages,
 )
-from jaxba.solver.candidate_loop import try_step_by_parts
+from jaxba.solver.stepwise import try_step_by_parts
 
 pytestmark = pytest.mark.step
 
@@ -103,9 +102,7 @@ def test_a_solve_compiled_at_level_quick_is_the_same_solve(how):
 @pytest.mark.parametrize("how", [{}, {"linear_solver": "implicit"}, {"method": "stba"}], ids=str)
 def test_a_solve_compiled_at_level_medium_is_the_same_solve(how, monkeypatch):
     full = solve(support.tiny(), "learned", **how, max_iterations=8, callback=lambda record: None)
-    monkeypatch.setattr(
-        importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("medium", 100),)
-    )
+    monkeypatch.setattr("jaxba.solver.stepwise.stages", lambda part, _: (Stage("medium", 100),))
     medium = solve(support.tiny(), "learned", **how, max_iterations=8, compilation="auto")
     assert (full.quick_iterations, medium.quick_iterations) == (0, medium.iterations)
     assert (medium.iterations, medium.accepted, medium.termination) == (
@@ -228,7 +225,7 @@ def test_the_optimised_program_takes_over_and_the_records_go_on(watched, monkeyp
     full = solve(support.tiny(), "ceres")
     assert full.iterations > 2
     before = {"factorization": (Stage("quick", 1),), "acceptance": (Stage("quick", 1), Stage("medium", 1))}
-    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: before[part])
+    monkeypatch.setattr("jaxba.solver.stepwise.stages", lambda part, _: before[part])
     records = []
     callback = records.append if watched else None
     mixed = solve(support.tiny(), "ceres", compilation="auto", callback=callback)
@@ -293,6 +290,6 @@ def test_the_command_reports_iterations_of_lower_levels(tmp_path, capsys, monkey
     assert " (all with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out
     assert run([*fast, "--compilation", "full"]) == 0
     assert "quickly" not in capsys.readouterr().out
-    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("quick", 1),))
+    monkeypatch.setattr("jaxba.solver.stepwise.stages", lambda part, _: (Stage("quick", 1),))
     assert run(fast) == 0
     assert " (1 of them with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import importlib
 import json
 import os
 import pickle
@@ -28,9 +27,9 @@ from jaxba import Loss, make_policy, register_pytree
 from jaxba.io import write_problem
 from jaxba.lm.step import try_step
 from jaxba.problem.options import Refinement, StepOptions
+from jaxba.results.retriangulate import retriangulate
 from jaxba.runtime import compilation, executable_cache
 from jaxba.runtime.compilation import ParallelCompilation, Stage, compile_and_run, program
-from jaxba.solver.retriangulate import retriangulate
 
 pytestmark = [
     pytest.mark.xla,
@@ -319,7 +318,7 @@ def test_a_program_from_the_cache_of_jax_is_not_written(folder, tmp_path):
 
 
 def test_programs_of_both_levels_are_stored(folder, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("jaxba.solver.solve"), "stages", lambda part, _: (Stage("quick", 1),))
+    monkeypatch.setattr("jaxba.solver.stepwise.stages", lambda part, _: (Stage("quick", 1),))
     once = lambda: solve(support.tiny(), "ceres", max_iterations=3, compilation="auto")
     first = once()
     assert first.quick_iterations == 1

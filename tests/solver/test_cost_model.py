@@ -18,8 +18,9 @@ from jaxba.damping.learned import ConstantAction
 from jaxba.lm.records import Prices
 from jaxba.problem.options import LinearSolver, StepOptions
 from jaxba.scenes import SceneConfig, random_scene
-from jaxba.solver import cost_model
-from jaxba.solver.cost_model import choose_linear_solver, count_pairs, predict, prices
+from jaxba.solver import choose, cost_model
+from jaxba.solver.choose import choose_linear_solver
+from jaxba.solver.cost_model import count_pairs, predict, prices
 from jaxba.solver.prepare import set_up
 
 SEQUENCE = SceneConfig(
@@ -181,9 +182,9 @@ def test_the_prices_of_methods_are_the_usual_ones():
 def test_observations_that_a_gpu_cannot_hold_are_refused_with_the_arithmetic(monkeypatch):
     problem = problem_of(20, 60, 0)
     needed = 0.5 * cost_model.BYTES_PER_OBSERVATION * problem.num_observations
-    monkeypatch.setattr(cost_model, "device_memory", lambda: needed + 1)
+    monkeypatch.setattr(choose, "device_memory", lambda: needed + 1)
     choose_linear_solver(problem, StepOptions(), "auto")
-    monkeypatch.setattr(cost_model, "device_memory", lambda: needed - 1)
+    monkeypatch.setattr(choose, "device_memory", lambda: needed - 1)
     with pytest.raises(ProblemError, match=r"of a device in float64 and .* in float32, more than its .* GB: divide"):
         choose_linear_solver(problem, StepOptions(), "implicit")
     choose_linear_solver(problem, StepOptions(), "implicit", devices=2)

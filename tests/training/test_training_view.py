@@ -10,6 +10,7 @@ from dataclasses import replace
 import browser
 import numpy as np
 import pytest
+import support
 from rich.console import Console
 
 from jaxba import BundleProblem
@@ -17,6 +18,7 @@ from jaxba.bench import training_page
 from jaxba.bench.tables import Table
 from jaxba.game.episode import Episode
 from jaxba.game.evaluate import Score
+from jaxba.lm.records import StepInfo
 from jaxba.training.config import load
 from jaxba.training.view import TrainingView
 
@@ -79,11 +81,11 @@ def test_elsewhere_every_chunk_is_a_line(config):
 
 def episode(count: int) -> Episode:
     """An episode of so many iterations, the second of which is rejected."""
-    steps = np.arange(count)
-    lambdas, accepted, paid = 10.0**-steps, steps != 1, np.arange(count + 1.0)
+    step = lambda k: support.step_info(k != 1, damping=10.0**-k)._replace(point_iterations=k, repairs=k)
+    steps, paid = StepInfo.stacked([step(k) for k in range(count)]), np.arange(count + 1.0)
     problem = BundleProblem.create(np.zeros((2, 9)), np.zeros((1, 3)), np.zeros((2, 2)), np.arange(2), np.zeros(2, int))
     cameras, points = np.zeros((count + 1, 2, 9)), np.zeros((count + 1, 1, 3))
-    return Episode(problem, cameras, points, 8.0 - paid, paid, lambdas, lambdas, accepted, steps, steps, True)
+    return Episode(problem, cameras, points, 8.0 - paid, paid, steps, True)
 
 
 EPISODES = [episode(5), episode(7)]
@@ -110,7 +112,7 @@ def test_the_page_has_mean_range_yardsticks_and_the_policys_lambda():
     ceres = next(trace for trace in price if trace.get("name") == "ceres")
     assert ceres["y"] == [8.25, 8.25]
     for trace, one in zip(charts["damping λ"]["data"], EPISODES, strict=True):
-        np.testing.assert_allclose(trace["y"], one.damping, rtol=1e-6)
+        np.testing.assert_allclose(trace["y"], one.steps.damping, rtol=1e-6)
         assert [k for k, symbol in enumerate(trace["marker"]["symbol"]) if symbol.endswith("-open")] == [1]
 
 

@@ -3,7 +3,7 @@
 Bundle adjustment moves every point downhill from where it is. A point that a long step, a bad start or a wrong depth
 took to a local minimum stays there: behind its cameras, far too distant, or at a depth where two wrong rays nearly
 meet. With the cameras fixed every point is a problem of three unknowns, which is solved here from several depths,
-without a linear solve of the whole problem. Bundle adjustment then continues (solver/alternation.py).
+without a linear solve of the whole problem. Bundle adjustment then continues (results/alternation.py).
 
 Source of the alternation: COLMAP's global refinement (Schoenberger, Frahm 2016, "Structure-from-motion revisited",
 section 4.4).

@@ -9,17 +9,17 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import jax
 import numpy as np
 
 from jaxba.damping import DampingPolicy
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.facing import set_aside
+from jaxba.results.retriangulate import Retriangulation, retriangulate_without
 from jaxba.runtime.compilation import CompileClock
-from jaxba.solver.callback_loop import IterationRecord, Watch
-from jaxba.solver.loop import History
+from jaxba.solver.loop import Callback, IterationRecord, Watch
 from jaxba.solver.options import SolveOptions, checked_options
 from jaxba.solver.prepare import DEFAULT_POLICY
-from jaxba.solver.retriangulate import Retriangulation, retriangulate_without
 from jaxba.solver.solve import Solution, solve_without
 
 MAX_ROUNDS = 5
@@ -31,7 +31,7 @@ def solve_and_retriangulate(
     policy: str | DampingPolicy = DEFAULT_POLICY,
     options: SolveOptions | None = None,
     *,
-    callback: Callable[[IterationRecord], bool | None] | None = None,
+    callback: Callback | None = None,
     on_search: Callable[[Retriangulation], None] | None = None,
     watch: Watch | None = None,
 ) -> Solution:
@@ -99,7 +99,7 @@ def _joined(before: Solution, last: Solution) -> Solution:
         initial_cost=before.initial_cost,
         iterations=before.iterations + last.iterations,
         accepted=before.accepted + last.accepted,
-        history=History(*(np.concatenate(pair) for pair in zip(before.history, last.history, strict=True))),
+        history=jax.tree.map(lambda *columns: np.concatenate(columns), before.history, last.history),
         setup_s=before.setup_s + last.setup_s,
         compile_s=before.compile_s + last.compile_s,
         total_s=before.total_s + last.total_s,

@@ -1,0 +1,1 @@
+"""What follows a solve: covariance, derivatives, retriangulation and its alternation with solves."""

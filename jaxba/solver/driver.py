@@ -1,0 +1,96 @@
+"""Who runs the iterations of a solve: one compiled program, on one device or several.
+
+The third way, from Python, is stepwise.py.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxba.lm.records import LMState, StepInfo
+from jaxba.lm.termination import Termination, Tolerances
+from jaxba.runtime.compilation import CompileClock, compile_and_run
+from jaxba.solver.compiled import solve_loop
+from jaxba.solver.iteration import Carry
+from jaxba.solver.prepare import Setup
+from jaxba.solver.sharded import Shards
+
+MIN_LENGTH = 128
+"""Smallest length of the record of a compiled loop, so that all lower limits use one program; larger limits are
+rounded up to a power of two."""
+
+
+class Driver:
+    """Runs the iterations of a solve, and has the state after them."""
+
+    whole = True
+    """Whether it can run all iterations as one program."""
+
+    carry: Carry
+    """The state of the loop; from `begin` on."""
+
+    quick_iterations = 0
+    """Iterations in which some program was not fully optimised."""
+
+    def __init__(self, setup: Setup, tolerances: Tolerances, max_iterations: int, clock: CompileClock) -> None:
+        self.setup, self.tolerances, self.clock = setup, tolerances, clock
+        self.limit = np.asarray(max(1, max_iterations), np.int32)  # a conversion by JAX is a program
+        self.length = max(MIN_LENGTH, 1 << int(self.limit - 1).bit_length())
+
+    def compile_s(self) -> float:
+        """Seconds of compilation so far."""
+        return self.clock.seconds
+
+    def begin(self) -> LMState:
+        """The state at the start."""
+        raise NotImplementedError
+
+    def finish(self) -> tuple[StepInfo, Termination]:
+        """Runs to the end; the records of all iterations as one, and why it ended."""
+        self.carry, found = jax.block_until_ready(self._all())
+        count = int(self.carry.iteration)
+        steps = jax.tree.map(lambda column: np.asarray(column)[:count], found)
+        return steps, Termination(int(self.carry.termination))
+
+    def iterate(self) -> tuple[StepInfo, Termination]:
+        """One iteration: its record, of Python scalars, and whether it ended the solve."""
+        raise NotImplementedError
+
+    def _all(self) -> tuple[Carry, Any]:
+        raise NotImplementedError
+
+
+class Compiled(Driver):
+    """All iterations as one program on one device."""
+
+    def begin(self) -> LMState:
+        self._start = jax.block_until_ready(self.setup.initial(compile_and_run))
+        return self._start
+
+    def _all(self) -> tuple[Carry, StepInfo]:
+        setup = self.setup
+        options = setup.policy, self.tolerances, setup.options, self.length, self.limit, setup.prices
+        return solve_loop(setup.layout, self._start, *options)
+
+
+class OnDevices(Driver):
+    """Several devices, all iterations as one program or one at a time."""
+
+    def __init__(self, shards: Shards, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._shards = shards
+
+    def begin(self) -> LMState:
+        self.carry = self._shards.begin(self.setup.policy, self.limit, self.setup.prices)
+        return jax.block_until_ready(self.carry.state)
+
+    def _all(self) -> tuple[Carry, StepInfo]:
+        return self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit, self.length)
+
+    def iterate(self) -> tuple[StepInfo, Termination]:
+        self.carry, step = self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit)
+        step = jax.tree.map(lambda x: x.item(), jax.device_get(step))
+        return step, Termination(int(self.carry.termination))
