@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from jaxba.bench import profile
-from jaxba.bench.summary import YARDSTICKS, Comparison, Summary
+from jaxba.bench.summary import YARDSTICKS, Summary
+from jaxba.game.statistics import Comparison
 
 if TYPE_CHECKING:
     from rich.console import Console

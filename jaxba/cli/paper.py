@@ -156,8 +156,8 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
         listed = {name: seconds[name] for name in TABLES_AND_FIGURES if name in seconds}
         files = write(runner, sections, report, _command(args), listed)
     console.print(
-        f"wrote {report}, {files[1]} and {len(files) - 2} figures; {sum(wall for wall, _ in seconds.values()):.0f} s of work in "
-        f"{folder}"
+        f"wrote {report}, {files[1]} and {len(files) - 2} figures; {sum(wall for wall, _ in seconds.values()):.0f} s "
+        f"of work in {folder}"
     )
     return status
 

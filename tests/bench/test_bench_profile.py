@@ -65,14 +65,13 @@ def test_of_a_float32_run_only_the_final_cost_counts_which_is_computed_in_float6
 def test_non_finite_costs_are_never_best_and_never_reached():
     broken = make_record("p", "broken", [math.nan, math.nan])
     assert profile.best_cost([broken, FAST]) == {"p": 100.0}
-    assert profile.first_iteration(broken, 1e9) == math.inf
+    assert profile.first(broken, 1e9) == Reach(math.inf, math.inf)
     assert math.isnan(profile.best_cost([broken])["p"])
     assert profile.reach_table([broken], Target("tau", 0.1))["broken"]["p"] == Reach(math.inf, math.inf)
 
 
 def test_start_below_the_threshold_counts_as_iteration_zero():
-    assert profile.first_iteration(FAST, 1000.0) == 0.0
-    assert profile.first_time(FAST, 1000.0) == 0.0
+    assert profile.first(FAST, 1000.0) == Reach(0.0, 0.0)
 
 
 def test_a_zero_residual_problem_does_not_demand_the_same_rounding_error_of_every_solver():

@@ -7,8 +7,9 @@ import math
 import pytest
 from rich.console import Console
 
-from jaxba.bench.summary import geometric_mean, summarize, to_json, write_summary, write_text
+from jaxba.bench.summary import summarize, to_json, write_summary, write_text
 from jaxba.bench.tables import number, print_summary, to_markdown
+from jaxba.game.statistics import geometric_mean
 from jaxba.solver.record import Record, TracePoint
 
 
