@@ -233,12 +233,6 @@ class Curve:
     fractions: tuple[float, ...]
     """Value of the function from each position on, in [0, 1]."""
 
-    def fraction_at(self, alpha: float) -> float:
-        """Value of the function at `alpha`; 0 below 1."""
-        return max(
-            (value for step, value in zip(self.alphas, self.fractions, strict=True) if step <= alpha), default=0.0
-        )
-
 
 def performance_profile(times: Mapping[str, Mapping[str, float]]) -> dict[str, Curve]:
     """Performance profile of each solver.

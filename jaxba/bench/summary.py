@@ -12,7 +12,7 @@ import math
 import os
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from jaxba.bench import profile
 from jaxba.bench.profile import Reach, Target
 from jaxba.bench.virtual import rules_of_one_step
 from jaxba.game.statistics import SHORTEST_TIME, Comparison, Reached, capped, compare, geometric_mean
+from jaxba.io import json_lines
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
 
@@ -266,24 +267,16 @@ def _coverage_warnings(cells: Sequence[Cell], solvers: Sequence[str], names: Seq
 
 def to_json(summary: Summary) -> dict[str, Any]:
     """The JSON object of `summary.json`. Non-finite numbers (never reached, unknown) become None."""
-    body = asdict(summary)
-    body["targets"] = [{"key": t.key, "label": t.label, "kind": t.kind, "value": t.value} for t in summary.targets]
+    plain = (str, int, float, bool, type(None))
+    metadata = {str(name): x if isinstance(x, plain) else str(x) for name, x in summary.metadata.items()}
+    targets = [{"key": t.key, "label": t.label, "kind": t.kind, "value": t.value} for t in summary.targets]
     rules = {
         "iteration_limit": profile.ITERATION_LIMIT,
         "zero_residual_floor": profile.ZERO_RESIDUAL_FLOOR,
         "means": "geometric, over reached problems; iterations_capped over all problems; ratios solver / yardstick",
     }
-    return _clean({"format": FORMAT, "rules": rules, **body})
-
-
-def _clean(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_clean(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
+    body = json_lines.plain(replace(summary, metadata=metadata))
+    return {"format": FORMAT, "rules": rules, **body, "targets": targets}
 
 
 def write_summary(path: str | os.PathLike[str], summary: Summary) -> None:
