@@ -27,9 +27,9 @@ from jaxba.cli.common import prepare_process
 from jaxba.damping.policy_file import load_policy
 from jaxba.game.constant_actions import best_constant_action, values_of
 from jaxba.game.env import make_game
-from jaxba.game.evaluate import paired_ratio
 from jaxba.game.look_ahead import look_ahead
 from jaxba.game.scene_bank import select
+from jaxba.game.statistics import paired_ratio
 from jaxba.runtime import process
 from jaxba.training.config import load
 from jaxba.training.task import BANK, read_banks

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
-from jaxba.bench.plots import Style
+from jaxba.bench.panels import Axis, Panel, Series, Style, merged, on
 from jaxba.bench.tables import Table
 
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
@@ -22,24 +22,20 @@ POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inli
 
 SYMBOLS = {"o": "circle", "s": "square", "D": "diamond", "^": "triangle-up", "v": "triangle-down"}
 SYMBOLS |= {"P": "cross", "*": "star", "X": "x"}
-"""Names in plotly.js of the markers in `plots.MARKERS`."""
+"""Names in plotly.js of the markers in `panels.MARKERS`."""
 
 DIGITS = 7
 """Significant digits of the numbers in a page."""
 
 
-@dataclass(frozen=True)
-class Chart:
-    """A chart. A trace is one of plotly.js with three keys of our own: `meta` is the name of the solver that hides it,
-    `rows` the number of a table in `Page.rows`, and `x` and `y` may also be `{axis: values}`, one for each position of
-    the page's switch, where values may be the number of a column of those rows."""
-
-    title: str
-    traces: list[dict[str, Any]]
-    layout: dict[str, Any]
-    note: str = ""
-    xaxes: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Extra settings of the x axis for each position of the switch."""
+_HOVER_ROWS = (
+    "<b>%{fullData.name}</b><br>iteration %{customdata[0]}, %{customdata[1]:.3g} s<br>cost %{customdata[2]:.7g}<br>"
+    "λ %{customdata[3]:.3g}, gain %{customdata[4]:.3g}, %{customdata[5]}<extra></extra>"
+)
+_HOVER_STEPS = (
+    "<b>%{fullData.name}</b><br>%{y:.3g} % of the problems within %{x:.3g} times<br>the best solver's<extra></extra>"
+)
+_HOVER = "<b>%{fullData.name}</b><br>%{x:.4g}: %{y:.4g}<extra></extra>"
 
 
 @dataclass(frozen=True)
@@ -51,25 +47,21 @@ class Page:
     """Machine, versions and the like, on top; the value of `command` is set as code."""
     sections: Sequence[str]
     """HTML, from `section`, `table`, `charts` and `groups`."""
-    charts: Sequence[Chart]
+    panels: Sequence[Panel]
     """Every chart, in the order of their numbers."""
     styles: Mapping[str, Style] = field(default_factory=dict)
     """Of what a reader can show and hide, by its name."""
     axes: Sequence[str] = ()
     """Positions of the switch of the x axis, the first one at the start."""
-    rows: Sequence[Sequence[Sequence[Any]]] = ()
-    """Tables that traces refer to."""
     warnings: Sequence[str] = ()
 
 
 def to_html(page: Page) -> str:
     """The document. Titles, names and notes are escaped, and so are names in charts, where plotly.js knows tags."""
     asset = lambda name: resources.files("jaxba.bench").joinpath("assets", name).read_text(encoding="utf-8")
-    charts = [
-        {"id": f"chart{k}", "data": chart.traces, "layout": {"height": 340, **chart.layout}, "xaxes": chart.xaxes}
-        for k, chart in enumerate(page.charts)
-    ]
-    book = _json({"axes": list(page.axes), "rows": page.rows, "charts": charts})
+    rows: dict[int, Any] = {}  # tables that traces refer to, by identity
+    charts = [_chart(panel, f"chart{k}", page, rows) for k, panel in enumerate(page.panels)]
+    book = _json({"axes": list(page.axes), "rows": list(rows.values()), "charts": charts})
     facts = "".join(
         f"<div><dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd></div>"
         for name, value in page.facts.items()
@@ -89,6 +81,83 @@ def to_html(page: Page) -> str:
         f'<script type="application/json" id="book">{book}</script>\n'
         f"<script>{_plotly()}</script>\n<script>{asset('page.js')}</script>\n</body></html>\n"
     )
+
+
+def _chart(panel: Panel, name: str, page: Page, rows: dict[int, Any]) -> dict[str, Any]:
+    """A panel in the words of plotly.js, with three keys of our own in its traces: `meta` is the chip that hides it,
+    `rows` the number of a table, and `x` and `y` are `{axis: values}`, one for each position of the page's switch,
+    where values may be the number of a column of those rows."""
+    heights = [y for one in panel.series for axis in panel.x for y in on(one.y, axis) if y == y and y > 0]
+    low, high = (min(heights), max(heights)) if heights else (1.0, 1.0)
+    traces = [trace for rank, one in enumerate(panel.series) for trace in _traces(panel, one, rank, page.styles, rows)]
+    yaxis = {"title": {"text": panel.y.label}, **_axis(panel.y)}
+    if panel.y.log:  # powers of ten alone where there is more than one
+        yaxis |= {"exponentformat": "power", "minorloglabels": "none" if high > 20 * low else "small digits"}
+    shapes = _dashed(panel.dashed, low, max(high, 10 * low))
+    xaxes = {axis: {"title": {"text": one.label}, **_axis(one)} for axis, one in panel.x.items()}
+    return {
+        "id": name,
+        "data": traces,
+        "layout": {"height": panel.height, "yaxis": yaxis, "shapes": shapes},
+        "xaxes": xaxes,
+    }
+
+
+def _axis(axis: Axis) -> dict[str, Any]:
+    if axis.limits is None:
+        return (
+            {"type": "log"} if axis.log else {"type": "linear", **({"rangemode": "tozero"} if axis.from_zero else {})}
+        )
+    return {"type": "log", "range": list(map(math.log10, axis.limits))} if axis.log else {"range": list(axis.limits)}
+
+
+def _traces(
+    panel: Panel, one: Series, rank: int, chips: Mapping[str, Style], rows: dict[int, Any]
+) -> list[dict[str, Any]]:
+    """The edges of a line's shaded range, if it has one, and the line. Lines get thinner one by one, so that of equal
+    ones all are seen."""
+    style, x = one.style, one.x
+    base: dict[str, Any] = {"name": html.escape(one.label or one.name), "meta": one.name if one.name in chips else ""}
+    found = []
+    if one.between:
+        edge = {"x": x, "meta": base["meta"], "mode": "lines", "line": {"width": 0, "color": style.color}}
+        edge["hoverinfo"] = "skip"
+        shade = {"fill": "tonexty", "fillcolor": _faint(style.color)}
+        low, high = one.between
+        found = [{**edge, "y": low}, {**edge, "y": high, **shade}]
+    if one.rows:
+        base["rows"] = list(rows).index(id(one.rows)) if id(one.rows) in rows else len(rows)
+        rows[id(one.rows)] = one.rows
+        x = {axis: column for column, axis in enumerate(panel.x)}
+    symbol, count = SYMBOLS[style.marker], len(panel.series)
+    width = 0.7 if one.thin else 1.5 if one.hollow else 1.5 + 2.0 * (count - 1 - rank) / max(count - 1, 1)
+    marker = {"symbol": symbol, "size": 6, "color": style.color, "maxdisplayed": 0 if panel.steps else 14}
+    if one.hollow:
+        symbols = [f"{symbol}-open" if empty else symbol for empty in one.hollow]
+        marker |= {"symbol": symbols, "maxdisplayed": 0, "size": 7}
+    line = {"color": style.color, "dash": dash(style), "width": width, **({"shape": "hv"} if panel.steps else {})}
+    hover = _HOVER_STEPS if panel.steps else _HOVER_ROWS if one.rows else _HOVER
+    marked = {"mode": "lines+markers", "marker": marker} if one.marked and not one.thin else {"mode": "lines"}
+    own = {"x": x, "y": one.y, "line": line, "hovertemplate": hover, **marked}
+    return [*found, {**base, **own, **({"opacity": 0.5} if one.thin else {})}]
+
+
+def _faint(color: str) -> str:
+    return "rgba({}, {}, {}, 0.18)".format(*(int(color[k : k + 2], 16) for k in (1, 3, 5)))
+
+
+def _dashed(lines: Mapping[str, float], low: float, high: float) -> list[dict[str, Any]]:
+    """Dashed lines over the width of a chart, labelled; those close to each other share a label."""
+    labels = {y: ", ".join(names) for y, names in merged(lines, low, high)}
+    return [
+        {
+            **{"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": y, "y1": y, "layer": "below"},
+            "line": {"color": "#8a8f94", "dash": "4px,4px", "width": 1},
+            "label": {"text": labels.get(y, ""), "textposition": "end", "yanchor": "bottom", "font": {"size": 11}},
+        }
+        for y in lines.values()
+        if math.isfinite(y) and y > 0
+    ]
 
 
 def _plotly() -> str:
@@ -154,11 +223,6 @@ def dash(style: Style) -> str:
     return "solid" if style.linestyle == "-" else ",".join(f"{2 * x:g}px" for x in style.linestyle[1])
 
 
-def line(style: Style, width: float = 2.0) -> dict[str, Any]:
-    """`line` of a trace; `width` in pixels."""
-    return {"color": style.color, "dash": dash(style), "width": width}
-
-
 def section(title: str, *parts: str) -> str:
     """A part of a page under a heading."""
     return f"<section><h2>{html.escape(title)}</h2>\n" + "\n".join(parts) + "</section>"
@@ -189,14 +253,14 @@ def table(content: Table, styles: Mapping[str, Style] | None = None) -> str:
     return section(content.title, grid, note(content.note))
 
 
-def charts(numbered: Iterable[tuple[int, Chart]]) -> str:
+def charts(numbered: Iterable[tuple[int, Panel]]) -> str:
     """Charts side by side, as many as there is room for."""
     return (
         '<div class="grid">'
         + "\n".join(
-            f'<figure><h3>{html.escape(chart.title)}</h3><div id="chart{k}"></div>'
-            f"<figcaption>{html.escape(chart.note)}</figcaption></figure>"
-            for k, chart in numbered
+            f'<figure><h3>{html.escape(panel.title)}</h3><div id="chart{k}"></div>'
+            f"<figcaption>{html.escape(panel.note)}</figcaption></figure>"
+            for k, panel in numbered
         )
         + "</div>"
     )

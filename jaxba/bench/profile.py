@@ -16,6 +16,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from jaxba.game.statistics import Reached
 from jaxba.solver.record import Record
 
 ITERATION_LIMIT = 100
@@ -104,9 +107,17 @@ NEVER = Reach(math.inf, math.inf)
 """The value for a target that is never reached."""
 
 
+def by_problem(records: Iterable[Record]) -> dict[str, list[Record]]:
+    """The records of each problem, in the order of their first one."""
+    found: dict[str, list[Record]] = {}
+    for record in records:
+        found.setdefault(record.problem, []).append(record)
+    return found
+
+
 def problem_names(records: Iterable[Record]) -> list[str]:
     """Problems in the order of their first record."""
-    return list(dict.fromkeys(record.problem for record in records))
+    return list(by_problem(records))
 
 
 def solver_names(records: Iterable[Record]) -> list[str]:
@@ -116,7 +127,8 @@ def solver_names(records: Iterable[Record]) -> list[str]:
 
 def initial_costs(records: Iterable[Record]) -> dict[str, float]:
     """f0 of each problem: the largest finite initial cost of its records, NaN if there is none."""
-    return _extreme(((r.problem, [r.initial_cost]) for r in records), max)
+    starts = {name: filter(math.isfinite, (r.initial_cost for r in runs)) for name, runs in by_problem(records).items()}
+    return {name: max(costs, default=math.nan) for name, costs in starts.items()}
 
 
 def best_cost(records: Iterable[Record], known_best: Mapping[str, float] | None = None) -> dict[str, float]:
@@ -127,24 +139,18 @@ def best_cost(records: Iterable[Record], known_best: Mapping[str, float] | None 
             computed in float64.
         known_best: costs of some problems known from other runs, pixels squared; used where lower.
     """
-    costs = [(r.problem, [r.initial_cost, lowest_cost(r)]) for r in records]
-    known = [(name, [(known_best or {}).get(name, math.nan)]) for name in dict.fromkeys(name for name, _ in costs)]
-    return _extreme([*costs, *known], min)
+    found = {}
+    for name, runs in by_problem(records).items():
+        costs = [cost for r in runs for cost in (r.initial_cost, lowest_cost(r))]
+        found[name] = min(filter(math.isfinite, [*costs, (known_best or {}).get(name, math.nan)]), default=math.nan)
+    return found
 
 
 def lowest_cost(record: Record) -> float:
     """The lowest finite accepted cost of a run, NaN if there is none. The trace of a float32 run is ignored, since its
     rounding errors are too large."""
     trace = [] if record.dtype == "float32" else [point.cost for point in record.trace]
-    return min((cost for cost in (record.final_cost, *trace) if math.isfinite(cost)), default=math.nan)
-
-
-def _extreme(costs: Iterable[tuple[str, Sequence[float]]], choose) -> dict[str, float]:
-    found: dict[str, float] = {}
-    for name, values in costs:
-        finite = [value for value in (*values, found.get(name, math.nan)) if math.isfinite(value)]
-        found[name] = choose(finite) if finite else math.nan
-    return found
+    return min(filter(math.isfinite, (record.final_cost, *trace)), default=math.nan)
 
 
 def threshold(f0: float, f_star: float, tolerance: float) -> float:
@@ -172,33 +178,24 @@ def own_end_threshold(record: Record) -> float:
     return relative_threshold(record.initial_cost, record.final_cost, OWN_END_TOLERANCE)
 
 
-def first_time(record: Record, cost: float) -> float:
-    """Seconds until the accepted cost is at most `cost`; infinity if that never happens."""
-    return next((_time(p.time_s) for p in record.trace if p.cost <= cost), math.inf)
+def first(record: Record, cost: float) -> Reach:
+    """Iterations and seconds until the accepted cost is at most `cost`."""
+    return next((_reach(p.iteration, p.time_s) for p in record.trace if p.cost <= cost), NEVER)
 
 
-def first_iteration(record: Record, cost: float) -> float:
-    """Iterations until the accepted cost is at most `cost`; infinity if that never happens."""
-    return next((float(p.iteration) for p in record.trace if p.cost <= cost), math.inf)
-
-
-def _time(seconds: float) -> float:
-    return seconds if math.isfinite(seconds) else math.inf
+def _reach(iterations: int, seconds: float) -> Reach:
+    return Reach(float(iterations), seconds if math.isfinite(seconds) else math.inf)
 
 
 def reach(record: Record, target: Target, f0: float, f_star: float) -> Reach:
     """Iterations and time of one solve to a target, given the problem's initial cost f0 and best cost f*."""
     if target.kind == "converged":
-        if not converged(record):
-            return NEVER
-        return Reach(float(record.iterations), _time(record.trace[-1].time_s if record.trace else record.total_s))
+        end = record.trace[-1].time_s if record.trace else record.total_s
+        return _reach(record.iterations, end) if converged(record) else NEVER
     if target.kind == "own_end":
-        cost = own_end_threshold(record)
-    elif target.kind == "relative":
-        cost = relative_threshold(f0, f_star, target.value)
-    else:
-        cost = threshold(f0, f_star, target.value)
-    return Reach(first_iteration(record, cost), first_time(record, cost))
+        return first(record, own_end_threshold(record))
+    level = relative_threshold if target.kind == "relative" else threshold
+    return first(record, level(f0, f_star, target.value))
 
 
 def reach_table(
@@ -212,6 +209,12 @@ def reach_table(
         item = reach(r, target, starts[r.problem], bests[r.problem])
         found.setdefault(r.solver, {}).setdefault(r.problem, []).append(item)
     return {solver: {name: _median_reach(items) for name, items in row.items()} for solver, row in found.items()}
+
+
+def reached(row: Mapping[str, Reach], names: Sequence[str]) -> Reached:
+    """A row of `reach_table` as arrays over problems; a problem that was not run counts as not reached."""
+    found = [row.get(name, NEVER) for name in names]
+    return Reached(np.array([r.iterations for r in found]), np.array([r.seconds for r in found]))
 
 
 def _median_reach(items: Sequence[Reach]) -> Reach:
@@ -229,12 +232,6 @@ class Curve:
 
     fractions: tuple[float, ...]
     """Value of the function from each position on, in [0, 1]."""
-
-    def fraction_at(self, alpha: float) -> float:
-        """Value of the function at `alpha`; 0 below 1."""
-        return max(
-            (value for step, value in zip(self.alphas, self.fractions, strict=True) if step <= alpha), default=0.0
-        )
 
 
 def performance_profile(times: Mapping[str, Mapping[str, float]]) -> dict[str, Curve]:
@@ -273,8 +270,8 @@ def cost_warnings(records: Sequence[Record]) -> list[str]:
     """A warning for each problem on which solvers have different initial costs, and so did not minimise the same
     function from the same start."""
     lines = []
-    for name in problem_names(records):
-        costs = {r.solver: r.initial_cost for r in records if r.problem == name and math.isfinite(r.initial_cost)}
+    for name, runs in by_problem(records).items():
+        costs = {r.solver: r.initial_cost for r in runs if math.isfinite(r.initial_cost)}
         if not costs:
             lines.append(f"{name}: no solver has a finite initial cost")
             continue

@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxba.bench import charts, page, plots, profile
+from jaxba.bench import page, plots, profile
+from jaxba.bench.panels import AXES, problem_panels, profile_panel, solver_styles
 from jaxba.bench.profile import RELATIVE_TOLERANCES, Target
 from jaxba.bench.summary import Summary, summarize, write_summary
 from jaxba.bench.tables import Table, tables
@@ -109,24 +110,23 @@ def to_html(
     known_best: Mapping[str, float] | None = None,
 ) -> str:
     """The report as one HTML document that loads nothing (`page`). The arguments are those of `write_all`."""
-    styles = plots.solver_styles(profile.solver_names(records))
-    profiles = charts.profile_charts(records, tolerance, known_best)
-    every, rows, by_problem = list(profiles), [], {}
+    styles = solver_styles(profile.solver_names(records))
+    every = [profile_panel(records, target, known_best) for target in profile.cost_targets(tolerance)]
+    profiles, by_problem = page.charts(enumerate(every)), {}
     for problem in profile.problem_names(records):
-        found, runs = charts.problem_charts(records, problem, tolerance, known_best, len(rows))
-        numbered = list(enumerate(found, start=len(every)))
-        every, rows = every + found, rows + runs
-        by_problem[problem] = page.charts(numbered)
+        found = problem_panels(records, problem, tolerance, known_best)
+        by_problem[problem] = page.charts(enumerate(found, start=len(every)))
+        every += found
     *main, details = tables(summary)
     sections = [
-        page.section("Performance profiles", page.note(PROFILES), page.charts(enumerate(profiles))),
+        page.section("Performance profiles", page.note(PROFILES), profiles),
         page.section("Convergence and damping", page.note(RUNS), page.groups("problem", by_problem)),
         *(page.table(table, styles) for table in main),
         page.table(details, styles),
         page.table(_problem_table(summary)),
     ]
     facts = {str(name): str(value) for name, value in summary.metadata.items()}
-    content = page.Page("jaxba benchmark", facts, sections, every, styles, charts.AXES, rows, warnings=summary.warnings)
+    content = page.Page("jaxba benchmark", facts, sections, every, styles, AXES, summary.warnings)
     return page.to_html(content)
 
 

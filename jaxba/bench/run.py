@@ -30,7 +30,7 @@ from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, SolverNameError, parse_solver
 from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.record import Record, record_of
-from jaxba.solver.solve import solve
+from jaxba.solver.solve import Solution, solve
 
 try:
     import fcntl
@@ -92,53 +92,34 @@ def run_solver(
         if on_iteration:
             on_iteration(step)
 
+    limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances(ftol=settings.ftol)}
     if solver.peer:
-        return _run_peer(problem, source, solver, repeat, settings, steps, watch)
-    policy, options = solver.build()
-    options = replace(
-        options,
-        linear_solver=settings.linear_solver if solver.method == DEFAULT_METHOD else "auto",
-        max_iterations=settings.max_iterations,
-        tolerances=Tolerances(ftol=settings.ftol),
-        compilation="full",
-    )
-    solution = solve(problem, policy, options, callback=watch)
+        solution, backend = _solve_by_peer(problem, solver, callback=watch, threads=threads(), **limits)
+    else:
+        policy, options = solver.build()
+        linear_solver = settings.linear_solver if solver.method == DEFAULT_METHOD else "auto"
+        options = replace(options, linear_solver=linear_solver, compilation="full", **limits)
+        solution, backend = solve(problem, policy, options, callback=watch), ""
     record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
+    if solver.peer:
+        record = replace(record, backend=backend, device="cpu: host")
     if solver.dtype == "float32":  # rounding errors of its own sums are larger than the differences between solvers
         record = replace(record, initial_cost=geometry.cost(problem), final_cost=geometry.cost(solution.problem))
     return record
 
 
-def _run_peer(
-    problem: BundleProblem,
-    source: Source,
-    solver: SolverName,
-    repeat: int,
-    settings: RunSettings,
-    steps: list[IterationRecord],
-    watch: Callable[[IterationRecord], Any],
-) -> Record:
-    """`run_solver` for another library, which computes on the host."""
+def _solve_by_peer(problem: BundleProblem, solver: SolverName, **options: Any) -> tuple[Solution, str]:
+    """The solution by another library, which computes on the host, and what the library is called."""
     from jaxba.peers.ceres import solve_by_ceres
     from jaxba.peers.colmap import backend
     from jaxba.peers.driven import drive_ceres
 
     mode = solver.peer.partition(":")[2]
-    shared: dict[str, Any] = {
-        "max_iterations": settings.max_iterations,
-        "tolerances": Tolerances(ftol=settings.ftol),
-        "threads": threads(),
-        "callback": watch,
-    }
-    if solver.policy:
-        policy, options = solver.build()
-        solution = drive_ceres(
-            problem, mode, policy, embedded=options.step_options(policy) if solver.embeds else None, **shared
-        )
-    else:
-        solution = solve_by_ceres(problem, mode, **shared)
-    record = record_of(solution, steps, name=source.name, family=source.family, solver=solver, repeat=repeat)
-    return replace(record, backend=backend(mode), device="cpu: host")
+    if not solver.policy:
+        return solve_by_ceres(problem, mode, **options), backend(mode)
+    policy, own = solver.build()
+    embedded = own.step_options(policy) if solver.embeds else None
+    return drive_ceres(problem, mode, policy, embedded=embedded, **options), backend(mode)
 
 
 def machine() -> dict[str, str]:

@@ -12,20 +12,21 @@ import math
 import os
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from jaxba.bench import profile
-from jaxba.bench.profile import NEVER, Reach, Target
-from jaxba.bench.virtual import best_reach, rules_of_one_step
+from jaxba.bench.profile import Reach, Target
+from jaxba.bench.virtual import rules_of_one_step
+from jaxba.game.statistics import SHORTEST_TIME, Comparison, Reached, capped, compare, geometric_mean
+from jaxba.io import json_lines
 from jaxba.runtime.atomic import write_text
 from jaxba.solver.record import Record
 
 YARDSTICKS = ("classic", "ceres")
 """Solvers that all others are compared with: the baseline of the paper, and the rule of the most used library."""
-
-SHORTEST_TIME = 1e-6
-"""Lower limit in seconds of times in geometric means; a time is 0 where the start satisfies a target."""
 
 FORMAT = 1
 """Version of `summary.json`; it changes when a key changes its meaning."""
@@ -72,22 +73,6 @@ class TargetSummary:
     """Geometric mean over all problems, with counts capped at `ITERATION_LIMIT`."""
     seconds: float
     """Geometric mean over the reached problems. NaN if none."""
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """A solver compared with a yardstick on one target. Ratios are solver / yardstick, so that below 1 is better."""
-
-    both: int
-    """Number of problems on which both reached the target; the ratios are geometric means over these."""
-    only_solver: int
-    """Number of problems on which only the solver reached it."""
-    only_yardstick: int
-    """Number of problems on which only the yardstick reached it."""
-    iterations: float
-    """Ratio of iterations."""
-    seconds: float
-    """Ratio of times."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +154,7 @@ def summarize(
     starts, bests = profile.initial_costs(records), profile.best_cost(records, known_best)
     tables = {target.key: profile.reach_table(records, target, known_best) for target in targets}
     names, solvers = profile.problem_names(records), profile.solver_names(records)
+    found = {key: {s: profile.reached(table.get(s, {}), names) for s in solvers} for key, table in tables.items()}
     cells = []
     for name in names:
         for solver in solvers:
@@ -178,21 +164,16 @@ def summarize(
                 cells.append(_cell(runs, reaches, starts[name], bests[name]))
     return Summary(
         targets=targets,
-        problems=[_problem([r for r in records if r.problem == name], starts[name], bests[name]) for name in names],
-        solvers=[_solver(solver, records, cells, targets, names) for solver in solvers],
+        problems=[_problem(runs, starts[name], bests[name]) for name, runs in profile.by_problem(records).items()],
+        solvers=[_solver(solver, records, cells, found, len(names)) for solver in solvers],
         cells=cells,
         warnings=profile.cost_warnings(records) + _coverage_warnings(cells, solvers, names),
-        virtual={best: _virtual(rules, tables, names) for best, rules in rules_of_one_step(solvers).items()},
+        virtual={
+            best: {key: _target(_best([rows[rule] for rule in rules])) for key, rows in found.items()}
+            for best, rules in rules_of_one_step(solvers).items()
+        },
         metadata=dict(metadata or {}),
     )
-
-
-def geometric_mean(values: Iterable[float], floor: float = 0.0) -> float:
-    """exp(mean(log)); values below `floor` count as `floor`, a zero makes it 0, infinity infinite, none NaN."""
-    raised = [max(value, floor) for value in values]
-    if not raised:
-        return math.nan
-    return 0.0 if 0.0 in raised else math.exp(math.fsum(math.log(value) for value in raised) / len(raised))
 
 
 def _median(values: Iterable[float]) -> float:
@@ -230,13 +211,15 @@ def _problem(runs: Sequence[Record], f0: float, f_star: float) -> ProblemSummary
 
 
 def _solver(
-    solver: str, records: Sequence[Record], cells: Sequence[Cell], targets: Sequence[Target], names: Sequence[str]
+    solver: str,
+    records: Sequence[Record],
+    cells: Sequence[Cell],
+    found: Mapping[str, Mapping[str, Reached]],
+    total: int,
 ) -> SolverSummary:
     own = [cell for cell in cells if cell.solver == solver]
     runs = [r for r in records if r.solver == solver]
     yardsticks = [y for y in YARDSTICKS if y != solver and any(cell.solver == y for cell in cells)]
-    by_pair = {(cell.solver, cell.problem): cell.reach for cell in cells}
-    reaches = lambda who, key: [by_pair[who, name][key] if (who, name) in by_pair else NEVER for name in names]
     iterations = sum(r.iterations for r in runs)
     points = [point for r in runs for point in r.trace[1:]]
     failures = sum(not p.accepted and not math.isfinite(p.gain_ratio) for p in points)
@@ -244,9 +227,9 @@ def _solver(
     return SolverSummary(
         solver=solver,
         run=len(own),
-        total=len(names),
-        targets={t.key: _target([cell.reach[t.key] for cell in own], len(names)) for t in targets},
-        against={y: {t.key: compare(reaches(solver, t.key), reaches(y, t.key)) for t in targets} for y in yardsticks},
+        total=total,
+        targets={key: _target(rows[solver]) for key, rows in found.items()},
+        against={y: {key: compare(rows[solver], rows[y]) for key, rows in found.items()} for y in yardsticks},
         final_ratio_worst=max(cell.final_ratio for cell in own),
         final_ratio_mean=geometric_mean(cell.final_ratio for cell in own),
         rejected_share=(iterations - sum(r.accepted for r in runs)) / iterations if iterations else math.nan,
@@ -257,34 +240,20 @@ def _solver(
     )
 
 
-def _virtual(
-    rules: Sequence[str], tables: Mapping[str, Mapping[str, Mapping[str, Reach]]], names: Sequence[str]
-) -> dict[str, TargetSummary]:
-    best = lambda table, name: best_reach([table[rule][name] for rule in rules if name in table[rule]])
-    return {key: _target([best(table, name) for name in names], len(names)) for key, table in tables.items()}
+def _best(rows: Sequence[Reached]) -> Reached:
+    """The fewest iterations and the least time on each problem, which may be those of different solvers."""
+    return Reached(*(np.min(numbers, axis=0) for numbers in zip(*rows, strict=True)))
 
 
-def _target(own: Sequence[Reach], total: int) -> TargetSummary:
-    reaches = [*own, *[NEVER] * (total - len(own))]
-    reached = [item for item in reaches if math.isfinite(item.iterations)]
+def _target(own: Reached) -> TargetSummary:
+    reached = np.isfinite(own.iterations)
     return TargetSummary(
-        reached=len(reached),
-        total=total,
-        iterations=geometric_mean((item.iterations for item in reached), floor=1.0),
-        iterations_capped=geometric_mean(
-            (min(item.iterations, float(profile.ITERATION_LIMIT)) for item in reaches), 1.0
-        ),
-        seconds=geometric_mean((item.seconds for item in reached), SHORTEST_TIME),
+        reached=int(reached.sum()),
+        total=len(reached),
+        iterations=geometric_mean(own.iterations[reached], floor=1.0),
+        iterations_capped=geometric_mean(capped(own.iterations, profile.ITERATION_LIMIT)),
+        seconds=geometric_mean(own.seconds[reached], SHORTEST_TIME),
     )
-
-
-def compare(ours: Sequence[Reach], theirs: Sequence[Reach]) -> Comparison:
-    """A solver compared with a yardstick, problem by problem."""
-    ran = [(math.isfinite(a.iterations), math.isfinite(b.iterations)) for a, b in zip(ours, theirs, strict=True)]
-    both = [(a, b) for a, b, reached in zip(ours, theirs, ran, strict=True) if all(reached)]
-    iterations = geometric_mean(max(a.iterations, 1.0) / max(b.iterations, 1.0) for a, b in both)
-    seconds = geometric_mean(max(a.seconds, SHORTEST_TIME) / max(b.seconds, SHORTEST_TIME) for a, b in both)
-    return Comparison(len(both), ran.count((True, False)), ran.count((False, True)), iterations, seconds)
 
 
 def _coverage_warnings(cells: Sequence[Cell], solvers: Sequence[str], names: Sequence[str]) -> list[str]:
@@ -298,24 +267,16 @@ def _coverage_warnings(cells: Sequence[Cell], solvers: Sequence[str], names: Seq
 
 def to_json(summary: Summary) -> dict[str, Any]:
     """The JSON object of `summary.json`. Non-finite numbers (never reached, unknown) become None."""
-    body = asdict(summary)
-    body["targets"] = [{"key": t.key, "label": t.label, "kind": t.kind, "value": t.value} for t in summary.targets]
+    plain = (str, int, float, bool, type(None))
+    metadata = {str(name): x if isinstance(x, plain) else str(x) for name, x in summary.metadata.items()}
+    targets = [{"key": t.key, "label": t.label, "kind": t.kind, "value": t.value} for t in summary.targets]
     rules = {
         "iteration_limit": profile.ITERATION_LIMIT,
         "zero_residual_floor": profile.ZERO_RESIDUAL_FLOOR,
         "means": "geometric, over reached problems; iterations_capped over all problems; ratios solver / yardstick",
     }
-    return _clean({"format": FORMAT, "rules": rules, **body})
-
-
-def _clean(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _clean(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_clean(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
+    body = json_lines.plain(replace(summary, metadata=metadata))
+    return {"format": FORMAT, "rules": rules, **body, "targets": targets}
 
 
 def write_summary(path: str | os.PathLike[str], summary: Summary) -> None:

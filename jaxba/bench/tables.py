@@ -1,15 +1,14 @@
-"""Tables of a summary, for the console, Markdown or HTML."""
+"""Tables of a summary, for the console or HTML."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from jaxba.bench import profile
-from jaxba.bench.summary import YARDSTICKS, Comparison, Summary
+from jaxba.bench.summary import YARDSTICKS, Summary
+from jaxba.game.statistics import Comparison
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -151,23 +150,6 @@ def _details(summary: Summary) -> Table:
         rows.append((c.problem, c.solver, *counts, *ends, *times, c.termination))
     note = "Medians over repeats; ∞: never. Times in seconds, without compilation; time s is that of the whole solve."
     return Table("Problems", (*header, "s to f*(1+0.001)", "time s", "termination"), rows, note, text_columns=2)
-
-
-def to_markdown(summary: Summary, details: bool = True) -> str:
-    """All tables as GitHub Markdown, warnings first."""
-
-    def plain(text: str) -> str:
-        return re.sub(r"([\\`*|<>\[\]$])", r"\\\1", " ".join(text.split()))
-
-    def line(cells: Iterable[str]) -> str:
-        return f"| {' | '.join(cells)} |"
-
-    parts = [f"> **Warning:** {plain(warning)}" for warning in summary.warnings]
-    for table in tables(summary, details):
-        marks = [":--" if i < table.text_columns else "--:" for i in range(len(table.header))]
-        rows = [line(map(plain, table.header)), line(marks), *(line(map(plain, row)) for row in table.rows)]
-        parts.append("\n".join([f"### {plain(table.title)}", "", *rows, "", plain(table.note)]))
-    return "\n\n".join(parts) + "\n"
 
 
 def print_summary(summary: Summary, console: Console, details: bool = True) -> None:

@@ -1,16 +1,18 @@
-"""The page that a training run ends with: curves, some episodes of the policy, and its table."""
+"""What a training ends with: the figure of its curves, and a page with these, some episodes and its table."""
 
 from __future__ import annotations
 
-import html
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
-from jaxba.bench import page
-from jaxba.bench.page import Chart
-from jaxba.bench.plots import Style, solver_styles
+from matplotlib.figure import Figure
+
+from jaxba.bench import page, plots
+from jaxba.bench.panels import MARKERS, Axis, Panel, Series, Style, on, solver_styles
 from jaxba.bench.tables import Table
 from jaxba.game.episode import Episode
+from jaxba.solver.figure import COLOURS
 from jaxba.training.log import Row
 
 AXES = ("updates", "seconds")
@@ -33,6 +35,46 @@ LEARNING = {
 }
 """Charts of the log of training and their titles; those that a log does not have are left out."""
 
+_X = {"updates": Axis("gradient updates"), "seconds": Axis("seconds of training")}
+_FROM_ZERO = Axis("", from_zero=True)
+
+
+def held_out_panels(rows: Sequence[Row], rules: Mapping[str, Any], paid: bool) -> list[Panel]:
+    """Held-out scores over training, and the levels of the yardsticks.
+
+    Args:
+        rows: of the log; those without an evaluation are left out.
+        rules: a `Score` by name of the yardstick.
+        paid: whether the game's work has a price (`HELD_OUT`).
+    """
+    styles, kept = solver_styles([TRAINED, *rules]), "price" if paid else "mean"
+    panels = []
+    for field, title in HELD_OUT.items():
+        scale = 100.0 if field == "failures" else 1.0
+        lines = _curve(rows, f"held_out/{'score' if field == kept else field}", styles[TRAINED], scale)
+        ends = {axis: [on(lines[-1].x, axis)[k] for k in (0, -1)] for axis in AXES} if lines else []
+        for name, one in rules.items() if lines else ():
+            lines.append(Series(name, ends, [scale * getattr(one, field)] * 2, styles[name], marked=False))
+        panels.append(Panel(title, lines, _X, _FROM_ZERO, height=320))
+    return panels
+
+
+def plot_curve(panels: Sequence[Panel], tolerance: float, agents: int) -> Figure:
+    """The figure of `held_out_panels`, over gradient updates.
+
+    Args:
+        panels: of `held_out_panels`.
+        tolerance: of success, for the label.
+        agents: whose mean and range is shown.
+    """
+    shown = [panel for panel in panels if any(one.name == TRAINED for one in panel.series)]
+    label = TRAINED if agents == 1 else f"{TRAINED}, mean and range of {agents} agents"
+    rename = lambda one: replace(one, label=label) if one.name == TRAINED and not one.thin else one
+    shown = [replace(panel, series=[rename(one) for one in panel.series]) for panel in shown]
+    figure = plots.plot_curves(shown, "updates")
+    figure.axes[0].set_ylabel(f"to f*(1 + {tolerance:g}) on held-out scenes")
+    return figure
+
 
 def to_html(
     rows: Sequence[Row],
@@ -53,18 +95,15 @@ def to_html(
         paid: whether the game's work has a price (`HELD_OUT`).
     """
     styles = solver_styles([TRAINED, *rules])
-    kept = "price" if paid else "mean"
-    log_name = lambda field: f"held_out/{'score' if field == kept else field}"
-    curves = [
-        _curve(rows, log_name(field), title, styles, {n: getattr(one, field) for n, one in rules.items()}, field)
-        for field, title in HELD_OUT.items()
+    curves = held_out_panels(rows, rules, paid)
+    logged = {name: title for name, title in LEARNING.items() if name in rows[0]}
+    learning = [
+        Panel(title, _curve(rows, name, styles[TRAINED]), _X, _FROM_ZERO, height=320) for name, title in logged.items()
     ]
-    usual = "episode/ceres"
-    learning = [_curve(rows, name, title, styles, {}, name) for name, title in LEARNING.items() if name in rows[0]]
-    for chart in learning[:1]:
-        chart.traces.append(_line(rows, usual, "Ceres' rule on these scenes", styles.get("ceres"), "ceres"))
-    played = _episode_charts(episodes)
-    every = [*curves, *learning, *played]
+    for panel in learning[:1]:
+        (usual,) = _curve(rows, "episode/ceres", styles.get("ceres", Style(COLOURS[-1], (0, (4, 3)), "o")), alone=True)
+        panel.series.append(replace(usual, name="ceres", label="Ceres' rule on these scenes", marked=False))
+    every = [*curves, *learning, *_episode_panels(episodes)]
     numbered = list(enumerate(every))
     first, second = len(curves), len(curves) + len(learning)
     agents = len({row["seed"] for row in rows})
@@ -82,108 +121,42 @@ def to_html(
     return page.to_html(page.Page("jaxba training", facts, sections, every, styles, AXES))
 
 
-def _x(rows: Sequence[Row]) -> dict[str, list[Any]]:
-    return {"updates": [row["updates"] for row in rows], "seconds": [row["wall_s"] for row in rows]}
-
-
-def _by_chunk(rows: Sequence[Row], name: str) -> list[tuple[Row, list[float]]]:
-    """The first row of every chunk that has the metric, and the metric of all agents."""
-    found: dict[int, tuple[Row, list[float]]] = {}
+def _curve(rows: Sequence[Row], name: str, style: Style, scale: float = 1.0, alone: bool = False) -> list[Series]:
+    """A metric over the chunks that have it: of several agents each one, unless `alone`, then the mean and its
+    range."""
+    chunks: dict[int, tuple[Row, list[float]]] = {}
     for row in rows:
         if row.get(name) is not None:
-            found.setdefault(row["chunk"], (row, []))[1].append(row[name])
-    return [found[chunk] for chunk in sorted(found)]
+            chunks.setdefault(row["chunk"], (row, []))[1].append(scale * row[name])
+    found = [chunks[chunk] for chunk in sorted(chunks)]
+    x = {"updates": [row["updates"] for row, _ in found], "seconds": [row["wall_s"] for row, _ in found]}
+    values = [agents for _, agents in found]
+    most = max(map(len, values), default=0)
+    mean = Series(TRAINED, x, [sum(ys) / len(ys) for ys in values], style)
+    if alone or most < 2:
+        return [mean] if found or alone else []
+    of = lambda k: [ys[k] if k < len(ys) else float("nan") for ys in values]
+    single = [Series(TRAINED, x, of(k), style, f"agent {k + 1}", thin=True) for k in range(most)]
+    return [replace(mean, between=([min(ys) for ys in values], [max(ys) for ys in values])), *single]
 
 
-def _line(rows: Sequence[Row], name: str, label: str, style: Style | None, meta: str) -> dict[str, Any]:
-    found = _by_chunk(rows, name)
-    look = page.line(style, 1.5) if style else {"color": "#7F7F7F", "dash": "dash", "width": 1.5}
-    y = [sum(values) / len(values) for _, values in found]
-    return {"name": label, "meta": meta, "x": _x([row for row, _ in found]), "y": y, "mode": "lines", "line": look}
-
-
-def _curve(
-    rows: Sequence[Row], name: str, title: str, styles: Mapping[str, Style], rules: Mapping[str, float], field: str
-) -> Chart:
-    """Mean and range of a metric over agents, each agent as a thin line, and the yardsticks."""
-    found, style = _by_chunk(rows, name), styles[TRAINED]
-    scale = 100.0 if field == "failures" else 1.0
-    x, values = _x([row for row, _ in found]), [[scale * v for v in ys] for _, ys in found]
-    several = any(len(ys) > 1 for ys in values)
-    traces: list[dict[str, Any]] = []
-    if several:
-        edge = {
-            "x": x,
-            "meta": TRAINED,
-            "mode": "lines",
-            "line": {"width": 0, "color": style.color},
-            "hoverinfo": "skip",
-        }
-        traces.append({**edge, "y": [min(ys) for ys in values]})
-        traces.append({**edge, "y": [max(ys) for ys in values], "fill": "tonexty", "fillcolor": _faint(style.color)})
-        for k in range(max(map(len, values))):
-            own = [ys[k] if k < len(ys) else None for ys in values]
-            hover = f"agent {k + 1}: %{{y:.4g}}<extra></extra>"
-            thin = {"width": 0.7, "color": style.color}
-            traces.append(
-                {
-                    "x": x,
-                    "y": own,
-                    "meta": TRAINED,
-                    "mode": "lines",
-                    "line": thin,
-                    "opacity": 0.5,
-                    "hovertemplate": hover,
-                }
-            )
-    mean = [sum(ys) / len(ys) for ys in values]
-    marker = {"symbol": page.SYMBOLS[style.marker], "size": 6, "color": style.color}
-    line = page.line(style, 2.5)
-    hover = "<b>trained</b><br>%{x:.4g}: %{y:.4g}<extra></extra>"
-    traces.append(
-        {"x": x, "y": mean, "name": TRAINED, "meta": TRAINED, "mode": "lines+markers", "line": line}
-        | {"marker": marker, "hovertemplate": hover}
-    )
-    for rule, value in rules.items():
-        ends = {axis: [xs[0], xs[-1]] if xs else [] for axis, xs in x.items()}
-        hover = f"<b>{html.escape(rule)}</b>: {scale * value:.4g}<extra></extra>"
-        flat = {"x": ends, "y": [scale * value] * 2, "name": html.escape(rule), "meta": rule, "mode": "lines"}
-        traces.append({**flat, "line": page.line(styles[rule], 1.5), "hovertemplate": hover})
-    layout: dict[str, Any] = {"height": 320, "yaxis": {"rangemode": "tozero"}}
-    xaxes = {"updates": {"title": {"text": "gradient updates"}}, "seconds": {"title": {"text": "seconds of training"}}}
-    return Chart(title, traces, layout, "", xaxes)
-
-
-def _faint(color: str) -> str:
-    return "rgba({}, {}, {}, 0.18)".format(*(int(color[k : k + 2], 16) for k in (1, 3, 5)))
-
-
-def _episode_charts(episodes: Sequence[Episode]) -> list[Chart]:
+def _episode_panels(episodes: Sequence[Episode]) -> list[Panel]:
     """Lambda, effort and cost over the iterations of some episodes."""
-    from jaxba.bench.plots import MARKERS
-    from jaxba.solver.figure import COLOURS
 
-    def chart(title: str, y: Callable[[Episode], Any], axis: dict[str, Any], starts: int) -> Chart:
-        traces = []
+    def panel(title: str, y: Callable[[Episode], Any], axis: Axis, start: int) -> Panel:
+        lines = []
         for k, one in enumerate(episodes):
-            color, symbol = COLOURS[k % len(COLOURS)], page.SYMBOLS[MARKERS[k % len(MARKERS)]]
+            style = Style(COLOURS[k % len(COLOURS)], "-", MARKERS[k % len(MARKERS)])
             numbers = [float(v) for v in y(one)]
-            x = [i + starts for i in range(len(numbers))]
-            filled = [True] * (1 - starts) + [bool(ok) for ok in one.steps.accepted]
-            symbols = [symbol if ok else f"{symbol}-open" for ok in filled]
-            traces.append(
-                {"x": x, "y": numbers, "name": f"scene {k + 1}", "mode": "lines+markers", "meta": ""}
-                | {"line": {"color": color, "width": 1.5}, "marker": {"symbol": symbols, "size": 7, "color": color}}
-                | {"hovertemplate": f"<b>scene {k + 1}</b>, iteration %{{x}}<br>%{{y:.4g}}<extra></extra>"}
-            )
-        layout = {"xaxis": {"title": {"text": "iteration"}}, "yaxis": axis, "height": 320}
-        return Chart(title, traces, layout)
+            hollow = [False] * (1 - start) + [not ok for ok in one.steps.accepted]
+            places = [i + start for i in range(len(numbers))]
+            lines.append(Series(f"scene {k + 1}", places, numbers, style, hollow=hollow))
+        return Panel(title, lines, {x: Axis("iteration") for x in AXES}, axis, height=320)
 
-    log = {"type": "log", "exponentformat": "power", "minorloglabels": "none"}
     return [
-        chart("damping λ", lambda one: one.steps.damping, log, 1),
-        chart("embedded point iterations", lambda one: one.steps.point_iterations, {"rangemode": "tozero"}, 1),
-        chart("repairs", lambda one: one.steps.repairs, {"rangemode": "tozero"}, 1),
-        chart("price paid, in plain steps", lambda one: one.paid, {"rangemode": "tozero"}, 0),
-        chart("cost (pixels²)", lambda one: one.cost, log, 0),
+        panel("damping λ", lambda one: one.steps.damping, Axis("", log=True), 1),
+        panel("embedded point iterations", lambda one: one.steps.point_iterations, _FROM_ZERO, 1),
+        panel("repairs", lambda one: one.steps.repairs, _FROM_ZERO, 1),
+        panel("price paid, in plain steps", lambda one: one.paid, _FROM_ZERO, 0),
+        panel("cost (pixels²)", lambda one: one.cost, Axis("", log=True), 0),
     ]

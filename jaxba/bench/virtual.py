@@ -6,9 +6,8 @@ with the same step. Source: "virtual best solver" of SATzilla (Xu et al. 2008).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
-from jaxba.bench.profile import NEVER, Reach
 from jaxba.damping import is_learned
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import SolverName, parse_solver
@@ -40,12 +39,6 @@ def rules_of_one_step(solvers: Iterable[str]) -> dict[str, list[str]]:
         for group in groups.values()
         if len(group) >= MIN_RULES
     }
-
-
-def best_reach(reaches: Sequence[Reach]) -> Reach:
-    """The fewest iterations and the least time, which may be those of different solvers."""
-    counts, times = [r.iterations for r in reaches], [r.seconds for r in reaches]
-    return Reach(min(counts), min(times)) if reaches else NEVER
 
 
 def _rule(name: str) -> SolverName | None:

@@ -20,8 +20,8 @@ from jaxba.io import check_output, write_problem
 from jaxba.io.files import sidecar_path, strip_compression
 from jaxba.io.formats import FORMATS, by_ending
 from jaxba.io.frames import poses_of, read_sidecar, truth_of, write_sidecar
+from jaxba.io.notes import note, note_center
 from jaxba.io.poses import read_poses
-from jaxba.io.remarks import note, note_center
 from jaxba.kitti import evaluate
 from jaxba.kitti.assemble import Assembled, sidecar_contents, windows
 from jaxba.kitti.sequence import files_of, read_sequence

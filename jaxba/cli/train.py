@@ -248,7 +248,7 @@ def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -
 def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: TrainingView, command: str) -> int:
     """Writes the policies, the learning curve and the page, and prints the comparison with the rules."""
     from jaxba.bench import run as bench_run
-    from jaxba.bench import training_curve, training_page
+    from jaxba.bench import training_page
     from jaxba.bench.plots import save_figure
     from jaxba.bench.tables import to_rich
     from jaxba.game.episode import replay
@@ -259,8 +259,8 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
     files, rows = _write_policies(folder, work.config, work, best), log.read(folder)
     rules_of_game = work.config.game
     paid = rules_of_game.reward == "price"
-    rules = {name: {**one._asdict(), "score": one.price if paid else one.mean} for name, one in work.rules.items()}
-    figure = training_curve.plot_curve(rows, rules, rules_of_game.tolerance)
+    panels = training_page.held_out_panels(rows, work.rules, paid)
+    figure = training_page.plot_curve(panels, rules_of_game.tolerance, work.config.seeds)
     files += save_figure(figure, folder / CURVE)
     view.stage("comparing with the rules")
     compared = work.compare([one.actor for one in best])

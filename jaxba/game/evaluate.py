@@ -12,6 +12,7 @@ from jaxba.damping import DampingPolicy
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, reach
+from jaxba.game.statistics import capped, geometric_mean
 from jaxba.problem.options import StepOptions
 
 
@@ -46,13 +47,13 @@ def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]],
     length = np.concatenate([np.where(run.converged, run.iterations, limit) for run in runs])
     return Score(
         mean=float(counted.mean()),
-        geometric_mean=float(np.exp(np.log(counted).mean())),
+        geometric_mean=geometric_mean(counted),
         median=float(np.median(counted)),
         p90=float(np.percentile(counted, 90)),
         failures=float(np.mean(~(iterations <= limit))),
         to_convergence=float(length.mean()),
         end=float(np.median(ends)),
-        price=float(np.exp(np.log(paid).mean())),
+        price=geometric_mean(paid),
     )
 
 
@@ -69,27 +70,6 @@ def prices_to(run: Trajectories, iterations: Float[np.ndarray, " scenes"], limit
     return np.where(iterations <= limit, paid, np.maximum(run.paid[:, -1], limit))
 
 
-class Ratio(NamedTuple):
-    """A geometric mean of paired ratios, with its 95% interval."""
-
-    mean: float
-    low: float
-    high: float
-
-
-RESAMPLES = 2000
-"""Bootstrap samples; a bound of an interval moves by a fiftieth of its width from one set of samples to another."""
-
-
-def paired_ratio(ours: Float[np.ndarray, " cases"], theirs: Float[np.ndarray, " cases"]) -> Ratio:
-    """Geometric mean of `ours / theirs` over cases that both had, and the percentile interval of a bootstrap over the
-    cases. Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", section 13.3."""
-    logs = np.log(np.asarray(ours) / np.asarray(theirs))
-    rows = np.random.default_rng(0).integers(len(logs), size=(RESAMPLES, len(logs)))
-    low, high = np.percentile(logs[rows].mean(axis=1), [2.5, 97.5])
-    return Ratio(*(float(np.exp(x)) for x in (logs.mean(), low, high)))
-
-
 def amounts(
     runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int, priced: bool
 ) -> np.ndarray:
@@ -97,7 +77,7 @@ def amounts(
     tolerance. Other arguments as for `score`."""
     reached = [reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)]
     if not priced:
-        return np.clip(np.concatenate(reached), 1, limit)
+        return capped(np.concatenate(reached), limit)
     return np.concatenate([prices_to(run, found, limit) for run, found in zip(runs, reached, strict=True)])
 
 

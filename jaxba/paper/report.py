@@ -21,76 +21,9 @@ CLAIMS = "claims.md"
 BUSY_CORES = 0.9
 """With fewer processor cores in use on average, other programs must have slowed the run down."""
 
-INTERPRETATIONS: tuple[tuple[str, str, str], ...] = (
-    (
-        "damping",
-        "text: `H + λI`; code: `diag(H)(1 + λ)`",
-        "`H + λ diag(H)`, clamped as Ceres does; a λ is then scale-free",
-    ),
-    (
-        "classic rule",
-        "text: halve λ when the error rose; code: halve it after a gain above 0.4, double it otherwise; first λ 1/4 "
-        "(text) or 3e-2 (code)",
-        "the code's directions, the text's 1/4",
-    ),
-    ("rejected steps", "not stated; the code restores the state", "rejected, and counted as an iteration"),
-    (
-        "stopping",
-        "text: 1e-6; code: absolute cost below 1e-10",
-        "relative decrease of an accepted step below 1e-6, not of one that damping made short",
-    ),
-    (
-        "unknowns",
-        "camera poses and points",
-        "the same on the synthetic scenes and on KITTI; on BAL the nine numbers of its cameras",
-    ),
-    (
-        "synthetic scenes",
-        "text: random poses and points; code: cameras on a line, noise-free bearings",
-        "random poses and points, pixels with half a pixel of noise, or no relative tolerance would make sense; the "
-        "error of the start, which the text does not give, is chosen",
-    ),
-    (
-        "state",
-        "text: last five errors; code: one predicted decrease, un-normalised",
-        "the text's, root mean square in pixels, at most 1000",
-    ),
-    ("action", "text: λ in [0, ∞); code: tanh, half of it is λ = 1e-15", "tanh over log10 λ from -10 to 2"),
-    (
-        "reward",
-        "measured seconds, bonus 10",
-        "-1 an iteration, bonus 10; a clock of measured durations in one ablation and in the tables KITTI and BAL",
-    ),
-    (
-        "episode's end",
-        "the stopping rule",
-        "within 1e-3 of the best cost known for the scene; the tables count the stopping rule",
-    ),
-    (
-        "networks",
-        "text: value and critics of three layers of 256, policy of four; code: fewer",
-        "as the text: value and critics two hidden layers of 256 and a linear one, policy three and a linear one",
-    ),
-    (
-        "time delay",
-        "text: 5 iterations between the critics; code: a soft target 0.01",
-        "the target value network is copied every 5 updates",
-    ),
-    ("temperature", "code: fixed at 1", "fixed at 1"),
-    (
-        "choice of the policy",
-        "code: fewest iterations seen in training",
-        "fewest on training scenes; the tables use other scenes, and all seeds",
-    ),
-    ("success", "within 100 iterations", "the same; a failure counts as 100 in every mean"),
-    (
-        "train and test sets",
-        "not stated for BAL and KITTI",
-        "tables KITTI and BAL: trained on other problems than the one judged; ablations: on synthetic scenes",
-    ),
-)
-"""Subjects on which the paper's text and its released code are open or contradict each other: what both say, and what
-is done here."""
+INTERPRETATIONS = "interpretations.md"
+"""Section on the subjects on which the paper's text and its released code are open or contradict each other: what both
+say, and what is done here. Beside this module."""
 
 
 def write(
@@ -154,8 +87,7 @@ def _claims(runner: Runner, sections: Sequence[Section], command: str) -> str:
 def _rest(runner: Runner, sections: Sequence[Section], seconds: Mapping[str, tuple[float, float]]) -> list[str]:
     """What follows the claims: interpretations, every table and figure, settings and times."""
     parts = [
-        "## What the paper leaves open, and what is done here",
-        table(("subject", "paper: text and released code", "here"), INTERPRETATIONS, 3),
+        Path(__file__).with_name(INTERPRETATIONS).read_text(encoding="utf-8").rstrip(),
         "## Tables and figures",
         "`good ends`: fraction of the solves that end within 1 % of the best cost found in this run. `seeds: range`: "
         "number of training runs and the range of their means.",

@@ -119,10 +119,9 @@ def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Out
         best: best known cost of each problem.
     """
     found = []
-    for name in profile.problem_names(records):
-        runs = [r for r in records if r.problem == name]
+    for name, runs in profile.by_problem(records).items():
         first = runs[0]
-        near = profile.first_iteration(first, profile.relative_threshold(first.initial_cost, best[name], NEAR))
+        near = profile.first(first, profile.relative_threshold(first.initial_cost, best[name], NEAR)).iterations
         end = first.final_cost / best[name] - 1 if best[name] > 0 else 0.0
         seconds = statistics.median(r.setup_s + (r.trace[-1].time_s if r.trace else r.total_s) for r in runs)
         found.append(_outcome(first.iterations, profile.converged(first), near, end, seconds))
@@ -130,14 +129,8 @@ def of_records(records: Sequence[Record], best: Mapping[str, float]) -> list[Out
 
 
 def _outcome(iterations: int, converged: bool, near: float, end: float, seconds: float = math.nan) -> Outcome:
-    good = converged and iterations <= ITERATION_LIMIT
-    return Outcome(
-        iterations=float(iterations) if good else float(ITERATION_LIMIT),
-        converged=good,
-        near=min(max(near, 1.0), float(ITERATION_LIMIT)),
-        end=end,
-        seconds=seconds,
-    )
+    limit, good = float(ITERATION_LIMIT), converged and iterations <= ITERATION_LIMIT
+    return Outcome(float(iterations) if good else limit, good, min(max(near, 1.0), limit), end, seconds)
 
 
 def ratio(one: float, other: float) -> float:

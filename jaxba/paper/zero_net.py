@@ -179,11 +179,6 @@ def _train(
     return last.layers, means
 
 
-def parameters(net: ZeroNet) -> int:
-    """Number of parameters of a network."""
-    return sum(int(np.size(part)) for layer in net.layers for part in layer)
-
-
 def save(path: Any, net: ZeroNet) -> None:
     """Writes the weights to a .npz file atomically."""
     with atomic_write(path) as file:

@@ -1,7 +1,7 @@
-"""Applies jaxba's embedded iterations and acceptance test to steps that Ceres computes. Needs the extra `ceres`.
+"""Accepts or rejects the steps that Ceres computes as jaxba does its own. Needs the extra `ceres`.
 
 Ceres itself accepts every step: its problem has an additional residual (`AcceptAnyStep`) that no parameter changes,
-large before a step and zero after it. jaxba then refines the step and accepts or rejects it as one of its own, and
+large before a step and zero after it. jaxba then refines the step if that is asked for, and accepts or rejects it, and
 Ceres continues from the result.
 """
 
@@ -24,7 +24,6 @@ from jaxba.lm.step import Proposal, initial_state, try_step
 from jaxba.model.linearize import linearize
 from jaxba.peers.ceres import Run, step_of
 from jaxba.peers.colmap import pyceres
-from jaxba.peers.model import half_rotation
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import ConjugateGradients, StepOptions
@@ -82,7 +81,7 @@ class ReportedByCeres(NamedTuple):
 
 
 class StepAcceptance:
-    """Refines the steps of a `Run`, and accepts or rejects them. Adds an `AcceptAnyStep` to the run's Ceres problem."""
+    """Accepts or rejects the steps of a `Run`. Adds an `AcceptAnyStep` to the run's Ceres problem."""
 
     def __init__(self, run: Run, options: StepOptions, min_gain: float) -> None:
         """Builds jaxba's layout and state of the problem.
@@ -165,3 +164,12 @@ def _evaluate(
     damped = slope - jnp.sum(change * change)
     proposal = Proposal(Step(cameras, points, slope, damped, *reported), linear.reference, jnp.zeros((), bool))
     return try_step(layout, state, damping, proposal, options, min_gain)
+
+
+def half_rotation(before: Float[Array, "4 n"], after: Float[Array, "4 n"]) -> Float[Array, "3 n"]:
+    """`v` with `after = exp(v) before` for unit quaternions: half of the rotation vector between them, radians."""
+    v, w = before[:3], before[3]
+    vector = w * after[:3] - after[3] * v - jnp.cross(after[:3], v, axis=0)
+    real = w * after[3] + jnp.sum(after[:3] * v, axis=0)
+    sine = jnp.linalg.norm(vector, axis=0)
+    return jnp.where(sine > 0, jnp.arctan2(sine, real) / jnp.where(sine > 0, sine, 1), 1) * vector

@@ -21,9 +21,10 @@ from jaxba.damping.policy import trained_step
 from jaxba.damping.registry import BOLD, GUARDED, LEARNED
 from jaxba.game.constant_actions import best_constant_action
 from jaxba.game.env import Game, make_game
-from jaxba.game.evaluate import Ratio, Runs, Score, amounts, best_costs, evaluate, paired_ratio, play_all, scores
+from jaxba.game.evaluate import Runs, Score, amounts, best_costs, evaluate, play_all, scores
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks, select
+from jaxba.game.statistics import Ratio, paired_ratio
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.runtime.atomic import atomic_write

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from jaxba.training.log import Row
+
 BLOCKS = "▁▂▃▄▅▆▇█"
 """Heights of a bar in the line of past scores."""
 
@@ -22,8 +24,8 @@ class TrainingView:
         self.console, self.config = console, config
         self.rules: Mapping[str, Any] = {}
         self.best: Sequence[Any] = ()  # the best policies that this process has trained
-        self._rows: Sequence[Mapping[str, Any]] = ()
-        self._scored: Sequence[Mapping[str, Any]] = ()
+        self._rows: Sequence[Row] = ()
+        self._scored: Sequence[Row] = ()
         self._past: list[float] = []
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -35,10 +37,9 @@ class TrainingView:
             speed_estimate_period=600,
         )
         self._live = Live(self._bar, console=console, transient=True) if console.is_terminal else None
-        self._task: Any = None
+        self._task = self._bar.add_task("starting", total=None, now="")
 
     def __enter__(self) -> TrainingView:
-        self._task = self._bar.add_task("starting", total=None, now="")
         if self._live:
             self._live.start()
         return self
@@ -53,7 +54,7 @@ class TrainingView:
         if not self._live:
             self.console.print(description)
 
-    def rows(self, rows: Sequence[Mapping[str, Any]]) -> None:
+    def rows(self, rows: Sequence[Row]) -> None:
         """Reports a finished chunk, by its rows of the training log."""
         row, total = rows[0], self.config.chunks
         speed = f"{row['steps_per_s']:.0f} steps/s, {row['updates_per_s']:.0f} updates/s"
@@ -68,12 +69,11 @@ class TrainingView:
         if self._live:
             self._live.update(self._drawn())
             return
-        now = speed
         ended = [one for one in rows if one["episodes"]]
         if ended:
             length, rule = _mean(ended, "episode/length"), _mean(ended, "episode/ceres")
-            now += f", {length:.1f} iterations (Ceres' rule {rule:.1f})"
-        self.console.print(f"{description}: {now}, {row['wall_s']:.0f} s")
+            speed += f", {length:.1f} iterations (Ceres' rule {rule:.1f})"
+        self.console.print(f"{description}: {speed}, {row['wall_s']:.0f} s")
         if "held_out/score" in row:
             self.console.print(f"{description}: {self._held_out(rows)}")
 
@@ -101,31 +101,26 @@ class TrainingView:
         for name in ("trained", *(["agents"] if self.config.seeds > 1 else []), *shown):
             table.add_column(name, justify="right")
 
-        def add(
-            label: str, rows: Sequence[Mapping[str, Any]], name: str, others: Sequence[str], scale: float = 1.0
-        ) -> None:
+        def add(label: str, rows: Sequence[Row], name: str, others: Sequence[float], scale: float = 1.0) -> None:
             values = [scale * row[name] for row in rows if row.get(name) is not None]
             if values:
                 spread = [f"{min(values):.2f} to {max(values):.2f}"] if self.config.seeds > 1 else []
-                table.add_row(label, f"{sum(values) / len(values):.2f}", *spread, *others)
+                table.add_row(label, f"{sum(values) / len(values):.2f}", *spread, *(f"{x:.2f}" for x in others))
 
         played = [row for row in self._rows if row["episodes"]]
-        usual = [f"{_mean(played, 'episode/ceres'):.2f}"] if played and shown else []
+        usual = [_mean(played, "episode/ceres")] if played and shown else []
         add("episodes of this chunk: iterations", played, "episode/length", usual)
-        of = lambda field: [f"{getattr(one, field):.2f}" for one in shown.values()]
-        if self._paid:
-            add("held out: price", self._scored, "held_out/score", of("price"))
-            add("held out: iterations", self._scored, "held_out/mean", of("mean"))
-        else:
-            add("held out: iterations", self._scored, "held_out/score", of("mean"))
-            add("held out: price", self._scored, "held_out/price", of("price"))
-        failures = [f"{100 * one.failures:.2f}" for one in shown.values()]
+        fields = {"price": "price", "iterations": "mean"} if self._paid else {"iterations": "mean", "price": "price"}
+        for k, (label, field) in enumerate(fields.items()):
+            of = [getattr(one, field) for one in shown.values()]
+            add(f"held out: {label}", self._scored, f"held_out/{field if k else 'score'}", of)
+        failures = [100 * one.failures for one in shown.values()]
         add("held out: failures (%)", self._scored, "held_out/failures", failures, 100.0)
         if len(self._past) > 1:
             table.add_row("held out, evaluation by evaluation", _bars(self._past[-PAST:]))
         return table
 
-    def _held_out(self, rows: Sequence[Mapping[str, Any]]) -> str:
+    def _held_out(self, rows: Sequence[Row]) -> str:
         values = [row["held_out/score"] for row in rows if row.get("held_out/score") is not None]
         text = f"held out {_mean(rows, 'held_out/score'):.2f} {'plain steps paid' if self._paid else 'iterations'}"
         if len(rows) > 1:
@@ -139,7 +134,7 @@ class TrainingView:
         return text
 
 
-def _mean(rows: Sequence[Mapping[str, Any]], name: str) -> float:
+def _mean(rows: Sequence[Row], name: str) -> float:
     return sum(row[name] for row in rows if row.get(name) is not None) / len(rows)
 
 

@@ -11,7 +11,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from jaxba.bench import plots
+from jaxba.bench import panels, plots
 from jaxba.bench.profile import Target
 from jaxba.bench.report import file_names, run_metadata, to_html, write_all
 from jaxba.bench.summary import summarize
@@ -129,7 +129,7 @@ def test_a_solver_has_one_colour_in_all_charts_and_figures():
     records = [make_record(p, s, 12) for p in "ab" for s in ("q", "classic", "learned", "r")]
     _, _, book = page_of(records)
     colours = {(trace["meta"], trace["line"]["color"]) for chart in book["charts"] for trace in chart["data"]}
-    styles = plots.solver_styles(["q", "classic", "learned", "r"])
+    styles = panels.solver_styles(["q", "classic", "learned", "r"])
     assert colours == {(name, style.color) for name, style in styles.items()}
 
 
@@ -161,11 +161,11 @@ def test_run_that_produced_no_numbers_still_makes_a_report(tmp_path):
 
 def test_many_solvers_have_different_styles_and_yardsticks_always_the_same():
     solvers = [f"s{i}" for i in range(20)] + ["ceres", "classic"]
-    styles = plots.solver_styles(solvers)
+    styles = panels.solver_styles(solvers)
     assert len({(s.color, str(s.linestyle)) for s in styles.values()}) == len(solvers)
-    assert styles["classic"] == plots.solver_styles(["x", "classic"])["classic"]
-    alone = plots.solver_styles(["mine", "ceres", "bold"])
-    assert alone["bold"] == plots.solver_styles(["bold"])["bold"]
+    assert styles["classic"] == panels.solver_styles(["x", "classic"])["classic"]
+    alone = panels.solver_styles(["mine", "ceres", "bold"])
+    assert alone["bold"] == panels.solver_styles(["bold"])["bold"]
     assert len({style.color for style in alone.values()}) == 3
     assert list(styles) == solvers
 
@@ -176,7 +176,7 @@ def test_profile_curves_have_the_fractions_computed_by_hand():
     figure = plots.plot_profiles(records, [Target("relative", 1e-2)], known_best={"a": 100.0})
     by_iterations = figure.axes[1]
     curves = {line.get_color(): np.asarray(line.get_xydata()) for line in by_iterations.get_lines()}
-    styles = plots.solver_styles(["x", "y"])
+    styles = panels.solver_styles(["x", "y"])
     assert curves[styles["x"].color][0].tolist() == [1.0, 100.0]
     assert [3.0, 100.0] in curves[styles["y"].color].tolist()
 

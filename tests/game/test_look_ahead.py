@@ -12,10 +12,11 @@ from tiny_game import AGENT, KIND, RULES, tiny_bank
 
 from jaxba.damping.learned import ConstantAction
 from jaxba.game.env import make_game
-from jaxba.game.evaluate import paired_ratio, prices_to
+from jaxba.game.evaluate import prices_to
 from jaxba.game.look_ahead import look_ahead, play_on
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import draw_prices, reach
+from jaxba.game.statistics import paired_ratio
 from jaxba.problem.options import StepOptions
 
 pytestmark = pytest.mark.slow

@@ -211,8 +211,6 @@ def _schedule_text(runner: Runner) -> str:
     )
 
 
-THREE_FIFTHS = "The paper's schedule takes three fifths of classic's iterations ({})"
-
 SCHEDULE = Ablation(
     "schedule",
     "Table: constant schedules",

@@ -12,7 +12,7 @@ from jaxba.bench import profile
 from jaxba.bench.plots import plot_convergence, plot_lambda, plot_profiles
 from jaxba.bench.profile import RELATIVE_TOLERANCES, Target, converged
 from jaxba.bench.sources import SCENE_PREFIX, Source, sources
-from jaxba.bench.summary import compare
+from jaxba.game.statistics import compare
 from jaxba.paper import claims, real_problems
 from jaxba.paper.markdown import Section
 from jaxba.paper.runner import ELSEWHERE, Method, Runner, method_named
@@ -171,7 +171,7 @@ def _speed_claim(records: list[Record], tau: float, text: str, faster: bool) -> 
     table = profile.reach_table(records, Target("tau", tau))
     ours, classic = table.get("learned-driver", {}), table.get("classic", {})
     names = [name for name in ours if name in classic]
-    found = compare([ours[name] for name in names], [classic[name] for name in names])
+    found = compare(profile.reached(ours, names), profile.reached(classic, names))
     if not found.both:
         return claims.Claim(text, "figure", "-", "not run")
     reached, base = ((found.both + alone) / len(names) for alone in (found.only_solver, found.only_yardstick))

@@ -1,0 +1,88 @@
+"""Statistics of solvers or policies on problems, for games, trainings, benchmarks and the paper.
+
+Pure functions of arrays with an entry per problem or scene. Iterations and seconds to a target are infinite if it is
+never reached. Ratios are ours / theirs, so that below 1 is better.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+SHORTEST_TIME = 1e-6
+"""Lower limit in seconds of times in geometric means; a time is 0 where the start satisfies a target."""
+
+RESAMPLES = 2000
+"""Bootstrap samples; a bound of an interval moves by a fiftieth of its width from one set of samples to another."""
+
+
+class Reached(NamedTuple):
+    """What a solver needed to a target on every problem."""
+
+    iterations: Float[np.ndarray, " problems"]
+    seconds: Float[np.ndarray, " problems"]
+
+
+class Ratio(NamedTuple):
+    """A geometric mean of paired ratios, with its 95% interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A solver compared with a yardstick on one target."""
+
+    both: int
+    """Number of problems on which both reached the target; the ratios are geometric means over these."""
+    only_solver: int
+    """Number of problems on which only the solver reached it."""
+    only_yardstick: int
+    """Number of problems on which only the yardstick reached it."""
+    iterations: float
+    """Ratio of iterations."""
+    seconds: float
+    """Ratio of times."""
+
+
+def capped(iterations: Float[np.ndarray, " *shape"], limit: int) -> Float[np.ndarray, " *shape"]:
+    """Iterations to a target where a failure counts as the limit, and a target reached at the start as one."""
+    return np.clip(iterations, 1.0, limit)
+
+
+def geometric_mean(values: Iterable[Any], floor: float = 0.0) -> float:
+    """exp(mean(log)); values below `floor` count as `floor`, a zero makes it 0, infinity infinite, none NaN."""
+    given = values if isinstance(values, np.ndarray) else np.fromiter(values, float)
+    raised = np.maximum(given, floor)
+    if not raised.size or (raised == 0).any():
+        return 0.0 if raised.size else math.nan
+    return float(np.exp(np.log(raised).mean()))
+
+
+def compare(ours: Reached, theirs: Reached) -> Comparison:
+    """A solver compared with a yardstick, problem by problem."""
+    a, b = np.isfinite(ours.iterations), np.isfinite(theirs.iterations)
+    ratio = lambda x, y, floor: geometric_mean(np.maximum(x[a & b], floor) / np.maximum(y[a & b], floor))
+    return Comparison(
+        both=int(np.sum(a & b)),
+        only_solver=int(np.sum(a & ~b)),
+        only_yardstick=int(np.sum(b & ~a)),
+        iterations=ratio(ours.iterations, theirs.iterations, 1.0),
+        seconds=ratio(ours.seconds, theirs.seconds, SHORTEST_TIME),
+    )
+
+
+def paired_ratio(ours: Float[np.ndarray, " cases"], theirs: Float[np.ndarray, " cases"]) -> Ratio:
+    """Geometric mean of `ours / theirs` over cases that both had, and the percentile interval of a bootstrap over the
+    cases. Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", section 13.3."""
+    logs = np.log(np.asarray(ours) / np.asarray(theirs))
+    rows = np.random.default_rng(0).integers(len(logs), size=(RESAMPLES, len(logs)))
+    low, high = np.percentile(logs[rows].mean(axis=1), [2.5, 97.5])
+    return Ratio(*(float(np.exp(x)) for x in (logs.mean(), low, high)))
