@@ -35,6 +35,8 @@ class UnknownMethodError(ValueError):
 
 
 class _Methods(Mapping[str, StepMethod]):
+    """The mapping `METHODS`, made of entry points."""
+
     @functools.cached_property
     def _found(self) -> dict[str, EntryPoint]:
         own = (EntryPoint(name, place, GROUP) for name, place in SHIPPED.items())
