@@ -1,12 +1,11 @@
-"""What a game could be won by: the look-ahead with rollouts beside the best constant action and a trained policy.
+"""How far a game could be won: the look-ahead with rollouts beside the best constant action and a trained policy.
 
     python -m benchmarks.look_ahead RUN [--scenes 64]
 
-RUN is a folder of `jaxba-train` whose work has a price (`game.reward: price`). The best constant action is searched on
-its training scenes. The first of its held-out scenes are then played by that action, by the trained policy, and by a
-look-ahead (jaxba/game/look_ahead.py) with either as its base; from every state the look-ahead tries a grid of lambdas
-with every effort. Printed are geometric means of the prices, and their paired ratios to the constant action's with 95%
-intervals.
+RUN is a folder of `jaxba-train`. The best constant action is searched on its training scenes. The first of its held-out
+scenes are then played by that action, by the trained policy, and by a look-ahead (jaxba/game/look_ahead.py) with either
+as its base; from every state the look-ahead tries a grid of lambdas. Printed are geometric means of the iterations, and
+their paired ratios to the constant action's with 95% intervals.
 """
 
 from __future__ import annotations
@@ -25,17 +24,16 @@ import tyro
 
 from jaxba.cli.common import prepare_process
 from jaxba.damping.policy_file import load_policy
-from jaxba.game.constant_actions import best_constant_action, values_of
 from jaxba.game.env import make_game
-from jaxba.game.evaluate import paired_ratio
+from jaxba.game.evaluate import best_constant_action, paired_ratio
 from jaxba.game.look_ahead import look_ahead
 from jaxba.game.scene_bank import select
 from jaxba.runtime import process
 from jaxba.training.config import load
-from jaxba.training.task import BANK, read_banks
+from jaxba.training.task import BANK, first_scenes, read_banks
 
 LAMBDAS = (-1.0, -0.6, -0.2, 0.2, 0.6)
-"""First number of the actions that are tried."""
+"""Actions that are tried."""
 
 
 @dataclass(frozen=True)
@@ -60,22 +58,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     with process.single_blas_thread():
         training, held_out = ([getattr(split, part) for split in splits] for part in ("train", "held_out"))
         limits = rules.tolerance, rules.max_iterations
-        constant = best_constant_action(kinds, training, rules.agent, options, *limits)
-        print(f"best constant action: {', '.join(f'{x:.2f}' for x in constant.action)}")
+        constant = best_constant_action(kinds, first_scenes(training, held_out), rules.agent, options, *limits)
+        print(f"best constant action: {constant.action[0]:.2f}")
         few = [select(bank, np.arange(min(args.scenes, len(bank.initial_cost)))) for bank in held_out]
         game = make_game(rules, kinds, few, config.envs, config.step_options)
-        actions = np.array(list(itertools.product(LAMBDAS, *values_of(rules.agent)[1:])))
+        actions = np.array(LAMBDAS)[:, None]
         policies = {"constant action": constant, "learned": load_policy(args.run / "policy.safetensors")}
-        prices: dict[str, np.ndarray] = {}
+        taken: dict[str, np.ndarray] = {}
         for (name, policy), looks in itertools.product(policies.items(), (False, True)):
             started, label = time.perf_counter(), f"look-ahead from {name}" if looks else name
             played = look_ahead(game, policy, actions, looks)
-            prices[label] = np.concatenate([one.paid for one in played])
-            failures = 1 - np.mean(np.concatenate([one.success for one in played]))
-            mean, ratio = np.exp(np.log(prices[label]).mean()), paired_ratio(prices[label], prices["constant action"])
+            taken[label] = np.concatenate([iterations for iterations, _ in played])
+            failures = 1 - np.mean(np.concatenate([success for _, success in played]))
+            mean, ratio = np.exp(np.log(taken[label]).mean()), paired_ratio(taken[label], taken["constant action"])
             interval = "{:.3f} [{:.3f}, {:.3f}]".format(*ratio)
             seconds = time.perf_counter() - started
-            print(f"{label:30} price {mean:.3f}, {interval}, {failures:.1%} never ({seconds:.0f} s)", flush=True)
+            print(f"{label:30} {mean:.3f} iterations, {interval}, {failures:.1%} never ({seconds:.0f} s)", flush=True)
     return 0
 
 

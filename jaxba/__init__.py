@@ -31,7 +31,6 @@ from jaxba.io import (
     write_ply,
     write_problem,
 )
-from jaxba.linear.step import Effort
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import initial_state, lm_step
 from jaxba.lm.termination import Termination, Tolerances
@@ -77,7 +76,6 @@ __all__ = [
     "Coordinates",
     "Covariance",
     "DampingPolicy",
-    "Effort",
     "Geometric",
     "History",
     "IterationRecord",

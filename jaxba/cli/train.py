@@ -278,8 +278,7 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
 
     files, rows = _write_policies(folder, work.config, work, best), log.read(folder)
     rules_of_game = work.config.game
-    paid = rules_of_game.reward == "price"
-    rules = {name: {**one._asdict(), "score": one.price if paid else one.mean} for name, one in work.rules.items()}
+    rules = {name: {**one._asdict(), "score": one.mean} for name, one in work.rules.items()}
     figure = plot_curve(rows, rules, rules_of_game.tolerance)
     files += save_figure(figure, folder / CURVE)
     view.stage("comparing with the rules")
@@ -294,7 +293,7 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
     ]
     facts = {"command": command, "agents": str(work.config.seeds), **bench_run.machine()}
     page = folder / PAGE
-    write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts, paid))
+    write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts))
     view.__exit__()
     drawn = to_rich(table)
     drawn.columns[0].no_wrap = drawn.columns[-1].no_wrap = True
@@ -305,7 +304,7 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
 
 
 def _table(compared: Any, tolerance: float, count: int) -> Table:
-    """Scores on the held-out scenes, and what the trained policies pay over each other row."""
+    """Scores on the held-out scenes, and the iterations of the trained policies over those of each other row."""
     from jaxba.bench.tables import Table
 
     agents = len(next(iter(compared.by_agent.values())))
@@ -314,13 +313,13 @@ def _table(compared: Any, tolerance: float, count: int) -> Table:
     for name, score in compared.scores.items():
         own = [f"{x:.2f}" for x in compared.by_agent.get(name, ())] or ["-"] * agents
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
-        ends = f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}", f"{score.price:.2f}"
+        ends = f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}"
         ratio = "{:.3f} [{:.3f}, {:.3f}]".format(*compared.ratios[name]) if name in compared.ratios else "-"
         rows.append((name, *numbers, *ends, *(own if single else ()), ratio))
-    header = ("policy", "mean", "geom. mean", "median", "p90", "failures", "converged", "final gap", "price")
+    header = ("policy", "mean", "geom. mean", "median", "p90", "failures", "converged", "final gap")
     return Table(
         f"Iterations to f*(1 + {tolerance:g}) on {count} held-out scenes",
         (*header, *single, "trained over it [95%]"),
         rows,
-        "A failure counts as the limit. The last column: what the trained policies pay over this one, scene by scene.",
+        "A failure counts as the limit. The last column: iterations of the trained policies over this one's, by scene.",
     )

@@ -19,9 +19,8 @@ AXES = ("updates", "seconds")
 TRAINED = "trained"
 """Name of the trained policy in charts."""
 
-HELD_OUT = {"price": "price", "mean": "mean iterations", "p90": "90th percentile", "failures": "failures (%)"}
-"""Charts of held-out scores: fields of a `Score` and their titles. Where training pays, the log has `price` as
-`score`, elsewhere `mean`."""
+HELD_OUT = {"mean": "mean iterations", "p90": "90th percentile", "failures": "failures (%)"}
+"""Charts of held-out scores: fields of a `Score` and their titles. The log has `mean` as `score`."""
 
 LEARNING = {
     "episode/length": "iterations of a training episode",
@@ -40,7 +39,6 @@ def to_html(
     table: Table,
     episodes: Sequence[Episode],
     facts: Mapping[str, str],
-    paid: bool,
 ) -> str:
     """The page.
 
@@ -50,11 +48,9 @@ def to_html(
         table: the comparison on the held-out scenes.
         episodes: of the best policy.
         facts: machine, versions, command.
-        paid: whether the game's work has a price (`HELD_OUT`).
     """
     styles = solver_styles([TRAINED, *rules])
-    kept = "price" if paid else "mean"
-    log_name = lambda field: f"held_out/{'score' if field == kept else field}"
+    log_name = lambda field: f"held_out/{'score' if field == 'mean' else field}"
     curves = [
         _curve(rows, log_name(field), title, styles, {n: getattr(one, field) for n, one in rules.items()}, field)
         for field, title in HELD_OUT.items()
@@ -159,7 +155,7 @@ def _faint(color: str) -> str:
 
 
 def _episode_charts(episodes: Sequence[Episode]) -> list[Chart]:
-    """Lambda, effort and cost over the iterations of some episodes."""
+    """Lambda, work and cost over the iterations of some episodes."""
     from jaxba.bench.plots import MARKERS
     from jaxba.solver.figure import COLOURS
 
@@ -184,6 +180,5 @@ def _episode_charts(episodes: Sequence[Episode]) -> list[Chart]:
         chart("damping λ", lambda one: one.damping, log, 1),
         chart("embedded point iterations", lambda one: one.point_iterations, {"rangemode": "tozero"}, 1),
         chart("repairs", lambda one: one.repairs, {"rangemode": "tozero"}, 1),
-        chart("price paid, in plain steps", lambda one: one.paid, {"rangemode": "tozero"}, 0),
         chart("cost (pixels²)", lambda one: one.cost, log, 0),
     ]

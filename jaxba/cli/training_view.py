@@ -82,10 +82,6 @@ class TrainingView:
 
         return Group(self._bar, self.table())
 
-    @property
-    def _paid(self) -> bool:
-        return self.config.game.reward == "price"
-
     def _yardsticks(self) -> dict[str, Any]:
         from jaxba.training.task import CONSTANT
 
@@ -112,13 +108,7 @@ class TrainingView:
         played = [row for row in self._rows if row["episodes"]]
         usual = [f"{_mean(played, 'episode/ceres'):.2f}"] if played and shown else []
         add("episodes of this chunk: iterations", played, "episode/length", usual)
-        of = lambda field: [f"{getattr(one, field):.2f}" for one in shown.values()]
-        if self._paid:
-            add("held out: price", self._scored, "held_out/score", of("price"))
-            add("held out: iterations", self._scored, "held_out/mean", of("mean"))
-        else:
-            add("held out: iterations", self._scored, "held_out/score", of("mean"))
-            add("held out: price", self._scored, "held_out/price", of("price"))
+        add("held out: iterations", self._scored, "held_out/score", [f"{one.mean:.2f}" for one in shown.values()])
         failures = [f"{100 * one.failures:.2f}" for one in shown.values()]
         add("held out: failures (%)", self._scored, "held_out/failures", failures, 100.0)
         if len(self._past) > 1:
@@ -127,11 +117,11 @@ class TrainingView:
 
     def _held_out(self, rows: Sequence[Mapping[str, Any]]) -> str:
         values = [row["held_out/score"] for row in rows if row.get("held_out/score") is not None]
-        text = f"held out {_mean(rows, 'held_out/score'):.2f} {'plain steps paid' if self._paid else 'iterations'}"
+        text = f"held out {_mean(rows, 'held_out/score'):.2f} iterations"
         if len(rows) > 1:
             text += f" ({min(values):.2f} to {max(values):.2f})"
         text += f", p90 {_mean(rows, 'held_out/p90'):.0f}, failures {100 * _mean(rows, 'held_out/failures'):.1f} %"
-        rules = [f"{n} {one.price if self._paid else one.mean:.2f}" for n, one in self._yardsticks().items()]
+        rules = [f"{n} {one.mean:.2f}" for n, one in self._yardsticks().items()]
         if rules:
             text += f" ({', '.join(rules)})"
         if any(one.chunk == rows[0]["chunk"] for one in self.best):

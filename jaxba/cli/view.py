@@ -158,8 +158,8 @@ def _episode(args: Arguments) -> Shown:
         cost=played.cost,
         damping=np.concatenate([start, played.damping]),
         gain_ratio=np.concatenate([start, played.gain_ratio]),
-        time_s=played.paid,
-        unit="plain steps paid",
+        time_s=np.arange(len(played.cost), dtype=float),
+        unit="iterations",
     )
     return shown(recording, f"scene {args.scene}, {args.policy}")
 

@@ -13,10 +13,9 @@ from jaxtyping import Float
 
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.clock import duration
-from jaxba.damping.guard import FIRST_DAMPING, GuardState, full_effort, initial_guard, update_guard
+from jaxba.damping.guard import FIRST_DAMPING, GuardState, initial_guard, update_guard
 from jaxba.damping.policy import ProblemInfo
-from jaxba.linear.step import Effort
-from jaxba.lm.records import Prices, StepInfo
+from jaxba.lm.records import StepInfo
 
 FLOOR = 1e-9
 """Smallest relative decrease that a feature distinguishes from zero."""
@@ -56,7 +55,7 @@ SOLVE_FEATURES = (
     "smallest_accepted",  # log10 of the smallest accepted lambda
     "largest_rejected",  # log10 of the largest lambda rejected since the last accepted step
 )
-"""Features of the solve, in order; what the action decided besides lambda follows."""
+"""Features of the solve, in order."""
 
 
 class Memory(NamedTuple):
@@ -69,19 +68,12 @@ class Memory(NamedTuple):
     smallest_accepted: Float[Array, ""]
     largest_rejected: Float[Array, ""]
     guard: GuardState
-    effort: Effort | None  # of the last step, once it is chosen; None if it is fixed
 
 
 def observation_size(config: AgentConfig) -> int:
     """Numbers in an observation."""
     if config.observation == "scale-free":
-        return (
-            len(StepFeatures._fields) * config.history
-            + len(SOLVE_FEATURES)
-            + config.action_size
-            - 1
-            + (len(Prices._fields) if config.observes_prices else 0)
-        )
+        return len(StepFeatures._fields) * config.history + len(SOLVE_FEATURES)
     return config.history
 
 
@@ -98,7 +90,6 @@ def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
         smallest_accepted=number(FIRST_DAMPING),
         largest_rejected=number(config.low),
         guard=initial_guard(dtype),
-        effort=full_effort(config),
     )
 
 
@@ -121,11 +112,6 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
         _scaled_decades(memory.smallest_accepted),
         _scaled_decades(memory.largest_rejected),
     ]
-    if memory.effort is not None:
-        points, repairs = memory.effort
-        solve += [points / config.refine_points, repairs.astype(points.dtype)]
-    if config.observes_prices:
-        solve += [_log(price) + 1 for price in memory.info.prices]
     features = jnp.concatenate([memory.steps.reshape(-1), jnp.stack([jnp.asarray(x) for x in solve])])
     return jnp.clip(jnp.nan_to_num(features), -FEATURE_LIMIT, FEATURE_LIMIT).astype(jnp.float32)
 
@@ -165,7 +151,6 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         smallest_accepted=pick(jnp.minimum(guard.damping, memory.smallest_accepted), memory.smallest_accepted),
         largest_rejected=pick(config.low, jnp.maximum(guard.damping, memory.largest_rejected)),
         guard=guard,
-        effort=memory.effort,
     )
 
 

@@ -1,4 +1,4 @@
-"""The guard between an agent and the solver: which lambda and which effort follow from an action.
+"""The guard between an agent and the solver: which lambda follows from an action.
 
 An action in (-1, 1) is linear in log10 of lambda. With guard `hand-over` lambda is then limited:
 
@@ -10,7 +10,6 @@ An action in (-1, 1) is linear in log10 of lambda. With guard `hand-over` lambda
     after an inexact step     lambda >= last lambda
 
 After `patience` rejections in a row, or `max_rejections` in all, Ceres' rule chooses lambda to the end of the solve.
-The effort stays the agent's.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.rules import LARGEST, Ceres
-from jaxba.linear.step import Effort
 from jaxba.lm.records import StepInfo
 from jaxba.refinement.backtracking import SHORTER
 
@@ -117,7 +115,7 @@ def damping_of(config: AgentConfig, guard: GuardState, action: Float[Array, ""])
     Args:
         config: range of lambda and limits.
         guard: state before the iteration.
-        action: first number of the action, in (-1, 1).
+        action: in (-1, 1).
     """
     dtype = guard.damping.dtype
     middle, half = _scale(config)
@@ -138,22 +136,6 @@ def damping_of(config: AgentConfig, guard: GuardState, action: Float[Array, ""])
     restart = jnp.where(guard.accepted_damping > rule, guard.accepted_damping, FIRST_DAMPING)
     rule = jnp.where(guard.consecutive_rejections == config.patience, jnp.maximum(rule, restart), rule)
     return jnp.clip(10 ** jnp.where(guard.handed_over, rule, wanted), 10**least, LARGEST)
-
-
-def effort_for(config: AgentConfig, guard: GuardState, action: Float[Array, " actions"]) -> Effort | None:
-    """The effort that an action decides; None if it is fixed."""
-    if config.effort == "fixed":
-        return None
-    dtype = guard.damping.dtype
-    fraction = 0.5 + 0.5 * action.astype(dtype)
-    return Effort(jnp.round(fraction[1] * config.refine_points).astype(jnp.int32), action[2] > 0)
-
-
-def full_effort(config: AgentConfig) -> Effort | None:
-    """All point iterations, and repairs; None if the effort is fixed."""
-    if config.effort == "fixed":
-        return None
-    return Effort(jnp.asarray(config.refine_points, jnp.int32), jnp.ones((), bool))
 
 
 def _scale(config: AgentConfig) -> tuple[float, float]:

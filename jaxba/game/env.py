@@ -4,7 +4,7 @@
 | --- | --- |
 | state | a scene of the bank, its current cameras and points, the agent's memory of the episode |
 | observation | `damping.features.observe`; critics also see the distance to the best known cost |
-| action | numbers in (-1, 1): lambda by `damping.guard.damping_of`, effort by `damping.guard.effort_for` |
+| action | a number in (-1, 1): lambda by `damping.guard.damping_of` |
 | terminated | accepted cost within `tolerance` of the best known cost, or the limit if `limit_is_failure` |
 | truncated | the limit otherwise |
 | reward | `GameConfig.reward` |
@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.clock import duration
 from jaxba.damping.features import Memory, begin, observation_size, observe, record
-from jaxba.damping.guard import GuardState, action_of, damping_of, effort_for
+from jaxba.damping.guard import GuardState, action_of, damping_of
 from jaxba.damping.rules import Ceres
 from jaxba.game.devices import all_rows, own_rows
 from jaxba.game.protocol import Step
@@ -42,15 +42,11 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.typing import register_pytree
 
-Reward = Literal["duration", "constant", "reduction", "reversed", "price", "clock"]
+Reward = Literal["duration", "constant", "reduction", "reversed", "clock"]
 
 POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
 Ladybug-49: three take 3.9 of 12.6 ms."""
-
-USUAL = 8.0
-"""Iterations that Ceres' rule usually takes: prices are paid relative to those of the scene, so that the mean over
-scenes weighs easy and hard ones alike, as a geometric mean does."""
 
 DISTANCE_FLOOR = 1e-6
 """Relative distance to the best known cost that a critic does not distinguish from zero."""
@@ -68,10 +64,9 @@ class GameConfig:
 
     reward: Reward = "duration"
     """Of an iteration. `duration`: minus a deterministic cost of the iteration. `clock`: minus its duration by a clock,
-    which varies as measured ones do (`damping/clock.py`). `price`: minus the price of the work
-    that it did, at the prices of the scene (`BankConfig.price_spread`) and relative to its difficulty (`USUAL`).
-    `constant`: -1. `reduction`: zero, and the bonus shrinks with every iteration. `reversed`: minus log10 of the cost
-    over the best known cost (the paper's reversed roles of state and reward)."""
+    which varies as measured ones do (`damping/clock.py`). `constant`: -1. `reduction`: zero, and the bonus shrinks with
+    every iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's reversed roles of state
+    and reward)."""
 
     bonus: float = 10.0
     """Added if the episode ends in success. Source: Belder et al. 2023."""
@@ -160,7 +155,7 @@ class Game:
     @property
     def action_size(self) -> int:
         """Numbers of an action."""
-        return self.config.agent.action_size
+        return 1
 
     @for_traces
     def reset(self, key: Array) -> tuple[GameState, Float[Array, "envs features"]]:
@@ -216,10 +211,9 @@ class Game:
         layout = class_layout(kind, self.options)
         layout = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
         guard = episode.memory.guard
-        damping, effort = damping_of(agent, guard, action[0]), effort_for(agent, guard, action)
-        state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, guard.iteration, effort)
-        memory = record(agent, episode.memory._replace(effort=effort), step)
-        return Episode(episode.scene, state, memory), step
+        damping = damping_of(agent, guard, action[0])
+        state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, guard.iteration)
+        return Episode(episode.scene, state, record(agent, episode.memory, step)), step
 
     @for_traces
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
@@ -244,8 +238,7 @@ class Game:
         limit = after.memory.guard.iteration >= rules.max_iterations
         terminated = success | (limit & rules.limit_is_failure)
         truncated = limit & ~terminated
-        usual = jnp.clip(bank.ceres_iterations[episode.scene], 1, rules.max_iterations)
-        reward = self._reward(step, after.memory, best, success, usual)
+        reward = self._reward(step, after.memory, best, success)
         fresh = self._fresh(bank, key)
         following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
         single = lambda x: jnp.asarray(x, jnp.float32)
@@ -258,16 +251,11 @@ class Game:
         observed = functools.partial(self._observe, bank)
         return following, Step(observed(following), single(reward), terminated, truncated, observed(after), metrics)
 
-    def _reward(
-        self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""], usual: Array | float = USUAL
-    ) -> Array:
+    def _reward(self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]) -> Array:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
-            points = self.options.refinement.points if memory.effort is None else memory.effort.point_iterations
-            reward = bonus - (1 + POINT_ITERATION_COST * points)
-        elif rules.reward == "price":
-            reward = bonus - USUAL * memory.info.prices.of(step) / usual
+            reward = bonus - (1 + POINT_ITERATION_COST * self.options.refinement.points)
         elif rules.reward == "clock":
             reward = bonus - duration(step)
         elif rules.reward == "constant":
@@ -281,7 +269,7 @@ class Game:
     @for_traces
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
         """Uniform actions in half of the environments, Ceres' rule in a quarter, and a hundredth of its lambda in the
-        last quarter. Numbers of an action other than lambda are uniform in all of them."""
+        last quarter."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
         rules = [all_rows(jax.vmap(_rule_damping)(part.memory.guard), self.devices) for part in state.episodes]

@@ -12,11 +12,11 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
+from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, worth_solving
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, state_at
 from jaxba.lm.termination import converged_in_cost
 from jaxba.problem.bundle_problem import BundleProblem
@@ -42,9 +42,6 @@ class Episode(NamedTuple):
 
     cost: Float[np.ndarray, " states"]
     """Accepted cost, pixels squared."""
-
-    paid: Float[np.ndarray, " states"]
-    """Price of all iterations so far (`Prices`), in plain steps."""
 
     damping: Float[np.ndarray, " iterations"]
     """Lambda of each iteration, one fewer than states."""
@@ -94,7 +91,7 @@ def replay(
     check_x64(bank.initial_cost.dtype)
     one = jax.tree.map(lambda x: x[scene], bank)
     arguments = one.scenes, one.info, one.initial_cost, policy, options, limit
-    return _episode(kind, one.scenes, one.info, _played(kind, *arguments, jnp.asarray(ftol, one.initial_cost.dtype)))
+    return _episode(kind, one.scenes, _played(kind, *arguments, jnp.asarray(ftol, one.initial_cost.dtype)))
 
 
 @for_traces
@@ -141,8 +138,7 @@ def _played(
 
     def body(carry: Any, iteration: Array) -> tuple[Any, Any]:
         state, memory, damping, live = carry
-        effort = effort_of(policy, memory)
-        after, step = lm_step(layout, state, damping, options, policy.min_gain, iteration, effort)
+        after, step = lm_step(layout, state, damping, options, policy.min_gain, iteration)
         memory, damping = policy.propose(memory, step)
         ended = converged_in_cost(step, ftol)
         return (after, memory, damping, live & ~ended), (after, step, live, ended)
@@ -153,7 +149,7 @@ def _played(
     return _Played(start, states, steps, live, jnp.any(live & ended))
 
 
-def _episode(kind: SceneClass, scene: Scenes, info: ProblemInfo, played: _Played) -> Episode:
+def _episode(kind: SceneClass, scene: Scenes, played: _Played) -> Episode:
     count = int(np.sum(played.live))
     seen = np.asarray(scene.mask).reshape(kind.cameras, kind.points + 1)[:, :-1]
     pixels = np.asarray(scene.pixels).reshape(2, kind.cameras, kind.points + 1)
@@ -162,7 +158,6 @@ def _episode(kind: SceneClass, scene: Scenes, info: ProblemInfo, played: _Played
     whole = lambda first, rest: np.concatenate([np.asarray(first)[None], np.asarray(rest)[:count]])
     all_cameras = np.moveaxis(whole(played.start.cameras, played.states.cameras), 1, 2)[:, cameras]
     all_points = np.moveaxis(whole(played.start.points, played.states.points), 1, 2)[:, points]
-    price = np.asarray(jax.vmap(Prices.of, in_axes=(None, 0))(info.prices, played.steps))[:count]
     problem = BundleProblem.create(
         all_cameras[0], all_points[0], pixels[:, cameras[camera], points[point]].T, camera, point
     )
@@ -172,7 +167,6 @@ def _episode(kind: SceneClass, scene: Scenes, info: ProblemInfo, played: _Played
         all_cameras,
         all_points,
         whole(played.start.cost, played.steps.cost),
-        np.concatenate([[0.0], np.cumsum(price)]),
         own("damping"),
         own("gain_ratio"),
         own("accepted"),

@@ -1,9 +1,9 @@
 """One-step look-ahead with rollouts: how much a policy could save, if it knew what every action leads to.
 
 From every state each of some actions is tried, followed by a base policy to the end of the episode, and the action with
-the lowest price in all is played. That is never worse than the base policy; and no policy that improves on it in one
-step can be better, since this one knows the true price to the end. Source: Bertsekas, Tsitsiklis and Wu 1997, "Rollout
-Algorithms for Combinatorial Optimization".
+the fewest iterations in all is played. That is never worse than the base policy; and no policy that improves on it in
+one step can be better, since this one knows the true number to the end. Source: Bertsekas, Tsitsiklis and Wu 1997,
+"Rollout Algorithms for Combinatorial Optimization".
 """
 
 from __future__ import annotations
@@ -27,22 +27,15 @@ from jaxba.runtime.jit import jit
 
 
 class Played(NamedTuple):
-    """What an episode came to."""
+    """An episode that is played to its end."""
 
-    paid: Float[Array, ""]
-    """Price of its iterations; at least that of as many plain steps as the limit has if it was no success."""
-
-    success: Bool[Array, ""]
-    """Whether it came within the game's tolerance of the best known cost."""
-
-    iterations: Int[Array, ""]
-    """Its iterations."""
-
-
-class _Run(NamedTuple):
     episode: Episode
-    paid: Array
-    success: Array
+    success: Bool[Array, ""]  # whether it came within the game's tolerance of the best known cost
+
+    @property
+    def iterations(self) -> Int[Array, ""]:
+        """Its iterations; the game's limit if it was no success."""
+        return self.episode.memory.guard.iteration
 
 
 def play_on(
@@ -52,8 +45,8 @@ def play_on(
     policy: AgentPolicy,
     actions: Float[Array, "tries actions"],
     start: Episode,
-) -> Float[Array, " tries"]:
-    """Price to the end of an episode, if each of some actions is played once and then the policy's.
+) -> Int[Array, " tries"]:
+    """Iterations of an episode to its end, if each of some actions is played once and then the policy's.
 
     Args:
         game: rules; `reward` and bonus play no part.
@@ -63,72 +56,52 @@ def play_on(
         actions: first actions.
         start: state of the episode.
     """
-    advance = _advance(game, kind, bank)
-    first = jax.vmap(lambda action: advance(_Run(start, *_nothing(start)), action))
+    advance = functools.partial(_advance, game, kind, bank)
+    first = jax.vmap(lambda action: advance(Played(start, jnp.zeros((), bool)), action))
 
-    def body(runs: _Run) -> _Run:
-        return step_groups(lambda run: _choose(_ended(game, run), run, advance(run, _action(policy, run))), runs)
+    def turn(run: Played) -> Played:
+        after = advance(run, _action(policy, run))
+        return jax.tree.map(lambda old, new: jnp.where(_ended(game, run), old, new), run, after)
 
-    runs = lax.while_loop(lambda runs: ~jnp.all(jax.vmap(lambda run: _ended(game, run))(runs)), body, first(actions))
-    return jax.vmap(lambda run: _result(game, run).paid)(runs)
-
-
-def _nothing(start: Episode) -> tuple[Array, Array]:
-    return jnp.zeros_like(start.state.cost), jnp.zeros((), bool)
+    under_way = lambda runs: ~jnp.all(jax.vmap(functools.partial(_ended, game))(runs))
+    return lax.while_loop(under_way, lambda runs: step_groups(turn, runs), first(actions)).iterations
 
 
-def _advance(game: Game, kind: SceneClass, bank: Bank):
-    """Plays one action and adds its price."""
-
-    def advance(run: _Run, action: Float[Array, " actions"]) -> _Run:
-        episode, step = game.iterate(kind, bank, run.episode, action)
-        success = step.cost <= bank.best_cost[episode.scene] * (1 + game.config.tolerance)
-        return _Run(episode, run.paid + episode.memory.info.prices.of(step).astype(run.paid.dtype), success)
-
-    return advance
+def _advance(game: Game, kind: SceneClass, bank: Bank, run: Played, action: Float[Array, " actions"]) -> Played:
+    episode, step = game.iterate(kind, bank, run.episode, action)
+    return Played(episode, step.cost <= bank.best_cost[episode.scene] * (1 + game.config.tolerance))
 
 
-def _action(policy: AgentPolicy, run: _Run) -> Float[Array, " actions"]:
+def _action(policy: AgentPolicy, run: Played) -> Float[Array, " actions"]:
     return policy.act(observe(policy.config, run.episode.memory))
 
 
-def _ended(game: Game, run: _Run) -> Bool[Array, ""]:
-    return run.success | (run.episode.memory.guard.iteration >= game.config.max_iterations)
-
-
-def _choose(condition: Array, if_true: _Run, if_false: _Run) -> _Run:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)
-
-
-def _result(game: Game, run: _Run) -> Played:
-    iteration = run.episode.memory.guard.iteration
-    paid = jnp.where(run.success, run.paid, jnp.maximum(run.paid, game.config.max_iterations))
-    return Played(paid, run.success, iteration)
+def _ended(game: Game, run: Played) -> Bool[Array, ""]:
+    return run.success | (run.iterations >= game.config.max_iterations)
 
 
 @functools.partial(jit, static_argnames=("number", "looks"))
-def _look_ahead(game: Game, number: int, policy: AgentPolicy, actions: Array, looks: bool) -> Played:
+def _look_ahead(game: Game, number: int, policy: AgentPolicy, actions: Array, looks: bool) -> tuple[Array, Array]:
     kind, bank = game.kinds[number], game.banks[number]
-    advance = _advance(game, kind, bank)
 
-    def one(scene: Int[Array, ""]) -> Played:
-        def body(run: _Run) -> _Run:
+    def one(scene: Int[Array, ""]) -> tuple[Array, Array]:
+        def body(run: Played) -> Played:
             own = _action(policy, run)
             if looks:
                 tried = jnp.concatenate([own[None], actions.astype(own.dtype)])
-                prices = play_on(game, kind, bank, policy, tried, run.episode)
-                own = tried[jnp.argmin(prices)]
-            return advance(run, own)
+                own = tried[jnp.argmin(play_on(game, kind, bank, policy, tried, run.episode))]
+            return _advance(game, kind, bank, run, own)
 
-        start = game.start(bank, scene)
-        return _result(game, lax.while_loop(lambda run: ~_ended(game, run), body, _Run(start, *_nothing(start))))
+        start = Played(game.start(bank, scene), jnp.zeros((), bool))
+        end = lax.while_loop(lambda run: ~_ended(game, run), body, start)
+        return end.iterations, end.success
 
     return lax.map(one, jnp.arange(bank.initial_cost.shape[0], dtype=jnp.int32))
 
 
 def look_ahead(
     game: Game, policy: AgentPolicy, actions: Float[np.ndarray, "tries actions"], looks: bool = True
-) -> list[Played]:
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Plays every scene of a game's banks with look-ahead.
 
     Args:
@@ -138,7 +111,7 @@ def look_ahead(
         looks: if False, the policy plays alone.
 
     Returns:
-        One `Played` of NumPy arrays for each bank.
+        Iterations of every scene and whether it was solved, for each bank.
     """
     tried = jnp.asarray(actions, jnp.float32)
     return [

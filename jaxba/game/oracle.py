@@ -96,6 +96,4 @@ def oracle(
     """The search on every scene of a bank; the lambdas of the best sequence are not returned."""
     costs = np.asarray(_search(kind, bank, options, iterations, width, grid))
     count = len(costs)
-    return Trajectories(
-        costs, np.zeros_like(costs[:, 1:]), np.full(count, iterations), np.zeros(count, bool), np.zeros_like(costs)
-    )
+    return Trajectories(costs, np.zeros_like(costs[:, 1:]), np.full(count, iterations), np.zeros(count, bool))

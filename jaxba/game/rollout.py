@@ -16,10 +16,10 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
-from jaxba.damping import DampingPolicy, effort_of
+from jaxba.damping import DampingPolicy
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, state_at
 from jaxba.lm.termination import converged_in_cost
 from jaxba.problem.options import StepOptions
@@ -97,9 +97,6 @@ class Trajectories(NamedTuple):
     converged: Bool[np.ndarray, " scenes"]
     """Whether the convergence test ended it, and not the limit."""
 
-    paid: Float[np.ndarray, "scenes iterations"]
-    """Price of all iterations so far, at the scene's prices; shaped as `costs`."""
-
 
 class _Lane(NamedTuple):
     scene: Int[Array, " lanes"]
@@ -116,7 +113,6 @@ class _Loop(NamedTuple):
     dampings: Array
     iterations: Array
     converged: Array
-    paid: Array
 
 
 @for_traces
@@ -135,13 +131,12 @@ def play(
     """
     check_x64(bank.initial_cost.dtype)
     loop = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
-    found = jax.tree.map(np.asarray, (loop.costs, loop.dampings, loop.iterations, loop.converged, loop.paid))
-    costs, dampings, iterations, converged, prices = found
+    found = jax.tree.map(np.asarray, (loop.costs, loop.dampings, loop.iterations, loop.converged))
+    costs, dampings, iterations, converged = found
     costs = np.concatenate([np.asarray(bank.initial_cost)[:, None], costs[:-1]], axis=1)
     past = np.arange(limit + 1) > iterations[:-1, None]
     last = np.take_along_axis(costs, iterations[:-1, None], axis=1)
-    paid = np.cumsum(np.concatenate([np.zeros((len(costs), 1)), prices[:-1]], axis=1), axis=1)
-    return Trajectories(np.where(past, last, costs), dampings[:-1], iterations[:-1], converged[:-1], paid)
+    return Trajectories(np.where(past, last, costs), dampings[:-1], iterations[:-1], converged[:-1])
 
 
 @functools.partial(jit, static_argnames=("kind", "options", "limit"))
@@ -160,8 +155,7 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
     def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:
         row = jnp.minimum(lane.scene, count - 1)
         seen = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
-        effort = effort_of(policy, lane.policy)
-        state, step = lm_step(seen, lane.state, lane.damping, options, policy.min_gain, lane.iteration, effort)
+        state, step = lm_step(seen, lane.state, lane.damping, options, policy.min_gain, lane.iteration)
         policy_state, damping = policy.propose(lane.policy, step)
         return _Lane(lane.scene, state, policy_state, damping, lane.iteration + 1), step
 
@@ -172,8 +166,6 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
         done = converged | (lane.iteration >= limit)
         costs = loop.costs.at[row, lane.iteration - 1].set(step.cost)
         dampings = loop.dampings.at[row, lane.iteration - 1].set(step.damping)
-        prices = jax.tree.map(lambda x: x[jnp.minimum(lane.scene, count - 1)], bank.info.prices)
-        paid = loop.paid.at[row, lane.iteration - 1].set(jax.vmap(Prices.of)(prices, step).astype(loop.paid.dtype))
         upcoming = loop.next_scene + jnp.cumsum(done) - 1
         new = jax.vmap(fresh)(upcoming.astype(jnp.int32))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
@@ -184,7 +176,6 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
             dampings,
             loop.iterations.at[row].set(lane.iteration),
             loop.converged.at[row].set(converged),
-            paid,
         )
 
     dtype = bank.initial_cost.dtype
@@ -195,6 +186,5 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
         jnp.zeros((count + 1, limit), dtype),
         jnp.zeros((count + 1,), jnp.int32),
         jnp.zeros((count + 1,), bool),
-        jnp.zeros((count + 1, limit), dtype),
     )
     return lax.while_loop(lambda loop: jnp.any(loop.lane.scene < count), body, loop)

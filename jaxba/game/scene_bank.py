@@ -24,7 +24,6 @@ from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.game.warm_starts import warm_starts
 from jaxba.game.windows import read_windows
-from jaxba.lm.records import Prices
 from jaxba.model.linearize import cost
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, Refinement, StepOptions, check_count
@@ -70,16 +69,8 @@ class Bank(NamedTuple):
     ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule with the portfolio's steps, to the game's tolerance
 
 
-def draw_prices(key: Array, count: int, spread: float) -> Prices:
-    """Prices of each scene, every one drawn log-uniformly from `spread` decades around the default of `Prices`."""
-    decades = jax.random.uniform(key, (len(Prices._fields), count), minval=-0.5, maxval=0.5) * spread
-    return Prices(*(default * 10.0**d for default, d in zip(Prices(), decades, strict=True)))
-
-
-def info_of(
-    kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int, prices: Prices | None = None
-) -> ProblemInfo:
-    """What a policy knows about each scene before the first iteration. Prices are the default ones unless given."""
+def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
+    """What a policy knows about each scene before the first iteration."""
     count = len(scenes.mask)
     grid = scenes.mask.reshape(count, kind.cameras, kind.points + 1)
     whole = lambda x: x.astype(jnp.int32)
@@ -93,7 +84,6 @@ def info_of(
         unit=jnp.ones_like(initial),
         focal=focal,
         max_iterations=jnp.full((count,), limit, jnp.int32),
-        prices=jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, initial.dtype), (count,)), prices or Prices()),
     )
 
 
@@ -134,9 +124,6 @@ class BankConfig:
     problems: tuple[str, ...] = ()
     """Real problems, from which classes of the family `windows` are cut."""
 
-    price_spread: float = 0.0
-    """Decades over which the prices of a scene's work are spread (`draw_prices`)."""
-
     dtype: str = "float64"
     """Floating point type of the game's solves."""
 
@@ -158,8 +145,6 @@ class BankConfig:
             raise ValueError(f"warm_share must be 0 to 1, is {self.warm_share}")
         if bool(self.problems) != any(kind.family == "windows" for kind in self.classes):
             raise ValueError("problems and classes of the family windows go together: only one of them is given")
-        if not 0 <= self.price_spread <= 4:
-            raise ValueError(f"price_spread must be 0 to 4 decades, is {self.price_spread}")
         _ = self.options  # raises ValueError if impossible
 
 
@@ -186,13 +171,12 @@ def solve_scenes(
     on_rule: Callable[[str], None] = lambda _: None,
     warm_share: float = 0.0,
     tolerance: float = 1e-3,
-    price_spread: float = 0.0,
 ) -> Draft:
     """Solves scenes with every rule.
 
     Args:
         kind: class of the scenes.
-        key: random key, for warm starts and prices.
+        key: random key, for warm starts.
         scenes: the scenes.
         options: of the steps.
         limit: iterations of an episode, for the scenes' `ProblemInfo`.
@@ -200,7 +184,6 @@ def solve_scenes(
         on_rule: called with the name of a rule when it begins.
         warm_share: fraction of the scenes with a warm start.
         tolerance: to which the first rule's iterations are counted.
-        price_spread: see `draw_prices`.
     """
     count = len(scenes.mask)
     initial = initial_costs(kind, scenes)
@@ -210,8 +193,6 @@ def solve_scenes(
     if warm_share:
         scenes, initial = warm_starts(kind, scenes, initial, jax.random.fold_in(key, count), warm_share, options)
         info = info_of(kind, scenes, initial, limit)
-    prices = draw_prices(jax.random.fold_in(key, count + 1), len(initial), price_spread)
-    info = info_of(kind, scenes, initial, limit, prices)
     bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
     runs = {}
     for rule in rules:
@@ -262,16 +243,7 @@ def make_banks(
         on_rule = lambda rule, where=where, count=count: report(f"{count} scenes of {where}: {rule}")
         class_key = jax.random.fold_in(key, number and MORE_CLASSES + number)
         solved = lambda scenes, on_rule=on_rule, kind=kind, class_key=class_key: solve_scenes(
-            kind,
-            class_key,
-            scenes,
-            options,
-            limit,
-            PORTFOLIO,
-            on_rule,
-            config.warm_share,
-            tolerance,
-            config.price_spread,
+            kind, class_key, scenes, options, limit, PORTFOLIO, on_rule, config.warm_share, tolerance
         )
         if kind.family == "windows":
             seed = int(jax.random.randint(class_key, (), 0, 2**31 - 1))

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Effort, Step
+from jaxba.linear.step import Step
 from jaxba.lm.damped_step import solve_step
 from jaxba.lm.method import Round, RoundMethod
 from jaxba.lm.records import LMState, StepInfo
@@ -89,7 +89,6 @@ def lm_step(
     options: StepOptions,
     min_gain: float | Float[Array, ""] = 0.0,
     iteration: int | Int[Array, ""] = 0,
-    effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """One iteration: one linear solve with the given lambda, accepted or rejected.
 
@@ -104,7 +103,6 @@ def lm_step(
         options: static options of the step.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
         iteration: number of the iteration, from 0; methods with random clusters use other ones in each.
-        effort: overrides the point iterations and the repairs of the options; ignored by the method `ddlm`.
 
     Returns:
         The next state (unchanged after a rejection) and the record of the iteration.
@@ -117,7 +115,7 @@ def lm_step(
     if not options.single_solve:
         return _round(layout, state, jnp.asarray(damping, state.cost.dtype), options, min_gain, iteration)
     proposal = propose(layout, state, damping, options, iteration)
-    return try_step(layout, state, damping, proposal, options, min_gain, effort)
+    return try_step(layout, state, damping, proposal, options, min_gain)
 
 
 def propose(
@@ -143,10 +141,9 @@ def try_step(
     proposal: Proposal,
     options: StepOptions,
     min_gain: float | Float[Array, ""] = 0.0,
-    effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
-    candidate = best_candidate(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    candidate = best_candidate(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain)
     return take_step(layout, state, damping, proposal, candidate)
 
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Effort, Step
+from jaxba.linear.step import Step
 from jaxba.model.linearize import Reference
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide
@@ -120,14 +120,11 @@ class Comparison(NamedTuple):
     min_gain: float | Float[Array, ""]
     """Gain ratio that an accepted candidate must exceed."""
 
-    point_iterations: int | Int[Array, ""]
-    """Number of embedded point iterations."""
-
     starts: Int[Array, ""]
     """Starts of points after the full step, see `PointSearch`."""
 
     matters: Bool[Array, "*parts"]
-    """Whether the predicted decrease is worth camera rounds and further trials, and the effort allows them."""
+    """Whether the predicted decrease is worth camera rounds and further trials."""
 
 
 def comparison(
@@ -139,16 +136,9 @@ def comparison(
     step: Step,
     options: StepOptions,
     min_gain: float | Float[Array, ""],
-    effort: Effort | None,
 ) -> Comparison:
     """The `Comparison` of a step. Arguments as for `best_candidate`."""
-    point_iterations = options.refinement.points
-    if effort is not None:
-        point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     predicted = step.predicted(jnp.ones_like(cost))
-    matters = predicted > NEGLIGIBLE * cost
-    if effort is not None:
-        matters = matters & effort.repairs
     previous = PreviousPoints.of(parts.layout, points, reference)
     return Comparison(
         parts=parts,
@@ -160,9 +150,8 @@ def comparison(
         step=step,
         options=options,
         min_gain=min_gain,
-        point_iterations=point_iterations,
         starts=jnp.where(jnp.all(predicted <= NEAR_CONVERGENCE * cost), 2, 1),
-        matters=matters,
+        matters=predicted > NEGLIGIBLE * cost,
     )
 
 
@@ -186,8 +175,9 @@ def assess(
     """
     options, parts = against.options, against.parts
     min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * jnp.sum(against.step.predicted(step_fraction)))
-    search = PointSearch(against.point_iterations, jnp.where(full_step, against.starts, 0), min_decrease)
-    work = work._replace(point_iterations=(work.point_iterations + against.point_iterations).astype(jnp.int32))
+    iterations = options.refinement.points
+    search = PointSearch(iterations, jnp.where(full_step, against.starts, 0), min_decrease)
+    work = work._replace(point_iterations=(work.point_iterations + iterations).astype(jnp.int32))
     points, terms = parts.refine(cameras, points, against.previous, options, search)
     cost, decrease = parts.sums(terms), parts.sums(against.terms - terms)
     predicted = against.step.predicted(step_fraction)

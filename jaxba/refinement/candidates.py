@@ -24,7 +24,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Effort, Step
+from jaxba.linear.step import Step
 from jaxba.model.linearize import Reference
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.acceptance import Candidate, Comparison, Work, assess, comparison, select
@@ -77,7 +77,6 @@ def best_candidate(
     step: Step,
     options: StepOptions,
     min_gain: float | Float[Array, ""],
-    effort: Effort | None = None,
 ) -> Candidate:
     """Evaluates a step: the candidate of the iteration, with the accept decision, for every subproblem.
 
@@ -92,9 +91,8 @@ def best_candidate(
         step: solution of the damped system, with the linear model of each subproblem.
         options: static options of the step.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
-        effort: overrides the number of point iterations of the options.
     """
-    against = comparison(parts, cameras, points, cost, reference, step, options, min_gain, effort)
+    against = comparison(parts, cameras, points, cost, reference, step, options, min_gain)
     start = jax.tree.map(jnp.asarray, first_search(cameras, points, cost, step))
     if not has_repairs(options):
         return _assess_next(against, start, start.cameras)

@@ -20,8 +20,8 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
-from jaxba.damping import DampingPolicy, decides_effort, effort_of
-from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.damping import DampingPolicy
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step, propose, try_step
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.bundle_problem import BundleProblem
@@ -68,12 +68,11 @@ class _Loop(NamedTuple):
     tolerances: Tolerances
     options: StepOptions
     max_iterations: int
-    prices: Prices
 
     def start(self, call: Callable[..., Any], state: LMState) -> Carry:
         """The carry before the first iteration, from the initial state."""
         info_program = program(problem_info, "options", "max_iterations", level="quick")
-        info = call(info_program, self.layout, state, self.options, self.max_iterations, self.prices)
+        info = call(info_program, self.layout, state, self.options, self.max_iterations)
         # without the parameters, whose shapes differ, the policy's program is compiled once for all problems
         return call(program(begin, level="quick"), info, self.policy, None)._replace(state=state)
 
@@ -88,22 +87,19 @@ class _Loop(NamedTuple):
             levels: level of compilation of each part of the step, by the name of its function.
         """
         state, options = carry.state, self.options
-        effort = None
-        if decides_effort(self.policy):
-            effort = call(program(effort_of, level="quick"), self.policy, carry.policy)
         part = lambda function: program(function, "options", level=levels[function.__name__])
         # NumPy's: each conversion by JAX is a program
         min_gain = np.asarray(self.policy.min_gain, state.cost.dtype)
         if options.single_solve:
             arguments = (self.layout, state, carry.damping)
             proposal = call(part(propose), *arguments, options, carry.iteration)
-            arguments = (*arguments, proposal, options, min_gain, effort)
+            arguments = (*arguments, proposal, options, min_gain)
             if has_repairs(options):
                 state, step = try_step_by_parts(call, part, *arguments)
             else:
                 state, step = call(part(try_step), *arguments)
         else:
-            arguments = (self.layout, state, carry.damping, options, min_gain, carry.iteration, effort)
+            arguments = (self.layout, state, carry.damping, options, min_gain, carry.iteration)
             state, step = call(part(lm_step), *arguments)
         limit, partitions = np.int32(self.max_iterations), np.int32(num_partitions(self.layout))
         policy_arguments = (carry._replace(state=None), step, self.policy, self.tolerances, limit, partitions)
@@ -170,7 +166,7 @@ def run_stepwise(
     Raises:
         ProblemError: the cost of the initial state is not finite.
     """
-    loop = _Loop(setup.layout, setup.policy, tolerances, setup.options, max_iterations, setup.prices)
+    loop = _Loop(setup.layout, setup.policy, tolerances, setup.options, max_iterations)
     runs: Counter[str] = Counter()
 
     def levels_now() -> dict[str, Level]:

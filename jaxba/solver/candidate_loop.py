@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.linear.step import Effort
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import Proposal, take_step
 from jaxba.problem.options import StepOptions
@@ -41,12 +40,11 @@ def try_candidate(
     proposal: Proposal,
     options: StepOptions,
     min_gain: Float[Array, ""],
-    effort: Effort | None,
     search: Search,
     refined: Float[Array, "parameters cameras"],
 ) -> tuple[Search, Int[Array, ""]]:
     """One turn of the search for the candidate of a step, and what comes next. Arguments as for `next_search`."""
-    against = comparison(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    against = comparison(Whole(layout), *state[:3], proposal.reference, proposal.step, options, min_gain)
     search = next_search(against, search, refined)
     following = jnp.where(search.active, jnp.where(search.refining, Next.CAMERA_ROUND, Next.CANDIDATE), Next.NOTHING)
     return search, following
@@ -66,7 +64,6 @@ def try_step_by_parts(
     proposal: Proposal,
     options: StepOptions,
     min_gain: Any,
-    effort: Effort | None,
 ) -> tuple[LMState, StepInfo]:
     """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs or compiles.
 
@@ -79,7 +76,7 @@ def try_step_by_parts(
     search = first_search(state.cameras, state.points, state.cost, proposal.step)
     refined = state.cameras
     while True:
-        arguments = (layout, state, proposal, options, min_gain, effort, search, refined)
+        arguments = (layout, state, proposal, options, min_gain, search, refined)
         search, following = call(part(try_candidate), *arguments)
         if not isinstance(following, Array) or int(following) == Next.NOTHING:
             break

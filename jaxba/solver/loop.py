@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
-from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
+from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm.damped_step import largest_diagonal
-from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, only_free
@@ -77,9 +77,7 @@ class Carry(NamedTuple):
     """Integer of a `Termination`."""
 
 
-def problem_info(
-    layout: Layout, state: LMState, options: StepOptions, max_iterations: Any, prices: Prices
-) -> ProblemInfo:
+def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: Any) -> ProblemInfo:
     """The information that a policy gets before the first iteration."""
     unit = jnp.ones_like(state.cost)
     if options.coordinates.scaling == "identity":
@@ -96,7 +94,6 @@ def problem_info(
         unit=unit,
         focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
         max_iterations=count(max_iterations),
-        prices=Prices(*(jnp.asarray(x, state.cost.dtype) for x in prices)),
     )
     return info
 
@@ -180,7 +177,6 @@ def solve_loop(
     options: StepOptions,
     max_iterations: int,
     limit: Int[AnyArray, ""] | None = None,
-    prices: Prices = Prices(),  # noqa: B008 - immutable
 ) -> tuple[Carry, History]:
     """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes.
 
@@ -192,7 +188,6 @@ def solve_loop(
         options: static options of the step.
         max_iterations: length of the histories, static.
         limit: a lower limit of iterations, not static.
-        prices: of the work of an iteration, for policies that observe them.
 
     Returns:
         Final carry, and histories of length `max_iterations`, zero after the last iteration.
@@ -202,8 +197,7 @@ def solve_loop(
     """
     check_x64(state.cost.dtype)
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
-    carry = begin(problem_info(layout, state, options, iteration_limit, prices), policy, state)
-
+    carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)
     return loop_from(layout, carry, policy, tolerances, options, max_iterations, iteration_limit)
 
 
@@ -216,8 +210,7 @@ def iterate(
     limit: Any,
 ) -> tuple[Carry, StepInfo]:
     """One iteration of the loop. Arguments as for `solve_loop`."""
-    effort = effort_of(policy, carry.policy)
-    state, step = lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration, effort)
+    state, step = lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration)
     return advance(carry, state, step, policy, tolerances, limit, num_partitions(layout)), step
 
 

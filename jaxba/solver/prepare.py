@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
-from jaxba.damping.policy import observes_prices
 from jaxba.damping.registry import GUARDED
-from jaxba.lm.records import LMState, Prices
+from jaxba.lm.records import LMState
 from jaxba.lm.step import initial_state
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import set_aside, without_views_of
@@ -26,7 +25,7 @@ from jaxba.problem.rigs import with_unseen_of_frames
 from jaxba.runtime import distributed, process
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.runtime.numerics import numerics, refuse_traces
-from jaxba.solver.cost_model import choose_linear_solver, prices
+from jaxba.solver.cost_model import choose_linear_solver
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
@@ -81,9 +80,6 @@ class Setup(ArrayRecord):
 
     dtype: np.dtype[Any]
     """Type of the parameters of the solve."""
-
-    prices: Prices
-    """Of the work of an iteration, NumPy scalars; the default ones for a policy that does not observe them."""
 
     setup_s: float
     """Seconds for the layout and the transfer to the device."""
@@ -191,10 +187,8 @@ def set_up(
         shards = None if len(devices) == 1 else Shards(here, step, devices, dtype)
         layout = jax.device_put(layout_for(here, step, capacity, observations)) if shards is None else shards.first
         start = here if capacity is None else padded_parameters(here, capacity)
-        known = prices(problem, step, observations) if observes_prices(policy) else Prices()
-        known = jax.tree.map(lambda x: np.asarray(x, dtype), known)
         setup_s = time.perf_counter() - started
-    return Setup(given, problem, away, layout, step, policy, capacity, offset, start, dtype, known, setup_s, shards)
+    return Setup(given, problem, away, layout, step, policy, capacity, offset, start, dtype, setup_s, shards)
 
 
 def check_problem(problem: BundleProblem) -> None:

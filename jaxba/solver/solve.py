@@ -227,7 +227,7 @@ def _run_sharded(
     limit = np.asarray(max_iterations, np.int32)
     history: Any = None
     with CompileClock() as clock:
-        carry = jax.block_until_ready(setup.shards.begin(setup.policy, limit, setup.prices))
+        carry = jax.block_until_ready(setup.shards.begin(setup.policy, limit))
         initial_cost = float(carry.state.cost)
         setup.check_cost(carry.state)
         if callback is None and watch is None:
@@ -260,7 +260,7 @@ def _run_nothing(setup: Setup, tolerances: Tolerances, max_iterations: int) -> R
         if setup.shards is None:
             state = jax.block_until_ready(setup.initial(compile_and_run))
         else:
-            state = setup.shards.begin(setup.policy, np.asarray(1, np.int32), setup.prices).state
+            state = setup.shards.begin(setup.policy, np.asarray(1, np.int32)).state
         setup.check_cost(state)
     nothing = History(*(np.empty(0, setup.dtype) for _ in History._fields))
     history = nothing._replace(accepted=np.empty(0, bool), cg_iterations=np.empty(0, np.int32))
@@ -278,7 +278,7 @@ def _run_compiled(setup: Setup, tolerances: Tolerances, max_iterations: int) -> 
         setup.check_cost(state)
         length = max(MIN_HISTORY, 1 << (max_iterations - 1).bit_length())
         limit = np.asarray(max_iterations, np.int32)  # a conversion by JAX is a program
-        result = solve_loop(setup.layout, state, setup.policy, tolerances, setup.options, length, limit, setup.prices)
+        result = solve_loop(setup.layout, state, setup.policy, tolerances, setup.options, length, limit)
         carry, history = jax.block_until_ready(result)
     total_s = time.perf_counter() - started - clock.seconds
     return Run(carry, history, float(state.cost), 0, clock.seconds, total_s)

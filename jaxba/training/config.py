@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from jaxba.damping.agent_config import AgentConfig, EffortMode
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import observation_size
 from jaxba.damping.policy_file import LARGEST_FILE
 from jaxba.game.env import GameConfig
@@ -98,16 +98,7 @@ class TrainConfig:
             raise ValueError(f"bank.dtype must be float64 or float32, not {self.bank.dtype!r}")
         _check_agent(self.sac)
         _check_size(self.sac, self.game.agent)
-        _check_effort(self.game.agent.effort, self.method, self.step_options)
-
-
-def _check_effort(effort: EffortMode, method: str, options: StepOptions) -> None:
-    """Refuses an effort that the method cannot use."""
-    if effort != "fixed" and not options.single_solve:
-        raise ValueError(
-            f"game.agent.effort: {effort!r} has no effect on method {method}, "
-            "whose rounds always have all point iterations"
-        )
+        _ = self.step_options  # raises ValueError if impossible
 
 
 def _check_agent(sac: SacConfig) -> None:
@@ -131,7 +122,7 @@ def _check_agent(sac: SacConfig) -> None:
 
 def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
     """Refuses networks that are too large for a policy file."""
-    sizes = [observation_size(agent), *[sac.width] * sac.policy_layers, 2 * agent.action_size]
+    sizes = [observation_size(agent), *[sac.width] * sac.policy_layers, 2]
     numbers = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     if 4 * numbers > LARGEST_FILE - METADATA_BYTES:
         raise ValueError(

@@ -58,7 +58,7 @@ class Recording:
     """Actual over predicted decrease; NaN for the start."""
 
     time_s: Float[np.ndarray, " iterations"]
-    """Seconds since the start; of an episode of the game the price of its iterations."""
+    """Seconds since the start; of an episode of the game the number of iterations."""
 
     source: str = ""
     """Where the problem was read."""

@@ -16,7 +16,7 @@ from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import begin
 from jaxba.damping.guard import damping_of
-from jaxba.damping.learned import ConstantAction, LearnedPolicy, boldest, without_weights
+from jaxba.damping.learned import ConstantAction, LearnedPolicy, without_weights
 from jaxba.damping.policy import trained_step
 from jaxba.solver.names import parse_solver
 
@@ -81,13 +81,6 @@ def test_guarded_has_one_lambda_until_a_step_fails_and_the_embedded_iterations_o
     np.testing.assert_allclose(found, [-8, -8, -8, -7.5, -8], atol=1e-6)
     embedded = trained_step(make_policy("bold")).refinement
     assert trained_step(policy).refinement == replace(embedded, points=1)
-
-
-def test_the_boldest_action_has_the_least_effort():
-    config = AgentConfig(effort="points+repairs")
-    assert boldest(config).action == (-1.0, -1.0, -1.0)
-    state, _ = boldest(config).init(info())
-    assert (int(state.effort.point_iterations), bool(state.effort.repairs)) == (0, False)
 
 
 @pytest.mark.parametrize(

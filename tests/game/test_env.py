@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.spatial.transform import Rotation
 from support import same_bits, solve
 from tiny_game import AGENT, KIND, RULES, grid, problem_of, tiny_bank, tiny_game
@@ -23,9 +22,17 @@ from jaxba import StepOptions, make_method, make_policy
 from jaxba.damping.clock import duration
 from jaxba.damping.features import begin, observation_size, observe
 from jaxba.damping.guard import damping_of
-from jaxba.damping.learned import Layer, LearnedPolicy
+from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
 from jaxba.game.env import POINT_ITERATION_COST, Game, GameConfig
-from jaxba.game.evaluate import evaluate, play_all, score, scores
+from jaxba.game.evaluate import (
+    CONSTANT_ACTIONS,
+    best_constant_action,
+    evaluate,
+    paired_ratio,
+    play_all,
+    score,
+    scores,
+)
 from jaxba.game.protocol import Environment
 from jaxba.game.random_scenes import (
     MIN_VIEWS,
@@ -246,7 +253,7 @@ def test_costs_start_at_the_start_never_rise_and_stay_after_the_end():
     np.testing.assert_array_equal(found.costs[:, 0], bank.initial_cost)
     assert (np.diff(found.costs, axis=1) <= 0).all()
     ends = 0
-    for costs, dampings, count, converged, _ in zip(*found, strict=True):
+    for costs, dampings, count, converged in zip(*found, strict=True):
         assert 1 <= count <= LIMIT
         assert converged or count == LIMIT
         assert (costs[count:] == costs[count]).all()
@@ -552,8 +559,7 @@ def test_reaching_a_cost_is_counted_from_the_start():
 
 def test_a_score_is_what_numpy_makes_of_the_iterations():
     costs = np.array([[8.0, 4.0, 2.0, 1.0, 1.0], [8.0, 1.0, 1.0, 1.0, 1.0], [8.0, 7.0, 6.0, 5.0, 5.0]])
-    paid = np.array([[0.0, 1.5, 3.0, 4.5, 6.0], [0.0, 2.0, 4.0, 4.0, 4.0], [0.0, 1.0, 2.0, 3.0, 4.5]])
-    run = Trajectories(costs, costs[:, 1:], np.array([4, 2, 4]), np.array([True, True, False]), paid)
+    run = Trajectories(costs, costs[:, 1:], np.array([4, 2, 4]), np.array([True, True, False]))
     found = score([run, run], [np.ones(3), np.array([4.0, 1.0, 5.0])], 1e-3, 4)
     there = np.array([3, 1, 4, 1, 1, 3])  # the third never gets there: the limit
     np.testing.assert_allclose(found.mean, there.mean())
@@ -563,7 +569,27 @@ def test_a_score_is_what_numpy_makes_of_the_iterations():
     np.testing.assert_allclose(found.failures, 1 / 6)
     np.testing.assert_allclose(found.to_convergence, 2 * (4 + 2 + 4) / 6)
     np.testing.assert_allclose(found.end, np.median([0, 0, 4, -0.75, 0, 0]))
-    np.testing.assert_allclose(found.price, stats.gmean([4.5, 2, 4.5, 1.5, 2, 3]))
+
+
+def test_a_paired_ratio_is_the_geometric_mean_with_the_interval_of_its_standard_error():
+    rng = np.random.default_rng(0)
+    theirs = rng.lognormal(size=400)
+    np.testing.assert_allclose(paired_ratio(0.9 * theirs, theirs), 0.9)
+    noise = rng.normal(scale=0.3, size=400)
+    found = paired_ratio(theirs * np.exp(noise), theirs)
+    np.testing.assert_allclose(found.mean, np.exp(noise.mean()))
+    half = 1.96 * noise.std() / np.sqrt(400)
+    np.testing.assert_allclose(np.log([found.low, found.high]), noise.mean() + np.array([-half, half]), atol=0.2 * half)
+
+
+def test_the_best_constant_action_has_the_fewest_iterations():
+    bank = tiny_bank()
+    best = best_constant_action([KIND], [bank], AGENT, StepOptions(), 1e-3, LIMIT)
+    means = [
+        evaluate([KIND], [bank], ConstantAction((action,), AGENT), StepOptions(), 1e-3, LIMIT).mean
+        for action in CONSTANT_ACTIONS
+    ]
+    assert means[CONSTANT_ACTIONS.index(best.action[0])] == min(means) < max(means)
 
 
 def test_an_evaluation_is_the_score_of_playing():

@@ -32,7 +32,6 @@ def test_an_episode_is_that_of_the_bank_and_its_parameters_have_its_costs():
         assert len(one.damping) == count == len(one.cost) - 1
         np.testing.assert_allclose(one.cost, runs.costs[scene, : count + 1], rtol=1e-9)
         np.testing.assert_allclose(one.damping, runs.dampings[scene, :count], rtol=1e-9)
-        np.testing.assert_allclose(one.paid, runs.paid[scene, : count + 1])
         assert one.converged == runs.converged[scene]
         assert one.problem.num_observations == problem_of(KIND, bank.scenes, scene).num_observations
         assert set(one.problem.point_index) == set(range(one.problem.num_points))
