@@ -5,8 +5,8 @@
 | state | a scene of the bank, its current cameras and points, the agent's memory of the episode |
 | observation | `damping.features.observe`; critics also see the distance to the best known cost |
 | action | a number in (-1, 1): lambda by `damping.guard.damping_of` |
-| terminated | accepted cost within `tolerance` of the best known cost, or the limit if `limit_is_failure` |
-| truncated | the limit otherwise |
+| terminated | accepted cost within `tolerance` of the best known cost, or the limit, as in the paper |
+| truncated | never |
 | reward | `GameConfig.reward` |
 
 Everything is traced once. An episode that ends is followed by one on a random scene of the bank.
@@ -79,9 +79,6 @@ class GameConfig:
 
     max_iterations: int = 40
     """Limit of an episode's length."""
-
-    limit_is_failure: bool = True
-    """Whether an episode that reaches the limit is terminated, as in the paper, or truncated."""
 
     def __post_init__(self) -> None:
         if self.reward not in get_args(Reward):
@@ -235,12 +232,10 @@ class Game:
         best = bank.best_cost[episode.scene]
         after, step = self.iterate(kind, bank, episode, action)
         success = step.cost <= best * (1 + rules.tolerance)
-        limit = after.memory.guard.iteration >= rules.max_iterations
-        terminated = success | (limit & rules.limit_is_failure)
-        truncated = limit & ~terminated
+        terminated = success | (after.memory.guard.iteration >= rules.max_iterations)
         reward = self._reward(step, after.memory, best, success)
         fresh = self._fresh(bank, key)
-        following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
+        following = jax.tree.map(lambda new, old: jnp.where(terminated, new, old), fresh, after)
         single = lambda x: jnp.asarray(x, jnp.float32)
         metrics = {
             "length": single(after.memory.guard.iteration),
@@ -249,7 +244,8 @@ class Game:
             "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
         }
         observed = functools.partial(self._observe, bank)
-        return following, Step(observed(following), single(reward), terminated, truncated, observed(after), metrics)
+        never = jnp.zeros_like(terminated)
+        return following, Step(observed(following), single(reward), terminated, never, observed(after), metrics)
 
     def _reward(self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]) -> Array:
         rules = self.config

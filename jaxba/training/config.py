@@ -22,6 +22,10 @@ from jaxba.problem.options import StepOptions
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig
 
+CLUSTER_CAMERAS = 4
+"""Largest number of cameras in a cluster, for methods with clusters; the default for real problems is too large for
+scenes of the game."""
+
 METADATA_BYTES = 1 << 14
 """Reserved for the metadata of a policy file, of which the configuration takes 3 kB."""
 
@@ -55,10 +59,6 @@ class TrainConfig:
     method: MethodName = "lm"
     """How a step is computed (jaxba/methods/registry.py). Scenes are solved and selected with plain LM."""
 
-    cluster_cameras: int = 4
-    """Largest number of cameras in a cluster, for methods with clusters; the default for real problems is too large for
-    scenes of the game."""
-
     bank: BankConfig = field(default_factory=BankConfig)
     """Scenes."""
 
@@ -79,11 +79,11 @@ class TrainConfig:
             return plain
         method = make_method(self.method)
         if method.options(plain).cluster_cameras is not None:
-            method = make_method(f"{self.method}:{self.cluster_cameras}")
+            method = make_method(f"{self.method}:{CLUSTER_CAMERAS}")
         return method.options(plain)
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep", "cluster_cameras"):
+        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.seed < 2**31:
@@ -108,7 +108,7 @@ def _check_agent(sac: SacConfig) -> None:
             raise ValueError(f"sac.{name} must be at least 1, not {getattr(sac, name)}")
     if sac.policy_layers < 1:
         raise ValueError(f"sac.actor_layers must be at least 1, not {sac.actor_layers}")
-    for name in ("learning_rate", "initial_temperature", "reward_scale", "log_std_max"):
+    for name in ("learning_rate", "initial_temperature"):
         if not getattr(sac, name) > 0:
             raise ValueError(f"sac.{name} must be positive, not {getattr(sac, name)}")
     for name in ("gamma", "tau"):
@@ -116,8 +116,6 @@ def _check_agent(sac: SacConfig) -> None:
             raise ValueError(f"sac.{name} must lie in (0, 1], not {getattr(sac, name)}")
     if not sac.log_std_min < 0:
         raise ValueError(f"sac.log_std_min must be negative, not {sac.log_std_min}")
-    if sac.max_grad_norm is not None and not sac.max_grad_norm > 0:
-        raise ValueError(f"sac.max_grad_norm must be positive or null, not {sac.max_grad_norm}")
 
 
 def _check_size(sac: SacConfig, agent: AgentConfig) -> None:

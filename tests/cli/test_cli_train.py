@@ -212,7 +212,7 @@ def test_an_interrupted_run_continues_with_the_same_results(folder, finished, ca
 @pytest.mark.slow
 def test_an_agent_is_trained_for_the_given_method(tmp_path):
     out = tmp_path / "run"
-    assert run([*COMMAND, "method=stba", "cluster_cameras=2", "chunks=1", "--out", str(out)]) == 0
+    assert run([*COMMAND, "method=stba", "chunks=1", "--out", str(out)]) == 0
     assert list(task.build(load(str(out / "config.yaml")), out).rules) == ["stba", "ceres", "virtual best"]
     assert (out / "policy.safetensors").is_file()
 

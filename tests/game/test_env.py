@@ -314,9 +314,9 @@ def _host(tree):
 
 
 @functools.cache
-def random_game(limit_is_failure: bool):
+def random_game():
     """What happens in 50 steps of random actions: pairs of the state before and the step, all on the host."""
-    game = tiny_game(replace(RULES, limit_is_failure=limit_is_failure), ENVS)
+    game = tiny_game(RULES, ENVS)
     state, seen = _jitted_reset(game, jax.random.key(3))
     found = []
     for action in actions(50):
@@ -328,7 +328,7 @@ def random_game(limit_is_failure: bool):
 
 
 def test_the_game_keeps_the_contract_of_an_environment():
-    game, found = random_game(False)
+    game, found = random_game()
     assert isinstance(game, Environment)
     assert (game.num_envs, game.observation_size, game.action_size) == (ENVS, observation_size(AGENT) + 1, 1)
     assert game.privileged_size == 1
@@ -339,16 +339,14 @@ def test_the_game_keeps_the_contract_of_an_environment():
 
 
 def test_fifty_random_actions_leave_everything_finite():
-    for _, found in (random_game(False), random_game(True)):
-        for before, seen, _, step in found:
-            leaves = jax.tree.leaves((before.episodes, seen, step))
-            assert all(np.isfinite(x).all() for x in leaves if np.issubdtype(x.dtype, np.inexact))
+    for before, seen, _, step in random_game()[1]:
+        leaves = jax.tree.leaves((before.episodes, seen, step))
+        assert all(np.isfinite(x).all() for x in leaves if np.issubdtype(x.dtype, np.inexact))
 
 
-@pytest.mark.parametrize("limit_is_failure", [False, True])
-def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else(limit_is_failure):
+def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else():
     """The cost after the action is that of `lm_step` on the scene alone, taken once more."""
-    game, found = random_game(limit_is_failure)
+    game, found = random_game()
     bank = tiny_bank()
     goals = limits = 0
     for k, (before, _, action, step) in enumerate(found):
@@ -359,8 +357,8 @@ def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else(limit_is_f
         success = step.metrics["success"] > 0
         if cost is not None:
             np.testing.assert_array_equal(success, cost <= best * (1 + RULES.tolerance))
-        np.testing.assert_array_equal(step.terminated, success | (at_limit if limit_is_failure else False))
-        np.testing.assert_array_equal(step.truncated, False if limit_is_failure else at_limit & ~success)
+        np.testing.assert_array_equal(step.terminated, success | at_limit)
+        assert not step.truncated.any()
         np.testing.assert_array_equal(step.metrics["length"], episodes.memory.guard.iteration + 1)
         goals, limits = goals + success.sum(), limits + (at_limit & ~success).sum()
     assert goals >= 5
@@ -379,7 +377,7 @@ def _alone(game: Game, episodes, action, e: int) -> float:
 
 
 def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_is_the_true_one():
-    game, found = random_game(False)
+    game, found = random_game()
     starts = {}
     for scene in range(len(tiny_bank().initial_cost)):
         episode = game.start(game.banks[0], jnp.asarray(scene, jnp.int32))
@@ -479,7 +477,7 @@ def test_a_point_iteration_costs_a_tenth_of_a_linear_solve():
 
 def test_the_game_pays_what_it_says():
     """The rewards of the compiled game, from the costs in its own states."""
-    game, found = random_game(False)
+    game, found = random_game()
     checked = 0
     for k in range(len(found) - 1):
         before, _, _, step = found[k]
@@ -495,7 +493,7 @@ def test_the_game_pays_what_it_says():
 
 
 def test_the_same_key_and_actions_give_the_same_numbers_and_the_game_is_traced_once():
-    game, found = random_game(False)
+    game, found = random_game()
     traced = _jitted_step._cache_size()
     state, _ = _jitted_reset(game, jax.random.key(3))
     for action, (before, _, _, step) in zip(actions(50), found, strict=True):

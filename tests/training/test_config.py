@@ -91,13 +91,13 @@ def test_overrides_are_yaml():
             "bank.classes=[{cameras: 6, points: 20}, {cameras: 8, points: 30, family: wide}]",
             "bank.scenes=[10, 20]",
             "envs=[3, 4]",
-            "sac.max_grad_norm=null",
+            "sac.target_entropy=null",
             "sac.learn_temperature=false",
             "sac.gamma=1",
         ],
     )
     assert found.bank.classes == (SceneClass(6, 20), SceneClass(8, 30))
-    assert (found.envs, found.sac.max_grad_norm, found.sac.learn_temperature) == ((3, 4), None, False)
+    assert (found.envs, found.sac.target_entropy, found.sac.learn_temperature) == ((3, 4), None, False)
     assert isinstance(found.sac.gamma, float)
 
 
@@ -144,7 +144,6 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("sac.gamma=1.5", "sac.gamma must lie in (0, 1]"),
         ("sac.learning_rate=0", "sac.learning_rate must be positive"),
         ("sac.log_std_min=1", "sac.log_std_min must be negative"),
-        ("sac.max_grad_norm=-1", "sac.max_grad_norm must be positive or null"),
         ("bank.refine_points=-1", "bank: refine_points must be at least 0, is -1"),
         ("bank.warm_share=2", "bank: warm_share must be 0 to 1, is 2"),
         ("game.tolerance=100", "game: tolerance must be below 1, is 100"),
