@@ -116,11 +116,6 @@ class AgentConfig:
         )
         return replace(options, refinement=refinement, coordinates=coordinates)
 
-    @property
-    def guarded(self) -> bool:
-        """Whether the guard is on."""
-        return self.guard != "off"
-
 
 def config_from(values: dict[str, Any]) -> AgentConfig:
     """The inverse of `dataclasses.asdict`.

@@ -72,7 +72,7 @@ class ConstantAction(AgentPolicy):
 
     def init(self, info: ProblemInfo) -> tuple[GuardState, Float[Array, ""]]:
         """See `DampingPolicy`."""
-        return self._allowed(initial_guard(info.cost.dtype))
+        return self._allowed(initial_guard(self.config, info.cost.dtype))
 
     def propose(self, state: GuardState, step: StepInfo) -> tuple[GuardState, Float[Array, ""]]:
         """See `DampingPolicy`."""
@@ -85,27 +85,6 @@ class ConstantAction(AgentPolicy):
 def boldest(config: AgentConfig) -> ConstantAction:
     """The policy that always asks for the smallest lambda."""
     return ConstantAction((-1.0,), config)
-
-
-FREE_DESCENT = 11.0
-"""Decades by which lambda may fall where nothing limits it: the whole range of an action."""
-
-GUARDED_DECADES, GUARDED_POINTS = -8.0, 1
-"""log10 of lambda and point iterations of `guarded`. On 512 training scenes of a game in which every part of an
-iteration cost its work, with a guard that leaves lambda free until a step fails, this constant action cost 0.3% more
-than the best one, which has -9 (three seeds, docs/notebook/game.md); on real problems this one was measured."""
-
-
-def guarded() -> ConstantAction:
-    """Nearly Gauss-Newton, with all embedded iterations: one small lambda, until the guard raises it after a rejection
-    or a shortened step."""
-    config = AgentConfig(
-        low=GUARDED_DECADES,
-        first_low=GUARDED_DECADES,
-        descent=FREE_DESCENT,
-        refine_points=GUARDED_POINTS,
-    )
-    return boldest(config)
 
 
 class Layer(NamedTuple):

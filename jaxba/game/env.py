@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.clock import duration
 from jaxba.damping.features import Memory, begin, observation_size, observe, record
-from jaxba.damping.guard import GuardState, action_of, damping_of
+from jaxba.damping.guard import action_of, damping_of
 from jaxba.damping.rules import Ceres
 from jaxba.game.devices import all_rows, own_rows
 from jaxba.game.protocol import Step
@@ -204,13 +204,12 @@ class Game:
         self, kind: SceneClass, bank: Bank, episode: Episode, action: Float[Array, " actions"]
     ) -> tuple[Episode, StepInfo]:
         """One LM iteration of one scene."""
-        agent = self.config.agent
+        agent, memory = self.config.agent, episode.memory
         layout = class_layout(kind, self.options)
         layout = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
-        guard = episode.memory.guard
-        damping = damping_of(agent, guard, action[0])
-        state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, guard.iteration)
-        return Episode(episode.scene, state, record(agent, episode.memory, step)), step
+        damping = damping_of(agent, memory.guard, action[0])
+        state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, memory.iteration)
+        return Episode(episode.scene, state, record(agent, memory, step)), step
 
     @for_traces
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
@@ -232,15 +231,15 @@ class Game:
         best = bank.best_cost[episode.scene]
         after, step = self.iterate(kind, bank, episode, action)
         success = step.cost <= best * (1 + rules.tolerance)
-        terminated = success | (after.memory.guard.iteration >= rules.max_iterations)
+        terminated = success | (after.memory.iteration >= rules.max_iterations)
         reward = self._reward(step, after.memory, best, success)
         fresh = self._fresh(bank, key)
         following = jax.tree.map(lambda new, old: jnp.where(terminated, new, old), fresh, after)
         single = lambda x: jnp.asarray(x, jnp.float32)
         metrics = {
-            "length": single(after.memory.guard.iteration),
+            "length": single(after.memory.iteration),
             "success": single(success),
-            "rejections": single(after.memory.guard.rejections),
+            "rejections": single(after.memory.guard.rescue.rejections),
             "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
         }
         observed = functools.partial(self._observe, bank)
@@ -257,7 +256,7 @@ class Game:
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":
-            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.guard.iteration - 1))
+            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.iteration - 1))
         else:
             reward = bonus - jnp.log10(step.cost / best)
         return rules.scale * reward
@@ -268,18 +267,18 @@ class Game:
         last quarter."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
-        rules = [all_rows(jax.vmap(_rule_damping)(part.memory.guard), self.devices) for part in state.episodes]
+        rules = [all_rows(jax.vmap(_rule_damping)(part.memory), self.devices) for part in state.episodes]
         rule = jnp.concatenate(rules) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
         action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
         return uniform.at[1::2, 0].set(action[1::2])
 
 
-def _rule_damping(guard: GuardState) -> Array:
+def _rule_damping(memory: Memory) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
-    rule, rejections = Ceres(), guard.consecutive_rejections
-    factor = rule.factor(rejections == 0, guard.gain, rule.growth_after(rejections))
-    return guard.damping + jnp.where(guard.iteration == 0, 0.0, jnp.log10(factor))
+    rule, rejections = Ceres(), memory.guard.rescue.in_a_row
+    factor = rule.factor(rejections == 0, memory.gain, rule.growth_after(rejections))
+    return memory.damping + jnp.where(memory.iteration == 0, 0.0, jnp.log10(factor))
 
 
 def make_game(

@@ -35,7 +35,7 @@ class Played(NamedTuple):
     @property
     def iterations(self) -> Int[Array, ""]:
         """Its iterations; the game's limit if it was no success."""
-        return self.episode.memory.guard.iteration
+        return self.episode.memory.iteration
 
 
 def play_on(

@@ -165,7 +165,7 @@ def _train(
         change, optimiser = adam.update(gradient, state.adam, state.layers)
         key, *keys = jax.random.split(state.key, 1 + config.batch)
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, Tolerances().ftol)
-        done = converged | (after.memory.guard.iteration >= config.max_iterations)
+        done = converged | (after.memory.iteration >= config.max_iterations)
         new = jax.vmap(another)(jnp.stack(keys))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
         episodes = jax.tree.map(pick, new, after)

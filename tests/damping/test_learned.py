@@ -196,7 +196,7 @@ def test_every_shipped_policy_can_be_used_and_is_small():
     assert {path.name for path in shipped} >= set(registry.SHIPPED.values())
     for path in shipped:
         assert path.stat().st_size <= LARGEST_FILE
-        assert load_policy(path).config.guarded
+        assert load_policy(path).config.guard == "hand-over"
 
 
 # The network

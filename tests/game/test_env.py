@@ -353,13 +353,13 @@ def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else():
         (episodes,) = before.episodes
         best = np.asarray(bank.best_cost)[episodes.scene]
         cost = np.array([_alone(game, episodes, action, e) for e in range(ENVS)]) if k < 12 else None
-        at_limit = episodes.memory.guard.iteration + 1 >= RULES.max_iterations
+        at_limit = episodes.memory.iteration + 1 >= RULES.max_iterations
         success = step.metrics["success"] > 0
         if cost is not None:
             np.testing.assert_array_equal(success, cost <= best * (1 + RULES.tolerance))
         np.testing.assert_array_equal(step.terminated, success | at_limit)
         assert not step.truncated.any()
-        np.testing.assert_array_equal(step.metrics["length"], episodes.memory.guard.iteration + 1)
+        np.testing.assert_array_equal(step.metrics["length"], episodes.memory.iteration + 1)
         goals, limits = goals + success.sum(), limits + (at_limit & ~success).sum()
     assert goals >= 5
     assert limits >= 5
@@ -403,7 +403,7 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
                 np.testing.assert_allclose(step.final_observation[e, -1], decades, atol=1e-4)
         if k + 1 < len(found):
             (following,) = found[k + 1][0].episodes
-            assert (following.memory.guard.iteration[done] == 0).all()
+            assert (following.memory.iteration[done] == 0).all()
             np.testing.assert_array_equal(
                 following.state.cost[done], np.asarray(tiny_bank().initial_cost)[following.scene[done]]
             )
@@ -452,7 +452,7 @@ def test_rewards_are_those_of_the_contract(config):
         step = step_info(True, cost=cost, previous_cost=before)
         found = game._reward(
             step,
-            memory._replace(guard=memory.guard._replace(iteration=jnp.asarray(iteration, jnp.int32))),
+            memory._replace(iteration=jnp.asarray(iteration, jnp.int32)),
             jnp.asarray(best),
             jnp.asarray(success),
         )
