@@ -31,9 +31,9 @@ from jaxba.damping.features import Memory, begin, observation_size, observe, rec
 from jaxba.damping.guard import action_of, damping_of
 from jaxba.damping.rules import Ceres
 from jaxba.game.devices import all_rows, own_rows
+from jaxba.game.groups import step_groups
 from jaxba.game.protocol import Step
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.rollout import step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo

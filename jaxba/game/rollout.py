@@ -7,8 +7,7 @@ scene.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import DampingPolicy
+from jaxba.game.groups import step_groups
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo
@@ -26,60 +26,8 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, for_traces
 
-T = TypeVar("T")
-
 LANES = 128
 """Scenes solved at a time."""
-
-GROUP = 8
-"""Scenes that step together on a CPU. Trials and camera rounds of a group last until its slowest scene is done, and
-arrays of this size stay in a core's cache: 8 scenes of 10 x 40 took no more time per scene than 64."""
-
-
-def step_groups(function: Callable[..., T], *arguments: Any, shared: Any = None) -> T:
-    """`jax.vmap(function)` in groups of `GROUP`, one after the other, on a CPU; at once elsewhere.
-
-    Under `jax.vmap` the groups stay as large and there are more of them.
-
-    Args:
-        function: of one scene. It gets `shared` first if that is not None.
-        arguments: with a first axis of scenes.
-        shared: arrays that all scenes share. Under `jax.vmap` the function must not close over others.
-    """
-    if jax.default_backend() != "cpu":
-        return _at_once(function, shared, arguments)
-
-    @jax.custom_batching.custom_vmap
-    def grouped(shared: Any, arguments: Any) -> T:
-        return _grouped(function, shared, arguments)
-
-    @grouped.def_vmap
-    def more_groups(size: int, batched: Any, shared: Any, arguments: Any) -> tuple[T, Any]:
-        if any(jax.tree.leaves(batched[0])):
-            raise ValueError("arrays that all scenes share must not be batched")
-        whole = lambda x, own: x if own else jnp.broadcast_to(x, (size, *x.shape))
-        flat = jax.tree.map(lambda x, own: whole(x, own).reshape(-1, *x.shape[1 + own :]), arguments, batched[1])
-        found = _grouped(function, shared, flat)
-        found = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), found)
-        return found, jax.tree.map(lambda _: True, found)
-
-    return grouped(shared, arguments)
-
-
-def _at_once(function: Callable[..., T], shared: Any, arguments: Any) -> T:
-    one = function if shared is None else functools.partial(function, shared)
-    return jax.vmap(one)(*arguments)
-
-
-def _grouped(function: Callable[..., T], shared: Any, arguments: Any) -> T:
-    count = jax.tree.leaves(arguments)[0].shape[0]
-    if count <= GROUP:
-        return _at_once(function, shared, arguments)
-    # whole groups only: `lax.map` would run the remainder at the same time as the groups, and two batched
-    # factorisations at a time can deadlock if XLA has two threads
-    rows = jnp.minimum(jnp.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
-    found = lax.map(lambda a: _at_once(function, shared, a), jax.tree.map(lambda x: x[rows], arguments))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
 
 
 class Trajectories(NamedTuple):

@@ -28,7 +28,7 @@ from jaxba.damping.guard import damping_of
 from jaxba.damping.learned import Layer
 from jaxba.damping.policy import ProblemInfo
 from jaxba.game.env import Episode, Game
-from jaxba.game.rollout import step_groups
+from jaxba.game.groups import step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost

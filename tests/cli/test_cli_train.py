@@ -17,7 +17,7 @@ from safetensors import safe_open
 
 from jaxba.cli.train import run
 from jaxba.damping.policy_file import load_policy
-from jaxba.game import rollout
+from jaxba.game import groups, rollout
 from jaxba.game.scene_bank import TooFewScenes
 from jaxba.training import log, task
 from jaxba.training.config import load
@@ -36,7 +36,7 @@ CLOCKS = ("wall_s", "chunk_s", "steps_per_s", "updates_per_s", "cpu_per_wall", "
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     """Few lanes and rules, since every rule needs its own compiled program."""
-    monkeypatch.setattr(rollout, "LANES", rollout.GROUP)
+    monkeypatch.setattr(rollout, "LANES", groups.GROUP)
     monkeypatch.setattr(task, "BASELINES", ("ceres",))
 
 
@@ -45,7 +45,7 @@ def scenes(tmp_path_factory) -> Path:
     """A folder whose run was interrupted after the first chunk."""
     folder = tmp_path_factory.mktemp("train") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "LANES", rollout.GROUP)
+        patch.setattr(rollout, "LANES", groups.GROUP)
         patch.setattr(task, "BASELINES", ("ceres",))
         interrupt_at(1, patch)
         assert run([*COMMAND, "--out", str(folder)]) == 130
@@ -61,7 +61,7 @@ def folder(scenes, tmp_path) -> Path:
 def finished(scenes, tmp_path_factory) -> Path:
     folder = Path(shutil.copytree(scenes, tmp_path_factory.mktemp("done") / "run"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rollout, "LANES", rollout.GROUP)
+        patch.setattr(rollout, "LANES", groups.GROUP)
         patch.setattr(task, "BASELINES", ("ceres",))
         assert run(["--out", str(folder), "--resume"]) == 0
     return folder
@@ -133,9 +133,9 @@ def test_a_finished_run_resumed_prints_the_table_again(finished, capsys):
 IN_ANOTHER = """
 import sys
 from jaxba.cli import train
-from jaxba.game import rollout
+from jaxba.game import groups, rollout
 from jaxba.training import task
-rollout.LANES, task.BASELINES = rollout.GROUP, ("ceres",)
+rollout.LANES, task.BASELINES = groups.GROUP, ("ceres",)
 sys.exit(train.run(sys.argv[1:]))
 """
 

@@ -33,6 +33,7 @@ from jaxba.game.evaluate import (
     score,
     scores,
 )
+from jaxba.game.groups import GROUP, step_groups
 from jaxba.game.protocol import Environment
 from jaxba.game.random_scenes import (
     MIN_VIEWS,
@@ -43,7 +44,7 @@ from jaxba.game.random_scenes import (
     _angle_axis,
     make_scenes,
 )
-from jaxba.game.rollout import GROUP, Trajectories, play, step_groups
+from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, select
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState
