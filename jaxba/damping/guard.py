@@ -52,8 +52,8 @@ def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> Guar
     lowest = jnp.where(is_inexact(step), damping, damping - config.descent)
     lowest = jnp.where(failures > 0, jnp.maximum(lowest, damping + config.escalate * failures), lowest)
     highest = jnp.where(_is_overdamped(step), damping - 1, jnp.inf)
-    bounds = (jnp.where(rescue.in_charge, rule, x).astype(guard.lowest.dtype) for x in (lowest, highest))
-    return GuardState(*bounds, rescue)
+    decided = lambda limit: jnp.where(rescue.in_charge, rule, limit).astype(guard.lowest.dtype)
+    return GuardState(decided(lowest), decided(highest), rescue)
 
 
 def _is_overdamped(step: StepInfo) -> Bool[Array, ""]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
+from jaxba.typing import AnyArray
 
 
 class ProblemInfo(NamedTuple):
@@ -34,6 +36,29 @@ class ProblemInfo(NamedTuple):
 
     max_iterations: Int[Array, ""]
     """Limit of iterations."""
+
+    @classmethod
+    def of(
+        cls,
+        cost: Float[Array, ""],
+        observations: Any,
+        points: Any,
+        seen: Bool[AnyArray, " cameras"],
+        focal: Float[AnyArray, " cameras"],
+        max_iterations: Any,
+        unit: Any = 1.0,
+    ) -> ProblemInfo:
+        """The fields, of their types: `seen` says which cameras are observed, `focal` has their focal lengths."""
+        count = lambda n: jnp.asarray(n, jnp.int32)
+        return cls(
+            cost=cost,
+            observations=count(observations),
+            cameras=count(jnp.sum(seen)),
+            points=count(points),
+            unit=jnp.asarray(unit, cost.dtype),
+            focal=jnp.nanmedian(jnp.where(seen, jnp.abs(focal), jnp.nan)),
+            max_iterations=count(max_iterations),
+        )
 
 
 @runtime_checkable

@@ -71,20 +71,13 @@ class Bank(NamedTuple):
 
 def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
     """What a policy knows about each scene before the first iteration."""
-    count = len(scenes.mask)
-    grid = scenes.mask.reshape(count, kind.cameras, kind.points + 1)
-    whole = lambda x: x.astype(jnp.int32)
-    seen = jnp.any(grid, axis=2)
-    focal = jnp.nanmedian(jnp.where(seen, scenes.cameras[:, 6], jnp.nan), axis=1)
-    return ProblemInfo(
-        cost=initial,
-        observations=whole(jnp.sum(scenes.mask, axis=1)),
-        cameras=whole(jnp.sum(seen, axis=1)),
-        points=whole(jnp.sum(jnp.any(grid, axis=1), axis=1)),
-        unit=jnp.ones_like(initial),
-        focal=focal,
-        max_iterations=jnp.full((count,), limit, jnp.int32),
-    )
+
+    def one(scene: Scenes, cost: Array) -> ProblemInfo:
+        grid = scene.mask.reshape(kind.cameras, kind.points + 1)
+        seen, points = jnp.any(grid, axis=1), jnp.sum(jnp.any(grid, axis=0))
+        return ProblemInfo.of(cost, jnp.sum(grid), points, seen, scene.cameras[6], limit)
+
+    return jax.vmap(one)(scenes, initial)
 
 
 def worth_solving(kind: SceneClass, info: ProblemInfo) -> Int[np.ndarray, " kept"]:

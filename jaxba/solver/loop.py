@@ -79,23 +79,13 @@ class Carry(NamedTuple):
 
 def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: Any) -> ProblemInfo:
     """The information that a policy gets before the first iteration."""
-    unit = jnp.ones_like(state.cost)
+    unit: Any = 1.0
     if options.coordinates.scaling == "identity":
         linear = linearize(layout, state.cameras, state.points, options.loss)
         unit = largest_diagonal(layout, only_free(layout, linear, "free"))
-    count = lambda n: jnp.asarray(n, jnp.int32)
     tracks = point_sum(layout, jnp.asarray(layout.slot_mask, state.cost.dtype)[None])
     observations, points = sum_over_devices(layout, (jnp.sum(layout.slot_mask), jnp.sum(tracks > 0)))
-    info = ProblemInfo(
-        cost=state.cost,
-        observations=count(observations),
-        cameras=count(jnp.sum(layout.camera_seen)),
-        points=count(points),
-        unit=unit,
-        focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
-        max_iterations=count(max_iterations),
-    )
-    return info
+    return ProblemInfo.of(state.cost, observations, points, layout.camera_seen, state.cameras[6], max_iterations, unit)
 
 
 def begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> Carry:
