@@ -34,9 +34,6 @@ CURVE = "curve"
 PAGE = "report.html"
 """File with curves, episodes and the table, interactive."""
 
-EPISODES = 6
-"""Held-out scenes whose episodes are in the page."""
-
 FILE_WIDTH = 160
 """Width of the table in characters if the output is not a terminal."""
 
@@ -271,7 +268,7 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
     from jaxba.bench.tables import to_rich
     from jaxba.cli import training_page
     from jaxba.cli.training_curve import plot_curve
-    from jaxba.game.episode import replay
+    from jaxba.game.rollout import play
     from jaxba.runtime.atomic import write_text
     from jaxba.training import log
     from jaxba.training.driver import best_of
@@ -288,9 +285,7 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
     chosen = best_of(best)
     kind, bank = work.config.bank.classes[0], work.held_out[0]
     policy, limit = work.policy(chosen.actor), rules_of_game.max_iterations
-    episodes = [
-        replay(kind, bank, k, policy, work.game.options, limit) for k in range(min(EPISODES, len(bank.initial_cost)))
-    ]
+    episodes = play(kind, bank, policy, work.game.options, limit)
     facts = {"command": command, "agents": str(work.config.seeds), **bench_run.machine()}
     page = folder / PAGE
     write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts))

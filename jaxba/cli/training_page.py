@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from jaxba.bench import page
 from jaxba.bench.page import Chart
 from jaxba.bench.plots import Style, solver_styles
 from jaxba.bench.tables import Table
-from jaxba.game.episode import Episode
+from jaxba.game.rollout import Trajectories
 from jaxba.training.log import Row
 
 AXES = ("updates", "seconds")
@@ -21,6 +23,9 @@ TRAINED = "trained"
 
 HELD_OUT = {"mean": "mean iterations", "p90": "90th percentile", "failures": "failures (%)"}
 """Charts of held-out scores: fields of a `Score` and their titles. The log has `mean` as `score`."""
+
+EPISODES = 6
+"""Scenes whose episodes are shown."""
 
 LEARNING = {
     "episode/length": "iterations of a training episode",
@@ -37,7 +42,7 @@ def to_html(
     rows: Sequence[Row],
     rules: Mapping[str, Any],
     table: Table,
-    episodes: Sequence[Episode],
+    episodes: Trajectories,
     facts: Mapping[str, str],
 ) -> str:
     """The page.
@@ -46,7 +51,7 @@ def to_html(
         rows: of the log.
         rules: a `Score` by name of the yardstick.
         table: the comparison on the held-out scenes.
-        episodes: of the best policy.
+        episodes: of the best policy; the first `EPISODES` are shown.
         facts: machine, versions, command.
     """
     styles = solver_styles([TRAINED, *rules])
@@ -70,7 +75,7 @@ def to_html(
         page.table(table, styles),
         page.section("Learning", page.note(spread), page.charts(numbered[first:second])),
         page.section(
-            f"The best policy on {len(episodes)} held-out scenes",
+            f"The best policy on {min(EPISODES, len(episodes.iterations))} held-out scenes",
             page.note("Every line is a scene. Hollow: the step was rejected."),
             page.charts(numbered[second:]),
         ),
@@ -154,31 +159,24 @@ def _faint(color: str) -> str:
     return "rgba({}, {}, {}, 0.18)".format(*(int(color[k : k + 2], 16) for k in (1, 3, 5)))
 
 
-def _episode_charts(episodes: Sequence[Episode]) -> list[Chart]:
-    """Lambda, work and cost over the iterations of some episodes."""
+def _episode_charts(episodes: Trajectories) -> list[Chart]:
+    """Lambda and cost over the iterations of some episodes."""
     from jaxba.bench.plots import MARKERS
     from jaxba.solver.figure import COLOURS
 
-    def chart(title: str, y: Callable[[Episode], Any], axis: dict[str, Any], starts: int) -> Chart:
+    def chart(title: str, rows: np.ndarray, starts: int) -> Chart:
         traces = []
-        for k, one in enumerate(episodes):
+        for k, count in enumerate(episodes.iterations[:EPISODES]):
             color, symbol = COLOURS[k % len(COLOURS)], page.SYMBOLS[MARKERS[k % len(MARKERS)]]
-            numbers = [float(v) for v in y(one)]
-            x = [i + starts for i in range(len(numbers))]
-            filled = [True] * (1 - starts) + [bool(ok) for ok in one.accepted]
-            symbols = [symbol if ok else f"{symbol}-open" for ok in filled]
+            numbers = rows[k, : count + 1 - starts].tolist()
+            accepted = np.diff(episodes.costs[k, : count + 1]) < 0
+            symbols = [symbol if ok else f"{symbol}-open" for ok in [True] * (1 - starts) + accepted.tolist()]
             traces.append(
-                {"x": x, "y": numbers, "name": f"scene {k + 1}", "mode": "lines+markers", "meta": ""}
+                {"x": list(range(starts, count + 1)), "y": numbers, "name": f"scene {k + 1}", "mode": "lines+markers"}
                 | {"line": {"color": color, "width": 1.5}, "marker": {"symbol": symbols, "size": 7, "color": color}}
-                | {"hovertemplate": f"<b>scene {k + 1}</b>, iteration %{{x}}<br>%{{y:.4g}}<extra></extra>"}
+                | {"hovertemplate": f"<b>scene {k + 1}</b>, iteration %{{x}}<br>%{{y:.4g}}<extra></extra>", "meta": ""}
             )
-        layout = {"xaxis": {"title": {"text": "iteration"}}, "yaxis": axis, "height": 320}
-        return Chart(title, traces, layout)
+        log = {"type": "log", "exponentformat": "power", "minorloglabels": "none"}
+        return Chart(title, traces, {"xaxis": {"title": {"text": "iteration"}}, "yaxis": log, "height": 320})
 
-    log = {"type": "log", "exponentformat": "power", "minorloglabels": "none"}
-    return [
-        chart("damping λ", lambda one: one.damping, log, 1),
-        chart("embedded point iterations", lambda one: one.point_iterations, {"rangemode": "tozero"}, 1),
-        chart("repairs", lambda one: one.repairs, {"rangemode": "tozero"}, 1),
-        chart("cost (pixels²)", lambda one: one.cost, log, 0),
-    ]
+    return [chart("damping λ", episodes.dampings, 1), chart("cost (pixels²)", episodes.costs, 0)]

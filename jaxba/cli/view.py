@@ -135,33 +135,20 @@ def _check_apart(args: Arguments) -> None:
 def _episode(args: Arguments) -> Shown:
     """An episode on a scene of the game's default class."""
     import jax
-    import numpy as np
 
     import jaxba
-    from jaxba.game.episode import draw
     from jaxba.game.random_scenes import SceneClass
-    from jaxba.viewer.recording import Recording
+    from jaxba.game.scene_bank import draw
+    from jaxba.viewer.recording import Recorder
     from jaxba.viewer.sources import shown
 
     assert args.policy is not None
     jax.config.update("jax_enable_x64", True)  # the game's type
     policy = jaxba.make_policy(args.policy)
-    options = jaxba.trained_step(policy)
-    played = draw(SceneClass(), jax.random.key(0), args.scene, policy, options, LARGEST_EPISODE)
-    start = np.array([np.nan])
-    recording = Recording(
-        problem=played.problem,
-        whole=played.problem.num_points,
-        cameras=played.cameras,
-        points=played.points,
-        state=np.arange(len(played.cost)),
-        cost=played.cost,
-        damping=np.concatenate([start, played.damping]),
-        gain_ratio=np.concatenate([start, played.gain_ratio]),
-        time_s=np.arange(len(played.cost), dtype=float),
-        unit="iterations",
-    )
-    return shown(recording, f"scene {args.scene}, {args.policy}")
+    problem = draw(SceneClass(), jax.random.key(0), args.scene)
+    recorder = Recorder(problem)
+    jaxba.solve(problem, policy, jaxba.SolveOptions(max_iterations=LARGEST_EPISODE), watch=recorder)
+    return shown(recorder.recording(), f"scene {args.scene}, {args.policy}")
 
 
 def check_extra() -> None:

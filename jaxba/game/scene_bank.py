@@ -21,10 +21,11 @@ from jaxtyping import Bool, Float, Int
 from jaxba.damping import ProblemInfo, make_policy
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
 from jaxba.game.rollout import Trajectories, play
-from jaxba.game.scene_layout import class_layout, with_scene
+from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
 from jaxba.game.warm_starts import warm_starts
 from jaxba.game.windows import read_windows
 from jaxba.model.linearize import cost
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, Refinement, StepOptions, check_count
 from jaxba.runtime.jit import jit
@@ -96,6 +97,24 @@ def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
         return cost(with_scene(layout, scene.pixels, scene.mask), scene.cameras, scene.points, Loss())
 
     return jax.lax.map(one, scenes, batch_size=256)
+
+
+DRAWN = 64
+"""Scenes of which `draw` takes the first that is worth solving; 85% of the default class are."""
+
+
+@for_traces
+def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
+    """The random scene of a class with this number, for this key.
+
+    Raises:
+        ValueError: none of `DRAWN` scenes is worth solving.
+    """
+    scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
+    rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
+    if not len(rows):
+        raise ValueError(f"no scene of {kind.cameras} cameras and {kind.points} points is worth solving")
+    return scene_problem(kind, scenes, int(rows[0]))
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxba import BundleProblem
 from jaxba.bench.tables import Table
 from jaxba.cli import training_page
 from jaxba.cli.training_view import TrainingView
-from jaxba.game.episode import Episode
 from jaxba.game.evaluate import Score
+from jaxba.game.rollout import Trajectories
 from jaxba.training.config import load
 
 RULES = {
@@ -75,16 +74,10 @@ def test_elsewhere_every_chunk_is_a_line(config):
     assert lines[1].startswith("chunk 1/4: held out 6.00 iterations (5.00 to 7.00)")
 
 
-def episode(count: int) -> Episode:
-    """An episode of so many iterations, the second of which is rejected."""
-    steps = np.arange(count)
-    lambdas, accepted, cost = 10.0**-steps, steps != 1, 8.0 - np.arange(count + 1.0)
-    problem = BundleProblem.create(np.zeros((2, 9)), np.zeros((1, 3)), np.zeros((2, 2)), np.arange(2), np.zeros(2, int))
-    cameras, points = np.zeros((count + 1, 2, 9)), np.zeros((count + 1, 1, 3))
-    return Episode(problem, cameras, points, cost, lambdas, lambdas, accepted, steps, steps, True)
+COSTS = 8.0 - np.tile([0, 1, 1, 2, 3, 4, 5, 6], (2, 1))
+"""Of two episodes, of five and seven iterations; the second of each is rejected."""
 
-
-EPISODES = [episode(5), episode(7)]
+EPISODES = Trajectories(COSTS, 10.0 ** -COSTS[:, 1:], np.array([5, 7]), np.array([True, True]))
 
 
 def page_of() -> str:
@@ -107,8 +100,8 @@ def test_the_page_has_mean_range_yardsticks_and_the_policys_lambda():
     np.testing.assert_allclose(trained["y"], [6.0, 12.5 / 3], rtol=1e-6)
     ceres = next(trace for trace in mean if trace.get("name") == "ceres")
     assert ceres["y"] == [6.0, 6.0]
-    for trace, one in zip(charts["damping λ"]["data"], EPISODES, strict=True):
-        np.testing.assert_allclose(trace["y"], one.damping, rtol=1e-6)
+    for trace, row, count in zip(charts["damping λ"]["data"], EPISODES.dampings, (5, 7), strict=True):
+        np.testing.assert_allclose(trace["y"], row[:count], rtol=1e-6)
         assert [k for k, symbol in enumerate(trace["marker"]["symbol"]) if symbol.endswith("-open")] == [1]
 
 
@@ -119,7 +112,7 @@ def test_the_page_is_drawn_without_errors_and_without_the_network(tmp_path):
     with browser.chromium() as page:
         page.get(path.as_uri())
         count = page.execute_script("return document.querySelectorAll('.scatterlayer .trace').length")
-        assert count > 5 * len(EPISODES)
+        assert count > 2 * len(EPISODES.iterations)
         title = "return document.querySelector('.xtitle').textContent"
         assert page.execute_script(title) == "gradient updates"
         page.execute_script("document.querySelector('[data-axis=seconds]').click()")
