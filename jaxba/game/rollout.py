@@ -57,10 +57,7 @@ class _Lane(NamedTuple):
 class _Loop(NamedTuple):
     lane: _Lane
     next_scene: Int[Array, ""]
-    costs: Array
-    dampings: Array
-    iterations: Array
-    converged: Array
+    found: Any  # `Trajectories` of JAX arrays, with an extra row for idle lanes; costs without the start
 
 
 @for_traces
@@ -79,12 +76,11 @@ def play(
     """
     check_x64(bank.initial_cost.dtype)
     loop = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
-    found = jax.tree.map(np.asarray, (loop.costs, loop.dampings, loop.iterations, loop.converged))
-    costs, dampings, iterations, converged = found
-    costs = np.concatenate([np.asarray(bank.initial_cost)[:, None], costs[:-1]], axis=1)
-    past = np.arange(limit + 1) > iterations[:-1, None]
-    last = np.take_along_axis(costs, iterations[:-1, None], axis=1)
-    return Trajectories(np.where(past, last, costs), dampings[:-1], iterations[:-1], converged[:-1])
+    found: Trajectories = jax.tree.map(lambda x: np.asarray(x)[:-1], loop.found)
+    costs = np.concatenate([np.asarray(bank.initial_cost)[:, None], found.costs], axis=1)
+    past = np.arange(limit + 1) > found.iterations[:, None]
+    last = np.take_along_axis(costs, found.iterations[:, None], axis=1)
+    return found._replace(costs=np.where(past, last, costs))
 
 
 @functools.partial(jit, static_argnames=("kind", "options", "limit"))
@@ -112,27 +108,19 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
         row = jnp.minimum(lane.scene, count)  # idle lanes write to an extra row that is dropped
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, ftol)
         done = converged | (lane.iteration >= limit)
-        costs = loop.costs.at[row, lane.iteration - 1].set(step.cost)
-        dampings = loop.dampings.at[row, lane.iteration - 1].set(step.damping)
+        found = loop.found._replace(
+            costs=loop.found.costs.at[row, lane.iteration - 1].set(step.cost),
+            dampings=loop.found.dampings.at[row, lane.iteration - 1].set(step.damping),
+            iterations=loop.found.iterations.at[row].set(lane.iteration),
+            converged=loop.found.converged.at[row].set(converged),
+        )
         upcoming = loop.next_scene + jnp.cumsum(done) - 1
         new = jax.vmap(fresh)(upcoming.astype(jnp.int32))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-        return _Loop(
-            jax.tree.map(pick, new, lane),
-            (loop.next_scene + jnp.sum(done)).astype(jnp.int32),
-            costs,
-            dampings,
-            loop.iterations.at[row].set(lane.iteration),
-            loop.converged.at[row].set(converged),
-        )
+        return _Loop(jax.tree.map(pick, new, lane), (loop.next_scene + jnp.sum(done)).astype(jnp.int32), found)
 
-    dtype = bank.initial_cost.dtype
-    loop = _Loop(
-        jax.vmap(fresh)(jnp.arange(lanes, dtype=jnp.int32)),
-        jnp.asarray(lanes, jnp.int32),
-        jnp.zeros((count + 1, limit), dtype),
-        jnp.zeros((count + 1, limit), dtype),
-        jnp.zeros((count + 1,), jnp.int32),
-        jnp.zeros((count + 1,), bool),
-    )
+    rows = np.zeros((count + 1, limit), bank.initial_cost.dtype)
+    nothing = Trajectories(rows, rows, np.zeros(count + 1, np.int32), np.zeros(count + 1, bool))
+    first = jax.vmap(fresh)(jnp.arange(lanes, dtype=jnp.int32))
+    loop = _Loop(first, jnp.asarray(lanes, jnp.int32), jax.tree.map(jnp.asarray, nothing))
     return lax.while_loop(lambda loop: jnp.any(loop.lane.scene < count), body, loop)

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import ProblemInfo, make_policy
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
-from jaxba.game.rollout import Trajectories, play
+from jaxba.game.rollout import play
 from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
 from jaxba.game.warm_starts import warm_starts
 from jaxba.game.windows import read_windows
@@ -165,10 +165,9 @@ class TooFewScenes(ValueError):
 
 
 class Draft(NamedTuple):
-    """All scenes of one class with the runs of the portfolio."""
+    """All scenes of one class, and which of them are usable."""
 
     bank: Bank
-    runs: dict[str, Trajectories]
     usable: np.ndarray
 
 
@@ -217,7 +216,7 @@ def solve_scenes(
     soonest = np.min([reach(run.costs, best, 1e-3) for run in runs.values()], axis=0)
     floor = SMALLEST_COST * np.asarray(info.observations)
     usable = (ratio > MIN_RATIO) & (ratio < MAX_RATIO) & (soonest <= EASY_ENOUGH) & (best > floor)
-    return Draft(bank, runs, usable)
+    return Draft(bank, usable)
 
 
 class Split(NamedTuple):

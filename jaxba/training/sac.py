@@ -72,29 +72,6 @@ class SacConfig:
     log_std_min: float = -5.0
     """Lower bound of the log standard deviation before tanh."""
 
-    @classmethod
-    def paper(cls) -> SacConfig:
-        """The paper's agent; what the paper does not state is taken from its released code.
-
-        Value network and critics of three fully connected layers, the last one linear, a policy of four, width 256;
-        mean squared errors; target value network refreshed every 5 iterations.
-        """
-        return cls(
-            variant="value",
-            width=256,
-            layers=2,
-            actor_layers=3,
-            layer_norm=False,
-            learning_rate=3e-4,
-            gamma=0.99,
-            tau=1.0,
-            target_every=5,
-            initial_temperature=1.0,
-            learn_temperature=False,
-            log_std_min=-20.0,
-            privileged=False,
-        )
-
     @property
     def policy_layers(self) -> int:
         """Hidden layers of the policy."""

@@ -60,7 +60,18 @@ def test_a_file_may_extend_a_preset_and_overrides_win_over_both(tmp_path):
 
 def test_the_preset_of_the_paper_is_the_papers_setting():
     found = load("paper")
-    assert found.sac == SacConfig.paper()
+    assert found.sac == SacConfig(
+        variant="value",
+        width=256,
+        actor_layers=3,
+        layer_norm=False,
+        tau=1.0,
+        target_every=5,
+        initial_temperature=1.0,
+        learn_temperature=False,
+        log_std_min=-20.0,
+        privileged=False,
+    )
     assert found.bank.classes == (SceneClass(10, 10, "paper"),)
     agent = found.game.agent
     assert (agent.observation, agent.guard, agent.refine_points) == ("paper", "off", 0)

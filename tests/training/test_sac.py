@@ -13,6 +13,7 @@ import pytest
 from scipy import integrate, stats
 
 from jaxba.training import networks, sac
+from jaxba.training.config import load
 from jaxba.training.replay import Transition
 from jaxba.training.sac import Learner, SacConfig
 
@@ -224,12 +225,8 @@ def test_a_fixed_temperature_stays() -> None:
     chex.assert_trees_all_equal(learner.log_temperature, fresh(VALUE).log_temperature)
 
 
-def test_presets() -> None:
-    paper = SacConfig.paper()
-    assert (paper.variant, paper.width, paper.target_every, paper.tau) == ("value", 256, 5, 1.0)
+def test_the_papers_networks_have_as_many_layers_as_it_says() -> None:
+    paper = load("paper").sac
     layers = jax.eval_shape(lambda key: sac.init(paper, key, 5, 1), jax.random.key(0))
     count = lambda params: sum("kernel" in jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(params))
     assert (count(layers.actor), count(layers.critic), count(layers.value)) == (4, 3, 3)  # two critics, stacked
-    assert not paper.learn_temperature
-    assert paper.log_std_min == -20.0
-    assert hash(paper) != hash(SacConfig())
