@@ -95,7 +95,7 @@ def rows(location: str, solver: str, linear_solver: LinearSolverChoice, repeats:
         if has_repairs(options):
             del parts["try_step"]
             search = first_search(state.cameras, state.points, state.cost, proposal.step)
-            candidate = lambda la, s, p, *rest: try_candidate(la, s, p, options, jnp.zeros((), dtype), None, *rest)
+            candidate = lambda la, s, p, *rest: try_candidate(la, s, p, options, jnp.zeros((), dtype), *rest)
             parts["candidate"] = (candidate, (layout, state, proposal, search, state.cameras))
         if options.refinement.camera_rounds:
             cameras = lambda la, c, p: refine_cameras(la, c, p, options)

@@ -16,11 +16,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from benchmarks.oracle import WIDTH, oracle
 from jaxba.cli.common import prepare_process
 from jaxba.damping import DampingPolicy, Schedule, make_policy
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.evaluate import Score, score, virtual_best
-from jaxba.game.oracle import WIDTH, oracle
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import reach, select
 from jaxba.problem.options import Refinement, StepOptions

@@ -26,9 +26,9 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba import LMState
-from jaxba.damping import POLICIES, DampingPolicy, ProblemInfo, effort_of
+from jaxba.damping import POLICIES, DampingPolicy, ProblemInfo
+from jaxba.game.groups import step_groups
 from jaxba.game.random_scenes import SceneClass, SceneFamily, Scenes, make_scenes
-from jaxba.game.rollout import step_groups
 from jaxba.game.scene_bank import info_of, initial_costs
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.step import lm_step, state_at
@@ -107,8 +107,8 @@ def solve_all(
 
         def body(number: Array, carry: tuple) -> tuple:
             found, policy_state, damping = carry
-            effort, before = effort_of(policy, policy_state), found.state
-            state, step = lm_step(seen, before, damping, options, policy.min_gain, number, effort)
+            before = found.state
+            state, step = lm_step(seen, before, damping, options, policy.min_gain, number)
             finite = functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(x)) for x in state[:3]])
             policy_state, after = policy.propose(policy_state, step)
             found = Found(

@@ -8,13 +8,14 @@ and 1e-6 of the lowest cost of any of them (or of the file `--best`), and the it
 100, also if the search had fewer iterations. The search ends when no state of its beam improves by 1e-6, relatively. An
 iteration of the search takes `width x grid` linear solves and counts as one.
 
-`jaxba/game/oracle.py` does the same for small scenes, with all states of a beam in one batched program. Real problems
-are too large for that, so here the states are stepped one after the other.
+`oracle` does the same for the scenes of a bank (`benchmarks.game`), with all states of a beam in one batched program.
+Real problems are too large for that, so `search` steps the states one after the other.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,18 +24,32 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array, lax
+from jaxtyping import Float
 
 from benchmarks.suite import real_problems
 from jaxba import DampingPolicy, LMState, SolveOptions, StepOptions, initial_state, lm_step, make_policy, solve
 from jaxba.bench.sources import sources
 from jaxba.cli.common import prepare_process
 from jaxba.damping.learned import LearnedPolicy
-from jaxba.game.oracle import GRID, WIDTH
+from jaxba.game.groups import step_groups
+from jaxba.game.random_scenes import SceneClass
+from jaxba.game.rollout import Trajectories
+from jaxba.game.scene_bank import Bank
+from jaxba.game.scene_layout import class_layout, with_scene
+from jaxba.lm.records import StepInfo
+from jaxba.lm.step import state_at
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime import process
 from jaxba.solver.choose import choose_linear_solver
 from jaxba.solver.names import parse_solver
 from jaxba.structure.layout import layout_for
+
+GRID = tuple(10.0**decade for decade in (-8, -7, -6, -5, -4, -3, -2, -1, 0))
+"""Lambdas tried from every state."""
+
+WIDTH = 4
+"""States kept."""
 
 TOLERANCES = (1e-3, 1e-4, 1e-6)
 LIMIT = 100
@@ -115,6 +130,73 @@ def search(problem: BundleProblem, options: StepOptions, min_gain: float, iterat
         if len(before) == len(beam) and all(float(new.cost) > float(old.cost) * (1 - 1e-6) for old, new in pairs):
             return Run(np.array(costs), turn + 1)
     return Run(np.array(costs), LIMIT)
+
+
+def beam_search(
+    step: Callable[[LMState, Array], tuple[LMState, StepInfo]],
+    start: LMState,
+    iterations: int,
+    width: int = WIDTH,
+    grid: tuple[float, ...] = GRID,
+) -> Float[Array, " _"]:
+    """Lowest accepted cost after each number of iterations, the start first.
+
+    Args:
+        step: one LM iteration from a state with a lambda; pure.
+        start: first state.
+        iterations: linear solves in a row.
+        width: states kept after each iteration. States of equal cost come last, since they are mostly the same state.
+        grid: lambdas.
+    """
+    pairs = [(state, damping) for state in range(width) for damping in range(len(grid))]
+    parent = jnp.array([pair[0] for pair in pairs])
+    dampings = jnp.asarray(grid, start.cost.dtype)[jnp.array([pair[1] for pair in pairs])]
+    beam = jax.tree.map(lambda x: jnp.broadcast_to(x, (width, *x.shape)), start)
+    beam = beam._replace(cost=beam.cost.at[1:].set(jnp.inf))
+
+    def body(beam: LMState, _: None) -> tuple[LMState, Array]:
+        origin = jax.tree.map(lambda x: x[parent], beam)
+        after, info = step_groups(step, origin, dampings)
+        alive = info.accepted & jnp.isfinite(origin.cost)
+        costs = jnp.concatenate([jnp.where(alive, after.cost, jnp.inf), beam.cost])
+        order = jnp.argsort(costs)
+        duplicate = jnp.concatenate([jnp.zeros(1, bool), jnp.diff(costs[order]) <= 0])
+        best = order[jnp.argsort(jnp.where(duplicate, jnp.inf, costs[order]))[:width]]
+        kept = jax.tree.map(lambda new, old: jnp.concatenate([new, old])[best], after, beam)
+        beam = kept._replace(cost=costs[best])
+        return beam, beam.cost[0]
+
+    costs = lax.scan(body, beam, None, length=iterations)[1]
+    return jnp.concatenate([start.cost[None], costs])
+
+
+@functools.partial(jax.jit, static_argnames=("kind", "options", "iterations", "width", "grid"))
+def _search(
+    kind: SceneClass, bank: Bank, options: StepOptions, iterations: int, width: int, grid: tuple[float, ...]
+) -> Array:
+    layout = class_layout(kind, options)
+
+    def one(scene: Bank) -> Array:
+        seen = with_scene(layout, scene.scenes.pixels, scene.scenes.mask)
+        start = state_at(scene.scenes.cameras, scene.scenes.points, scene.initial_cost, options)
+        step = lambda state, damping: lm_step(seen, state, damping, options)
+        return beam_search(step, start, iterations, width, grid)
+
+    return lax.map(one, bank)
+
+
+def oracle(
+    kind: SceneClass,
+    bank: Bank,
+    options: StepOptions,
+    iterations: int,
+    width: int = WIDTH,
+    grid: tuple[float, ...] = GRID,
+) -> Trajectories:
+    """The search on every scene of a bank; the lambdas of the best sequence are not returned."""
+    costs = np.asarray(_search(kind, bank, options, iterations, width, grid))
+    count = len(costs)
+    return Trajectories(costs, np.zeros_like(costs[:, 1:]), np.full(count, iterations), np.zeros(count, bool))
 
 
 def _play(problem: BundleProblem, policy: DampingPolicy, options: SolveOptions) -> Run:

@@ -29,6 +29,7 @@ from jax import Array
 
 from benchmarks.metrics import Metric, to_json, to_text
 from jaxba.game.protocol import Step
+from jaxba.training.config import load
 from jaxba.training.sac import SacConfig
 from jaxba.training.train_loop import LoopConfig, run_chunk, start
 from jaxba.typing import register_pytree
@@ -181,7 +182,7 @@ def run(repeats: int, envs: int, updates: int) -> list[Metric]:
         "jaxba, width 256": ours(peer_like, envs, updates),
         "jaxba, width 64": ours(dataclasses.replace(peer_like, width=64), envs, 5 * updates),
         "jaxba, default (64, layer norm)": ours(SacConfig(), envs, 5 * updates),
-        "jaxba, paper": ours(SacConfig.paper(), envs, updates),
+        "jaxba, paper": ours(load("paper").sac, envs, updates),
     }
     peers: list[Sbx] = []
     python = os.environ.get(VARIABLE, "")

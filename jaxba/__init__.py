@@ -31,7 +31,6 @@ from jaxba.io import (
     write_ply,
     write_problem,
 )
-from jaxba.linear.step import Effort
 from jaxba.lm.method import StepMethod
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import initial_state, lm_step
@@ -79,7 +78,6 @@ __all__ = [
     "Coordinates",
     "Covariance",
     "DampingPolicy",
-    "Effort",
     "Geometric",
     "IterationRecord",
     "LMState",

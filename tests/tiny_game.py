@@ -25,7 +25,7 @@ AGENT = AgentConfig(
     camera_rounds=0,
     pattern_moves=0,
 )
-RULES = GameConfig(agent=AGENT, max_iterations=4, limit_is_failure=False)
+RULES = GameConfig(agent=AGENT, max_iterations=4)
 
 
 @functools.cache

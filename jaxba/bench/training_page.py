@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from jaxba.bench import page, plots
 from jaxba.bench.panels import MARKERS, Axis, Panel, Series, Style, on, solver_styles
 from jaxba.bench.tables import Table
-from jaxba.game.episode import Episode
+from jaxba.game.rollout import Trajectories
 from jaxba.solver.figure import COLOURS
 from jaxba.training.log import Row
 
@@ -21,9 +22,11 @@ AXES = ("updates", "seconds")
 TRAINED = "trained"
 """Name of the trained policy in charts."""
 
-HELD_OUT = {"price": "price", "mean": "mean iterations", "p90": "90th percentile", "failures": "failures (%)"}
-"""Charts of held-out scores: fields of a `Score` and their titles. Where training pays, the log has `price` as
-`score`, elsewhere `mean`."""
+HELD_OUT = {"mean": "mean iterations", "p90": "90th percentile", "failures": "failures (%)"}
+"""Charts of held-out scores: fields of a `Score` and their titles. The log has `mean` as `score`."""
+
+EPISODES = 6
+"""Scenes whose episodes are shown."""
 
 LEARNING = {
     "episode/length": "iterations of a training episode",
@@ -39,19 +42,18 @@ _X = {"updates": Axis("gradient updates"), "seconds": Axis("seconds of training"
 _FROM_ZERO = Axis("", from_zero=True)
 
 
-def held_out_panels(rows: Sequence[Row], rules: Mapping[str, Any], paid: bool) -> list[Panel]:
+def held_out_panels(rows: Sequence[Row], rules: Mapping[str, Any]) -> list[Panel]:
     """Held-out scores over training, and the levels of the yardsticks.
 
     Args:
         rows: of the log; those without an evaluation are left out.
         rules: a `Score` by name of the yardstick.
-        paid: whether the game's work has a price (`HELD_OUT`).
     """
-    styles, kept = solver_styles([TRAINED, *rules]), "price" if paid else "mean"
+    styles = solver_styles([TRAINED, *rules])
     panels = []
     for field, title in HELD_OUT.items():
         scale = 100.0 if field == "failures" else 1.0
-        lines = _curve(rows, f"held_out/{'score' if field == kept else field}", styles[TRAINED], scale)
+        lines = _curve(rows, f"held_out/{'score' if field == 'mean' else field}", styles[TRAINED], scale)
         ends = {axis: [on(lines[-1].x, axis)[k] for k in (0, -1)] for axis in AXES} if lines else []
         for name, one in rules.items() if lines else ():
             lines.append(Series(name, ends, [scale * getattr(one, field)] * 2, styles[name], marked=False))
@@ -80,9 +82,8 @@ def to_html(
     rows: Sequence[Row],
     rules: Mapping[str, Any],
     table: Table,
-    episodes: Sequence[Episode],
+    episodes: Trajectories,
     facts: Mapping[str, str],
-    paid: bool,
 ) -> str:
     """The page.
 
@@ -90,12 +91,11 @@ def to_html(
         rows: of the log.
         rules: a `Score` by name of the yardstick.
         table: the comparison on the held-out scenes.
-        episodes: of the best policy.
+        episodes: of the best policy; the first `EPISODES` are shown.
         facts: machine, versions, command.
-        paid: whether the game's work has a price (`HELD_OUT`).
     """
     styles = solver_styles([TRAINED, *rules])
-    curves = held_out_panels(rows, rules, paid)
+    curves = held_out_panels(rows, rules)
     logged = {name: title for name, title in LEARNING.items() if name in rows[0]}
     learning = [
         Panel(title, _curve(rows, name, styles[TRAINED]), _X, _FROM_ZERO, height=320) for name, title in logged.items()
@@ -113,7 +113,7 @@ def to_html(
         page.table(table, styles),
         page.section("Learning", page.note(spread), page.charts(numbered[first:second])),
         page.section(
-            f"The best policy on {len(episodes)} held-out scenes",
+            f"The best policy on {min(EPISODES, len(episodes.iterations))} held-out scenes",
             page.note("Every line is a scene. Hollow: the step was rejected."),
             page.charts(numbered[second:]),
         ),
@@ -140,23 +140,17 @@ def _curve(rows: Sequence[Row], name: str, style: Style, scale: float = 1.0, alo
     return [replace(mean, between=([min(ys) for ys in values], [max(ys) for ys in values])), *single]
 
 
-def _episode_panels(episodes: Sequence[Episode]) -> list[Panel]:
-    """Lambda, effort and cost over the iterations of some episodes."""
+def _episode_panels(episodes: Trajectories) -> list[Panel]:
+    """Lambda and cost over the iterations of some episodes."""
 
-    def panel(title: str, y: Callable[[Episode], Any], axis: Axis, start: int) -> Panel:
+    def panel(title: str, values: np.ndarray, start: int) -> Panel:
         lines = []
-        for k, one in enumerate(episodes):
+        for k, count in enumerate(episodes.iterations[:EPISODES]):
             style = Style(COLOURS[k % len(COLOURS)], "-", MARKERS[k % len(MARKERS)])
-            numbers = [float(v) for v in y(one)]
-            hollow = [False] * (1 - start) + [not ok for ok in one.steps.accepted]
-            places = [i + start for i in range(len(numbers))]
-            lines.append(Series(f"scene {k + 1}", places, numbers, style, hollow=hollow))
-        return Panel(title, lines, {x: Axis("iteration") for x in AXES}, axis, height=320)
+            rejected = np.diff(episodes.costs[k, : count + 1]) >= 0
+            hollow = [False] * (1 - start) + rejected.tolist()
+            numbers = values[k, : count + 1 - start].tolist()
+            lines.append(Series(f"scene {k + 1}", list(range(start, count + 1)), numbers, style, hollow=hollow))
+        return Panel(title, lines, {x: Axis("iteration") for x in AXES}, Axis("", log=True), height=320)
 
-    return [
-        panel("damping λ", lambda one: one.steps.damping, Axis("", log=True), 1),
-        panel("embedded point iterations", lambda one: one.steps.point_iterations, _FROM_ZERO, 1),
-        panel("repairs", lambda one: one.steps.repairs, _FROM_ZERO, 1),
-        panel("price paid, in plain steps", lambda one: one.paid, _FROM_ZERO, 0),
-        panel("cost (pixels²)", lambda one: one.cost, Axis("", log=True), 0),
-    ]
+    return [panel("damping λ", episodes.dampings, 1), panel("cost (pixels²)", episodes.costs, 0)]

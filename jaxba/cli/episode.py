@@ -32,26 +32,15 @@ def recorded(policy: str, scene: int) -> Recording:
         scene: number of the random scene.
     """
     import jax
-    import numpy as np
 
     import jaxba
-    from jaxba.game.episode import draw
     from jaxba.game.random_scenes import SceneClass
-    from jaxba.viewer.recording import Recording
+    from jaxba.game.scene_bank import draw
+    from jaxba.viewer.recording import Recorder
 
     jax.config.update("jax_enable_x64", True)  # the game's type
-    player = jaxba.make_policy(policy)
-    played = draw(SceneClass(), jax.random.key(0), scene, player, jaxba.trained_step(player), LARGEST_EPISODE)
-    start = np.array([np.nan])
-    return Recording(
-        problem=played.problem,
-        whole=played.problem.num_points,
-        cameras=played.cameras,
-        points=played.points,
-        state=np.arange(len(played.cost)),
-        cost=played.cost,
-        damping=np.concatenate([start, played.damping]),
-        gain_ratio=np.concatenate([start, played.gain_ratio]),
-        time_s=played.paid,
-        unit="plain steps paid",
-    )
+    problem = draw(SceneClass(), jax.random.key(0), scene)
+    recorder = Recorder(problem)
+    options = jaxba.SolveOptions(max_iterations=LARGEST_EPISODE)
+    jaxba.solve(problem, jaxba.make_policy(policy), options, watch=recorder)
+    return recorder.recording()

@@ -34,9 +34,6 @@ CURVE = "curve"
 PAGE = "report.html"
 """File with curves, episodes and the table, interactive."""
 
-EPISODES = 6
-"""Held-out scenes whose episodes are in the page."""
-
 FILE_WIDTH = 160
 """Width of the table in characters if the output is not a terminal."""
 
@@ -251,15 +248,14 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
     from jaxba.bench import training_page
     from jaxba.bench.plots import save_figure
     from jaxba.bench.tables import to_rich
-    from jaxba.game.episode import replay
+    from jaxba.game.rollout import play
     from jaxba.runtime.atomic import write_text
     from jaxba.training import log
     from jaxba.training.driver import best_of
 
     files, rows = _write_policies(folder, work.config, work, best), log.read(folder)
     rules_of_game = work.config.game
-    paid = rules_of_game.reward == "price"
-    panels = training_page.held_out_panels(rows, work.rules, paid)
+    panels = training_page.held_out_panels(rows, work.rules)
     figure = training_page.plot_curve(panels, rules_of_game.tolerance, work.config.seeds)
     files += save_figure(figure, folder / CURVE)
     view.stage("comparing with the rules")
@@ -269,12 +265,10 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
     chosen = best_of(best)
     kind, bank = work.config.bank.classes[0], work.held_out[0]
     policy, limit = work.policy(chosen.actor), rules_of_game.max_iterations
-    episodes = [
-        replay(kind, bank, k, policy, work.game.options, limit) for k in range(min(EPISODES, len(bank.initial_cost)))
-    ]
+    episodes = play(kind, bank, policy, work.game.options, limit)
     facts = {"command": command, "agents": str(work.config.seeds), **bench_run.machine()}
     page = folder / PAGE
-    write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts, paid))
+    write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts))
     view.__exit__()
     drawn = to_rich(table)
     drawn.columns[0].no_wrap = drawn.columns[-1].no_wrap = True
@@ -285,7 +279,7 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
 
 
 def _table(compared: Any, tolerance: float, count: int) -> Table:
-    """Scores on the held-out scenes, and what the trained policies pay over each other row."""
+    """Scores on the held-out scenes, and the iterations of the trained policies over those of each other row."""
     from jaxba.bench.tables import Table
 
     agents = len(next(iter(compared.by_agent.values())))
@@ -294,13 +288,13 @@ def _table(compared: Any, tolerance: float, count: int) -> Table:
     for name, score in compared.scores.items():
         own = [f"{x:.2f}" for x in compared.by_agent.get(name, ())] or ["-"] * agents
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
-        ends = f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}", f"{score.price:.2f}"
+        ends = f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}"
         ratio = "{:.3f} [{:.3f}, {:.3f}]".format(*compared.ratios[name]) if name in compared.ratios else "-"
         rows.append((name, *numbers, *ends, *(own if single else ()), ratio))
-    header = ("policy", "mean", "geom. mean", "median", "p90", "failures", "converged", "final gap", "price")
+    header = ("policy", "mean", "geom. mean", "median", "p90", "failures", "converged", "final gap")
     return Table(
         f"Iterations to f*(1 + {tolerance:g}) on {count} held-out scenes",
         (*header, *single, "trained over it [95%]"),
         rows,
-        "A failure counts as the limit. The last column: what the trained policies pay over this one, scene by scene.",
+        "A failure counts as the limit. The last column: iterations of the trained policies over this one's, by scene.",
     )

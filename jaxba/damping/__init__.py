@@ -1,7 +1,7 @@
 """Damping policies: who chooses lambda."""
 
 from jaxba.damping.learned import AgentPolicy, ConstantAction, LearnedPolicy
-from jaxba.damping.policy import DampingPolicy, ProblemInfo, decides_effort, effort_of
+from jaxba.damping.policy import DampingPolicy, ProblemInfo
 from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
 from jaxba.damping.registry import (
     LEARNED,
@@ -30,8 +30,6 @@ __all__ = [
     "Schedule",
     "UnknownPolicyError",
     "brings_embedded",
-    "decides_effort",
-    "effort_of",
     "is_learned",
     "load_policy",
     "make_policy",

@@ -9,7 +9,6 @@ from jaxba.problem.options import LensStep, PointStarts, Refinement, StepOptions
 
 Observation = Literal["scale-free", "paper", "duration"]
 GuardMode = Literal["off", "hand-over"]
-EffortMode = Literal["fixed", "points+repairs"]
 
 LARGEST_ESCALATION = 12.0
 """Decades; more than the whole range of lambda would have no further effect."""
@@ -83,13 +82,8 @@ class AgentConfig:
     previous_steps: int = 3
     """Earlier steps that are combined with the new one, if the method supports it, `Refinement.previous_steps`."""
 
-    effort: EffortMode = "fixed"
-    """What an action decides besides lambda. `fixed`: nothing. `points+repairs`: its second number, the embedded point
-    iterations of the step; the third says, where it is positive, that trials, camera rounds and pattern moves are
-    allowed. What they cost is then observed, too."""
-
     def __post_init__(self) -> None:
-        for name, known in (("observation", Observation), ("guard", GuardMode), ("effort", EffortMode)):
+        for name, known in (("observation", Observation), ("guard", GuardMode)):
             if getattr(self, name) not in get_args(known):
                 raise ValueError(f"{name} must be one of {', '.join(get_args(known))}, not {getattr(self, name)!r}")
         if not 1 <= self.history <= 20:
@@ -106,8 +100,6 @@ class AgentConfig:
             raise ValueError(f"descent must be positive, is {self.descent}")
         if not 0 <= self.escalate <= LARGEST_ESCALATION:
             raise ValueError(f"escalate must be 0 to {LARGEST_ESCALATION:g}, is {self.escalate}")
-        if self.effort != "fixed" and not self.refine_points:
-            raise ValueError(f"effort {self.effort!r} needs embedded point iterations to choose from: refine_points")
         check_count("refine_points", self.refine_points, 0)
         self.step_options(StepOptions())
 
@@ -123,21 +115,6 @@ class AgentConfig:
             previous_steps=self.previous_steps,
         )
         return replace(options, refinement=refinement, coordinates=coordinates)
-
-    @property
-    def guarded(self) -> bool:
-        """Whether the guard is on."""
-        return self.guard != "off"
-
-    @property
-    def action_size(self) -> int:
-        """Numbers of an action: lambda, and what `effort` adds."""
-        return 1 if self.effort == "fixed" else 3
-
-    @property
-    def observes_prices(self) -> bool:
-        """Whether the prices of work are part of the observation."""
-        return self.effort == "points+repairs"
 
 
 def config_from(values: dict[str, Any]) -> AgentConfig:

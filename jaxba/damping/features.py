@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.clock import duration
-from jaxba.damping.guard import FIRST_DAMPING, GuardState, full_effort, initial_guard, update_guard
+from jaxba.damping.guard import GuardState, initial_guard, update_guard
+from jaxba.damping.guarded import FIRST_DAMPING, finite_gain, times_shortened
 from jaxba.damping.policy import ProblemInfo
-from jaxba.linear.step import Effort
-from jaxba.lm.records import Prices, StepInfo
+from jaxba.lm.records import StepInfo
 
 FLOOR = 1e-9
 """Smallest relative decrease that a feature distinguishes from zero."""
@@ -56,32 +56,28 @@ SOLVE_FEATURES = (
     "smallest_accepted",  # log10 of the smallest accepted lambda
     "largest_rejected",  # log10 of the largest lambda rejected since the last accepted step
 )
-"""Features of the solve, in order; what the action decided besides lambda follows."""
+"""Features of the solve, in order."""
 
 
 class Memory(NamedTuple):
     """State of an agent between iterations."""
 
     info: ProblemInfo
+    iteration: Int[Array, ""]  # number of the next iteration, from 0
+    damping: Float[Array, ""]  # log10 of the last lambda
+    gain: Float[Array, ""]  # gain ratio of the last step, -1 if not finite
     steps: Float[Array, "history features"]  # `StepFeatures` of the last steps, newest first
     errors: Float[Array, " history"]  # the observation itself, unless it is `scale-free`; newest first
     cost: Float[Array, ""]
     smallest_accepted: Float[Array, ""]
     largest_rejected: Float[Array, ""]
     guard: GuardState
-    effort: Effort | None  # of the last step, once it is chosen; None if it is fixed
 
 
 def observation_size(config: AgentConfig) -> int:
     """Numbers in an observation."""
     if config.observation == "scale-free":
-        return (
-            len(StepFeatures._fields) * config.history
-            + len(SOLVE_FEATURES)
-            + config.action_size
-            - 1
-            + (len(Prices._fields) if config.observes_prices else 0)
-        )
+        return len(StepFeatures._fields) * config.history + len(SOLVE_FEATURES)
     return config.history
 
 
@@ -92,13 +88,15 @@ def begin(config: AgentConfig, info: ProblemInfo) -> Memory:
     error = jnp.minimum(_rms_error(info, info.cost), PAPER_LIMIT) if config.observation == "paper" else number(0.0)
     return Memory(
         info=info,
+        iteration=jnp.zeros((), jnp.int32),
+        damping=number(FIRST_DAMPING),
+        gain=number(0.0),
         steps=jnp.zeros((config.history, len(StepFeatures._fields)), dtype),
         errors=jnp.zeros((config.history,), dtype).at[0].set(error),
         cost=info.cost,
         smallest_accepted=number(FIRST_DAMPING),
         largest_rejected=number(config.low),
-        guard=initial_guard(dtype),
-        effort=full_effort(config),
+        guard=initial_guard(config, dtype),
     )
 
 
@@ -106,7 +104,7 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
     """What the network sees, float32."""
     if config.observation != "scale-free":
         return memory.errors.astype(jnp.float32)
-    info, guard = memory.info, memory.guard
+    info, rescue = memory.info, memory.guard.rescue
     unknowns = 9.0 * info.cameras + 3.0 * info.points
     solve = [
         _log(info.cost / memory.cost) / 3,
@@ -114,18 +112,13 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
         _log(info.observations / info.points),
         _log(2.0 * info.observations / unknowns),
         _log(info.cameras) - 1,
-        guard.consecutive_rejections / 3.0,
-        guard.rejections / 5.0,
-        1 - guard.iteration / info.max_iterations,
-        _scaled_decades(guard.accepted_damping),
+        rescue.in_a_row / 3.0,
+        rescue.rejections / 5.0,
+        1 - memory.iteration / info.max_iterations,
+        _scaled_decades(rescue.worked),
         _scaled_decades(memory.smallest_accepted),
         _scaled_decades(memory.largest_rejected),
     ]
-    if memory.effort is not None:
-        points, repairs = memory.effort
-        solve += [points / config.refine_points, repairs.astype(points.dtype)]
-    if config.observes_prices:
-        solve += [_log(price) + 1 for price in memory.info.prices]
     features = jnp.concatenate([memory.steps.reshape(-1), jnp.stack([jnp.asarray(x) for x in solve])])
     return jnp.clip(jnp.nan_to_num(features), -FEATURE_LIMIT, FEATURE_LIMIT).astype(jnp.float32)
 
@@ -133,7 +126,7 @@ def observe(config: AgentConfig, memory: Memory) -> Float[Array, " features"]:
 def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     """After an iteration."""
     dtype = memory.cost.dtype
-    guard = update_guard(config, memory.guard, step)
+    damping, gain = jnp.log10(step.damping).astype(dtype), finite_gain(step).astype(dtype)
     decrease = (step.previous_cost - step.cost) / step.previous_cost
     scaled = lambda x: (_log(x + FLOOR) + 4.5) / 4.5
     features = StepFeatures(
@@ -141,12 +134,12 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
         decrease=_log(step.previous_cost / step.cost),
         small_decrease=scaled(decrease),
         promised=scaled(step.predicted / step.previous_cost),
-        gain=guard.gain / (1 + jnp.abs(guard.gain)),
+        gain=gain / (1 + jnp.abs(gain)),
         candidate=jnp.where(step.accepted, 0.0, _log(step.candidate_cost / step.previous_cost)),
-        damping=_scaled_decades(guard.damping),
+        damping=_scaled_decades(damping),
         accepted=jnp.where(step.accepted, 1.0, -1.0),
         damping_fraction=step.damping_fraction,
-        shortened=guard.shortened / 2,
+        shortened=times_shortened(step) / 2,
     )
     row = jnp.nan_to_num(jnp.stack(features), nan=FEATURE_LIMIT)
     row = jnp.clip(row, -FEATURE_LIMIT, FEATURE_LIMIT).astype(dtype)
@@ -159,13 +152,15 @@ def record(config: AgentConfig, memory: Memory, step: StepInfo) -> Memory:
     pick = lambda if_accepted, if_rejected: jnp.where(step.accepted, if_accepted, if_rejected).astype(dtype)
     return Memory(
         info=memory.info,
+        iteration=(memory.iteration + 1).astype(jnp.int32),
+        damping=damping,
+        gain=gain,
         steps=shifted(memory.steps, row),
         errors=shifted(memory.errors, error),
         cost=step.cost,
-        smallest_accepted=pick(jnp.minimum(guard.damping, memory.smallest_accepted), memory.smallest_accepted),
-        largest_rejected=pick(config.low, jnp.maximum(guard.damping, memory.largest_rejected)),
-        guard=guard,
-        effort=memory.effort,
+        smallest_accepted=pick(jnp.minimum(damping, memory.smallest_accepted), memory.smallest_accepted),
+        largest_rejected=pick(config.low, jnp.maximum(damping, memory.largest_rejected)),
+        guard=update_guard(config, memory.guard, step),
     )
 
 

@@ -1,4 +1,4 @@
-"""The guard between an agent and the solver: which lambda and which effort follow from an action.
+"""The guard between an agent and the solver: which lambda follows from an action.
 
 An action in (-1, 1) is linear in log10 of lambda. With guard `hand-over` lambda is then limited:
 
@@ -10,31 +10,20 @@ An action in (-1, 1) is linear in log10 of lambda. With guard `hand-over` lambda
     after an inexact step     lambda >= last lambda
 
 After `patience` rejections in a row, or `max_rejections` in all, Ceres' rule chooses lambda to the end of the solve.
-The effort stays the agent's.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.rules import LARGEST, Ceres
-from jaxba.linear.step import Effort
+from jaxba.damping.guarded import Rescue, is_inexact, smallest_decades, times_shortened
+from jaxba.damping.rules import LARGEST
 from jaxba.lm.records import StepInfo
-from jaxba.refinement.backtracking import SHORTER
-
-FIRST_DAMPING = -4.0
-"""log10 of the lambda at which Ceres' rule starts. Source: Ceres initial_trust_region_radius 1e4."""
-
-INEXACT_FRACTION = 0.1
-"""A step is inexact if damping's share of its curvature is below this fraction of the forcing term. A smaller lambda
-then changes nothing but the number of iterations of conjugate gradients. On random scenes of 600 to 1,197 cameras 0.01
-instead saved fewer iterations."""
 
 OVERDAMPED_DECREASE, OVERDAMPED_FRACTION = 1e-2, 0.5
 """A step of full length is overdamped if its relative decrease is below the first number and damping's share of its
@@ -46,63 +35,31 @@ was rejected twice after them, and Ceres' rule took over in iteration 8."""
 class GuardState(NamedTuple):
     """What the guard remembers between iterations."""
 
-    iteration: Int[Array, ""]  # number of the next iteration, from 0
-    damping: Float[Array, ""]  # log10 of the last lambda
-    accepted_damping: Float[Array, ""]  # log10 of the last accepted lambda
-    gain: Float[Array, ""]  # gain ratio of the last step, -1 if not finite
-    shortened: Float[Array, ""]  # how often the last step was shortened
-    consecutive_rejections: Int[Array, ""]
-    rejections: Int[Array, ""]  # in all
-    growth: Float[Array, ""]  # factor of Ceres' rule after the next rejection
-    handed_over: Bool[Array, ""]  # Ceres' rule chooses lambda to the end
-    overdamped: Bool[Array, ""]  # of the last step, see `OVERDAMPED_DECREASE`
-    inexact: Bool[Array, ""]  # of the last step, see `INEXACT_FRACTION`
+    lowest: Float[Array, ""]  # log10 of the smallest lambda that it allows next
+    highest: Float[Array, ""]  # and of the largest
+    rescue: Rescue
 
 
-def initial_guard(dtype: Any) -> GuardState:
+def initial_guard(config: AgentConfig, dtype: Any) -> GuardState:
     """Before the first iteration."""
-    number = lambda x: jnp.asarray(x, dtype)
-    zero, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
-    return GuardState(
-        iteration=zero,
-        damping=number(FIRST_DAMPING),
-        accepted_damping=number(FIRST_DAMPING),
-        gain=number(0.0),
-        shortened=number(0.0),
-        consecutive_rejections=zero,
-        rejections=zero,
-        growth=number(Ceres().reject_growth),
-        handed_over=no,
-        overdamped=no,
-        inexact=no,
-    )
+    return GuardState(jnp.asarray(config.first_low, dtype), jnp.asarray(jnp.inf, dtype), Rescue.begin(dtype))
 
 
 def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> GuardState:
     """After an iteration."""
-    dtype = guard.damping.dtype
-    damping = jnp.log10(step.damping).astype(dtype)
+    rescue, rule = guard.rescue.after(step, config.patience, config.max_rejections)
+    damping, failures = jnp.log10(step.damping), jnp.where(step.accepted, times_shortened(step), 1.0)
+    lowest = jnp.where(is_inexact(step), damping, damping - config.descent)
+    lowest = jnp.where(failures > 0, jnp.maximum(lowest, damping + config.escalate * failures), lowest)
+    highest = jnp.where(_is_overdamped(step), damping - 1, jnp.inf)
+    decided = lambda limit: jnp.where(rescue.in_charge, rule, limit).astype(guard.lowest.dtype)
+    return GuardState(decided(lowest), decided(highest), rescue)
+
+
+def _is_overdamped(step: StepInfo) -> Bool[Array, ""]:
     decrease = (step.previous_cost - step.cost) / step.previous_cost
-    gain = jnp.where(jnp.isfinite(step.gain_ratio), step.gain_ratio, -1.0)
-    shortened = jnp.round(-jnp.log(step.step_fraction) / -math.log(SHORTER))
-    consecutive = jnp.where(step.accepted, 0, guard.consecutive_rejections + 1).astype(jnp.int32)
-    rejections = (guard.rejections + ~step.accepted).astype(jnp.int32)
-    growth = jnp.where(guard.handed_over, 2 * guard.growth, Ceres().reject_growth)
-    growth = jnp.where(step.accepted, 0.5 * Ceres().reject_growth, growth).astype(dtype)
     weak = (decrease < OVERDAMPED_DECREASE) & (step.damping_fraction > OVERDAMPED_FRACTION)
-    return GuardState(
-        iteration=(guard.iteration + 1).astype(jnp.int32),
-        damping=damping,
-        accepted_damping=jnp.where(step.accepted, damping, guard.accepted_damping).astype(dtype),
-        gain=gain.astype(dtype),
-        shortened=shortened.astype(dtype),
-        consecutive_rejections=consecutive,
-        rejections=rejections,
-        growth=growth,
-        handed_over=guard.handed_over | (rejections >= config.max_rejections) | (consecutive >= config.patience),
-        overdamped=step.accepted & (step.step_fraction == 1) & weak,
-        inexact=step.accepted & (step.damping_fraction < INEXACT_FRACTION * step.forcing),
-    )
+    return step.accepted & (step.step_fraction == 1) & weak
 
 
 def action_of(config: AgentConfig, decades: Float[Array, ""]) -> Float[Array, ""]:
@@ -115,56 +72,19 @@ def damping_of(config: AgentConfig, guard: GuardState, action: Float[Array, ""])
     """The lambda that the guard allows.
 
     Args:
-        config: range of lambda and limits.
+        config: range of lambda.
         guard: state before the iteration.
-        action: first number of the action, in (-1, 1).
+        action: in (-1, 1).
     """
-    dtype = guard.damping.dtype
+    dtype = guard.lowest.dtype
     middle, half = _scale(config)
-    least = _smallest_decades(config, dtype)
+    least = smallest_decades(config.low, dtype)
     wanted = jnp.clip(middle + half * action.astype(dtype), least, config.high)
-    if not config.guarded:
+    if config.guard == "off":
         return 10**wanted
-    lowest = jnp.where(guard.iteration == 0, config.first_low, guard.damping - config.descent)
-    wanted = jnp.maximum(wanted, jnp.where(guard.inexact, guard.damping, lowest))
-    rejected = guard.consecutive_rejections > 0
-    must_rise = rejected | (guard.shortened > 0)
-    rise = config.escalate * jnp.where(rejected, 1.0, guard.shortened)
-    wanted = jnp.where(must_rise, jnp.maximum(wanted, guard.damping + rise), wanted)
-    wanted = jnp.where(guard.overdamped, jnp.minimum(wanted, guard.damping - 1), wanted)
-    rule = guard.damping + jnp.log10(Ceres().factor(~rejected, guard.gain, guard.growth))
-    # Ceres' rule starts at the last accepted lambda, or at its own first one if twice the rejected lambda is larger.
-    # It starts again in the same way when it is rejected `patience` times in a row itself.
-    restart = jnp.where(guard.accepted_damping > rule, guard.accepted_damping, FIRST_DAMPING)
-    rule = jnp.where(guard.consecutive_rejections == config.patience, jnp.maximum(rule, restart), rule)
-    return jnp.clip(10 ** jnp.where(guard.handed_over, rule, wanted), 10**least, LARGEST)
-
-
-def effort_for(config: AgentConfig, guard: GuardState, action: Float[Array, " actions"]) -> Effort | None:
-    """The effort that an action decides; None if it is fixed."""
-    if config.effort == "fixed":
-        return None
-    dtype = guard.damping.dtype
-    fraction = 0.5 + 0.5 * action.astype(dtype)
-    return Effort(jnp.round(fraction[1] * config.refine_points).astype(jnp.int32), action[2] > 0)
-
-
-def full_effort(config: AgentConfig) -> Effort | None:
-    """All point iterations, and repairs; None if the effort is fixed."""
-    if config.effort == "fixed":
-        return None
-    return Effort(jnp.asarray(config.refine_points, jnp.int32), jnp.ones((), bool))
+    return jnp.clip(10 ** jnp.clip(wanted, guard.lowest, guard.highest), 10**least, LARGEST)
 
 
 def _scale(config: AgentConfig) -> tuple[float, float]:
     """log10 of lambda for the action 0, and how many decades above it the action 1 is."""
     return 0.5 * (config.low + config.high), 0.5 * (config.high - config.low)
-
-
-def _smallest_decades(config: AgentConfig, dtype: Any) -> float:
-    """log10 of the smallest lambda: one below the rounding unit is lost when it is added to a diagonal.
-
-    In float64 that is below every agent's range. In float32 `learned` would go to 1e-9, at which the systems of real
-    problems have no correct digit left, and steps are rejected or shortened to a quarter.
-    """
-    return max(config.low, math.log10(float(jnp.finfo(dtype).eps)))

@@ -13,19 +13,11 @@ from jaxtyping import Float
 
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import Memory, begin, observe, record
-from jaxba.damping.guard import GuardState, damping_of, effort_for, initial_guard, update_guard
+from jaxba.damping.guard import GuardState, damping_of, initial_guard, update_guard
 from jaxba.damping.policy import ProblemInfo
-from jaxba.linear.step import Effort
 from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
-
-
-class Guarded(NamedTuple):
-    """State of a policy that observes nothing: what its guard remembers."""
-
-    guard: GuardState
-    effort: Effort | None  # of the next step; None if it is fixed
 
 
 class AgentPolicy(ABC):
@@ -43,15 +35,6 @@ class AgentPolicy(ABC):
         """Gain ratio that a step must exceed."""
         return self.config.min_gain
 
-    @property
-    def observes_prices(self) -> bool:
-        """See `policy.observes_prices`."""
-        return self.config.observes_prices
-
-    def effort(self, state: Memory | Guarded) -> Effort | None:
-        """See `policy.effort_of`."""
-        return state.effort
-
     def step_options(self, base: StepOptions) -> StepOptions:
         """The step that the policy was trained with; what it does not decide is that of `base`."""
         return self.config.step_options(base)
@@ -66,8 +49,7 @@ class AgentPolicy(ABC):
 
     def _choose(self, memory: Memory) -> tuple[Memory, Float[Array, ""]]:
         action = self.act(observe(self.config, memory))
-        effort = effort_for(self.config, memory.guard, action)
-        return memory._replace(effort=effort), damping_of(self.config, memory.guard, action[0])
+        return memory, damping_of(self.config, memory.guard, action[0])
 
 
 @register_pytree
@@ -78,8 +60,8 @@ class ConstantAction(AgentPolicy):
     The best constant action of a game is the baseline that training has to beat.
     """
 
-    action: tuple[float, ...]
-    """Numbers in [-1, 1], as many as `AgentConfig.action_size`."""
+    action: tuple[float]
+    """In [-1, 1]."""
 
     config: AgentConfig = field(metadata={"static": True})
     """What the action means."""
@@ -88,44 +70,21 @@ class ConstantAction(AgentPolicy):
         """The action, whatever the observation."""
         return jnp.asarray(self.action, jnp.float32)
 
-    def init(self, info: ProblemInfo) -> tuple[Guarded, Float[Array, ""]]:
+    def init(self, info: ProblemInfo) -> tuple[GuardState, Float[Array, ""]]:
         """See `DampingPolicy`."""
-        return self._allowed(initial_guard(info.cost.dtype))
+        return self._allowed(initial_guard(self.config, info.cost.dtype))
 
-    def propose(self, state: Guarded, step: StepInfo) -> tuple[Guarded, Float[Array, ""]]:
+    def propose(self, state: GuardState, step: StepInfo) -> tuple[GuardState, Float[Array, ""]]:
         """See `DampingPolicy`."""
-        return self._allowed(update_guard(self.config, state.guard, step))
+        return self._allowed(update_guard(self.config, state, step))
 
-    def _allowed(self, guard: GuardState) -> tuple[Guarded, Float[Array, ""]]:
-        action = jnp.asarray(self.action, jnp.float32)
-        state = Guarded(guard, effort_for(self.config, guard, action))
-        return state, damping_of(self.config, guard, action[0])
+    def _allowed(self, guard: GuardState) -> tuple[GuardState, Float[Array, ""]]:
+        return guard, damping_of(self.config, guard, jnp.asarray(self.action, jnp.float32)[0])
 
 
 def boldest(config: AgentConfig) -> ConstantAction:
-    """The policy that always asks for the smallest lambda and the least effort."""
-    return ConstantAction((-1.0,) * config.action_size, config)
-
-
-FREE_DESCENT = 11.0
-"""Decades by which lambda may fall where nothing limits it: the whole range of an action."""
-
-GUARDED_DECADES, GUARDED_POINTS = -8.0, 1
-"""log10 of lambda and point iterations of `guarded`. On 512 training scenes of the game in which work has a price, with
-a guard that leaves lambda free until a step fails, this constant action pays 0.3% more than the best one, which has -9
-(three seeds); on real problems this one was measured."""
-
-
-def guarded() -> ConstantAction:
-    """Nearly Gauss-Newton, with all embedded iterations: one small lambda, until the guard raises it after a rejection
-    or a shortened step."""
-    config = AgentConfig(
-        low=GUARDED_DECADES,
-        first_low=GUARDED_DECADES,
-        descent=FREE_DESCENT,
-        refine_points=GUARDED_POINTS,
-    )
-    return boldest(config)
+    """The policy that always asks for the smallest lambda."""
+    return ConstantAction((-1.0,), config)
 
 
 class Layer(NamedTuple):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Effort
-from jaxba.lm.records import Prices, StepInfo
+from jaxba.lm.records import StepInfo
 from jaxba.problem.options import StepOptions
+from jaxba.typing import AnyArray
 
 
 class ProblemInfo(NamedTuple):
@@ -36,8 +37,28 @@ class ProblemInfo(NamedTuple):
     max_iterations: Int[Array, ""]
     """Limit of iterations."""
 
-    prices: Prices = Prices()
-    """What the work of an iteration costs."""
+    @classmethod
+    def of(
+        cls,
+        cost: Float[Array, ""],
+        observations: Any,
+        points: Any,
+        seen: Bool[AnyArray, " cameras"],
+        focal: Float[AnyArray, " cameras"],
+        max_iterations: Any,
+        unit: Any = 1.0,
+    ) -> ProblemInfo:
+        """The fields, of their types: `seen` says which cameras are observed, `focal` has their focal lengths."""
+        count = lambda n: jnp.asarray(n, jnp.int32)
+        return cls(
+            cost=cost,
+            observations=count(observations),
+            cameras=count(jnp.sum(seen)),
+            points=count(points),
+            unit=jnp.asarray(unit, cost.dtype),
+            focal=jnp.nanmedian(jnp.where(seen, jnp.abs(focal), jnp.nan)),
+            max_iterations=count(max_iterations),
+        )
 
 
 @runtime_checkable
@@ -47,9 +68,8 @@ class DampingPolicy(Protocol):
     A policy is a frozen dataclass and a pytree (`jaxba.register_pytree`): its numbers are traced, so that changing
     one never recompiles, and its class selects the code. Both functions are pure and jittable.
 
-    A policy may have two more functions. `effort(state)` gives the point iterations of the next iteration, and
-    whether it may have repairs (`jaxba.linear.step.Effort`). `step_options(base)` gives the `StepOptions` that it was
-    made for, which `solve` uses unless its options say otherwise.
+    A policy may have a third function: `step_options(base)` gives the `StepOptions` that it was made for, which `solve`
+    uses unless its options say otherwise.
     """
 
     @property
@@ -64,21 +84,6 @@ class DampingPolicy(Protocol):
     def propose(self, state: Any, step: StepInfo) -> tuple[Any, Float[Array, ""]]:
         """State and lambda of the next iteration, after the step that used the last lambda."""
         ...
-
-
-def decides_effort(policy: DampingPolicy) -> bool:
-    """Whether the policy has a function for the effort of an iteration; otherwise `StepOptions` decide it."""
-    return getattr(policy, "effort", None) is not None
-
-
-def observes_prices(policy: DampingPolicy) -> bool:
-    """Whether `ProblemInfo.prices` should be those of the problem: computing them takes time."""
-    return bool(getattr(policy, "observes_prices", False))
-
-
-def effort_of(policy: DampingPolicy, state: Any) -> Effort | None:
-    """Point iterations of the next iteration, and whether it may have repairs; None if `StepOptions` decide them."""
-    return policy.effort(state) if decides_effort(policy) else None  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def trained_step(policy: DampingPolicy) -> StepOptions:

@@ -76,7 +76,10 @@ def load_policy(path: str | Path) -> LearnedPolicy:
     if metadata.get("format") != FORMAT:
         raise PolicyFileError(f"{path}: no policy of jaxba (its metadata says {metadata.get('format', 'nothing')!r})")
     try:
-        config = config_from(json.loads(metadata["agent"]))
+        agent = json.loads(metadata["agent"])
+        if agent.pop("effort", "fixed") != "fixed":  # a setting of earlier versions
+            raise ValueError("its actions decide more than lambda")
+        config = config_from(agent)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise PolicyFileError(f"{path}: cannot be used by this version: {error}") from None
     count = len(tensors) // 2
@@ -96,8 +99,8 @@ def load_policy(path: str | Path) -> LearnedPolicy:
         if not (np.isfinite(layer.kernel).all() and np.isfinite(layer.bias).all()):
             raise PolicyFileError(f"{path}: layer {k} holds numbers that are not finite")
         size = layer.kernel.shape[1]
-    if not layers or size != 2 * config.action_size:
-        raise PolicyFileError(f"{path}: the last layer must give {2 * config.action_size} numbers, not {size}")
+    if not layers or size != 2:
+        raise PolicyFileError(f"{path}: the last layer must give 2 numbers, not {size}")
     return LearnedPolicy(tuple(layers), config)
 
 

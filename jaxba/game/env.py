@@ -4,9 +4,9 @@
 | --- | --- |
 | state | a scene of the bank, its current cameras and points, the agent's memory of the episode |
 | observation | `damping.features.observe`; critics also see the distance to the best known cost |
-| action | numbers in (-1, 1): lambda by `damping.guard.damping_of`, effort by `damping.guard.effort_for` |
-| terminated | accepted cost within `tolerance` of the best known cost, or the limit if `limit_is_failure` |
-| truncated | the limit otherwise |
+| action | a number in (-1, 1): lambda by `damping.guard.damping_of` |
+| terminated | accepted cost within `tolerance` of the best known cost, or the limit, as in the paper |
+| truncated | never |
 | reward | `GameConfig.reward` |
 
 Everything is traced once. An episode that ends is followed by one on a random scene of the bank.
@@ -28,12 +28,12 @@ from jaxtyping import Bool, Float, Int
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.clock import duration
 from jaxba.damping.features import Memory, begin, observation_size, observe, record
-from jaxba.damping.guard import GuardState, action_of, damping_of, effort_for
+from jaxba.damping.guard import action_of, damping_of
 from jaxba.damping.rules import Ceres
 from jaxba.game.devices import all_rows, own_rows
+from jaxba.game.groups import step_groups
 from jaxba.game.protocol import Step
 from jaxba.game.random_scenes import SceneClass
-from jaxba.game.rollout import step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState, StepInfo
@@ -42,15 +42,11 @@ from jaxba.problem.options import StepOptions
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.typing import register_pytree
 
-Reward = Literal["duration", "constant", "reduction", "reversed", "price", "clock"]
+Reward = Literal["duration", "constant", "reduction", "reversed", "clock"]
 
 POINT_ITERATION_COST = 0.1
 """Cost of an embedded point iteration relative to the linear solve, for the deterministic duration. Measured on
 Ladybug-49: three take 3.9 of 12.6 ms."""
-
-USUAL = 8.0
-"""Iterations that Ceres' rule usually takes: prices are paid relative to those of the scene, so that the mean over
-scenes weighs easy and hard ones alike, as a geometric mean does."""
 
 DISTANCE_FLOOR = 1e-6
 """Relative distance to the best known cost that a critic does not distinguish from zero."""
@@ -68,10 +64,9 @@ class GameConfig:
 
     reward: Reward = "duration"
     """Of an iteration. `duration`: minus a deterministic cost of the iteration. `clock`: minus its duration by a clock,
-    which varies as measured ones do (`damping/clock.py`). `price`: minus the price of the work
-    that it did, at the prices of the scene (`BankConfig.price_spread`) and relative to its difficulty (`USUAL`).
-    `constant`: -1. `reduction`: zero, and the bonus shrinks with every iteration. `reversed`: minus log10 of the cost
-    over the best known cost (the paper's reversed roles of state and reward)."""
+    which varies as measured ones do (`damping/clock.py`). `constant`: -1. `reduction`: zero, and the bonus shrinks with
+    every iteration. `reversed`: minus log10 of the cost over the best known cost (the paper's reversed roles of state
+    and reward)."""
 
     bonus: float = 10.0
     """Added if the episode ends in success. Source: Belder et al. 2023."""
@@ -84,9 +79,6 @@ class GameConfig:
 
     max_iterations: int = 40
     """Limit of an episode's length."""
-
-    limit_is_failure: bool = True
-    """Whether an episode that reaches the limit is terminated, as in the paper, or truncated."""
 
     def __post_init__(self) -> None:
         if self.reward not in get_args(Reward):
@@ -160,7 +152,7 @@ class Game:
     @property
     def action_size(self) -> int:
         """Numbers of an action."""
-        return self.config.agent.action_size
+        return 1
 
     @for_traces
     def reset(self, key: Array) -> tuple[GameState, Float[Array, "envs features"]]:
@@ -212,14 +204,12 @@ class Game:
         self, kind: SceneClass, bank: Bank, episode: Episode, action: Float[Array, " actions"]
     ) -> tuple[Episode, StepInfo]:
         """One LM iteration of one scene."""
-        agent = self.config.agent
+        agent, memory = self.config.agent, episode.memory
         layout = class_layout(kind, self.options)
         layout = with_scene(layout, bank.scenes.pixels[episode.scene], bank.scenes.mask[episode.scene])
-        guard = episode.memory.guard
-        damping, effort = damping_of(agent, guard, action[0]), effort_for(agent, guard, action)
-        state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, guard.iteration, effort)
-        memory = record(agent, episode.memory._replace(effort=effort), step)
-        return Episode(episode.scene, state, memory), step
+        damping = damping_of(agent, memory.guard, action[0])
+        state, step = lm_step(layout, episode.state, damping, self.options, agent.min_gain, memory.iteration)
+        return Episode(episode.scene, state, record(agent, memory, step)), step
 
     @for_traces
     def step(self, state: GameState, action: Float[Array, "envs actions"]) -> tuple[GameState, Step]:
@@ -241,39 +231,32 @@ class Game:
         best = bank.best_cost[episode.scene]
         after, step = self.iterate(kind, bank, episode, action)
         success = step.cost <= best * (1 + rules.tolerance)
-        limit = after.memory.guard.iteration >= rules.max_iterations
-        terminated = success | (limit & rules.limit_is_failure)
-        truncated = limit & ~terminated
-        usual = jnp.clip(bank.ceres_iterations[episode.scene], 1, rules.max_iterations)
-        reward = self._reward(step, after.memory, best, success, usual)
+        terminated = success | (after.memory.iteration >= rules.max_iterations)
+        reward = self._reward(step, after.memory, best, success)
         fresh = self._fresh(bank, key)
-        following = jax.tree.map(lambda new, old: jnp.where(terminated | truncated, new, old), fresh, after)
+        following = jax.tree.map(lambda new, old: jnp.where(terminated, new, old), fresh, after)
         single = lambda x: jnp.asarray(x, jnp.float32)
         metrics = {
-            "length": single(after.memory.guard.iteration),
+            "length": single(after.memory.iteration),
             "success": single(success),
-            "rejections": single(after.memory.guard.rejections),
+            "rejections": single(after.memory.guard.rescue.rejections),
             "ceres": single(jnp.minimum(bank.ceres_iterations[episode.scene], rules.max_iterations)),
         }
         observed = functools.partial(self._observe, bank)
-        return following, Step(observed(following), single(reward), terminated, truncated, observed(after), metrics)
+        never = jnp.zeros_like(terminated)
+        return following, Step(observed(following), single(reward), terminated, never, observed(after), metrics)
 
-    def _reward(
-        self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""], usual: Array | float = USUAL
-    ) -> Array:
+    def _reward(self, step: StepInfo, memory: Memory, best: Array, success: Bool[Array, ""]) -> Array:
         rules = self.config
         bonus = jnp.where(success, rules.bonus, 0.0)
         if rules.reward == "duration":
-            points = self.options.refinement.points if memory.effort is None else memory.effort.point_iterations
-            reward = bonus - (1 + POINT_ITERATION_COST * points)
-        elif rules.reward == "price":
-            reward = bonus - USUAL * memory.info.prices.of(step) / usual
+            reward = bonus - (1 + POINT_ITERATION_COST * self.options.refinement.points)
         elif rules.reward == "clock":
             reward = bonus - duration(step)
         elif rules.reward == "constant":
             reward = bonus - 1
         elif rules.reward == "reduction":
-            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.guard.iteration - 1))
+            reward = bonus * jnp.maximum(0.0, 1 - BONUS_DECAY * (memory.iteration - 1))
         else:
             reward = bonus - jnp.log10(step.cost / best)
         return rules.scale * reward
@@ -281,21 +264,21 @@ class Game:
     @for_traces
     def demonstrate(self, state: GameState, key: Array) -> Float[Array, "envs actions"]:
         """Uniform actions in half of the environments, Ceres' rule in a quarter, and a hundredth of its lambda in the
-        last quarter. Numbers of an action other than lambda are uniform in all of them."""
+        last quarter."""
         agent = self.config.agent
         uniform = jax.random.uniform(key, (self.num_envs, self.action_size), minval=-1.0, maxval=1.0)
-        rules = [all_rows(jax.vmap(_rule_damping)(part.memory.guard), self.devices) for part in state.episodes]
+        rules = [all_rows(jax.vmap(_rule_damping)(part.memory), self.devices) for part in state.episodes]
         rule = jnp.concatenate(rules) - 2.0 * (jnp.arange(self.num_envs) % 4 == 3)
         action = jax.vmap(lambda decades: action_of(agent, decades))(rule)
         action = jnp.clip(action, -0.99, 0.99).astype(jnp.float32)
         return uniform.at[1::2, 0].set(action[1::2])
 
 
-def _rule_damping(guard: GuardState) -> Array:
+def _rule_damping(memory: Memory) -> Array:
     """log10 of the lambda that Ceres' rule would use next."""
-    rule, rejections = Ceres(), guard.consecutive_rejections
-    factor = rule.factor(rejections == 0, guard.gain, rule.growth_after(rejections))
-    return guard.damping + jnp.where(guard.iteration == 0, 0.0, jnp.log10(factor))
+    rule, rejections = Ceres(), memory.guard.rescue.in_a_row
+    factor = rule.factor(rejections == 0, memory.gain, rule.growth_after(rejections))
+    return memory.damping + jnp.where(memory.iteration == 0, 0.0, jnp.log10(factor))
 
 
 def make_game(

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.damping import DampingPolicy
+from jaxba.damping import ConstantAction, DampingPolicy
+from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, reach
@@ -32,18 +33,12 @@ class Score(NamedTuple):
     end: float
     """Median of the final cost over the best known, less one."""
 
-    price: float
-    """Geometric mean of the price of the iterations to within the tolerance (`Prices`); a failure costs as many plain
-    steps as the limit has, or what was paid if that is more."""
-
 
 def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int) -> Score:
     """The score of a policy's runs on several banks; every scene has the same weight."""
-    by_bank = [reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)]
-    iterations = np.concatenate(by_bank)
-    counted = amounts(runs, best, tolerance, limit, priced=False)
+    iterations = iterations_to(runs, best, tolerance)
+    counted = capped(iterations, limit)
     ends = np.concatenate([run.costs[:, -1] / b - 1 for run, b in zip(runs, best, strict=True)])
-    paid = amounts(runs, best, tolerance, limit, priced=True)
     length = np.concatenate([np.where(run.converged, run.iterations, limit) for run in runs])
     return Score(
         mean=float(counted.mean()),
@@ -53,32 +48,14 @@ def score(runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]],
         failures=float(np.mean(~(iterations <= limit))),
         to_convergence=float(length.mean()),
         end=float(np.median(ends)),
-        price=geometric_mean(paid),
     )
 
 
-def prices_to(run: Trajectories, iterations: Float[np.ndarray, " scenes"], limit: int) -> Float[np.ndarray, " scenes"]:
-    """Price of each scene's iterations to a tolerance, see `Score.price`.
-
-    Args:
-        run: trajectories of a policy.
-        iterations: iterations to the tolerance, as `scene_bank.reach` returns them.
-        limit: largest number of iterations.
-    """
-    at = np.clip(np.maximum(iterations, 1), 1, limit).astype(int)
-    paid = np.take_along_axis(run.paid, at[:, None], axis=1)[:, 0]
-    return np.where(iterations <= limit, paid, np.maximum(run.paid[:, -1], limit))
-
-
-def amounts(
-    runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float, limit: int, priced: bool
-) -> np.ndarray:
-    """Of every scene of several banks the price (`Score.price`) or, if not `priced`, the iterations to within the
-    tolerance. Other arguments as for `score`."""
-    reached = [reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)]
-    if not priced:
-        return capped(np.concatenate(reached), limit)
-    return np.concatenate([prices_to(run, found, limit) for run, found in zip(runs, reached, strict=True)])
+def iterations_to(
+    runs: Sequence[Trajectories], best: Sequence[Float[np.ndarray, " _"]], tolerance: float
+) -> Float[np.ndarray, " scenes"]:
+    """Iterations to within a tolerance of every scene of several banks, at least 1; infinite for a failure."""
+    return np.maximum(np.concatenate([reach(run.costs, b, tolerance) for run, b in zip(runs, best, strict=True)]), 1)
 
 
 def evaluate(
@@ -101,6 +78,32 @@ def evaluate(
     """
     runs = [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
     return score(runs, [np.asarray(bank.best_cost) for bank in banks], tolerance, limit)
+
+
+CONSTANT_ACTIONS = tuple(float(x) for x in np.linspace(-1.0, 1.0, 12))
+"""Actions of which `best_constant_action` takes the best: a decade apart in the default range of lambda."""
+
+
+def best_constant_action(
+    kinds: Sequence[SceneClass],
+    banks: Sequence[Bank],
+    config: AgentConfig,
+    options: StepOptions,
+    tolerance: float,
+    limit: int,
+) -> ConstantAction:
+    """The constant action with the fewest mean iterations: what an agent must beat to have learned something.
+
+    Args:
+        kinds: classes of the banks.
+        banks: scenes to search on, those of training.
+        config: what an action means, and the guard.
+        options: of the agent's step.
+        tolerance: relative to the best known cost.
+        limit: largest number of linear solves of a scene.
+    """
+    tried = [ConstantAction((action,), config) for action in CONSTANT_ACTIONS]
+    return min(tried, key=lambda one: evaluate(kinds, banks, one, options, tolerance, limit).mean)
 
 
 Runs = list[Trajectories]
@@ -128,7 +131,6 @@ def virtual_best(runs: Sequence[Trajectories], limit: int) -> Trajectories:
         dampings=runs[0].dampings,
         iterations=np.min([np.where(run.converged, run.iterations, limit) for run in runs], axis=0),
         converged=np.any([run.converged for run in runs], axis=0),
-        paid=np.min([run.paid for run in runs], axis=0),
     )
 
 

@@ -7,8 +7,7 @@ scene.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +16,10 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import DampingPolicy
+from jaxba.game.groups import step_groups
 from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_layout import class_layout, with_scene
-from jaxba.lm.records import Prices, StepInfo
+from jaxba.lm.records import StepInfo
 from jaxba.lm.step import state_at
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.problem.options import StepOptions
@@ -27,60 +27,8 @@ from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.solver.iteration import Carry, begin, iterate
 
-T = TypeVar("T")
-
 LANES = 128
 """Scenes solved at a time."""
-
-GROUP = 8
-"""Scenes that step together on a CPU. Trials and camera rounds of a group last until its slowest scene is done, and
-arrays of this size stay in a core's cache: 8 scenes of 10 x 40 took no more time per scene than 64."""
-
-
-def step_groups(function: Callable[..., T], *arguments: Any, shared: Any = None) -> T:
-    """`jax.vmap(function)` in groups of `GROUP`, one after the other, on a CPU; at once elsewhere.
-
-    Under `jax.vmap` the groups stay as large and there are more of them.
-
-    Args:
-        function: of one scene. It gets `shared` first if that is not None.
-        arguments: with a first axis of scenes.
-        shared: arrays that all scenes share. Under `jax.vmap` the function must not close over others.
-    """
-    if jax.default_backend() != "cpu":
-        return _at_once(function, shared, arguments)
-
-    @jax.custom_batching.custom_vmap
-    def grouped(shared: Any, arguments: Any) -> T:
-        return _grouped(function, shared, arguments)
-
-    @grouped.def_vmap
-    def more_groups(size: int, batched: Any, shared: Any, arguments: Any) -> tuple[T, Any]:
-        if any(jax.tree.leaves(batched[0])):
-            raise ValueError("arrays that all scenes share must not be batched")
-        whole = lambda x, own: x if own else jnp.broadcast_to(x, (size, *x.shape))
-        flat = jax.tree.map(lambda x, own: whole(x, own).reshape(-1, *x.shape[1 + own :]), arguments, batched[1])
-        found = _grouped(function, shared, flat)
-        found = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), found)
-        return found, jax.tree.map(lambda _: True, found)
-
-    return grouped(shared, arguments)
-
-
-def _at_once(function: Callable[..., T], shared: Any, arguments: Any) -> T:
-    one = function if shared is None else functools.partial(function, shared)
-    return jax.vmap(one)(*arguments)
-
-
-def _grouped(function: Callable[..., T], shared: Any, arguments: Any) -> T:
-    count = jax.tree.leaves(arguments)[0].shape[0]
-    if count <= GROUP:
-        return _at_once(function, shared, arguments)
-    # whole groups only: `lax.map` would run the remainder at the same time as the groups, and two batched
-    # factorisations at a time can deadlock if XLA has two threads
-    rows = jnp.minimum(jnp.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
-    found = lax.map(lambda a: _at_once(function, shared, a), jax.tree.map(lambda x: x[rows], arguments))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
 
 
 class Trajectories(NamedTuple):
@@ -98,9 +46,6 @@ class Trajectories(NamedTuple):
     converged: Bool[np.ndarray, " scenes"]
     """Whether the convergence test ended it, and not the limit."""
 
-    paid: Float[np.ndarray, "scenes iterations"]
-    """Price of all iterations so far, at the scene's prices; shaped as `costs`."""
-
 
 class _Lane(NamedTuple):
     scene: Int[Array, " lanes"]
@@ -110,11 +55,7 @@ class _Lane(NamedTuple):
 class _Loop(NamedTuple):
     lane: _Lane
     next_scene: Int[Array, ""]
-    costs: Array
-    dampings: Array
-    iterations: Array
-    converged: Array
-    paid: Array
+    found: Any  # `Trajectories` of JAX arrays, with an extra row for idle lanes; costs without the start
 
 
 @for_traces
@@ -133,13 +74,11 @@ def play(
     """
     check_x64(bank.initial_cost.dtype)
     loop = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
-    found = jax.tree.map(np.asarray, (loop.costs, loop.dampings, loop.iterations, loop.converged, loop.paid))
-    costs, dampings, iterations, converged, prices = found
-    costs = np.concatenate([np.asarray(bank.initial_cost)[:, None], costs[:-1]], axis=1)
-    past = np.arange(limit + 1) > iterations[:-1, None]
-    last = np.take_along_axis(costs, iterations[:-1, None], axis=1)
-    paid = np.cumsum(np.concatenate([np.zeros((len(costs), 1)), prices[:-1]], axis=1), axis=1)
-    return Trajectories(np.where(past, last, costs), dampings[:-1], iterations[:-1], converged[:-1], paid)
+    found: Trajectories = jax.tree.map(lambda x: np.asarray(x)[:-1], loop.found)
+    costs = np.concatenate([np.asarray(bank.initial_cost)[:, None], found.costs], axis=1)
+    past = np.arange(limit + 1) > found.iterations[:, None]
+    last = np.take_along_axis(costs, found.iterations[:, None], axis=1)
+    return found._replace(costs=np.where(past, last, costs))
 
 
 @functools.partial(jit, static_argnames=("kind", "options", "limit"))
@@ -166,31 +105,19 @@ def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptio
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, ftol)
         iteration = lane.carry.iteration
         done = converged | (iteration >= limit)
-        costs = loop.costs.at[row, iteration - 1].set(step.cost)
-        dampings = loop.dampings.at[row, iteration - 1].set(step.damping)
-        prices = jax.tree.map(lambda x: x[jnp.minimum(lane.scene, count - 1)], bank.info.prices)
-        paid = loop.paid.at[row, iteration - 1].set(jax.vmap(Prices.of)(prices, step).astype(loop.paid.dtype))
+        found = loop.found._replace(
+            costs=loop.found.costs.at[row, iteration - 1].set(step.cost),
+            dampings=loop.found.dampings.at[row, iteration - 1].set(step.damping),
+            iterations=loop.found.iterations.at[row].set(iteration),
+            converged=loop.found.converged.at[row].set(converged),
+        )
         upcoming = loop.next_scene + jnp.cumsum(done) - 1
         new = jax.vmap(fresh)(upcoming.astype(jnp.int32))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-        return _Loop(
-            jax.tree.map(pick, new, lane),
-            (loop.next_scene + jnp.sum(done)).astype(jnp.int32),
-            costs,
-            dampings,
-            loop.iterations.at[row].set(iteration),
-            loop.converged.at[row].set(converged),
-            paid,
-        )
+        return _Loop(jax.tree.map(pick, new, lane), (loop.next_scene + jnp.sum(done)).astype(jnp.int32), found)
 
-    dtype = bank.initial_cost.dtype
-    loop = _Loop(
-        jax.vmap(fresh)(jnp.arange(lanes, dtype=jnp.int32)),
-        jnp.asarray(lanes, jnp.int32),
-        jnp.zeros((count + 1, limit), dtype),
-        jnp.zeros((count + 1, limit), dtype),
-        jnp.zeros((count + 1,), jnp.int32),
-        jnp.zeros((count + 1,), bool),
-        jnp.zeros((count + 1, limit), dtype),
-    )
+    rows = np.zeros((count + 1, limit), bank.initial_cost.dtype)
+    nothing = Trajectories(rows, rows, np.zeros(count + 1, np.int32), np.zeros(count + 1, bool))
+    first = jax.vmap(fresh)(jnp.arange(lanes, dtype=jnp.int32))
+    loop = _Loop(first, jnp.asarray(lanes, jnp.int32), jax.tree.map(jnp.asarray, nothing))
     return lax.while_loop(lambda loop: jnp.any(loop.lane.scene < count), body, loop)

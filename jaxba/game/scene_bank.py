@@ -20,12 +20,12 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.damping import ProblemInfo, make_policy
 from jaxba.game.random_scenes import SceneClass, Scenes, make_scenes
-from jaxba.game.rollout import Trajectories, play
-from jaxba.game.scene_layout import class_layout, with_scene
+from jaxba.game.rollout import play
+from jaxba.game.scene_layout import class_layout, scene_problem, with_scene
 from jaxba.game.warm_starts import warm_starts
 from jaxba.game.windows import read_windows
-from jaxba.lm.records import Prices
 from jaxba.model.linearize import cost
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, Refinement, StepOptions, check_count
 from jaxba.runtime.jit import jit
@@ -70,31 +70,15 @@ class Bank(NamedTuple):
     ceres_iterations: Float[Array, " scenes"]  # of Ceres' rule with the portfolio's steps, to the game's tolerance
 
 
-def draw_prices(key: Array, count: int, spread: float) -> Prices:
-    """Prices of each scene, every one drawn log-uniformly from `spread` decades around the default of `Prices`."""
-    decades = jax.random.uniform(key, (len(Prices._fields), count), minval=-0.5, maxval=0.5) * spread
-    return Prices(*(default * 10.0**d for default, d in zip(Prices(), decades, strict=True)))
+def info_of(kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int) -> ProblemInfo:
+    """What a policy knows about each scene before the first iteration."""
 
+    def one(scene: Scenes, cost: Array) -> ProblemInfo:
+        grid = scene.mask.reshape(kind.cameras, kind.points + 1)
+        seen, points = jnp.any(grid, axis=1), jnp.sum(jnp.any(grid, axis=0))
+        return ProblemInfo.of(cost, jnp.sum(grid), points, seen, scene.cameras[6], limit)
 
-def info_of(
-    kind: SceneClass, scenes: Scenes, initial: Float[Array, " scenes"], limit: int, prices: Prices | None = None
-) -> ProblemInfo:
-    """What a policy knows about each scene before the first iteration. Prices are the default ones unless given."""
-    count = len(scenes.mask)
-    grid = scenes.mask.reshape(count, kind.cameras, kind.points + 1)
-    whole = lambda x: x.astype(jnp.int32)
-    seen = jnp.any(grid, axis=2)
-    focal = jnp.nanmedian(jnp.where(seen, scenes.cameras[:, 6], jnp.nan), axis=1)
-    return ProblemInfo(
-        cost=initial,
-        observations=whole(jnp.sum(scenes.mask, axis=1)),
-        cameras=whole(jnp.sum(seen, axis=1)),
-        points=whole(jnp.sum(jnp.any(grid, axis=1), axis=1)),
-        unit=jnp.ones_like(initial),
-        focal=focal,
-        max_iterations=jnp.full((count,), limit, jnp.int32),
-        prices=jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, initial.dtype), (count,)), prices or Prices()),
-    )
+    return jax.vmap(one)(scenes, initial)
 
 
 def worth_solving(kind: SceneClass, info: ProblemInfo) -> Int[np.ndarray, " kept"]:
@@ -115,6 +99,24 @@ def initial_costs(kind: SceneClass, scenes: Scenes) -> Float[Array, " scenes"]:
     return jax.lax.map(one, scenes, batch_size=256)
 
 
+DRAWN = 64
+"""Scenes of which `draw` takes the first that is worth solving; 85% of the default class are."""
+
+
+@for_traces
+def draw(kind: SceneClass, key: Array, number: int) -> BundleProblem:
+    """The random scene of a class with this number, for this key.
+
+    Raises:
+        ValueError: none of `DRAWN` scenes is worth solving.
+    """
+    scenes = make_scenes(kind, jax.random.fold_in(key, number), DRAWN)
+    rows = worth_solving(kind, info_of(kind, scenes, initial_costs(kind, scenes), 1))
+    if not len(rows):
+        raise ValueError(f"no scene of {kind.cameras} cameras and {kind.points} points is worth solving")
+    return scene_problem(kind, scenes, int(rows[0]))
+
+
 @dataclass(frozen=True)
 class BankConfig:
     """How many scenes of which kind."""
@@ -133,9 +135,6 @@ class BankConfig:
 
     problems: tuple[str, ...] = ()
     """Real problems, from which classes of the family `windows` are cut."""
-
-    price_spread: float = 0.0
-    """Decades over which the prices of a scene's work are spread (`draw_prices`)."""
 
     dtype: str = "float64"
     """Floating point type of the game's solves."""
@@ -158,8 +157,6 @@ class BankConfig:
             raise ValueError(f"warm_share must be 0 to 1, is {self.warm_share}")
         if bool(self.problems) != any(kind.family == "windows" for kind in self.classes):
             raise ValueError("problems and classes of the family windows go together: only one of them is given")
-        if not 0 <= self.price_spread <= 4:
-            raise ValueError(f"price_spread must be 0 to 4 decades, is {self.price_spread}")
         _ = self.options  # raises ValueError if impossible
 
 
@@ -168,10 +165,9 @@ class TooFewScenes(ValueError):
 
 
 class Draft(NamedTuple):
-    """All scenes of one class with the runs of the portfolio."""
+    """All scenes of one class, and which of them are usable."""
 
     bank: Bank
-    runs: dict[str, Trajectories]
     usable: np.ndarray
 
 
@@ -186,13 +182,12 @@ def solve_scenes(
     on_rule: Callable[[str], None] = lambda _: None,
     warm_share: float = 0.0,
     tolerance: float = 1e-3,
-    price_spread: float = 0.0,
 ) -> Draft:
     """Solves scenes with every rule.
 
     Args:
         kind: class of the scenes.
-        key: random key, for warm starts and prices.
+        key: random key, for warm starts.
         scenes: the scenes.
         options: of the steps.
         limit: iterations of an episode, for the scenes' `ProblemInfo`.
@@ -200,7 +195,6 @@ def solve_scenes(
         on_rule: called with the name of a rule when it begins.
         warm_share: fraction of the scenes with a warm start.
         tolerance: to which the first rule's iterations are counted.
-        price_spread: see `draw_prices`.
     """
     count = len(scenes.mask)
     initial = initial_costs(kind, scenes)
@@ -210,8 +204,6 @@ def solve_scenes(
     if warm_share:
         scenes, initial = warm_starts(kind, scenes, initial, jax.random.fold_in(key, count), warm_share, options)
         info = info_of(kind, scenes, initial, limit)
-    prices = draw_prices(jax.random.fold_in(key, count + 1), len(initial), price_spread)
-    info = info_of(kind, scenes, initial, limit, prices)
     bank = Bank(scenes, initial, initial, info, jnp.zeros_like(initial))
     runs = {}
     for rule in rules:
@@ -224,7 +216,7 @@ def solve_scenes(
     soonest = np.min([reach(run.costs, best, 1e-3) for run in runs.values()], axis=0)
     floor = SMALLEST_COST * np.asarray(info.observations)
     usable = (ratio > MIN_RATIO) & (ratio < MAX_RATIO) & (soonest <= EASY_ENOUGH) & (best > floor)
-    return Draft(bank, runs, usable)
+    return Draft(bank, usable)
 
 
 class Split(NamedTuple):
@@ -262,16 +254,7 @@ def make_banks(
         on_rule = lambda rule, where=where, count=count: report(f"{count} scenes of {where}: {rule}")
         class_key = jax.random.fold_in(key, number and MORE_CLASSES + number)
         solved = lambda scenes, on_rule=on_rule, kind=kind, class_key=class_key: solve_scenes(
-            kind,
-            class_key,
-            scenes,
-            options,
-            limit,
-            PORTFOLIO,
-            on_rule,
-            config.warm_share,
-            tolerance,
-            config.price_spread,
+            kind, class_key, scenes, options, limit, PORTFOLIO, on_rule, config.warm_share, tolerance
         )
         if kind.family == "windows":
             seed = int(jax.random.randint(class_key, (), 0, 2**31 - 1))

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float
 
+from jaxba.game.groups import step_groups
 from jaxba.game.random_scenes import SceneClass, Scenes
-from jaxba.game.rollout import step_groups
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState
 from jaxba.lm.step import lm_step, state_at

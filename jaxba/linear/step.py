@@ -1,11 +1,11 @@
-"""The records of a damped step: the step with its linear model, and the limits on its cost in time."""
+"""The record of a damped step, with its linear model."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 
 class Step(NamedTuple):
@@ -26,10 +26,3 @@ class Step(NamedTuple):
         nothing cancels.
         """
         return fraction * (0.5 * fraction * self.damped + (1 - 0.5 * fraction) * self.slope)
-
-
-class Effort(NamedTuple):
-    """Limits of one iteration, for policies that choose them anew each time. Traced, so a change compiles nothing."""
-
-    point_iterations: Int[Array, ""]  # replaces Refinement.points, which is its maximum
-    repairs: Bool[Array, ""]  # whether camera rounds, trials and pattern moves may be made

@@ -101,32 +101,3 @@ class StepInfo(NamedTuple):
 KINDS: dict[str, Any] = {"accepted": bool, "weightless": bool}
 KINDS |= dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), np.int32)
 """Types of the fields of a record that are no floating point numbers."""
-
-
-class Prices(NamedTuple):
-    """What the work of an iteration costs, in units of a plain step: linearise, solve by a factorisation, and evaluate
-    one candidate. Source of the defaults but that of a product: geometric means over twelve real problems of 1,400 to
-    115,000 observations (`benchmarks.prices`)."""
-
-    candidate: float | Float[Array, ""] = 0.1
-    """Evaluating another candidate."""
-
-    point_iteration: float | Float[Array, ""] = 0.08
-    """An embedded point iteration."""
-
-    camera_round: float | Float[Array, ""] = 0.2
-    """Re-optimising every camera on its own, without the candidate that follows."""
-
-    product: float | Float[Array, ""] = 0.06
-    """An iteration of conjugate gradients. An estimate: one product with the reduced system takes 20 to 25 of an
-    implicit step's 351 ms on a scene of Ladybug-1197's size. Those of method `deeplm` were not measured."""
-
-    def of(self, step: StepInfo) -> Float[Array, ""]:
-        """The price of an iteration."""
-        return (
-            1.0
-            + self.candidate * step.repairs
-            + self.point_iteration * step.point_iterations
-            + self.camera_round * step.camera_rounds
-            + self.product * step.cg_iterations
-        )

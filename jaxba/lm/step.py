@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Effort, Step
+from jaxba.linear.step import Step
 from jaxba.lm.damped_step import solve_step
 from jaxba.lm.method import check_plain, method_of
 from jaxba.lm.records import LMState, StepInfo
@@ -86,7 +86,6 @@ def lm_step(
     options: StepOptions,
     min_gain: float | Float[Array, ""] = 0.0,
     iteration: int | Int[Array, ""] = 0,
-    effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """One iteration: one linear solve with the given lambda, accepted or rejected.
 
@@ -101,7 +100,6 @@ def lm_step(
         options: static options of the step.
         min_gain: the step is accepted if the cost falls and the gain ratio exceeds this.
         iteration: number of the iteration, from 0; methods with random clusters use other ones in each.
-        effort: overrides the point iterations and the repairs of the options.
 
     Returns:
         The next state (unchanged after a rejection) and the record of the iteration.
@@ -112,7 +110,7 @@ def lm_step(
     """
     check_x64(state.cost.dtype)
     proposal = propose(layout, state, damping, options, iteration)
-    return try_step(layout, state, damping, proposal, options, min_gain, effort)
+    return try_step(layout, state, damping, proposal, options, min_gain)
 
 
 def propose(
@@ -138,10 +136,9 @@ def try_step(
     proposal: Proposal,
     options: StepOptions,
     min_gain: float | Float[Array, ""] = 0.0,
-    effort: Effort | None = None,
 ) -> tuple[LMState, StepInfo]:
     """Second part of `lm_step`: evaluate the step and accept or reject it. Arguments as for `lm_step`."""
-    against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain)
     return take_step(layout, state, damping, proposal, best_candidate(against), options)
 
 

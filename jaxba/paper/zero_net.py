@@ -28,7 +28,7 @@ from jaxba.damping.guard import damping_of
 from jaxba.damping.learned import Layer
 from jaxba.damping.policy import ProblemInfo
 from jaxba.game.env import Episode, Game
-from jaxba.game.rollout import step_groups
+from jaxba.game.groups import step_groups
 from jaxba.game.scene_bank import Bank
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
@@ -165,7 +165,7 @@ def _train(
         change, optimiser = adam.update(gradient, state.adam, state.layers)
         key, *keys = jax.random.split(state.key, 1 + config.batch)
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, Tolerances().ftol)
-        done = converged | (after.memory.guard.iteration >= config.max_iterations)
+        done = converged | (after.memory.iteration >= config.max_iterations)
         new = jax.vmap(another)(jnp.stack(keys))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
         episodes = jax.tree.map(pick, new, after)

@@ -146,14 +146,6 @@ def _after_step(policy: DampingPolicy, carry: Carry, step: StepInfo, tolerances:
 
 def _problem_info(problem: BundleProblem, cost: float, max_iterations: int) -> ProblemInfo:
     """The `ProblemInfo` that `solve` makes for diagonal damping."""
-    cameras = np.unique(problem.camera_index)
-    count = lambda n: jnp.asarray(n, jnp.int32)
-    return ProblemInfo(
-        cost=jnp.asarray(cost),
-        observations=count(problem.num_observations),
-        cameras=count(len(cameras)),
-        points=count(len(np.unique(problem.point_index))),
-        unit=jnp.ones(()),
-        focal=jnp.median(jnp.abs(jnp.asarray(problem.cameras)[cameras, 6])),
-        max_iterations=count(max_iterations),
-    )
+    seen = np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0
+    points, focal = len(np.unique(problem.point_index)), np.asarray(problem.cameras)[:, 6]
+    return ProblemInfo.of(jnp.asarray(cost), problem.num_observations, points, seen, focal, max_iterations)

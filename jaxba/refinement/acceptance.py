@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.linear.step import Effort, Step
+from jaxba.linear.step import Step
 from jaxba.model.linearize import Reference, observation_costs, slot_frames, with_prior_costs
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide
@@ -118,14 +118,11 @@ class Comparison(NamedTuple):
     min_gain: float | Float[Array, ""]
     """Gain ratio that an accepted candidate must exceed."""
 
-    point_iterations: int | Int[Array, ""]
-    """Number of embedded point iterations."""
-
     starts: Int[Array, ""]
     """Starts of points after the full step (`midpoints.refine_from_starts`)."""
 
     matters: Bool[Array, ""]
-    """Whether the predicted decrease is worth camera rounds and further trials, and the effort allows them."""
+    """Whether the predicted decrease is worth camera rounds and further trials."""
 
 
 def comparison(
@@ -137,7 +134,6 @@ def comparison(
     step: Step,
     options: StepOptions,
     min_gain: float | Float[Array, ""],
-    effort: Effort | None,
 ) -> Comparison:
     """The `Comparison` of a step.
 
@@ -150,15 +146,9 @@ def comparison(
         step: solution of the damped system.
         options: static options of the step.
         min_gain: a candidate is accepted if the cost falls and the gain ratio exceeds this.
-        effort: overrides the number of point iterations of the options.
     """
-    point_iterations = options.refinement.points
-    if effort is not None:
-        point_iterations = jnp.minimum(effort.point_iterations, point_iterations)
     predicted = step.predicted(jnp.ones_like(cost))
     matters = predicted > NEGLIGIBLE * cost
-    if effort is not None:
-        matters = matters & effort.repairs
     previous = PreviousPoints.of(layout, points, reference)
     terms = previous.costs if options.refinement.points else reference.costs
     if reference.prior_costs is not None:
@@ -172,7 +162,6 @@ def comparison(
         step=step,
         options=options,
         min_gain=min_gain,
-        point_iterations=point_iterations,
         starts=jnp.where(predicted <= NEAR_CONVERGENCE * cost, 2, 1),
         matters=matters,
     )
@@ -198,7 +187,7 @@ def assess(
     """
     layout = against.layout
     predicted = against.step.predicted(step_fraction)
-    work = work._replace(point_iterations=(work.point_iterations + against.point_iterations).astype(jnp.int32))
+    work = work._replace(point_iterations=(work.point_iterations + against.options.refinement.points).astype(jnp.int32))
     points, terms = _refined(against, cameras, points, predicted, full_step)
     cost, decrease = (sum_over_devices(layout, total(each)) for each in (terms, against.terms - terms))
     gain = safe_divide(decrease, predicted)
@@ -217,7 +206,7 @@ def _refined(
     layout, loss, refinement = against.layout, against.options.loss, against.options.refinement
     if not refinement.points:
         return points, with_prior_costs(layout, cameras, observation_costs(layout, cameras, points, loss))
-    arguments = layout, slot_frames(layout, cameras), points, loss, against.point_iterations, against.previous
+    arguments = layout, slot_frames(layout, cameras), points, loss, against.options.refinement.points, against.previous
     min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * predicted)
     if refinement.starts == "step":
         points, costs = refine_points(*arguments, min_decrease)

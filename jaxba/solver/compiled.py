@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
-from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Termination, Tolerances
 from jaxba.problem.options import StepOptions
 from jaxba.runtime.jit import jit
@@ -31,7 +31,6 @@ def solve_loop(
     options: StepOptions,
     max_iterations: int,
     limit: Int[AnyArray, ""] | None = None,
-    prices: Prices = Prices(),  # noqa: B008 - immutable
 ) -> tuple[Carry, StepInfo]:
     """The solve loop as one compiled program. It can be vmapped over layouts and states of equal shapes.
 
@@ -43,7 +42,6 @@ def solve_loop(
         options: static options of the step.
         max_iterations: length of the record, static.
         limit: a lower limit of iterations, not static.
-        prices: of the work of an iteration, for policies that observe them.
 
     Returns:
         Final carry, and the record: arrays of length `max_iterations`, zero after the last iteration.
@@ -53,7 +51,7 @@ def solve_loop(
     """
     check_x64(state.cost.dtype)
     iteration_limit = max_iterations if limit is None else jnp.minimum(limit, max_iterations)
-    carry = begin(problem_info(layout, state, options, iteration_limit, prices), policy, state)
+    carry = begin(problem_info(layout, state, options, iteration_limit), policy, state)
     return loop_from(layout, carry, policy, tolerances, options, max_iterations, iteration_limit)
 
 

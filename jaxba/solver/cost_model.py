@@ -10,10 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxba.lm.records import Prices
 from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.problem.options import StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.camera_ordering import camera_order, is_banded
 from jaxba.structure.density import has_dense_shape, has_small_capacitance
@@ -73,19 +71,6 @@ SECONDS = Work(
 )
 """Fitted to steps with three point iterations in float64 on two cores of an x86-64 processor with AVX-512:
 `python -m benchmarks.choice --fit`."""
-
-FITTED_POINT_ITERATIONS = 3
-"""Point iterations of the steps that `SECONDS` was fitted to."""
-
-POINT_ITERATION_S = (2.4e-5, 1.9e-8)
-"""Seconds of an embedded point iteration: constant, and for each observation. The fit of `benchmarks.prices` on twelve
-real problems, within 0.4 to 1.4 of what each measured, as the next two."""
-
-CANDIDATE_S = (1.3e-4, 2.0e-8)
-"""Seconds of another candidate, likewise."""
-
-CAMERA_ROUND_S = (1.4e-4, 5.0e-8)
-"""Seconds of a camera round, likewise."""
 
 ASSUMED_PRODUCTS = 12
 """Assumed conjugate gradient iterations of a step with the two-level preconditioner. Measured: 6 to 20 on real
@@ -181,29 +166,6 @@ def predict(problem: BundleProblem, observations: ObservationOrder | None = None
     """Predicted time of one iteration with each linear solver. Arguments as for `work`."""
     solvers = work(problem, observations=observations)
     return SolverCosts(*(solvers[name].seconds if name in solvers else np.inf for name in SolverCosts._fields))
-
-
-def prices(problem: BundleProblem, options: StepOptions, observations: ObservationOrder | None = None) -> Prices:
-    """Prices of the work of an iteration, relative to its linear solve and first candidate, which this model predicts.
-
-    Args:
-        problem: determines sizes.
-        options: of the step, with the chosen linear solver. The prices of methods are not known: the default ones.
-        observations: as for `work`.
-    """
-    amounts = work(problem, observations=observations) if options.method is None else {}
-    if options.linear_solver not in amounts:
-        return Prices()
-    count = problem.num_observations
-    seconds = lambda part: part[0] + part[1] * count
-    whole = amounts[options.linear_solver].seconds
-    plain = max(whole - FITTED_POINT_ITERATIONS * seconds(POINT_ITERATION_S), whole / 2)
-    return Prices(
-        candidate=seconds(CANDIDATE_S) / plain,
-        point_iteration=seconds(POINT_ITERATION_S) / plain,
-        camera_round=seconds(CAMERA_ROUND_S) / plain,
-        product=SECONDS.implicit * count / plain,
-    )
 
 
 def _is_dense(observations: ObservationOrder) -> bool:

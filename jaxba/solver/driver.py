@@ -72,7 +72,7 @@ class Compiled(Driver):
 
     def _all(self) -> tuple[Carry, StepInfo]:
         setup = self.setup
-        options = setup.policy, self.tolerances, setup.options, self.length, self.limit, setup.prices
+        options = setup.policy, self.tolerances, setup.options, self.length, self.limit
         return solve_loop(setup.layout, self._start, *options)
 
 
@@ -84,7 +84,7 @@ class OnDevices(Driver):
         self._shards = shards
 
     def begin(self) -> LMState:
-        self.carry = self._shards.begin(self.setup.policy, self.limit, self.setup.prices)
+        self.carry = self._shards.begin(self.setup.policy, self.limit)
         return jax.block_until_ready(self.carry.state)
 
     def _all(self) -> tuple[Carry, StepInfo]:

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.damping import DampingPolicy, ProblemInfo, effort_of
+from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm.damped_step import largest_diagonal
-from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import lm_step
 from jaxba.lm.termination import Termination, Tolerances, termination_of
 from jaxba.model.linearize import linearize, only_free
@@ -45,27 +45,15 @@ class Carry(NamedTuple):
     """Integer of a `Termination`."""
 
 
-def problem_info(
-    layout: Layout, state: LMState, options: StepOptions, max_iterations: Any, prices: Prices
-) -> ProblemInfo:
+def problem_info(layout: Layout, state: LMState, options: StepOptions, max_iterations: Any) -> ProblemInfo:
     """The information that a policy gets before the first iteration."""
-    unit = jnp.ones_like(state.cost)
+    unit: Any = 1.0
     if options.coordinates.scaling == "identity":
         linear = linearize(layout, state.cameras, state.points, options.loss)
         unit = largest_diagonal(layout, only_free(layout, linear, "free"))
-    count = lambda n: jnp.asarray(n, jnp.int32)
     tracks = point_sum(layout, jnp.asarray(layout.slot_mask, state.cost.dtype)[None])
     observations, points = sum_over_devices(layout, (jnp.sum(layout.slot_mask), jnp.sum(tracks > 0)))
-    return ProblemInfo(
-        cost=state.cost,
-        observations=count(observations),
-        cameras=count(jnp.sum(layout.camera_seen)),
-        points=count(points),
-        unit=unit,
-        focal=jnp.nanmedian(jnp.where(layout.camera_seen, jnp.abs(state.cameras[6]), jnp.nan)),
-        max_iterations=count(max_iterations),
-        prices=Prices(*(jnp.asarray(x, state.cost.dtype) for x in prices)),
-    )
+    return ProblemInfo.of(state.cost, observations, points, layout.camera_seen, state.cameras[6], max_iterations, unit)
 
 
 def begin(info: ProblemInfo, policy: DampingPolicy, state: Any) -> Carry:
@@ -114,6 +102,5 @@ def iterate(
     limit: Any,
 ) -> tuple[Carry, StepInfo]:
     """The carry after one iteration, and its record. Arguments as for `solve_loop`."""
-    effort = effort_of(policy, carry.policy)
-    state, step = lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration, effort)
+    state, step = lm_step(layout, carry.state, carry.damping, options, policy.min_gain, carry.iteration)
     return advance(carry, state, step, policy, tolerances, limit, num_partitions(layout)), step

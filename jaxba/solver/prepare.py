@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxba.damping import DampingPolicy
-from jaxba.damping.policy import observes_prices
 from jaxba.damping.registry import GUARDED
-from jaxba.lm.records import LMState, Prices
+from jaxba.lm.records import LMState
 from jaxba.lm.step import initial_state
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import set_aside
@@ -23,7 +22,6 @@ from jaxba.runtime import distributed
 from jaxba.runtime.compilation import CompileClock, compile_and_run, program
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.choose import choose_linear_solver
-from jaxba.solver.cost_model import prices
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.names import resolve_policy
 from jaxba.solver.options import SolveOptions, checked_options
@@ -75,9 +73,6 @@ class Setup(ArrayRecord):
 
     dtype: np.dtype[Any]
     """Type of the parameters of the solve."""
-
-    prices: Prices
-    """Of the work of an iteration, NumPy scalars; the default ones for a policy that does not observe them."""
 
     setup_s: float
     """Seconds for the layout and the transfer to the device."""
@@ -174,10 +169,8 @@ def set_up(
         shards = None if len(devices) == 1 else Shards(here, step, devices, dtype)
         layout = jax.device_put(layout_for(here, step, capacity, observations)) if shards is None else shards.first
         start = here if capacity is None else padded_parameters(here, capacity)
-        known = prices(here, step, observations) if observes_prices(policy) else Prices()
-        known = jax.tree.map(lambda x: np.asarray(x, dtype), known)
         setup_s = time.perf_counter() - started
-    return Setup(problem, away, found, layout, step, policy, capacity, start, dtype, known, setup_s, shards)
+    return Setup(problem, away, found, layout, step, policy, capacity, start, dtype, setup_s, shards)
 
 
 def _pads(problem: BundleProblem, options: SolveOptions) -> bool:

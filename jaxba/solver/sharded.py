@@ -19,7 +19,7 @@ from jaxtyping import Float, Int
 
 from jaxba.damping import DampingPolicy
 from jaxba.lm.method import check_plain
-from jaxba.lm.records import LMState, Prices, StepInfo
+from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Tolerances
 from jaxba.model.linearize import cost
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -95,9 +95,9 @@ class Shards:
 
         return jax.tree.map(placed, *trees)
 
-    def begin(self, policy: DampingPolicy, limit: Int[np.ndarray, ""], prices: Prices) -> Carry:
+    def begin(self, policy: DampingPolicy, limit: Int[np.ndarray, ""]) -> Carry:
         """The carry before the first iteration."""
-        given = self.layout, self._cameras, self._points, policy, limit, prices
+        given = self.layout, self._cameras, self._points, policy, limit
         return _begin(*given, mesh=self._mesh, options=self._options)
 
     def run(
@@ -133,20 +133,19 @@ def _begin(
     points: Float[Array, "shards 3 points"],
     policy: DampingPolicy,
     limit: Int[Array, ""],
-    prices: Prices,
     *,
     mesh: Mesh,
     options: StepOptions,
 ) -> Carry:
-    def start(layout: Layout, cameras: Array, points: Array, policy: Any, limit: Array, prices: Prices) -> Carry:
+    def start(layout: Layout, cameras: Array, points: Array, policy: Any, limit: Array) -> Carry:
         layout, points = _own(layout), points[0]
         state = LMState(cameras, points, cost(layout, cameras, points, options.loss))
-        carry = begin(problem_info(layout, state, options, limit, prices), policy, state)
+        carry = begin(problem_info(layout, state, options, limit), policy, state)
         return _divided(carry, lambda x: x[None])
 
-    places = _DIVIDED, _EVERYWHERE, _DIVIDED, _EVERYWHERE, _EVERYWHERE, _EVERYWHERE
+    places = _DIVIDED, _EVERYWHERE, _DIVIDED, _EVERYWHERE, _EVERYWHERE
     on_all = jax.shard_map(start, mesh=mesh, in_specs=places, out_specs=_CARRY, check_vma=False)
-    return on_all(layout, cameras, points, policy, limit, prices)
+    return on_all(layout, cameras, points, policy, limit)
 
 
 @functools.partial(jit, static_argnames=("mesh", "options", "length"))

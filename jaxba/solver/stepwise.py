@@ -21,8 +21,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxba.damping import DampingPolicy, decides_effort, effort_of
-from jaxba.linear.step import Effort
+from jaxba.damping import DampingPolicy
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import Proposal, propose, take_step, try_step
 from jaxba.lm.termination import Termination, Tolerances
@@ -107,22 +106,19 @@ class Stepwise(Driver):
         """The carry before the first iteration, from the initial state."""
         setup = self.setup
         info_program = program(problem_info, "options", level="quick")
-        info = call(info_program, setup.layout, state, setup.options, self.limit, setup.prices)
+        info = call(info_program, setup.layout, state, setup.options, self.limit)
         # without the parameters, whose shapes differ, the policy's program is compiled once for all problems
         return call(program(begin, level="quick"), info, setup.policy, None)._replace(state=state)
 
     def _iterate(self, call: Call, carry: Carry) -> tuple[Carry, StepInfo, Any]:
         """One iteration: the next carry, its record, and the packed report for the host."""
         state, layout, options, policy = carry.state, self.setup.layout, self.setup.options, self.setup.policy
-        effort = None
-        if decides_effort(policy):
-            effort = call(program(effort_of, level="quick"), policy, carry.policy)
         part = lambda function: program(function, "options", level=self._levels[function.__name__])
         # NumPy's: each conversion by JAX is a program
         min_gain = np.asarray(policy.min_gain, state.cost.dtype)
         arguments = (layout, state, carry.damping)
         proposal = call(part(propose), *arguments, options, carry.iteration)
-        arguments = (*arguments, proposal, options, min_gain, effort)
+        arguments = (*arguments, proposal, options, min_gain)
         if has_repairs(options):
             state, step = try_step_by_parts(call, part, *arguments)
         else:
@@ -168,12 +164,11 @@ def try_candidate(
     proposal: Proposal,
     options: StepOptions,
     min_gain: Float[Array, ""],
-    effort: Effort | None,
     search: Search,
     refined: Float[Array, "parameters cameras"],
 ) -> tuple[Search, Int[Array, ""]]:
     """One turn of the search for the candidate of a step, and what comes next. Arguments as for `next_search`."""
-    against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain, effort)
+    against = comparison(layout, *state[:3], proposal.reference, proposal.step, options, min_gain)
     search = next_search(against, search, refined)
     following = jnp.where(search.active, jnp.where(search.refining, Next.CAMERA_ROUND, Next.CANDIDATE), Next.NOTHING)
     return search, following
@@ -193,7 +188,6 @@ def try_step_by_parts(
     proposal: Proposal,
     options: StepOptions,
     min_gain: Any,
-    effort: Effort | None,
 ) -> tuple[LMState, StepInfo]:
     """`try_step`, with the same arguments or their shapes and types, by programs that `call` runs or compiles.
 
@@ -206,7 +200,7 @@ def try_step_by_parts(
     search = first_search(state.cameras, state.points, state.cost, proposal.step)
     refined = state.cameras
     while True:
-        arguments = (layout, state, proposal, options, min_gain, effort, search, refined)
+        arguments = (layout, state, proposal, options, min_gain, search, refined)
         search, following = call(part(try_candidate), *arguments)
         if not isinstance(following, Array) or int(following) == Next.NOTHING:
             break

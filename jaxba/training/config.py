@@ -25,6 +25,10 @@ from jaxba.training.train_loop import LoopConfig
 
 MethodName = Literal["lm", "stba", "deeplm", "poba"]
 
+CLUSTER_CAMERAS = 4
+"""Largest number of cameras in a cluster, for methods with clusters; the default for real problems is too large for
+scenes of the game."""
+
 METADATA_BYTES = 1 << 14
 """Reserved for the metadata of a policy file, of which the configuration takes 3 kB."""
 
@@ -58,10 +62,6 @@ class TrainConfig:
     method: MethodName = "lm"
     """How a step is computed (jaxba/solver/methods.py). Scenes are solved and selected with plain LM."""
 
-    cluster_cameras: int = 4
-    """Largest number of cameras in a cluster, for methods with clusters; the default for real problems is too large for
-    scenes of the game."""
-
     bank: BankConfig = field(default_factory=BankConfig)
     """Scenes."""
 
@@ -80,11 +80,11 @@ class TrainConfig:
         plain = StepOptions(intrinsics=self.bank.intrinsics)
         method = make_method(self.method)
         if method.cluster_cameras is not None:
-            method = make_method(f"{self.method}:{self.cluster_cameras}")
+            method = make_method(f"{self.method}:{CLUSTER_CAMERAS}")
         return method.options(plain)
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep", "cluster_cameras"):
+        for name in ("seeds", "chunks", "evaluate_every", "checkpoint_every", "keep"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 0 <= self.seed < 2**31:
@@ -99,6 +99,7 @@ class TrainConfig:
             raise ValueError(f"bank.dtype must be float64 or float32, not {self.bank.dtype!r}")
         _check_agent(self.sac)
         _check_size(self.sac, self.game.agent)
+        _ = self.step_options  # raises ValueError if impossible
 
 
 def _check_agent(sac: SacConfig) -> None:
@@ -108,7 +109,7 @@ def _check_agent(sac: SacConfig) -> None:
             raise ValueError(f"sac.{name} must be at least 1, not {getattr(sac, name)}")
     if sac.policy_layers < 1:
         raise ValueError(f"sac.actor_layers must be at least 1, not {sac.actor_layers}")
-    for name in ("learning_rate", "initial_temperature", "reward_scale", "log_std_max"):
+    for name in ("learning_rate", "initial_temperature"):
         if not getattr(sac, name) > 0:
             raise ValueError(f"sac.{name} must be positive, not {getattr(sac, name)}")
     for name in ("gamma", "tau"):
@@ -116,13 +117,11 @@ def _check_agent(sac: SacConfig) -> None:
             raise ValueError(f"sac.{name} must lie in (0, 1], not {getattr(sac, name)}")
     if not sac.log_std_min < 0:
         raise ValueError(f"sac.log_std_min must be negative, not {sac.log_std_min}")
-    if sac.max_grad_norm is not None and not sac.max_grad_norm > 0:
-        raise ValueError(f"sac.max_grad_norm must be positive or null, not {sac.max_grad_norm}")
 
 
 def _check_size(sac: SacConfig, agent: AgentConfig) -> None:
     """Refuses networks that are too large for a policy file."""
-    sizes = [observation_size(agent), *[sac.width] * sac.policy_layers, 2 * agent.action_size]
+    sizes = [observation_size(agent), *[sac.width] * sac.policy_layers, 2]
     numbers = sum((inputs + 1) * outputs for inputs, outputs in itertools.pairwise(sizes))
     if 4 * numbers > LARGEST_FILE - METADATA_BYTES:
         raise ValueError(

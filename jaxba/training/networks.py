@@ -21,6 +21,9 @@ from jaxba.game.devices import own_rows
 LAST_LAYER = 3e-3
 """Bound of the uniform initial weights of every last layer. Source: Lillicrap et al. 2016 (DDPG), section 7."""
 
+LOG_STD_MAX = 2.0
+"""Upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code."""
+
 LARGEST_ACTION = float(np.nextafter(np.float32(1), np.float32(0)))
 """Largest float32 below one; tanh in float32 can round to one."""
 
@@ -48,9 +51,6 @@ class MLP(nn.Module):
     time.
     """
 
-    bias: float = 0.0
-    """Initial bias of the last layer, which is about the initial output."""
-
     @nn.compact
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         """Outputs of the last layer."""
@@ -59,9 +59,7 @@ class MLP(nn.Module):
             if self.layer_norm:
                 x = nn.LayerNorm(dtype=jnp.float32, use_bias=False, use_scale=False)(x)
             x = nn.relu(x)
-        first = nn.initializers.constant(self.bias)
-        last = nn.Dense(self.outputs, dtype=jnp.float32, param_dtype=jnp.float32, kernel_init=_small, bias_init=first)
-        return last(x)
+        return nn.Dense(self.outputs, dtype=jnp.float32, param_dtype=jnp.float32, kernel_init=_small)(x)
 
 
 class Value(nn.Module):
@@ -76,13 +74,10 @@ class Value(nn.Module):
     layer_norm: bool = False
     """See `MLP`."""
 
-    bias: float = 0.0
-    """Initial value of every observation."""
-
     @nn.compact
     def __call__(self, observation: Float[Array, "*batch features"]) -> Float[Array, "*batch"]:
         """Expected discounted sum of rewards, entropy included."""
-        return MLP(self.width, self.layers, 1, self.layer_norm, self.bias)(observation)[..., 0]
+        return MLP(self.width, self.layers, 1, self.layer_norm)(observation)[..., 0]
 
 
 class Critic(nn.Module):
@@ -96,9 +91,6 @@ class Critic(nn.Module):
 
     layer_norm: bool = False
     """See `MLP`."""
-
-    bias: float = 0.0
-    """Initial value of every observation."""
 
     members: int = 2
     """Networks in the ensemble."""
@@ -117,7 +109,7 @@ class Critic(nn.Module):
             axis_size=self.members,
         )
         inputs = jnp.concatenate([observation, action], axis=-1)
-        return ensemble(self.width, self.layers, self.layer_norm, self.bias)(inputs)
+        return ensemble(self.width, self.layers, self.layer_norm)(inputs)
 
 
 class Actor(nn.Module):
@@ -139,9 +131,6 @@ class Actor(nn.Module):
     log_std_min: float
     """Lower bound, negative."""
 
-    log_std_max: float
-    """Upper bound, positive."""
-
     @nn.compact
     def __call__(
         self, observation: Float[Array, "*batch features"]
@@ -149,8 +138,8 @@ class Actor(nn.Module):
         """Mean and log standard deviation."""
         outputs = MLP(self.width, self.layers, 2 * self.actions)(observation)
         mean, raw = jnp.split(outputs, 2, axis=-1)
-        span = self.log_std_max - self.log_std_min
-        log_std = self.log_std_min + span * jax.nn.sigmoid(raw + math.log(-self.log_std_min / self.log_std_max))
+        span = LOG_STD_MAX - self.log_std_min
+        log_std = self.log_std_min + span * jax.nn.sigmoid(raw + math.log(-self.log_std_min / LOG_STD_MAX))
         return mean, log_std
 
 

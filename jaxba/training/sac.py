@@ -72,41 +72,6 @@ class SacConfig:
     log_std_min: float = -5.0
     """Lower bound of the log standard deviation before tanh."""
 
-    log_std_max: float = 2.0
-    """Upper bound of the log standard deviation before tanh. Source: Haarnoja et al.'s code."""
-
-    reward_scale: float = 1.0
-    """Factor on rewards, so that returns lie in about [-10, 10]."""
-
-    initial_value: float = 0.0
-    """Initial output of the critics. Near the mean return, learning from constant negative rewards starts faster."""
-
-    max_grad_norm: float | None = None
-    """Largest norm of a network's gradient, which is scaled down to it; no limit if None."""
-
-    @classmethod
-    def paper(cls) -> SacConfig:
-        """The paper's agent; what the paper does not state is taken from its released code.
-
-        Value network and critics of three fully connected layers, the last one linear, a policy of four, width 256;
-        mean squared errors; target value network refreshed every 5 iterations.
-        """
-        return cls(
-            variant="value",
-            width=256,
-            layers=2,
-            actor_layers=3,
-            layer_norm=False,
-            learning_rate=3e-4,
-            gamma=0.99,
-            tau=1.0,
-            target_every=5,
-            initial_temperature=1.0,
-            learn_temperature=False,
-            log_std_min=-20.0,
-            privileged=False,
-        )
-
     @property
     def policy_layers(self) -> int:
         """Hidden layers of the policy."""
@@ -127,20 +92,15 @@ class Learner(NamedTuple):
 
 
 def _actor(config: SacConfig, actions: int) -> Any:  # flax types the outputs of its networks as anything or a pair
-    return networks.Actor(config.width, config.policy_layers, actions, config.log_std_min, config.log_std_max)
+    return networks.Actor(config.width, config.policy_layers, actions, config.log_std_min)
 
 
 def _critic(config: SacConfig) -> Any:
-    return networks.Critic(config.width, config.layers, config.layer_norm, config.initial_value)
+    return networks.Critic(config.width, config.layers, config.layer_norm)
 
 
 def _value(config: SacConfig) -> Any:
-    return networks.Value(config.width, config.layers, config.layer_norm, config.initial_value)
-
-
-def _optimizer(config: SacConfig) -> optax.GradientTransformation:
-    adam = optax.adam(config.learning_rate)
-    return adam if config.max_grad_norm is None else optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
+    return networks.Value(config.width, config.layers, config.layer_norm)
 
 
 def init(config: SacConfig, key: Array, observation_size: int, action_size: int, privileged_size: int = 0) -> Learner:
@@ -170,7 +130,7 @@ def init(config: SacConfig, key: Array, observation_size: int, action_size: int,
         value=value,
         target=jax.tree.map(jnp.copy, critic if value is None else value),
         log_temperature=log_temperature,
-        optimizers={name: _optimizer(config).init(params) for name, params in trained.items()},
+        optimizers={name: optax.adam(config.learning_rate).init(params) for name, params in trained.items()},
         key=key,
         updates=jnp.zeros((), jnp.int32),
     )
@@ -216,7 +176,7 @@ def update(
     key, next_key, policy_key = jax.random.split(learner.key, 3)
     actor_network, critic_network = _actor(config, action.shape[-1]), _critic(config)
     temperature = jnp.exp(learner.log_temperature)
-    optimizer, optimizers = _optimizer(config), dict(learner.optimizers)
+    optimizer, optimizers = optax.adam(config.learning_rate), dict(learner.optimizers)
 
     def step(name: str, params: Any, gradient: Any) -> Any:
         change, optimizers[name] = optimizer.update(gradient, optimizers[name], params)
@@ -229,7 +189,7 @@ def update(
         future = jnp.min(values, axis=0) - temperature * next_log
     else:
         future = _value(config).apply(learner.target, next_observation)
-    target_value = config.reward_scale * reward + config.gamma * discount * future
+    target_value = reward + config.gamma * discount * future
 
     def critic_loss(params):
         values = critic_network.apply(params, observation, action)

@@ -19,9 +19,8 @@ from jaxba.damping import DampingPolicy, make_policy
 from jaxba.damping.learned import LearnedPolicy, boldest, learned_from, without_weights
 from jaxba.damping.policy import trained_step
 from jaxba.damping.registry import BOLD, GUARDED, LEARNED
-from jaxba.game.constant_actions import best_constant_action
 from jaxba.game.env import Game, make_game
-from jaxba.game.evaluate import Runs, Score, amounts, best_costs, evaluate, play_all, scores
+from jaxba.game.evaluate import Runs, Score, best_constant_action, best_costs, evaluate, iterations_to, play_all, scores
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks, select
 from jaxba.game.statistics import Ratio, paired_ratio
@@ -39,6 +38,9 @@ RULES = "rules.npz"
 EMBEDDED = "+embedded"
 """Ending of the name of a rule that has the embedded iterations of the agent's step."""
 
+CONSTANT = "constant action"
+"""Name of the best constant action on training scenes."""
+
 BASELINES = (
     "ceres",
     "classic",
@@ -50,6 +52,7 @@ BASELINES = (
     BOLD,
     GUARDED,
     LEARNED,
+    CONSTANT,
 )
 """What a trained policy is compared with. Without the ending, rules have plain steps of the method. `bold` is the
 smallest lambda that the game's own guard allows, with the agent's step. `guarded` and `learned` are what ships, with
@@ -61,9 +64,6 @@ TRAINED = "trained"
 WEIGHTLESS = "its weights zero"
 """Name of the trained policy without its weights (`without_weights`)."""
 
-CONSTANT = "constant action"
-"""Name of the best constant action on the training scenes, where work has a price."""
-
 
 class Comparison(NamedTuple):
     """Trained policies on the held-out scenes."""
@@ -72,8 +72,7 @@ class Comparison(NamedTuple):
     """By name: of every agent if there are several, of all agents (means) and of their twins, and of the baselines."""
 
     ratios: dict[str, Ratio]
-    """What the trained policies pay over what each other row pays, scene by scene, the geometric mean over agents:
-    prices, or iterations where work has none."""
+    """Iterations of the trained policies over those of each other row, scene by scene; geometric mean over agents."""
 
     by_agent: dict[str, list[float]]
     """The same for every agent, over its own twin."""
@@ -107,30 +106,24 @@ class Task:
 
     @cached_property
     def chosen_on(self) -> tuple[Bank, ...]:
-        """Training scenes by which policies are chosen: the first ones, as many as are held out."""
-        sizes = [
-            min(len(bank.initial_cost), len(one.initial_cost))
-            for bank, one in zip(self.game.banks, self.held_out, strict=True)
-        ]
-        return tuple(select(bank, np.arange(size)) for bank, size in zip(self.game.banks, sizes, strict=True))
+        """Training scenes by which policies are chosen (`first_scenes`)."""
+        return first_scenes(self.game.banks, self.held_out)
 
     def evaluate(self, actor: Any) -> dict[str, float]:
         """Scores of a policy by their names in the log. `training/score` chooses among policies: on training scenes,
-        the mean number of iterations, the limit for a failure, or the price. Those on held-out scenes are for the eye
-        alone."""
+        the mean number of iterations, the limit for a failure. Those on held-out scenes are for the eye alone."""
         rules = self.config.game
-        kept = "price" if rules.reward == "price" else "mean"
         found = {}
         for name, banks in (("training", self.chosen_on), ("held_out", self.held_out)):
             arguments = self.policy(actor), self.game.options, rules.tolerance, rules.max_iterations
             scored = evaluate(self.config.bank.classes, banks, *arguments)
             fields = scored._asdict()
-            found |= {f"{name}/score": fields.pop(kept)} | {f"{name}/{field}": x for field, x in fields.items()}
+            found |= {f"{name}/score": fields.pop("mean")} | {f"{name}/{field}": x for field, x in fields.items()}
         return found
 
     def compare(self, actors: Sequence[Any]) -> Comparison:
         """Trained policies and their twins without weights beside the baselines, relative to the best costs of all."""
-        game, limits = self.config.game, (self.config.game.tolerance, self.config.game.max_iterations)
+        tolerance, limit = self.config.game.tolerance, self.config.game.max_iterations
         trained = [self.policy(actor) for actor in actors]
         play = lambda policy: _play(self.config, self.held_out, {"": (policy, self.game.options)})[""]
         groups = {
@@ -139,18 +132,26 @@ class Task:
         }
         alone = {f"{name} {k + 1}": run for name, runs in groups.items() for k, run in enumerate(runs)}
         best = best_costs({**alone, **self.baseline_runs}, self.held_out)
-        found = scores(alone, self.baseline_runs, self.held_out, *limits)
+        found = scores(alone, self.baseline_runs, self.held_out, tolerance, limit)
         means = {name: [found.pop(f"{name} {k + 1}") for k in range(len(actors))] for name in groups}
         each = {f"{TRAINED} {k + 1}": one for k, one in enumerate(means[TRAINED])} if len(actors) > 1 else {}
         mean = {name: Score(*(float(x) for x in np.mean(rows, axis=0))) for name, rows in means.items()}
-        paid = lambda runs: np.log([amounts(run, best, *limits, game.reward == "price") for run in runs])
-        ours, ratios, by_agent = paid(groups[TRAINED]), {}, {}
+        taken = lambda runs: np.log([np.minimum(iterations_to(run, best, tolerance), limit) for run in runs])
+        ours, ratios, by_agent = taken(groups[TRAINED]), {}, {}
         others = {WEIGHTLESS: groups[WEIGHTLESS], **{name: [run] for name, run in self.baseline_runs.items()}}
         for name, runs in others.items():
-            theirs = paid(runs)
+            theirs = taken(runs)
             ratios[name] = paired_ratio(np.exp(ours.mean(axis=0)), np.exp(theirs.mean(axis=0)))
             by_agent[name] = [float(x) for x in np.exp(np.mean(ours - theirs, axis=1))]
         return Comparison({**each, **mean, **found}, ratios, by_agent)
+
+
+def first_scenes(training: Sequence[Bank], held_out: Sequence[Bank]) -> tuple[Bank, ...]:
+    """The first scenes of the training banks, as many of each as are held out."""
+    count = lambda bank: len(bank.initial_cost)
+    return tuple(
+        select(bank, np.arange(min(count(bank), count(other)))) for bank, other in zip(training, held_out, strict=True)
+    )
 
 
 def build(
@@ -203,17 +204,12 @@ def _baseline_runs(
     if path.is_file():
         return _read_runs(path)
     report("baselines on the held-out scenes")
-    policies = baseline_policies(config, game.options, baselines or BASELINES)
-    if config.game.reward == "price":
-        found = best_constant_action(
-            config.bank.classes,
-            game.banks,
-            config.game.agent,
-            game.options,
-            config.game.tolerance,
-            config.game.max_iterations,
-            report,
-        )
+    names = list(baselines or BASELINES)
+    policies = baseline_policies(config, game.options, [name for name in names if name != CONSTANT])
+    if CONSTANT in names:
+        rules, banks = config.game, first_scenes(game.banks, held_out)
+        limits = rules.tolerance, rules.max_iterations
+        found = best_constant_action(config.bank.classes, banks, rules.agent, game.options, *limits)
         policies[CONSTANT] = found, game.options
     runs = _play(config, held_out, policies)
     _write_runs(path, runs)
@@ -228,8 +224,8 @@ def baseline_policies(
     Args:
         config: of the run.
         options: of the agent's step.
-        names: as in `BASELINES`. Those with embedded iterations, `guarded` and `learned` are left out if the agent's
-            step has none; the rule that belongs to the method comes first.
+        names: as in `BASELINES`, without `CONSTANT`. Those with embedded iterations, `guarded` and `learned` are left
+            out if the agent's step has none; the rule that belongs to the method comes first.
     """
     plain = config.step_options
     coordinates = replace(options.coordinates, camera_damping=plain.coordinates.camera_damping)

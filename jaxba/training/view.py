@@ -82,10 +82,6 @@ class TrainingView:
 
         return Group(self._bar, self.table())
 
-    @property
-    def _paid(self) -> bool:
-        return self.config.game.reward == "price"
-
     def _yardsticks(self) -> dict[str, Any]:
         from jaxba.training.task import CONSTANT
 
@@ -110,10 +106,7 @@ class TrainingView:
         played = [row for row in self._rows if row["episodes"]]
         usual = [_mean(played, "episode/ceres")] if played and shown else []
         add("episodes of this chunk: iterations", played, "episode/length", usual)
-        fields = {"price": "price", "iterations": "mean"} if self._paid else {"iterations": "mean", "price": "price"}
-        for k, (label, field) in enumerate(fields.items()):
-            of = [getattr(one, field) for one in shown.values()]
-            add(f"held out: {label}", self._scored, f"held_out/{field if k else 'score'}", of)
+        add("held out: iterations", self._scored, "held_out/score", [one.mean for one in shown.values()])
         failures = [100 * one.failures for one in shown.values()]
         add("held out: failures (%)", self._scored, "held_out/failures", failures, 100.0)
         if len(self._past) > 1:
@@ -122,11 +115,11 @@ class TrainingView:
 
     def _held_out(self, rows: Sequence[Row]) -> str:
         values = [row["held_out/score"] for row in rows if row.get("held_out/score") is not None]
-        text = f"held out {_mean(rows, 'held_out/score'):.2f} {'plain steps paid' if self._paid else 'iterations'}"
+        text = f"held out {_mean(rows, 'held_out/score'):.2f} iterations"
         if len(rows) > 1:
             text += f" ({min(values):.2f} to {max(values):.2f})"
         text += f", p90 {_mean(rows, 'held_out/p90'):.0f}, failures {100 * _mean(rows, 'held_out/failures'):.1f} %"
-        rules = [f"{n} {one.price if self._paid else one.mean:.2f}" for n, one in self._yardsticks().items()]
+        rules = [f"{n} {one.mean:.2f}" for n, one in self._yardsticks().items()]
         if rules:
             text += f" ({', '.join(rules)})"
         if any(one.chunk == rows[0]["chunk"] for one in self.best):

@@ -58,13 +58,10 @@ class Recording:
     """Actual over predicted decrease; NaN for the start."""
 
     time_s: Float[np.ndarray, " iterations"]
-    """Seconds since the start; of an episode of the game the price of its iterations."""
+    """Seconds since the start."""
 
     source: str = ""
     """Where the problem was read."""
-
-    unit: str = "s"
-    """Of `time_s`."""
 
     @property
     def last(self) -> int:

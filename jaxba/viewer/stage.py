@@ -256,6 +256,6 @@ class Stage:
             return between.join(["start", f"cost {recording.cost[0]:.5g}", error])
         how = "" if recording.accepted[k] else ", rejected"
         cost = f"cost {recording.cost[k]:.5g}, {error}"
-        took = f"{recording.time_s[k]:.3g} {recording.unit}"
+        took = f"{recording.time_s[k]:.3g} s"
         step = f"λ {recording.damping[k]:.2g}, gain {recording.gain_ratio[k]:.2g}, {took}"
         return between.join([f"iteration {k} of {recording.last}{how}", cost, step])

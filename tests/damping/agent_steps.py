@@ -1,4 +1,4 @@
-"""Made-up steps that an agent records, for the tests of its guard, its features and its effort."""
+"""Made-up steps that an agent records, for the tests of its guard and its features."""
 
 from __future__ import annotations
 

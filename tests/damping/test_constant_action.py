@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +15,7 @@ from jaxba.damping import registry
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.features import begin
 from jaxba.damping.guard import damping_of
-from jaxba.damping.learned import ConstantAction, LearnedPolicy, boldest, without_weights
-from jaxba.damping.policy import trained_step
+from jaxba.damping.learned import ConstantAction, LearnedPolicy, without_weights
 from jaxba.solver.names import parse_solver
 
 
@@ -69,25 +67,6 @@ def test_an_action_between_the_bounds_is_played_as_it_is():
     config = AgentConfig(guard="off", low=-10.0, high=2.0)
     found = solve(hard_scene(), ConstantAction((0.25,), config), SolveOptions(max_iterations=5))
     np.testing.assert_allclose(np.log10(found.history.damping), -2.5, rtol=1e-6)
-
-
-def test_guarded_has_one_lambda_until_a_step_fails_and_the_embedded_iterations_of_the_game():
-    policy = make_policy("guarded")
-    state = begin(policy.config, info())
-    found = []
-    for accepted in (ACCEPTED, ACCEPTED, REJECTED, ACCEPTED, ACCEPTED):
-        found.append(float(jnp.log10(damping_of(policy.config, state.guard, policy.act(jnp.zeros(1))[0]))))
-        state = after(policy.config, state, accepted, found[-1])
-    np.testing.assert_allclose(found, [-8, -8, -8, -7.5, -8], atol=1e-6)
-    embedded = trained_step(make_policy("bold")).refinement
-    assert trained_step(policy).refinement == replace(embedded, points=1)
-
-
-def test_the_boldest_action_has_the_least_effort():
-    config = AgentConfig(effort="points+repairs")
-    assert boldest(config).action == (-1.0, -1.0, -1.0)
-    state, _ = boldest(config).init(info())
-    assert (int(state.effort.point_iterations), bool(state.effort.repairs)) == (0, False)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from support import step_info
 
 from jaxba import Ceres
 from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.guard import FIRST_DAMPING, OVERDAMPED_DECREASE, OVERDAMPED_FRACTION
+from jaxba.damping.guard import OVERDAMPED_DECREASE, OVERDAMPED_FRACTION
+from jaxba.damping.guarded import FIRST_DAMPING
 from jaxba.game.env import _rule_damping
 
 
@@ -105,7 +106,7 @@ def test_what_is_demonstrated_is_ceres_rule_after_any_steps(steps):
     memory = begin(FREE, info())
     state, damping = Ceres().init(info())
     for accepted, gain in steps:
-        np.testing.assert_allclose(float(_rule_damping(memory.guard)), np.log10(damping), atol=1e-6)
+        np.testing.assert_allclose(float(_rule_damping(memory)), np.log10(damping), atol=1e-6)
         gain = gain if accepted else -gain
         step = step_info(accepted, gain, damping, cost=1.0, previous_cost=1.5 if accepted else 1.0, candidate_cost=2.0)
         state, damping = Ceres().propose(state, step)
@@ -139,7 +140,7 @@ def test_guarded_lambda_never_falls_after_a_rejection(patience, steps):
         now = decades(config, memory, wish)
         assert config.low - 1e-6 <= now <= 32 + 1e-6
         if rejected:
-            assert now > last
+            assert now > last or now > 32 - 1e-6  # the bound of every lambda
         memory = after(config, memory, accepted, now)
         last, rejected = now, not accepted
 
@@ -173,7 +174,7 @@ def test_lambda_does_not_fall_after_an_inexact_step_that_it_hardly_changed():
         np.testing.assert_allclose(decades(config, memory, -1), lowest, atol=1e-6)
         np.testing.assert_allclose(decades(config, memory, 1), config.high, atol=1e-6)
     rejected = after(config, begin(config, info()), REJECTED, -5.0, damping_fraction=0.0, forcing=0.1)
-    assert not rejected.guard.inexact
+    np.testing.assert_allclose(decades(config, rejected, -1), -4.5, atol=1e-6)  # for the rejection alone
 
 
 def test_lambda_falls_from_one_iteration_to_the_next_by_so_many_decades_at_most():

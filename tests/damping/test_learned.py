@@ -36,7 +36,7 @@ AGENT = AgentConfig(history=2, low=-10.0, high=2.0, first_low=-10.0, descent=50.
 def random_policy(seed: int, agent: AgentConfig = AGENT, width: int = 16, spread: float = 1.0) -> LearnedPolicy:
     """Two hidden layers of noise; its actions are anything in (-1, 1)."""
     rng = np.random.default_rng(seed)
-    sizes = [observation_size(agent), width, width, 2 * agent.action_size]
+    sizes = [observation_size(agent), width, width, 2]
     layers = [
         Layer(
             (spread * rng.normal(size=(a, b)) * np.sqrt(2 / a)).astype(np.float32),
@@ -115,6 +115,7 @@ BAD = {
     "no json": (GOOD, _facts(agent="{"), "cannot be used"),
     "json, but no settings": (GOOD, _facts(agent="[1, 2]"), "cannot be used"),
     "unknown setting": (GOOD, _agent(colour="red"), "colour"),
+    "actions of earlier versions": (GOOD, _agent(effort="points+repairs"), "more than lambda"),
     "unknown observation": (GOOD, _agent(observation="everything"), "observation"),
     "wrong type": (GOOD, _agent(history="5"), "history"),
     "not a number": (GOOD, _agent(escalate=float("nan")), "escalate"),
@@ -195,7 +196,7 @@ def test_every_shipped_policy_can_be_used_and_is_small():
     assert {path.name for path in shipped} >= set(registry.SHIPPED.values())
     for path in shipped:
         assert path.stat().st_size <= LARGEST_FILE
-        assert load_policy(path).config.guarded
+        assert load_policy(path).config.guard == "hand-over"
 
 
 # The network

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy import stats
 from scipy.spatial.transform import Rotation
 from support import same_bits, solve
 from tiny_game import AGENT, KIND, RULES, grid, problem_of, tiny_bank, tiny_game
@@ -23,9 +22,18 @@ from jaxba import StepOptions, make_method, make_policy
 from jaxba.damping.clock import duration
 from jaxba.damping.features import begin, observation_size, observe
 from jaxba.damping.guard import damping_of
-from jaxba.damping.learned import Layer, LearnedPolicy
+from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
 from jaxba.game.env import POINT_ITERATION_COST, Game, GameConfig
-from jaxba.game.evaluate import evaluate, play_all, score, scores
+from jaxba.game.evaluate import (
+    CONSTANT_ACTIONS,
+    best_constant_action,
+    evaluate,
+    paired_ratio,
+    play_all,
+    score,
+    scores,
+)
+from jaxba.game.groups import GROUP, step_groups
 from jaxba.game.protocol import Environment
 from jaxba.game.random_scenes import (
     MIN_VIEWS,
@@ -36,7 +44,7 @@ from jaxba.game.random_scenes import (
     _angle_axis,
     make_scenes,
 )
-from jaxba.game.rollout import GROUP, Trajectories, play, step_groups
+from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, select
 from jaxba.game.scene_layout import class_layout, with_scene
 from jaxba.lm.records import LMState
@@ -240,7 +248,7 @@ def test_costs_start_at_the_start_never_rise_and_stay_after_the_end():
     np.testing.assert_array_equal(found.costs[:, 0], bank.initial_cost)
     assert (np.diff(found.costs, axis=1) <= 0).all()
     ends = 0
-    for costs, dampings, count, converged, _ in zip(*found, strict=True):
+    for costs, dampings, count, converged in zip(*found, strict=True):
         assert 1 <= count <= LIMIT
         assert converged or count == LIMIT
         assert (costs[count:] == costs[count]).all()
@@ -301,9 +309,9 @@ def _host(tree):
 
 
 @functools.cache
-def random_game(limit_is_failure: bool):
+def random_game():
     """What happens in 50 steps of random actions: pairs of the state before and the step, all on the host."""
-    game = tiny_game(replace(RULES, limit_is_failure=limit_is_failure), ENVS)
+    game = tiny_game(RULES, ENVS)
     state, seen = _jitted_reset(game, jax.random.key(3))
     found = []
     for action in actions(50):
@@ -315,7 +323,7 @@ def random_game(limit_is_failure: bool):
 
 
 def test_the_game_keeps_the_contract_of_an_environment():
-    game, found = random_game(False)
+    game, found = random_game()
     assert isinstance(game, Environment)
     assert (game.num_envs, game.observation_size, game.action_size) == (ENVS, observation_size(AGENT) + 1, 1)
     assert game.privileged_size == 1
@@ -326,29 +334,27 @@ def test_the_game_keeps_the_contract_of_an_environment():
 
 
 def test_fifty_random_actions_leave_everything_finite():
-    for _, found in (random_game(False), random_game(True)):
-        for before, seen, _, step in found:
-            leaves = jax.tree.leaves((before.episodes, seen, step))
-            assert all(np.isfinite(x).all() for x in leaves if np.issubdtype(x.dtype, np.inexact))
+    for before, seen, _, step in random_game()[1]:
+        leaves = jax.tree.leaves((before.episodes, seen, step))
+        assert all(np.isfinite(x).all() for x in leaves if np.issubdtype(x.dtype, np.inexact))
 
 
-@pytest.mark.parametrize("limit_is_failure", [False, True])
-def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else(limit_is_failure):
+def test_an_episode_ends_at_the_goal_or_at_the_limit_and_nowhere_else():
     """The cost after the action is that of `lm_step` on the scene alone, taken once more."""
-    game, found = random_game(limit_is_failure)
+    game, found = random_game()
     bank = tiny_bank()
     goals = limits = 0
     for k, (before, _, action, step) in enumerate(found):
         (episodes,) = before.episodes
         best = np.asarray(bank.best_cost)[episodes.scene]
         cost = np.array([_alone(game, episodes, action, e) for e in range(ENVS)]) if k < 12 else None
-        at_limit = episodes.memory.guard.iteration + 1 >= RULES.max_iterations
+        at_limit = episodes.memory.iteration + 1 >= RULES.max_iterations
         success = step.metrics["success"] > 0
         if cost is not None:
             np.testing.assert_array_equal(success, cost <= best * (1 + RULES.tolerance))
-        np.testing.assert_array_equal(step.terminated, success | (at_limit if limit_is_failure else False))
-        np.testing.assert_array_equal(step.truncated, False if limit_is_failure else at_limit & ~success)
-        np.testing.assert_array_equal(step.metrics["length"], episodes.memory.guard.iteration + 1)
+        np.testing.assert_array_equal(step.terminated, success | at_limit)
+        assert not step.truncated.any()
+        np.testing.assert_array_equal(step.metrics["length"], episodes.memory.iteration + 1)
         goals, limits = goals + success.sum(), limits + (at_limit & ~success).sum()
     assert goals >= 5
     assert limits >= 5
@@ -366,7 +372,7 @@ def _alone(game: Game, episodes, action, e: int) -> float:
 
 
 def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_is_the_true_one():
-    game, found = random_game(False)
+    game, found = random_game()
     starts = {}
     for scene in range(len(tiny_bank().initial_cost)):
         episode = game.start(game.banks[0], jnp.asarray(scene, jnp.int32))
@@ -392,7 +398,7 @@ def test_after_the_end_the_next_observation_is_of_a_new_start_and_the_final_one_
                 np.testing.assert_allclose(step.final_observation[e, -1], decades, atol=1e-4)
         if k + 1 < len(found):
             (following,) = found[k + 1][0].episodes
-            assert (following.memory.guard.iteration[done] == 0).all()
+            assert (following.memory.iteration[done] == 0).all()
             np.testing.assert_array_equal(
                 following.state.cost[done], np.asarray(tiny_bank().initial_cost)[following.scene[done]]
             )
@@ -441,7 +447,7 @@ def test_rewards_are_those_of_the_contract(config):
         step = step_info(True, cost=cost, previous_cost=before)
         found = game._reward(
             step,
-            memory._replace(guard=memory.guard._replace(iteration=jnp.asarray(iteration, jnp.int32))),
+            memory._replace(iteration=jnp.asarray(iteration, jnp.int32)),
             jnp.asarray(best),
             jnp.asarray(success),
         )
@@ -466,7 +472,7 @@ def test_a_point_iteration_costs_a_tenth_of_a_linear_solve():
 
 def test_the_game_pays_what_it_says():
     """The rewards of the compiled game, from the costs in its own states."""
-    game, found = random_game(False)
+    game, found = random_game()
     checked = 0
     for k in range(len(found) - 1):
         before, _, _, step = found[k]
@@ -482,7 +488,7 @@ def test_the_game_pays_what_it_says():
 
 
 def test_the_same_key_and_actions_give_the_same_numbers_and_the_game_is_traced_once():
-    game, found = random_game(False)
+    game, found = random_game()
     traced = _jitted_step._cache_size()
     state, _ = _jitted_reset(game, jax.random.key(3))
     for action, (before, _, _, step) in zip(actions(50), found, strict=True):
@@ -546,8 +552,7 @@ def test_reaching_a_cost_is_counted_from_the_start():
 
 def test_a_score_is_what_numpy_makes_of_the_iterations():
     costs = np.array([[8.0, 4.0, 2.0, 1.0, 1.0], [8.0, 1.0, 1.0, 1.0, 1.0], [8.0, 7.0, 6.0, 5.0, 5.0]])
-    paid = np.array([[0.0, 1.5, 3.0, 4.5, 6.0], [0.0, 2.0, 4.0, 4.0, 4.0], [0.0, 1.0, 2.0, 3.0, 4.5]])
-    run = Trajectories(costs, costs[:, 1:], np.array([4, 2, 4]), np.array([True, True, False]), paid)
+    run = Trajectories(costs, costs[:, 1:], np.array([4, 2, 4]), np.array([True, True, False]))
     found = score([run, run], [np.ones(3), np.array([4.0, 1.0, 5.0])], 1e-3, 4)
     there = np.array([3, 1, 4, 1, 1, 3])  # the third never gets there: the limit
     np.testing.assert_allclose(found.mean, there.mean())
@@ -557,7 +562,27 @@ def test_a_score_is_what_numpy_makes_of_the_iterations():
     np.testing.assert_allclose(found.failures, 1 / 6)
     np.testing.assert_allclose(found.to_convergence, 2 * (4 + 2 + 4) / 6)
     np.testing.assert_allclose(found.end, np.median([0, 0, 4, -0.75, 0, 0]))
-    np.testing.assert_allclose(found.price, stats.gmean([4.5, 2, 4.5, 1.5, 2, 3]))
+
+
+def test_a_paired_ratio_is_the_geometric_mean_with_the_interval_of_its_standard_error():
+    rng = np.random.default_rng(0)
+    theirs = rng.lognormal(size=400)
+    np.testing.assert_allclose(paired_ratio(0.9 * theirs, theirs), 0.9)
+    noise = rng.normal(scale=0.3, size=400)
+    found = paired_ratio(theirs * np.exp(noise), theirs)
+    np.testing.assert_allclose(found.mean, np.exp(noise.mean()))
+    half = 1.96 * noise.std() / np.sqrt(400)
+    np.testing.assert_allclose(np.log([found.low, found.high]), noise.mean() + np.array([-half, half]), atol=0.2 * half)
+
+
+def test_the_best_constant_action_has_the_fewest_iterations():
+    bank = tiny_bank()
+    best = best_constant_action([KIND], [bank], AGENT, StepOptions(), 1e-3, LIMIT)
+    means = [
+        evaluate([KIND], [bank], ConstantAction((action,), AGENT), StepOptions(), 1e-3, LIMIT).mean
+        for action in CONSTANT_ACTIONS
+    ]
+    assert means[CONSTANT_ACTIONS.index(best.action[0])] == min(means) < max(means)
 
 
 def test_an_evaluation_is_the_score_of_playing():

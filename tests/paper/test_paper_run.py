@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from jaxba.cli.paper import run
-from jaxba.game import rollout, scene_bank
+from jaxba.game import groups, rollout, scene_bank
 from jaxba.paper.report import CLAIMS
 from jaxba.paper.store import PLAYS
 from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
@@ -68,7 +68,7 @@ def finished(settings, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("paper") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("JAXBA_DATA", raising=False)
-        patch.setattr(rollout, "LANES", rollout.GROUP)
+        patch.setattr(rollout, "LANES", groups.GROUP)
         patch.setattr(scene_bank, "PORTFOLIO", ("ceres",))  # every rule needs its own compiled program
         assert run(command(settings, folder)) == 0
     return folder
@@ -113,7 +113,7 @@ def test_a_second_call_computes_nothing(finished, settings, capsys):
 
 @pytest.mark.parametrize("lost", [0, 2])
 def test_only_a_missing_record_is_computed_again(finished, settings, capsys, lost, monkeypatch):
-    monkeypatch.setattr(rollout, "LANES", rollout.GROUP)
+    monkeypatch.setattr(rollout, "LANES", groups.GROUP)
     lines = (finished / PLAYS).read_text().splitlines(keepends=True)
     (finished / PLAYS).write_text("".join(line for k, line in enumerate(lines) if k != lost))
     assert run(command(settings, finished)) == 0

@@ -62,7 +62,7 @@ def test_the_derivative_of_the_next_cost_is_that_by_finite_differences(scene, ac
     expected = (next_cost(episode, action + h) - next_cost(episode, action - h)) / (2 * h)
     assert float(change) == pytest.approx(next_cost(episode, action), abs=1e-9)
     assert float(slope) == pytest.approx(expected, rel=1e-4, abs=1e-6)
-    assert int(after.memory.guard.iteration) == 2
+    assert int(after.memory.iteration) == 2
     assert float(step.damping) == pytest.approx(10 ** (-2 + 4 * action))
 
 

@@ -109,7 +109,6 @@ def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how
         "initial_state",
         "problem_info",
         "begin",
-        "effort_of",
         "propose",
         "try_step",
         "try_candidate",

@@ -12,16 +12,12 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from jaxba import BundleProblem, ProblemError, SolveOptions, build_layout
-from jaxba.damping.agent_config import AgentConfig
-from jaxba.damping.learned import ConstantAction
-from jaxba.lm.records import Prices
-from jaxba.problem.options import LinearSolver, StepOptions
+from jaxba import BundleProblem, ProblemError, build_layout
+from jaxba.problem.options import StepOptions
 from jaxba.scenes import SceneConfig, random_scene
 from jaxba.solver import choose, cost_model
 from jaxba.solver.choose import choose_linear_solver
-from jaxba.solver.cost_model import count_pairs, predict, prices
-from jaxba.solver.prepare import set_up
+from jaxba.solver.cost_model import count_pairs, predict
 
 SEQUENCE = SceneConfig(
     cameras=300, points=6000, observations=24000, max_depth=10.0, gap_share=0.0, trajectory="lateral"
@@ -151,32 +147,6 @@ def test_a_solver_without_the_memory_for_it_is_not_chosen(monkeypatch):
     costs = predict(problem)
     assert costs.explicit == costs.sparse == np.inf
     assert choose_linear_solver(problem, StepOptions(), "auto").linear_solver == "implicit"
-
-
-# Prices
-
-
-def test_embedded_iterations_are_cheap_where_the_linear_solve_is_not():
-    """Forty cameras that see all points: the more cameras, the dearer the solve beside work on each observation."""
-    linear: LinearSolver = "explicit"
-    few, many = (prices(problem_of(cameras, 200, seed=0), StepOptions(linear_solver=linear)) for cameras in (6, 120))
-    assert all(cheap < dear for cheap, dear in zip(many[:3], few[:3], strict=True))
-    assert all(0 < x < 1 for x in (*few, *many))
-
-
-def test_a_policy_that_observes_prices_is_told_those_of_the_problem_and_others_none():
-    problem = support.tiny()
-    agent = AgentConfig(effort="points+repairs")
-    told = set_up(problem, ConstantAction((0.0, 0.0, 0.0), agent)).prices
-    expected = prices(problem, set_up(problem, "ceres").options)
-    np.testing.assert_allclose(told, expected)
-    assert not np.allclose(told, Prices())
-    for policy in ("ceres", ConstantAction((0.0,), AgentConfig())):
-        np.testing.assert_allclose(set_up(problem, policy).prices, Prices())
-
-
-def test_the_prices_of_methods_are_the_usual_ones():
-    assert prices(support.tiny(), set_up(support.tiny(), "ceres", SolveOptions(method="stba")).options) == Prices()
 
 
 def test_observations_that_a_gpu_cannot_hold_are_refused_with_the_arithmetic(monkeypatch):

@@ -60,7 +60,18 @@ def test_a_file_may_extend_a_preset_and_overrides_win_over_both(tmp_path):
 
 def test_the_preset_of_the_paper_is_the_papers_setting():
     found = load("paper")
-    assert found.sac == SacConfig.paper()
+    assert found.sac == SacConfig(
+        variant="value",
+        width=256,
+        actor_layers=3,
+        layer_norm=False,
+        tau=1.0,
+        target_every=5,
+        initial_temperature=1.0,
+        learn_temperature=False,
+        log_std_min=-20.0,
+        privileged=False,
+    )
     assert found.bank.classes == (SceneClass(10, 10, "paper"),)
     agent = found.game.agent
     assert (agent.observation, agent.guard, agent.refine_points) == ("paper", "off", 0)
@@ -91,13 +102,13 @@ def test_overrides_are_yaml():
             "bank.classes=[{cameras: 6, points: 20}, {cameras: 8, points: 30, family: wide}]",
             "bank.scenes=[10, 20]",
             "envs=[3, 4]",
-            "sac.max_grad_norm=null",
+            "sac.target_entropy=null",
             "sac.learn_temperature=false",
             "sac.gamma=1",
         ],
     )
     assert found.bank.classes == (SceneClass(6, 20), SceneClass(8, 30))
-    assert (found.envs, found.sac.max_grad_norm, found.sac.learn_temperature) == ((3, 4), None, False)
+    assert (found.envs, found.sac.target_entropy, found.sac.learn_temperature) == ((3, 4), None, False)
     assert isinstance(found.sac.gamma, float)
 
 
@@ -127,10 +138,7 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("bank.dtype=64", "bank.dtype must be text, is 64"),
         ("envs=64", "envs must be a list, is 64"),
         ("envs=[a]", "envs[0] must be a whole number, is 'a'"),
-        (
-            "game.reward=fun",
-            "game.reward must be one of duration, constant, reduction, reversed, price, clock, is 'fun'",
-        ),
+        ("game.reward=fun", "game.reward must be one of duration, constant, reduction, reversed, clock, is 'fun'"),
         ("sac.width=[", "not YAML"),
         ("sac.width", "must be key=value"),
         ("chunks=0", "chunks must be at least 1, not 0"),
@@ -147,7 +155,6 @@ def test_the_word_off_is_a_guard_and_no_truth_value(tmp_path):
         ("sac.gamma=1.5", "sac.gamma must lie in (0, 1]"),
         ("sac.learning_rate=0", "sac.learning_rate must be positive"),
         ("sac.log_std_min=1", "sac.log_std_min must be negative"),
-        ("sac.max_grad_norm=-1", "sac.max_grad_norm must be positive or null"),
         ("bank.refine_points=-1", "bank: refine_points must be at least 0, is -1"),
         ("bank.warm_share=2", "bank: warm_share must be 0 to 1, is 2"),
         ("game.tolerance=100", "game: tolerance must be below 1, is 100"),

@@ -16,7 +16,6 @@ import toys
 from jaxba.damping import ProblemInfo
 from jaxba.game.random_scenes import Scenes
 from jaxba.game.scene_bank import Bank, Split
-from jaxba.lm.records import Prices
 from jaxba.training import checkpoint, driver, log, task
 from jaxba.training.checkpoint import CheckpointError
 from jaxba.training.config import TrainConfig, load
@@ -341,8 +340,7 @@ def test_banks_survive_their_file(tmp_path):
             jnp.ones((count, 9, 4)), jnp.ones((count, 3, 11)), jnp.ones((count, 2, 44)), jnp.ones((count, 44), bool)
         )
         whole = number.astype(jnp.int32)
-        prices = Prices(number, 2 * number, 3 * number, 4 * number)
-        info = ProblemInfo(number, whole, whole, whole, number, number, whole, prices)
+        info = ProblemInfo(number, whole, whole, whole, number, number, whole)
         return Bank(scenes, number, 2 * number, info, number)
 
     splits = [Split(bank(5), bank(2)), Split(bank(3), bank(1))]

@@ -9,18 +9,20 @@ import pytest
 from jaxba import make_policy
 from jaxba.damping.learned import boldest
 from jaxba.training.config import load
-from jaxba.training.task import BASELINES, baseline_policies
+from jaxba.training.task import BASELINES, CONSTANT, baseline_policies
+
+NAMES = tuple(name for name in BASELINES if name != CONSTANT)
 
 
 def found(preset: str, *overrides: str):
     config = load(preset, overrides)
     options = config.game.agent.step_options(config.step_options)
-    return config, options, baseline_policies(config, options, BASELINES)
+    return config, options, baseline_policies(config, options, NAMES)
 
 
 def test_rules_have_plain_steps_or_the_agents_embedded_iterations():
     config, options, policies = found("default")
-    assert tuple(policies) == BASELINES
+    assert tuple(policies) == NAMES
     assert policies["ceres"] == (make_policy("ceres"), config.step_options)
     assert policies["ceres+embedded"] == (make_policy("ceres"), options)
     assert policies["constant:1e-8+embedded"] == (make_policy("constant:1e-8"), options)
@@ -47,4 +49,4 @@ def test_without_embedded_iterations_only_plain_steps_and_bold_are_left():
 
 
 def test_the_rule_of_the_method_comes_first():
-    assert list(found("default", "method=stba")[2]) == ["stba", *BASELINES]
+    assert list(found("default", "method=stba")[2]) == ["stba", *NAMES]

@@ -10,21 +10,18 @@ from dataclasses import replace
 import browser
 import numpy as np
 import pytest
-import support
 from rich.console import Console
 
-from jaxba import BundleProblem
 from jaxba.bench import training_page
 from jaxba.bench.tables import Table
-from jaxba.game.episode import Episode
 from jaxba.game.evaluate import Score
-from jaxba.lm.records import StepInfo
+from jaxba.game.rollout import Trajectories
 from jaxba.training.config import load
 from jaxba.training.view import TrainingView
 
 RULES = {
-    "ceres": Score(6.0, 5.5, 6.0, 9.0, 0.02, 12.0, 1e-3, 8.25),
-    "ceres+embedded": Score(5.0, 4.5, 5.0, 7.0, 0.0, 10.0, 1e-4, 5.75),
+    "ceres": Score(6.0, 5.5, 6.0, 9.0, 0.02, 12.0, 1e-3),
+    "ceres+embedded": Score(5.0, 4.5, 5.0, 7.0, 0.0, 10.0, 1e-4),
 }
 
 
@@ -35,7 +32,7 @@ def rows(chunk: int, scores: tuple[float, ...] | None = None) -> list[dict]:
         row = {"seed": k, "chunk": chunk, "updates": 8 * chunk, "wall_s": 1.5 * chunk, "episodes": 4.0}
         row |= {"steps_per_s": 1234.0, "updates_per_s": 56.0, "episode/length": 5.0 + k, "episode/ceres": 7.5}
         if scores:
-            row |= {"held_out/score": scores[k], "held_out/mean": 4.0, "held_out/p90": 6.0, "held_out/failures": 0.01}
+            row |= {"held_out/score": scores[k], "held_out/p90": 6.0, "held_out/failures": 0.01}
         found.append(row)
     return found
 
@@ -53,7 +50,6 @@ def shown(console: Console, drawn) -> str:
 
 def test_a_terminal_shows_speed_spread_and_yardsticks(config):
     console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
-    assert config.game.reward == "price"
     with TrainingView(console, config) as view:
         view.rules = RULES
         for chunk, scores in ((1, (5.0, 6.0, 7.0)), (2, (3.0, 4.0, 5.5))):
@@ -62,8 +58,7 @@ def test_a_terminal_shows_speed_spread_and_yardsticks(config):
     assert "chunk 2/4" in text
     assert "1234 steps/s, 56 updates/s" in text
     lines = {line.split("  ")[0]: line for line in text.splitlines()}
-    price = lines["held out: price"]
-    assert re.findall(r"[\d.]+", price) == ["4.17", "3.00", "5.50", "8.25", "5.75"]
+    assert re.findall(r"[\d.]+", lines["held out: iterations"]) == ["4.17", "3.00", "5.50", "6.00", "5.00"]
     assert re.findall(r"[\d.]+", lines["episodes of this chunk: iterations"]) == ["6.00", "5.00", "7.00", "7.50"]
     assert re.findall(r"[\d.]+", lines["held out: failures (%)"])[0] == "1.00"
     assert "█▁" in text
@@ -76,25 +71,19 @@ def test_elsewhere_every_chunk_is_a_line(config):
         view.rows(rows(1, (5.0, 6.0, 7.0)))
     lines = file.getvalue().splitlines()
     assert lines[0] == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), 2 s"
-    assert lines[1].startswith("chunk 1/4: held out 6.00 plain steps paid (5.00 to 7.00)")
+    assert lines[1].startswith("chunk 1/4: held out 6.00 iterations (5.00 to 7.00)")
 
 
-def episode(count: int) -> Episode:
-    """An episode of so many iterations, the second of which is rejected."""
-    step = lambda k: support.step_info(k != 1, damping=10.0**-k)._replace(point_iterations=k, repairs=k)
-    steps, paid = StepInfo.stacked([step(k) for k in range(count)]), np.arange(count + 1.0)
-    problem = BundleProblem.create(np.zeros((2, 9)), np.zeros((1, 3)), np.zeros((2, 2)), np.arange(2), np.zeros(2, int))
-    cameras, points = np.zeros((count + 1, 2, 9)), np.zeros((count + 1, 1, 3))
-    return Episode(problem, cameras, points, 8.0 - paid, paid, steps, True)
+COSTS = 8.0 - np.tile([0, 1, 1, 2, 3, 4, 5, 6], (2, 1))
+"""Of two episodes, of five and seven iterations; the second of each is rejected."""
 
-
-EPISODES = [episode(5), episode(7)]
+EPISODES = Trajectories(COSTS, 10.0 ** -COSTS[:, 1:], np.array([5, 7]), np.array([True, True]))
 
 
 def page_of() -> str:
     log = [*rows(1), *rows(2, (5.0, 6.0, 7.0)), *rows(3), *rows(4, (3.0, 4.0, 5.5))]
     table = Table("Scores", ("policy", "mean"), [("trained", "4.17"), ("<b>", "1")], "")
-    return training_page.to_html(log, RULES, table, EPISODES, {"command": "jaxba-train <x>"}, paid=True)
+    return training_page.to_html(log, RULES, table, EPISODES, {"command": "jaxba-train <x>"})
 
 
 def test_the_page_has_mean_range_yardsticks_and_the_policys_lambda():
@@ -104,15 +93,15 @@ def test_the_page_has_mean_range_yardsticks_and_the_policys_lambda():
     assert '<tr data-key="trained">' in text
     book = json.loads(re.findall(r'id="book">(.*?)</script>', text, re.DOTALL)[0])
     charts = dict(zip(re.findall("<h3>(.*?)</h3>", text), book["charts"], strict=True))
-    low, high, *_ = price = charts["price"]["data"]
+    low, high, *_ = mean = charts["mean iterations"]["data"]
     assert [low["y"], high["y"]] == [[5.0, 3.0], [7.0, 5.5]]
-    mean = next(trace for trace in price if trace.get("name") == "trained")
-    assert mean["x"] == {"updates": [16, 32], "seconds": [3.0, 6.0]}
-    np.testing.assert_allclose(mean["y"], [6.0, 12.5 / 3], rtol=1e-6)
-    ceres = next(trace for trace in price if trace.get("name") == "ceres")
-    assert ceres["y"] == [8.25, 8.25]
-    for trace, one in zip(charts["damping λ"]["data"], EPISODES, strict=True):
-        np.testing.assert_allclose(trace["y"], one.steps.damping, rtol=1e-6)
+    trained = next(trace for trace in mean if trace.get("name") == "trained")
+    assert trained["x"] == {"updates": [16, 32], "seconds": [3.0, 6.0]}
+    np.testing.assert_allclose(trained["y"], [6.0, 12.5 / 3], rtol=1e-6)
+    ceres = next(trace for trace in mean if trace.get("name") == "ceres")
+    assert ceres["y"] == [6.0, 6.0]
+    for trace, row, count in zip(charts["damping λ"]["data"], EPISODES.dampings, (5, 7), strict=True):
+        np.testing.assert_allclose(trace["y"], row[:count], rtol=1e-6)
         assert [k for k, symbol in enumerate(trace["marker"]["symbol"]) if symbol.endswith("-open")] == [1]
 
 
@@ -123,7 +112,7 @@ def test_the_page_is_drawn_without_errors_and_without_the_network(tmp_path):
     with browser.chromium() as page:
         page.get(path.as_uri())
         count = page.execute_script("return document.querySelectorAll('.scatterlayer .trace').length")
-        assert count > 5 * len(EPISODES)
+        assert count > 2 * len(EPISODES.iterations)
         title = "return document.querySelector('.xtitle').textContent"
         assert page.execute_script(title) == "gradient updates"
         page.execute_script("document.querySelector('[data-axis=seconds]').click()")

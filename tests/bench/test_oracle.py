@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxba.game.oracle import beam_search
+from benchmarks.oracle import beam_search
 from jaxba.lm.records import LMState
 
 pytestmark = pytest.mark.slow
