@@ -24,15 +24,7 @@ from jaxba.damping.features import begin, observation_size, observe
 from jaxba.damping.guard import damping_of
 from jaxba.damping.learned import ConstantAction, Layer, LearnedPolicy
 from jaxba.game.env import POINT_ITERATION_COST, Game, GameConfig
-from jaxba.game.evaluate import (
-    CONSTANT_ACTIONS,
-    best_constant_action,
-    evaluate,
-    paired_ratio,
-    play_all,
-    score,
-    scores,
-)
+from jaxba.game.evaluate import CONSTANT_ACTIONS, best_constant_action, evaluate, play_all, score, scores
 from jaxba.game.groups import GROUP, step_groups
 from jaxba.game.protocol import Environment
 from jaxba.game.random_scenes import (
@@ -47,6 +39,7 @@ from jaxba.game.random_scenes import (
 from jaxba.game.rollout import Trajectories, play
 from jaxba.game.scene_bank import Bank, info_of, initial_costs, reach, select
 from jaxba.game.scene_layout import class_layout, with_scene
+from jaxba.game.statistics import paired_ratio
 from jaxba.lm.records import LMState
 from jaxba.lm.step import lm_step
 from jaxba.problem import geometry
