@@ -6,6 +6,8 @@ Imports inside of functions and those for type checkers count as well.
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -30,6 +32,12 @@ NO_MORE_THAN = {
     "kitti": {"typing", "runtime", "problem", "io"},
 }
 """Rooms that know less than all that stand before them."""
+
+LABORATORY = {"methods", "kitti", "game", "training", "peers", "bench", "paper"}
+"""Rooms that ask rather than solve. The library, which is all else, imports nothing of them."""
+
+LABORATORY_COMMANDS = {f"jaxba.cli.{name}" for name in ("bench", "train", "kitti", "paper", "episode")}
+"""Modules of commands that belong to them."""
 
 PACKAGE = Path(jaxba.__file__).parent
 SOURCES = {
@@ -74,6 +82,24 @@ def turned_arrows(room: str, sources: dict[str, str]) -> list[str]:
 @pytest.mark.parametrize("room", ORDER)
 def test_a_room_knows_nothing_of_those_above(room):
     assert turned_arrows(room, SOURCES) == []
+
+
+def in_laboratory(module: str) -> bool:
+    """Whether a module belongs to the laboratory."""
+    return room_of(module) in LABORATORY or module in LABORATORY_COMMANDS
+
+
+def test_the_library_imports_nothing_of_the_laboratory():
+    library = {module: source for module, source in SOURCES.items() if not in_laboratory(module)}
+    arrows = [(module, name) for module, source in library.items() for name in imports(source) if in_laboratory(name)]
+    assert arrows == []
+
+
+def test_import_jaxba_loads_nothing_of_the_laboratory():
+    program = "import sys, jaxba; print(*(name for name in sys.modules if name.startswith('jaxba.')))"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert "jaxba.solver.solve" in loaded
+    assert [name for name in loaded if in_laboratory(name)] == []
 
 
 def test_every_room_has_its_place_in_the_order():
