@@ -98,7 +98,7 @@ class Rescue(NamedTuple):
 
 GUARDED_DECADES = -8.0
 """log10 of the lambda of `Guarded`. On 512 training scenes of a game in which every part of an iteration cost its
-work, -9 was the best constant and -8 cost 0.3% more (three seeds, docs/notebook/game.md); on real problems -8 was
+work, -9 was the best constant and -8 cost 0.3% more (three seeds); on real problems -8 was
 measured."""
 
 
