@@ -40,9 +40,9 @@ from jaxba.linear.schur import (
 from jaxba.linear.step import Step
 from jaxba.linear.two_level import Anchor
 from jaxba.lm.method import DampedSystem, MethodStep, StepMethod
-from jaxba.model import camera
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import StepOptions
+from jaxba.rotations import rotation_matrix
 from jaxba.structure.conventions import components_first
 from jaxba.structure.devices import max_over_devices, sum_over_devices
 from jaxba.structure.layout import Layout
@@ -80,13 +80,11 @@ def solve_step(
     eliminated = eliminate_points(layout, linear, damping, options)
     reduced = camera_system(layout, linear, eliminated, coordinates, damping, options)
     if options.method is None:
-        frames = camera.frames(cameras)
-        anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
+        anchor = Anchor(rotation_matrix(cameras[:3]), cameras[3:6], points)
         solved = solve_reduced(layout, linear, eliminated, reduced, anchor, options, forcing)
         solution = MethodStep(solved[0], None, solved[1], residual_orthogonal=True)
     else:
-        if previous is not None and layout.unknowns is not None:
-            previous = jnp.asarray(layout.unknowns.restricted(previous))
+        previous = None if previous is None else jnp.asarray(layout.unknowns.restricted(previous))
         system = DampedSystem(layout, linear, eliminated, reduced, damping, cameras, iteration, forcing, previous)
         solution = cast(StepMethod, options.method).solve(system, options)
     manifold_step = jnp.where(layout.camera_seen[:, None], solution.cameras, jnp.zeros_like(solution.cameras))
@@ -99,9 +97,8 @@ def solve_step(
         # d.e is not zero: `-g.d - d.H d` takes the place of d.D d, with d.H d = |J d|^2
         change = jacobian_product(layout, linear, manifold_step, point_step)
         damped = slope - sum_over_devices(layout, sum(jnp.sum(m * m) for m in change))
-    step = components_first(camera_step)
     return Step(
-        step if layout.unknowns is None else layout.unknowns.expanded(step),
+        layout.unknowns.expanded(components_first(camera_step)),
         point_step,
         slope,
         damped,

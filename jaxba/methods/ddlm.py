@@ -205,8 +205,8 @@ def _step_shared_points(
     terms = lambda views: point_terms(views, options.loss)[:10]
     *entries, before = one_pass(points, terms)
     if options.refinement.points:
-        reference = Reference(*view_terms(layout, frames, points, lambda views: point_terms(views, options.loss)[9:]))
-        previous = PreviousPoints.of(layout, points, reference)
+        own, depth = view_terms(layout, frames, points, lambda views: point_terms(views, options.loss)[9:])
+        previous = PreviousPoints.of(layout, points, Reference(own, depth))
         refined, costs = refine_points(layout, frames, points, options.loss, options.refinement.points, previous)
         costs = jnp.where(partition.is_shared, costs, before)
         return jnp.where(partition.is_shared, refined, points), total(costs)

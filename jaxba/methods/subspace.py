@@ -25,7 +25,7 @@ from jaxtyping import Float
 from jaxba.linear.cholesky import solve_positive
 from jaxba.linear.schur import apply_reduced
 from jaxba.lm.method import DampedSystem
-from jaxba.model import camera
+from jaxba.rotations import left_jacobian
 
 RIDGE = 64.0
 """Machine epsilons added to the unit diagonal of the scaled Gram matrix, whose vectors may be nearly parallel."""
@@ -81,6 +81,6 @@ def on_manifold(
     cameras: Float[Array, "parameters cameras"], changes: Float[Array, "steps parameters cameras"]
 ) -> Float[Array, "steps cameras width"]:
     """Changes of camera parameters (angle-axis rotations) as steps in manifold coordinates, to first order."""
-    jacobian = camera.left_jacobian(cameras[:3])
+    jacobian = left_jacobian(cameras[:3])
     rotations = jnp.einsum("ijc,sjc->sci", jacobian, changes[:, :3], precision="highest")
     return jnp.concatenate([rotations, jnp.moveaxis(changes[:, 3:], 1, 2)], axis=2)

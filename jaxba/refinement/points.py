@@ -35,6 +35,7 @@ from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sums
+from jaxba.structure.sharing import Mask
 
 INITIAL_DAMPING = 1e-6
 """Relative damping of a point's first step: Gauss-Newton except for parallel rays."""
@@ -122,19 +123,16 @@ def refine_points(
         found = point_terms(views, loss)
         return [*found, *((seen & (found[-1] > 0)).astype(points.dtype) for seen in front)]
 
-    free = None if layout.unknowns is None else layout.unknowns.free_points
+    free = layout.unknowns.free_points
 
     def propose(best: _Carry) -> Float[Array, "3 points"]:
-        def moved(points: Array, system: Array, damping: Array, *free: Array) -> list[Array]:
+        def moved(points: Array, system: Array, damping: Array, free: Mask) -> list[Array]:
             matrix = [entry * (1 + damping) if k in (0, 2, 5) else entry for k, entry in enumerate(system[:6])]
             factor = cholesky3(matrix)
             after = [x - d for x, d in zip(points, factor.backward(factor.forward(list(system[6:]))), strict=True)]
-            return [
-                jnp.where(moves, new, old) for moves in free for new, old in zip(after, points, strict=True)
-            ] or after
+            return [free.where(new, old) for new, old in zip(after, points, strict=True)]
 
-        constant = () if free is None else (jnp.asarray(free),)
-        return jnp.stack(compute_in_one_loop(moved, best.points, best.system, best.damping, *constant))
+        return jnp.stack(compute_in_one_loop(moved, best.points, best.system, best.damping, free))
 
     def body(carry: _Carry) -> _Carry:
         *system, costs, inverse_depth_sum = (found := one_pass(carry.trial, terms, *fronts))[:11]

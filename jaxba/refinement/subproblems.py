@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxba.model.linearize import Reference, observation_costs, slot_frames, with_prior_costs
+from jaxba.model.linearize import Reference, observation_costs, prior_costs, slot_frames
 from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import refine_from_starts
 from jaxba.refinement.points import PreviousPoints, refine_points
@@ -79,7 +79,7 @@ class Whole(NamedTuple):
     def terms(self, reference: Reference, previous: PreviousPoints, options: StepOptions) -> Float[Array, " terms"]:
         """See `Subproblems`."""
         terms = previous.costs if options.refinement.points else reference.costs
-        return terms if reference.prior_costs is None else jnp.concatenate([terms, reference.prior_costs])
+        return jnp.concatenate([terms, *reference.prior_costs])
 
     def refine(
         self,
@@ -94,7 +94,7 @@ class Whole(NamedTuple):
             points, terms = _refined(self.layout, cameras, points, previous, options, search)
         else:
             terms = observation_costs(self.layout, cameras, points, options.loss)
-        return points, with_prior_costs(self.layout, cameras, terms)
+        return points, jnp.concatenate([terms, *prior_costs(self.layout, cameras)])
 
     def sums(self, terms: Float[Array, " terms"]) -> Float[Array, ""]:
         """See `Subproblems`."""

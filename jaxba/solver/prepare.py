@@ -274,7 +274,7 @@ def write_back(
     """
     points = np.array(problem.points, np.float64)
     seen = np.flatnonzero(layout.camera_seen)  # padding cameras are not seen
-    in_rigs = layout.unknowns is not None and layout.unknowns.in_rigs
+    in_rigs = layout.unknowns.in_rigs
     cameras = np.array(in_frames(problem).cameras if in_rigs else problem.cameras, np.float64)
     cameras[seen] = items_first(np.asarray(state.cameras, np.float64))[seen]
     if problem.lenses is not None:  # unobserved cameras follow the others with their lens

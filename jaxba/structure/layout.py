@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.structure.agreement import Agreement, size_of
+from jaxba.structure.agreement import ALONE, Agreement
 from jaxba.structure.camera_clusters import ClusterLayout, cluster_layout
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.density import is_dense
@@ -92,14 +92,14 @@ class Layout(ArrayRecord):
     partitions: Partition | None
     """Random partitions of the cameras, along a leading axis; None if no method uses them."""
 
-    unknowns: Unknowns | None
-    """Camera models, and what is shared or constant; None if all numbers of all BAL cameras and points are unknown."""
+    unknowns: Unknowns
+    """Camera models, and what is shared or constant."""
 
     buckets: tuple[Bucket, ...] = field(metadata={"static": True})
     """Shape of each bucket; empty for a layout with fixed capacity."""
 
-    axis: str | None = field(default=None, metadata={"static": True})
-    """Axis of the mesh over which points are divided (structure/devices.py); None: all are here."""
+    axes: tuple[str, ...] = field(default=(), metadata={"static": True})
+    """Axis of the mesh over which points are divided (structure/devices.py); none: all are here."""
 
     @property
     def num_slots(self) -> int:
@@ -128,7 +128,7 @@ def build_layout(
     capacity: Capacity | None = None,
     fixed_intrinsics: bool = False,
     observations: ObservationOrder | None = None,
-    agreement: Agreement | None = None,
+    agreement: Agreement = ALONE,
 ) -> Layout:
     """Assigns a problem's observations to slots and builds the index arrays of their sums.
 
@@ -161,74 +161,62 @@ def build_layout(
         raise ValueError(f"the problem is larger than the capacity: {capacity}")
     cameras = problem.num_cameras if capacity is None else capacity.cameras
     observations = observations or ObservationOrder.of(problem)
-    camera, point, tracks = observations.camera, observations.point, observations.tracks
-    order, start = observations.order, observations.start
+    camera, tracks = observations.camera, observations.tracks
     seen = np.bincount(camera, minlength=cameras)
-    part = lambda name: None if agreement is None else agreement.within(name)
-    is_seen = seen > 0 if agreement is None else agreement.total("seen", seen) > 0
+    is_seen = agreement.total("seen", seen) > 0
 
-    assignment = bucket_slots(tracks, part("buckets")) if capacity is None else padded_slots(tracks, capacity)
-    slot, slot_point, empty = assignment.slot, assignment.point, assignment.empty
-    slots = len(slot_point)
-    mask = np.zeros(slots, bool)
-    mask[slot] = True
-    slot_camera = np.zeros(slots, np.int32)
-    slot_camera[slot] = camera
-    pixels = np.zeros((2, slots))
-    pixels[:, slot] = np.asarray(problem.observations)[order].T
-    whitening = None
-    if problem.whitening is not None:
-        whitening = np.zeros((2, 2, slots))
-        whitening[:, :, slot] = np.moveaxis(np.asarray(problem.whitening)[order], 0, -1)
+    slots = bucket_slots(tracks, agreement.within("buckets")) if capacity is None else padded_slots(tracks, capacity)
+    slot, empty, count = slots.slot, slots.empty, len(slots.point)
+
+    def in_slots(values: np.ndarray, dtype: type) -> np.ndarray:
+        """Values of the sorted observations, along a last axis, in their slots; zero in the others."""
+        found = np.zeros((*values.shape[:-1], count), dtype)
+        found[..., slot] = values
+        return found
+
+    of_problem = lambda values: np.moveaxis(np.asarray(values)[observations.order], 0, -1)
+    whitening = None if problem.whitening is None else in_slots(of_problem(problem.whitening), float)
     room = None if capacity is None else room_for(seen, capacity.usual_observations(len(camera)), capacity.points)
     by_camera = sorted_by(camera, cameras)
-    levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, part("cameras"))
+    levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, agreement.within("cameras"))
     camera_levels = with_spare_row(levels, empty)
-    slot_grid = None
-    columns = sum(map(len, assignment.members))
-    if pairs and factor and grid and _is_dense(camera, point, tracks, cameras, columns, agreement):
-        slot_grid = np.full((columns, cameras), empty, np.int32)
-        slot_grid[slot_point[slot], camera] = slot
-    pair_lists = None
-    members = np.concatenate([np.asarray(points) for points in assignment.members])
+    members = np.concatenate([np.asarray(points) for points in slots.members])
     unknowns = unknowns_of(problem, is_seen, members, fixed=fixed_intrinsics, agreement=agreement)
-    if pairs and slot_grid is None:
+    pair_lists = slot_grid = drawn_partitions = camera_clusters = None
+    dense = pairs and factor and grid and is_dense(observations, cameras, len(members))
+    if agreement.size("listed pairs", int(not dense)) == 0:  # in all shards or none
+        slot_grid = np.full((len(members), cameras), empty, np.int32)
+        slot_grid[slots.point[slot], camera] = slot
+    elif pairs:
         slots_by_camera = camera_levels[0].ravel()
-        sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot
+        sorted_index = np.zeros(count, np.int32)  # camera-sorted index of each slot
         sorted_index[slots_by_camera] = np.arange(len(slots_by_camera))
-        empty_index = int(sorted_index[empty])
         pair_lists = pair_layout(
             camera,
             sorted_index[slot],
             tracks,
-            start,
+            observations.start,
             cameras,
-            empty_index,
+            int(sorted_index[empty]),
             factor=factor,
-            banded=unknowns is None or unknowns.frame is None,
+            banded=not unknowns.poses.several,
             capacity=capacity,
-            agreement=part("pairs"),
+            agreement=agreement.within("pairs"),
         )
-    drawn_partitions = None
     if partitions is not None:
         if pair_lists is None:
             raise ValueError("partitions need pairs that are listed: pairs=True, factor=False")
-        drawn_partitions = partition_layout(
-            camera, point, slot, cameras, len(tracks), slot_point, empty, pair_lists, largest=partitions
-        )
-    camera_clusters = None
+        drawn_partitions = partition_layout(observations, slots, pair_lists, partitions)
     if clusters:
-        shared = None if unknowns is None or unknowns.members is None else np.asarray(unknowns.members)
-        sorted_observations = camera, point, slot, cameras, len(tracks), slot_point, empty
-        camera_clusters = cluster_layout(*sorted_observations, shared, part("clusters"))
+        camera_clusters = cluster_layout(observations, slots, unknowns.lenses, agreement.within("clusters"))
     return Layout(
-        slot_camera=slot_camera,
-        slot_point=slot_point,
-        slot_mask=mask,
-        pixels=pixels,
+        slot_camera=in_slots(camera, np.int32),
+        slot_point=slots.point,
+        slot_mask=in_slots(np.ones(len(camera)), bool),
+        pixels=in_slots(of_problem(problem.observations), float),
         whitening=whitening,
-        bucket_points=assignment.members,
-        point_levels=assignment.levels,
+        bucket_points=slots.members,
+        point_levels=slots.levels,
         camera_levels=camera_levels,
         camera_seen=is_seen,
         pairs=pair_lists,
@@ -236,7 +224,7 @@ def build_layout(
         clusters=camera_clusters,
         partitions=drawn_partitions,
         unknowns=unknowns,
-        buckets=assignment.buckets,
+        buckets=slots.buckets,
     )
 
 
@@ -245,7 +233,7 @@ def layout_for(
     options: StepOptions,
     capacity: Capacity | None = None,
     observations: ObservationOrder | None = None,
-    agreement: Agreement | None = None,
+    agreement: Agreement = ALONE,
 ) -> Layout:
     """The layout with exactly the parts that a step with these options needs. Arguments as for `build_layout`."""
     return build_layout(
@@ -259,19 +247,6 @@ def layout_for(
         observations=observations,
         agreement=agreement,
     )
-
-
-def _is_dense(
-    camera: np.ndarray,
-    point: np.ndarray,
-    tracks: np.ndarray,
-    cameras: int,
-    columns: int,
-    agreement: Agreement | None,
-) -> bool:
-    """`is_dense`, of all shards or none."""
-    own = is_dense(camera, point, tracks, cameras, columns)
-    return size_of(agreement, "listed pairs", int(not own)) == 0
 
 
 def num_partitions(layout: Layout) -> int:

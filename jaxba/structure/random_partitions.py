@@ -20,7 +20,9 @@ from jaxtyping import Bool, Int
 
 from jaxba.structure.camera_clusters import cluster_members
 from jaxba.structure.covisibility import PairLayout
+from jaxba.structure.observation_order import ObservationOrder
 from jaxba.structure.sum_trees import TREE_WIDTH, sum_tree
+from jaxba.structure.track_buckets import Slots
 from jaxba.typing import AnyArray, register_pytree
 
 PARTITIONS = 16
@@ -62,34 +64,22 @@ class Partition:
 
 
 def partition_layout(
-    camera: Int[np.ndarray, " observations"],
-    point: Int[np.ndarray, " observations"],
-    slot: Int[np.ndarray, " observations"],
-    cameras: int,
-    points: int,
-    slot_point: Int[np.ndarray, " slots"],
-    empty: int,
-    pairs: PairLayout,
-    largest: int,
-    count: int = PARTITIONS,
+    observations: ObservationOrder, slots: Slots, pairs: PairLayout, largest: int, count: int = PARTITIONS
 ) -> Partition:
     """Draws partitions of a problem.
 
     Args:
-        camera: camera of each observation; observations are sorted by point, then by camera.
-        point: point of each observation.
-        slot: slot of each observation.
-        cameras: number of cameras.
-        points: number of points.
-        slot_point: point of each slot, in layout order.
-        empty: an empty slot.
+        observations: of the problem.
+        slots: of the observations.
         pairs: pairs of the same problem, not banded.
         largest: largest number of cameras in a cluster.
         count: number of partitions; only one is drawn if all cameras fit in one cluster.
     """
     from jaxba.structure.louvain import camera_graph, clusterings  # SciPy: its import takes 0.2 s
 
-    graph = camera_graph(camera, point, cameras, points)
+    camera, point, cameras = observations.camera, observations.point, observations.num_cameras
+    slot, slot_point, empty = slots.slot, slots.point, slots.empty
+    graph = camera_graph(camera, point, cameras, len(observations.tracks))
     if cameras <= largest:
         labels = np.zeros((1, cameras), int)
     else:
