@@ -8,7 +8,6 @@ scattered.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -130,7 +129,7 @@ def pair_layout(
     if capacity is not None:
         listed = np.tril_indices(cameras)
     listed = np.maximum(*listed) * np.int64(cameras) + np.minimum(*listed)
-    keys, counts, order = _BlockList.of(rows, columns, cameras, listed)
+    keys, counts, order = _sorted_by_block(rows, columns, cameras, listed)
     room = Exact.of(counts) if capacity is None else room_for(counts, capacity.pairs, capacity.points)
     largest = PAIR_BATCH if capacity is None else -(-PAIR_BATCH // 2)  # smaller ones, of which the last is rarely full
 
@@ -276,42 +275,30 @@ def _since(marks: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     return np.arange(len(marks)) - np.repeat(first, np.diff(first, append=len(marks)))
 
 
-class _BlockList(NamedTuple):
-    """The non-zero blocks of the lower triangle, and the pairs that add to them."""
+def _sorted_by_block(
+    rows: Int[np.ndarray, " pairs"],
+    columns: Int[np.ndarray, " pairs"],
+    cameras: int,
+    listed: Int[np.ndarray, " more"],
+) -> tuple[Int[np.ndarray, " blocks"], Int[np.ndarray, " blocks"], Int[np.ndarray, " pairs"]]:
+    """Keys `row * cameras + column` of non-zero blocks, sorted, their numbers of pairs, and pairs sorted by block.
 
-    keys: Int[np.ndarray, " blocks"]
-    """`row * cameras + column` of each block, sorted; all diagonal blocks are listed."""
-
-    counts: Int[np.ndarray, " blocks"]
-    """Number of pairs of each block."""
-
-    order: Int[np.ndarray, " pairs"]
-    """Pairs sorted by block; the sort is stable."""
-
-    @classmethod
-    def of(
-        cls,
-        rows: Int[np.ndarray, " pairs"],
-        columns: Int[np.ndarray, " pairs"],
-        cameras: int,
-        listed: Int[np.ndarray, " more"],
-    ) -> _BlockList:
-        """Sorts pairs by their blocks; those on the diagonal and further ones are listed also if they have no pairs."""
-        listed = np.append(listed, np.arange(cameras, dtype=np.int64) * (cameras + 1))
-        if cameras**2 <= MAX_COUNTED_BLOCKS:
-            pair_keys = rows * np.int32(cameras) + columns
-            counts = np.bincount(pair_keys, minlength=cameras**2)
-            has_pairs = counts > 0
-            has_pairs[listed] = True
-            keys = np.flatnonzero(has_pairs)
-            return cls(keys, counts[keys], sorted_by(pair_keys, cameras**2))
-        # by column, then by row
-        order = sorted_by(columns, cameras)
-        order = order[sorted_by(rows[order], cameras)]
-        keys = rows[order].astype(np.int64) * cameras + columns[order]
-        first = np.flatnonzero(np.diff(keys, prepend=-1))
-        counts = np.diff(first, append=len(keys))
-        every = np.union1d(keys[first], listed)
-        number = np.zeros(len(every), np.int64)
-        number[np.searchsorted(every, keys[first])] = counts
-        return cls(every, number, order)
+    Blocks on the diagonal and those of the keys `listed` are there also if they have no pairs. The sort is stable.
+    """
+    listed = np.append(listed, np.arange(cameras, dtype=np.int64) * (cameras + 1))
+    if cameras**2 <= MAX_COUNTED_BLOCKS:
+        pair_keys = rows * np.int32(cameras) + columns
+        counts = np.bincount(pair_keys, minlength=cameras**2)
+        has_pairs = counts > 0
+        has_pairs[listed] = True
+        keys = np.flatnonzero(has_pairs)
+        return keys, counts[keys], sorted_by(pair_keys, cameras**2)
+    # by column, then by row
+    order = sorted_by(columns, cameras)
+    order = order[sorted_by(rows[order], cameras)]
+    keys = rows[order].astype(np.int64) * cameras + columns[order]
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    every = np.union1d(keys[first], listed)
+    counts = np.zeros(len(every), np.int64)
+    counts[np.searchsorted(every, keys[first])] = np.diff(first, append=len(keys))
+    return every, counts, order
