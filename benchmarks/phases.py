@@ -19,18 +19,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.bench.sources import sources
-from jaxba.linear import reduced_system, schur
+from jaxba.linear import formed, reduced_system, schur
+from jaxba.linear.band_cholesky import band_factor
+from jaxba.linear.blocks import dense_blocks
 from jaxba.linear.cholesky import factor_and_solve
 from jaxba.linear.two_level import Anchor, coarse_preconditioner
 from jaxba.lm import step
-from jaxba.model import camera
 from jaxba.model.linearize import cost, linearize, slot_frames
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.points import refine_points
+from jaxba.rotations import rotation_matrix
 from jaxba.runtime import process
 from jaxba.structure.layout import Layout, layout_for
+
+
+def _factor(layout: Layout, blocks: jax.Array, right: jax.Array) -> jax.Array:
+    """Solves a system that is formed in blocks, as a band or dense."""
+    pairs = formed.pairs_of(layout)
+    if pairs.band is None:
+        return factor_and_solve(dense_blocks(pairs, blocks), right.reshape(-1))
+    return band_factor(pairs.band, blocks).solve(right)
 
 
 def timed(function: Any, *arguments: Any, repeats: int) -> tuple[Any, float, float, float]:
@@ -106,21 +116,19 @@ def measure(layout: Layout, problem: BundleProblem, options: StepOptions, rate: 
     yield phase("camera sums", by_camera, linear, points, rotation)
     system = done["camera sums"]
     if layout.grid is not None:
-        yield phase("form", lambda la, li, po, sy: reduced_system.dense_system(la, li, po, sy), linear, points, system)
+        yield phase("form", lambda la, li, po, sy: formed.dense_system(la, li, po, sy), linear, points, system)
         factor = lambda _, m, x: factor_and_solve(m, x.reshape(-1))
         yield phase("factor", factor, done["form"], system.right)
     elif plain.forms_reduced_system:
-        yield phase(
-            "form", lambda la, li, po, sy: reduced_system.reduced_blocks(la, li, po, sy), linear, points, system
-        )
-        solve = reduced_system.factor_blocks if plain.linear_solver == "explicit" else reduced_system.apply_blocks
-        name = "factor" if plain.linear_solver == "explicit" else "one product"
+        yield phase("form", lambda la, li, po, sy: formed.reduced_blocks(la, li, po, sy), linear, points, system)
+        direct = plain.linear_solver == "explicit"
+        solve = _factor if direct else formed.apply_blocks
+        name = "factor" if direct else "one product"
         yield phase(name, lambda la, b, x: solve(la, b, x), done["form"], system.right)
     else:
         product = lambda la, li, po, sy, x: schur.apply_reduced(la, li, po, sy, x)
         yield phase("one product", product, linear, points, system, system.right)
-    frames = camera.frames(state.cameras)
-    anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), state.points)
+    anchor = Anchor(rotation_matrix(state.cameras[:3]), state.cameras[3:6], state.points)
     if plain.uses_camera_clusters:
         coarse = lambda la, li, po, sy, an, x: coarse_preconditioner(la, li, po, sy, an)(x)
         yield phase("coarse system", coarse, linear, points, system, anchor, system.right)

@@ -30,7 +30,7 @@ LABORATORY = ("methods", "kitti", "datasets/kitti", "game", "training", "peers",
 LABORATORY_COMMANDS = ("bench", "train", "kitti", "paper", "episode")
 """Modules of commands that belong to them."""
 
-CORE = ("model", "linear", "refinement", "lm", "structure", "solver")
+CORE = ("model", "linear", "refinement", "lm", "structure", "solver", "results")
 """Rooms whose branches on None are counted."""
 
 

@@ -17,6 +17,7 @@ from jax import Array, lax
 from jaxtyping import Bool, Float, Int
 
 from jaxba.model import camera
+from jaxba.rotations import angle_axis, rotation_matrix
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.density import DENSE_UNKNOWNS
@@ -129,7 +130,7 @@ def _look_at(forward: Array, up: Array) -> Float[Array, "n 3 3"]:
 
 
 def _turns(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
-    return jnp.moveaxis(camera.rotation_matrix(vectors.T), -1, 0)
+    return jnp.moveaxis(rotation_matrix(vectors.T), -1, 0)
 
 
 def _path(motion: Array, key: Array, cameras: int) -> tuple[Array, Array]:
@@ -291,38 +292,11 @@ def _wide_start(rig: _Rig, reference: Array, world: Array, key: Array) -> tuple[
 
 
 def _camera_columns(rotation: Array, center: Array, lens: Array) -> Float[Array, "9 cameras"]:
-    return jnp.concatenate([_angle_axis(rotation).T, _translation(rotation, center).T, lens])
+    return jnp.concatenate([angle_axis(rotation).T, _translation(rotation, center).T, lens])
 
 
 def _translation(rotation: Array, center: Array) -> Float[Array, "n 3"]:
     return -jnp.einsum("nij,nj->ni", rotation, center)
-
-
-def _angle_axis(rotation: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
-    """Angle-axis vectors with angles in [0, pi], computed from the quaternion's largest entry (Shepperd 1978)."""
-    m = rotation
-    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
-    squares = jnp.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
-    antisymmetric = [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]]
-    symmetric = lambda i, j: m[:, i, j] + m[:, j, i]
-    x, y, z = antisymmetric
-    two = 2 * squares[:, 1:] - trace[:, None]
-    rows = jnp.stack(
-        [
-            jnp.stack([1 + trace, x, y, z], axis=1),
-            jnp.stack([x, 1 + two[:, 0], symmetric(0, 1), symmetric(0, 2)], axis=1),
-            jnp.stack([y, symmetric(0, 1), 1 + two[:, 1], symmetric(1, 2)], axis=1),
-            jnp.stack([z, symmetric(0, 2), symmetric(1, 2), 1 + two[:, 2]], axis=1),
-        ],
-        axis=1,
-    )
-    best = jnp.take_along_axis(rows, jnp.argmax(squares, axis=1)[:, None, None], axis=1)[:, 0]
-    best = best / jnp.linalg.norm(best, axis=1, keepdims=True)
-    best = jnp.where(best[:, :1] < 0, -best, best)
-    sine = jnp.linalg.norm(best[:, 1:], axis=1)
-    angle = 2 * jnp.arctan2(sine, best[:, 0])
-    scale = jnp.where(sine > 1e-12, angle / jnp.maximum(sine, 1e-12), 2.0)
-    return best[:, 1:] * scale[:, None]
 
 
 def _paper_scene(kind: SceneClass, key: Array) -> Scenes:

@@ -92,10 +92,3 @@ def band_factor(band: Band, blocks: Float[Array, "blocks width width"]) -> BandF
 
     _, (inverses, below) = lax.scan(eliminate, window, entering)
     return BandFactor(band, inverses, below)
-
-
-def band_factor_and_solve(
-    band: Band, blocks: Float[Array, "blocks width width"], right: Float[Array, "cameras width"]
-) -> Float[Array, "cameras width"]:
-    """Solves `S x = b`; non-finite if S is not positive definite."""
-    return band_factor(band, blocks).solve(right)

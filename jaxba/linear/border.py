@@ -15,7 +15,6 @@ Source: bordered systems as in Golub and Van Loan, "Matrix Computations", sectio
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,85 +23,73 @@ from jaxtyping import Float
 
 from jaxba.linear.cholesky import factor_and_solve
 from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.structure.covisibility import PairLayout
 from jaxba.structure.unknowns import Unknowns
-from jaxba.typing import AnyArray
+
+Solve = Callable[[Array], Array]
+"""A linear function of arrays [cameras, width] or [cameras, width, columns]."""
 
 
-class Border(NamedTuple):
-    """The border of the system, and which unknowns of the camera blocks are not part of it."""
-
-    unknowns: Unknowns
-    columns: Float[Array, "cameras kept border"]  # B
-    corner: Float[Array, "border border"]  # C
-
-    def kept(self, x: Float[Array, "cameras width ..."]) -> Float[Array, "cameras kept ..."]:
-        """The unknowns of camera blocks that are not part of the border; zero in the place of the others, or without
-        them if all lenses are shared."""
-        return _kept(self.unknowns, x)
-
-    def lens_sums(self, x: Float[Array, "cameras width"]) -> Float[Array, " border"]:
-        """`T_L^T x`."""
-        return self.unknowns.total(x[:, POSE_SIZE:]).reshape(-1)
-
-    def finish(
-        self, inner: Float[Array, "cameras kept"], solved: Float[Array, "cameras kept border"], right: Array
-    ) -> Float[Array, "cameras width"]:
-        """`T y` for `A^-1 b_A`, `A^-1 B` and b; non-finite if the system is not positive definite."""
-        product = lambda x: jnp.einsum("cam,ca...->m...", self.columns, x, precision="highest")
-        rest = self.lens_sums(right) - product(inner)
-        lens = factor_and_solve(self.corner - product(solved), rest)
-        x = inner - jnp.einsum("cam,m->ca", solved, lens, precision="highest")
-        own = x[:, POSE_SIZE:]
-        values = lens.reshape(-1, len(self.unknowns.columns))
-        own = jnp.zeros((len(x), values.shape[1]), x.dtype) if self.unknowns.all_shared else own
-        return jnp.concatenate([x[:, :POSE_SIZE], self.unknowns.spread(values, own)], axis=1)
-
-
-def border_of(unknowns: Unknowns, product: Callable[[Array], Array], like: Float[Array, "cameras width"]) -> Border:
-    """The border for shared lenses.
+def bordered(
+    unknowns: Unknowns, product: Solve, inner: Solve, like: Float[Array, "cameras width"], *, store: bool
+) -> Solve:
+    """`T (T^T S T)^-1 T^T` for shared lenses; non-finite if the system is not positive definite.
 
     Args:
-        unknowns: T.
+        unknowns: T. Where no lens is shared there is no border.
         product: product with S.
-        like: array of the shape and type of its argument.
+        inner: `A^-1`, for `without_lenses` of S.
+        like: array of the shape and type of a right-hand side.
+        store: whether `A^-1 B` is stored for several right-hand sides, and not computed along with the only one.
     """
-    members = jnp.asarray(unknowns.members).astype(like.dtype)
-    numbers = len(unknowns.columns)
+    lenses, numbers = unknowns.lenses, len(unknowns.columns)
+    if not lenses.several:
+        return inner
+    members = jnp.asarray(lenses.members).astype(like.dtype)
     unit = jnp.eye(numbers, like.shape[1], POSE_SIZE, dtype=like.dtype)  # one column of T_L for one camera
     columns_of = lambda member: jax.vmap(lambda row: product(member[:, None] * row))(unit)
-    columns = lax.map(columns_of, members.T)  # [lenses, numbers, cameras, width]
-    columns = columns.reshape(-1, *like.shape).transpose(1, 2, 0)
-    corner = jnp.einsum("cl,ckm->lkm", members, columns[:, POSE_SIZE:], precision="highest")
-    return Border(unknowns, _kept(unknowns, columns), corner.reshape(-1, columns.shape[-1]))
+    whole = lax.map(columns_of, members.T)  # [lenses, numbers, cameras, width]
+    whole = whole.reshape(-1, *like.shape).transpose(1, 2, 0)
+    corner = jnp.einsum("cl,ckm->lkm", members, whole[:, POSE_SIZE:], precision="highest").reshape(-1, whole.shape[2])
+
+    def kept(x: Array) -> Array:
+        if unknowns.all_shared:
+            return x[:, :POSE_SIZE]
+        keep = _keeps(unknowns, x.shape[1], x.dtype)
+        return x * keep.reshape(*keep.shape, *[1] * (x.ndim - 2))
+
+    columns = kept(whole)
+    stored = (inner(columns),) if store else ()
+
+    def solve(right: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
+        found = inner(jnp.concatenate([kept(right)[:, :, None], *([] if store else [columns])], axis=2))
+        own, solved = found[:, :, 0], jnp.concatenate([found[:, :, 1:], *stored], axis=2)
+        times = lambda x: jnp.einsum("cam,ca...->m...", columns, x, precision="highest")
+        rest = lenses.total(right[:, POSE_SIZE:])[lenses.owners].reshape(-1) - times(own)
+        lens = factor_and_solve(corner - times(solved), rest)
+        x = own - jnp.einsum("cam,m->ca", solved, lens, precision="highest")
+        others = jnp.zeros((len(x), numbers), x.dtype) if unknowns.all_shared else x[:, POSE_SIZE:]
+        values = lenses.total(others).at[lenses.owners].set(lens.reshape(-1, numbers))
+        return jnp.concatenate([x[:, :POSE_SIZE], lenses.copied(values)], axis=1)
+
+    return solve
 
 
-def without_shared(
-    unknowns: Unknowns, blocks: Float[Array, "blocks width width"], row: AnyArray, column: AnyArray, own: AnyArray
+def without_lenses(
+    unknowns: Unknowns, pairs: PairLayout, blocks: Float[Array, "blocks width width"]
 ) -> Float[Array, "blocks kept kept"]:
-    """The blocks of A from those of S.
-
-    Args:
-        unknowns: which cameras share their lens.
-        blocks: of S.
-        row: camera of the rows of each block.
-        column: camera of its columns.
-        own: whether the block is on the diagonal.
-    """
+    """The blocks of A from those of S: with unit rows for shared lenses, or without lenses if all are shared."""
+    if not unknowns.lenses.several:
+        return blocks
     if unknowns.all_shared:
         return blocks[:, :POSE_SIZE, :POSE_SIZE]
     keep = _keeps(unknowns, blocks.shape[-1], blocks.dtype)
-    kept = blocks * keep[row][:, :, None] * keep[column][:, None, :]
-    unit = jnp.eye(blocks.shape[-1], dtype=blocks.dtype)
-    return kept + jnp.where(own, 1 - keep[row].T, 0).T[:, :, None] * unit
-
-
-def _kept(unknowns: Unknowns, x: Array) -> Array:
-    if unknowns.all_shared:
-        return x[:, :POSE_SIZE]
-    keep = _keeps(unknowns, x.shape[1], x.dtype)
-    return x * keep.reshape(*keep.shape, *[1] * (x.ndim - 2))
+    rows = keep[pairs.block_row]
+    unit = jnp.where((pairs.block_camera < len(keep))[:, None], 1 - rows, 0)
+    kept = blocks * rows[:, :, None] * keep[pairs.block_column][:, None, :]
+    return kept + unit[:, :, None] * jnp.eye(blocks.shape[-1], dtype=blocks.dtype)
 
 
 def _keeps(unknowns: Unknowns, width: int, dtype: jnp.dtype) -> Float[Array, "cameras width"]:
-    shares = jnp.any(jnp.asarray(unknowns.members), axis=1)
-    return 1 - (shares[:, None] & (jnp.arange(width) >= POSE_SIZE)).astype(dtype)
+    shares = unknowns.lenses.is_shared[:, None]
+    return 1 - (shares & (jnp.arange(width) >= POSE_SIZE)).astype(dtype)

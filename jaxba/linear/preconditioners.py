@@ -27,6 +27,7 @@ from jaxba.runtime.fusion import fusion_barrier
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, outer_sum, take_rows, tree_sum
+from jaxba.structure.unknowns import Unknowns
 
 Operator = Callable[[Array], Array]
 
@@ -52,12 +53,12 @@ def preconditioner(
         name: which one.
     """
     if name == "jacobi":
-        return block_inverse(_with_shared(system, system.blocks))
+        return block_inverse(_with_shared(layout.unknowns, system.blocks))
     if blocks is None or layout.pairs is None:
         diagonal = diagonal_blocks(layout, linear, points, system)
     else:
         diagonal = take_rows(blocks, layout.pairs.diagonal)
-    fine = block_inverse(_with_shared(system, diagonal))
+    fine = block_inverse(_with_shared(layout.unknowns, diagonal))
     if name == "schur-jacobi":
         return fine
     coarse = coarse_preconditioner(layout, linear, points, system, anchor)
@@ -65,22 +66,16 @@ def preconditioner(
 
 
 def _with_shared(
-    system: CameraSystem, blocks: Float[Array, "cameras width width"]
+    unknowns: Unknowns, blocks: Float[Array, "cameras width width"]
 ) -> Float[Array, "cameras width width"]:
     """The blocks, with means over cameras in the place of a shared lens or the pose of a frame, which do not couple."""
-    unknowns = system.unknowns
-    if unknowns is None:
+    if not unknowns.shared:
         return blocks
-    pose, lens = blocks[:, :POSE_SIZE, :POSE_SIZE], blocks[:, POSE_SIZE:, POSE_SIZE:]
+    pose = unknowns.poses.mean(blocks[:, :POSE_SIZE, :POSE_SIZE])
+    lens = unknowns.lenses.mean(blocks[:, POSE_SIZE:, POSE_SIZE:])
     coupling = blocks[:, :POSE_SIZE, POSE_SIZE:]
-    flat = lambda part: part.reshape(len(part), -1)
-    if unknowns.members is not None:
-        shares = jnp.any(jnp.asarray(unknowns.members), axis=1)[:, None, None]
-        coupling = jnp.where(shares, jnp.zeros_like(coupling), coupling)
-        lens = unknowns.mean(flat(lens)).reshape(lens.shape)
-    if unknowns.frame is not None:
-        coupling = jnp.zeros_like(coupling)
-        pose = unknowns.frame_mean(flat(pose)).reshape(pose.shape)
+    apart = unknowns.lenses.is_shared[:, None, None] | unknowns.poses.several
+    coupling = jnp.where(apart, jnp.zeros_like(coupling), coupling)
     upper = jnp.concatenate([pose, coupling], axis=2)
     return jnp.concatenate([upper, jnp.concatenate([coupling.mT, lens], axis=2)], axis=1)
 

@@ -33,10 +33,9 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
-from jaxba.model import camera
 from jaxba.model.linearize import Linearization, normal_entries
-from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
+from jaxba.rotations import left_jacobian, left_jacobian_inverse
 from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.conventions import components_first
 from jaxba.structure.devices import max_over_devices, sum_over_devices
@@ -50,7 +49,6 @@ from jaxba.structure.segment_sums import (
     take_rows,
     tree_sum,
 )
-from jaxba.structure.unknowns import Unknowns
 
 
 class RotationCoordinates(NamedTuple):
@@ -66,7 +64,7 @@ class RotationCoordinates(NamedTuple):
             one = jnp.broadcast_to(jnp.eye(3, dtype=cameras.dtype), (cameras.shape[1], 3, 3))
             return cls(one, one)
         to_front = lambda m: jnp.moveaxis(m, -1, 0)
-        return cls(to_front(camera.left_jacobian(cameras[:3])), to_front(camera.left_jacobian_inverse(cameras[:3])))
+        return cls(to_front(left_jacobian(cameras[:3])), to_front(left_jacobian_inverse(cameras[:3])))
 
     def from_manifold(self, step: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         """A manifold step in the options' coordinates."""
@@ -91,10 +89,10 @@ class CameraSystem(NamedTuple):
     own: Float[Array, "cameras width width"]  # the part of it that is no sum over observations: D_c, and priors
     gradient: Float[Array, "cameras width"]  # g_c, manifold coordinates
     right: Float[Array, "cameras width"]  # b, right-hand side of the reduced system
-    damping: Float[Array, "cameras width"]  # D_c, diagonal in the options' coordinates
+    # D_c, diagonal in the options' coordinates; each camera has an equal part of what is shared
+    damping: Float[Array, "cameras width"]
     # [J_c, r, r - Q h], two rows an observation, sorted by camera (structure/layout.py)
     rows: Float[Array, "chunks terms columns"] | None = None
-    unknowns: Unknowns | None = None  # if something is shared: each camera holds an equal part of its damping
 
 
 def eliminate_points(
@@ -160,30 +158,21 @@ def camera_system(
     gathered = take_rows(as_rows(rows), level).reshape(level.shape[0], -1, width + 2)
     products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient, right = products[:, :, :width], products[:, :, width], -products[:, :, width + 1]
-    priors = linear.priors
-    if priors is not None:
+    for priors in linear.priors:
         blocks, gradient, right = blocks + priors.blocks, gradient + priors.gradient, right - priors.gradient
     rotation = jnp.einsum("cji,cjk,ckl->cil", coordinates.forward, blocks[:, :3, :3], coordinates.forward)
     diagonal = jnp.concatenate(
         [jnp.diagonal(rotation, axis1=1, axis2=2), jnp.diagonal(blocks, axis1=1, axis2=2)[:, 3:]], axis=1
     )
     factor = options.coordinates.camera_damping * damping
-    extra = damping_diagonal(diagonal, factor, options)
-    unknowns = layout.unknowns if layout.unknowns is not None and layout.unknowns.shared else None
-    if unknowns is not None and unknowns.members is not None:
-        whole = damping_diagonal(unknowns.total(diagonal[:, POSE_SIZE:]), factor, options)
-        count = unknowns.total(jnp.ones_like(diagonal[:, POSE_SIZE:]))
-        extra = extra.at[:, POSE_SIZE:].set(unknowns.spread(whole / count, extra[:, POSE_SIZE:]))
-    if unknowns is not None and unknowns.frame is not None:
-        whole = damping_diagonal(unknowns.frame_total(diagonal[:, :POSE_SIZE]), factor, options)
-        extra = extra.at[:, :POSE_SIZE].set(whole / unknowns.frame_total(jnp.ones_like(whole)))
+    extra = layout.unknowns.shares(damping_diagonal(layout.unknowns.sums(diagonal), factor, options))
     # a camera without observations gets a unit block, and so a zero step
     extra = jnp.where(layout.camera_seen[:, None], extra, jnp.ones_like(extra))
     on_manifold = jnp.einsum("cji,cj,cjk->cik", coordinates.inverse, extra[:, :3], coordinates.inverse)
     added = extra[:, :, None] * jnp.eye(width, dtype=extra.dtype)
     added = added.at[:, :3, :3].set(on_manifold)
-    own = added if priors is None else added + priors.blocks
-    return CameraSystem(blocks + added, own, gradient, right, extra, gathered, unknowns)
+    own = sum((priors.blocks for priors in linear.priors), added)
+    return CameraSystem(blocks + added, own, gradient, right, extra, gathered)
 
 
 def back_substitute(
@@ -263,14 +252,9 @@ def largest_gradient(
     layout: Layout, points: PointSystem, system: CameraSystem, coordinates: RotationCoordinates
 ) -> Float[Array, ""]:
     """Largest absolute entry of the gradient, in the options' coordinates."""
-    gradient, unknowns = system.gradient, system.unknowns
-    if unknowns is not None and unknowns.frame is not None:
-        gradient = gradient.at[:, :POSE_SIZE].set(unknowns.frame_total(gradient[:, :POSE_SIZE]))
+    gradient = layout.unknowns.sums(system.gradient)
     rotation = jnp.einsum("cji,cj->ci", coordinates.forward, gradient[:, :3])
-    lens = gradient[:, POSE_SIZE:]
-    if unknowns is not None and unknowns.members is not None:
-        lens = unknowns.spread(unknowns.total(lens), lens)
-    parts = rotation, gradient[:, 3:6], lens, jnp.stack(points.gradient)
+    parts = rotation, gradient[:, 3:], jnp.stack(points.gradient)
     largest = functools.reduce(jnp.maximum, [jnp.max(jnp.abs(part)) for part in parts if part.size])
     return max_over_devices(layout, largest)
 

@@ -20,8 +20,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from jaxba.linear.blocks import dense_blocks, pair_products
 from jaxba.linear.cholesky import factor_panels
@@ -33,6 +34,7 @@ from jaxba.structure.camera_clusters import ClusterLayout
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import as_rows, take_each, take_rows, tree_sum
+from jaxba.structure.sharing import Sharing
 
 SIMILARITY = 7
 """Columns of a similarity; those of the numbers of lenses follow."""
@@ -79,11 +81,10 @@ def coarse_preconditioner(
 ) -> Callable[[Array], Array]:
     """The product with `P (P^T S P)^-1 P^T`; zero if the coarse system is not positive definite."""
     clusters = _clusters(layout)
-    tied = None if clusters.tied is None or system.unknowns is None else jnp.asarray(clusters.tied)
     modes = camera_modes(layout, anchor, system.blocks.shape[-1])
-    matrix = coarse_system(layout, linear, points, system, anchor, modes)
-    if tied is not None:
-        matrix = _with_tied_lenses(matrix, tied, modes.shape[-1])
+    apart = Sharing.of(np.arange(len(clusters.members)))
+    tied = Sharing.joined((apart, SIMILARITY), (clusters.lenses, modes.shape[-1] - SIMILARITY))
+    matrix = tied.merged(coarse_system(layout, linear, points, system, anchor, modes))
     diagonal = jnp.diagonal(matrix)
     scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1)), 0)
     unknowns = matrix.shape[0]
@@ -94,45 +95,11 @@ def coarse_preconditioner(
 
     def apply(r: Array) -> Array:
         inner = cluster_sum(clusters, jnp.einsum("cam,ca->cm", modes, r))
-        right = inner.reshape(-1)
-        if tied is not None:
-            lens = jnp.matmul(tied.T.astype(r.dtype), inner[:, SIMILARITY:], precision="highest")
-            right = jnp.concatenate([(inner * _keeps(tied, inner)).reshape(-1), lens.reshape(-1)])
-        coarse = scale * panels.solve(scale * right)
-        coarse = jnp.where(valid, coarse, jnp.zeros_like(coarse))
-        own = coarse[: inner.size].reshape(inner.shape)
-        if tied is not None:
-            lens = jnp.matmul(tied.astype(r.dtype), coarse[inner.size :].reshape(lens.shape), precision="highest")
-            own = own.at[:, SIMILARITY:].add(lens)
-        coarse = own
+        coarse = scale * panels.solve(scale * tied.total(inner.reshape(-1)))
+        coarse = tied.copied(jnp.where(valid, coarse, jnp.zeros_like(coarse))).reshape(inner.shape)
         return jnp.einsum("cam,cm->ca", modes, take_rows(coarse, clusters.label))
 
     return apply
-
-
-def _with_tied_lenses(
-    lower: Float[Array, "unknowns unknowns"], tied: Bool[Array, "clusters lenses"], modes: int
-) -> Float[Array, "more more"]:
-    """The coarse system with one unknown per number of a shared lens, not one per cluster; the replaced rows become
-    identity rows."""
-    clusters = len(tied)
-    full = jnp.tril(lower) + jnp.tril(lower, -1).T
-    blocks = full.reshape(clusters, modes, clusters, modes)
-    member = tied.astype(full.dtype)
-    columns = jnp.einsum("cmdk,dl->cmlk", blocks[..., SIMILARITY:], member, precision="highest")
-    corner = jnp.einsum("cl,ckmn->lkmn", member, columns[:, SIMILARITY:], precision="highest")
-    keep = _keeps(tied, jnp.zeros((clusters, modes), full.dtype)).reshape(-1)
-    columns = columns.reshape(clusters * modes, -1) * keep[:, None]
-    full = full * keep[:, None] * keep + jnp.diag(1 - keep)
-    return jnp.block([[full, columns], [columns.T, corner.reshape(columns.shape[1], -1)]])
-
-
-def _keeps(
-    tied: Bool[Array, "clusters lenses"], like: Float[Array, "clusters modes"]
-) -> Float[Array, "clusters modes"]:
-    """0 for the columns of a lens of clusters that are tied, else 1."""
-    lens = jnp.arange(like.shape[1]) >= SIMILARITY
-    return 1 - (jnp.any(tied, axis=1)[:, None] & lens).astype(like.dtype)
 
 
 def coarse_system(

@@ -88,9 +88,8 @@ def solve_step(
         # d.e is not zero: `-g.d - d.H d` takes the place of d.D d, with d.H d = |J d|^2
         change = jacobian_product(layout, linear, manifold_step, point_step)
         damped = slope - sum_over_devices(layout, sum(jnp.sum(m * m) for m in change))
-    step = components_first(camera_step)
     return Step(
-        step if layout.unknowns is None else layout.unknowns.expanded(step),
+        layout.unknowns.expanded(components_first(camera_step)),
         point_step,
         slope,
         damped,

@@ -10,16 +10,15 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, cast
 
-import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
 from jaxba.linear.reduced_system import solve_reduced
 from jaxba.linear.schur import CameraSystem, PointSystem
 from jaxba.linear.two_level import Anchor
-from jaxba.model import camera
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import MethodTraits, StepOptions
+from jaxba.rotations import rotation_matrix
 from jaxba.structure.layout import Layout
 
 
@@ -108,8 +107,7 @@ class LevenbergMarquardt(StepMethod):
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
         cameras, points = system.parameters
-        frames = camera.frames(cameras)
-        anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
+        anchor = Anchor(rotation_matrix(cameras[:3]), cameras[3:6], points)
         step, iterations = solve_reduced(*system[:4], anchor, options, system.forcing)
         return MethodStep(step, None, iterations, residual_orthogonal=True)
 

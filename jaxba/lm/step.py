@@ -59,8 +59,7 @@ def initial_state(layout: Layout, problem: BundleProblem, options: StepOptions, 
         dtype: floating point type of the solve; that of the problem's arrays if None.
     """
     check_x64(problem.cameras.dtype if dtype is None else dtype)
-    unknowns = layout.unknowns
-    if unknowns is not None and unknowns.in_rigs and problem.cameras.shape[1] != POSE_SIZE + unknowns.size:
+    if layout.unknowns.in_rigs and problem.cameras.shape[1] != POSE_SIZE + layout.unknowns.size:
         raise ValueError("a problem with rigs must be in_frames (jaxba.problem.frames); jaxba.prepare does it")
     cameras = components_first(jnp.asarray(problem.cameras, dtype))
     # padding points have an index out of range and are placed at the origin
@@ -180,9 +179,8 @@ def take_step(
 def _check_lenses(layout: Layout, options: StepOptions) -> None:
     """Raises a ValueError for what a method does not support."""
     unknowns = layout.unknowns
-    if unknowns is not None and unknowns.frame is not None:
+    if unknowns.poses.several:
         apart = options.refinement.camera_rounds or options.refinement.pattern_moves
         if options.coordinates.rotation != "manifold" or apart:
             raise ValueError("rigs need rotation='manifold', and no camera rounds and pattern moves")
-    if unknowns is not None:
-        check_plain(options, shared_lenses=unknowns.shared, priors=unknowns.priors is not None)
+    check_plain(options, shared_lenses=unknowns.shared, priors=bool(unknowns.priors))

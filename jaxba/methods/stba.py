@@ -26,8 +26,8 @@ from jaxtyping import Float
 
 from jaxba.linear.cholesky import MIN_UNKNOWNS, factor_and_solve
 from jaxba.linear.cholesky3 import Cholesky3, cholesky3
+from jaxba.linear.formed import reduced_blocks
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.reduced_system import reduced_blocks
 from jaxba.linear.schur import CameraSystem, PointSystem, apply_reduced, damping_diagonal
 from jaxba.lm.method import DampedSystem, MethodStep, StepMethod
 from jaxba.model.linearize import Linearization, normal_entries

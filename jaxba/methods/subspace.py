@@ -26,8 +26,8 @@ from jaxtyping import Float
 from jaxba.linear.cholesky import solve_positive
 from jaxba.linear.schur import apply_reduced
 from jaxba.lm.method import DampedSystem, StepMethod
-from jaxba.model import camera
 from jaxba.problem.options import StepOptions
+from jaxba.rotations import left_jacobian
 
 RIDGE = 64.0
 """Machine epsilons added to the unit diagonal of the scaled Gram matrix, whose vectors may be nearly parallel."""
@@ -57,8 +57,7 @@ def best_in_span(system: DampedSystem, step: Float[Array, "cameras width"]) -> F
     Returns:
         A camera step in manifold coordinates.
     """
-    unknowns = system.layout.unknowns
-    changes = system.state if unknowns is None else jnp.asarray(unknowns.restricted(system.state))
+    changes = jnp.asarray(system.layout.unknowns.restricted(system.state))
     product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
     return with_previous(product, system.cameras.right, step, on_manifold(system.parameters[0], changes))
 
@@ -94,6 +93,6 @@ def on_manifold(
     cameras: Float[Array, "parameters cameras"], changes: Float[Array, "steps parameters cameras"]
 ) -> Float[Array, "steps cameras width"]:
     """Changes of camera parameters (angle-axis rotations) as steps in manifold coordinates, to first order."""
-    jacobian = camera.left_jacobian(cameras[:3])
+    jacobian = left_jacobian(cameras[:3])
     rotations = jnp.einsum("ijc,sjc->sci", jacobian, changes[:, :3], precision="highest")
     return jnp.concatenate([rotations, jnp.moveaxis(changes[:, 3:], 1, 2)], axis=2)

@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float
 
 from jaxba.model import camera
 from jaxba.model.observations import Views, view_terms
-from jaxba.model.priors import PriorTerms, prior_costs, prior_terms
-from jaxba.problem.intrinsics import POSE_SIZE
+from jaxba.model.priors import PriorTerms, costs_of, prior_terms
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics
 from jaxba.problem.safe_math import safe_sqrt
@@ -25,7 +24,7 @@ from jaxba.runtime.compilation import traced_once
 from jaxba.runtime.fusion import compute_unfused
 from jaxba.structure.devices import on_one_device, sum_over_devices
 from jaxba.structure.layout import Layout
-from jaxba.structure.segment_sums import take, total
+from jaxba.structure.segment_sums import total
 
 
 class Reference(NamedTuple):
@@ -33,7 +32,7 @@ class Reference(NamedTuple):
 
     costs: Array  # (slots,), pixels^2
     inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
-    prior_costs: Array | None = None  # (cameras,), of what is known besides the pixels; None: nothing
+    prior_costs: tuple[Array, ...] = ()  # (cameras,), of what is known besides the pixels, if anything is
 
 
 class Linearization(NamedTuple):
@@ -48,8 +47,8 @@ class Linearization(NamedTuple):
     point_jacobian: list[list[Array]]  # [2][3] of (slots,)
     costs: Array  # (slots,), pixels squared
     inverse_depth: Array  # (slots,), 1 / P.z; negative in front of the camera, zero in empty slots
-    priors: PriorTerms | None = None  # of cameras alone; None: there are no priors
-    prior_costs: Array | None = None  # (cameras,)
+    priors: tuple[PriorTerms, ...]  # of cameras alone, if there are priors
+    prior_costs: tuple[Array, ...]  # (cameras,)
 
     @property
     def reference(self) -> Reference:
@@ -90,22 +89,13 @@ def cost(
     """The cost `1/2 sum rho(|Sigma^(-1/2) (predicted - observed)|^2)`, pixels^2, and that of the priors."""
     # not fused with the sum: XLA would compile both to a slow library call
     of_pixels = compute_unfused(total, observation_costs(layout, cameras, points, loss), index=layout.slot_camera)
-    whole = with_prior_costs(layout, cameras, of_pixels[None]).sum() if _has_priors(layout) else of_pixels
-    return sum_over_devices(layout, whole)
+    return sum_over_devices(layout, sum(map(jnp.sum, prior_costs(layout, cameras)), of_pixels))
 
 
-def with_prior_costs(
-    layout: Layout, cameras: Float[Array, "parameters cameras"], terms: Float[Array, " terms"]
-) -> Float[Array, " more"]:
-    """Terms of the cost, followed by those of the priors of every camera if there are any."""
-    if not _has_priors(layout):
-        return terms
-    assert layout.unknowns is not None
-    return jnp.concatenate([terms, on_one_device(layout, prior_costs(layout.unknowns, cameras))])
-
-
-def _has_priors(layout: Layout) -> bool:
-    return layout.unknowns is not None and layout.unknowns.priors is not None
+def prior_costs(layout: Layout, cameras: Float[Array, "parameters cameras"]) -> tuple[Float[Array, " cameras"], ...]:
+    """The cost of the priors of each camera if there are any, on the first device."""
+    unknowns = layout.unknowns
+    return tuple(on_one_device(layout, costs_of(priors, unknowns, cameras)) for priors in unknowns.priors)
 
 
 def point_terms(views: Views, loss: Loss) -> list[Array]:
@@ -115,7 +105,7 @@ def point_terms(views: Views, loss: Loss) -> list[Array]:
     """
     projection = views.projected()
     residual = view_residuals(views, projection)
-    by_point = _whiten_columns(views, camera.derivatives(views.frames, projection).point)
+    by_point = _whiten_columns(views, camera.derivatives(views.frames, projection, ()).point)
     rows = views.materialized([*by_point[0], *by_point[1], *residual])
     residual = rows[6:]
     entries = normal_entries([rows[:3], rows[3:6]], residual)
@@ -137,13 +127,12 @@ def linearize(
     layout: Layout, cameras: Float[Array, "parameters cameras"], points: Float[Array, "3 points"], loss: Loss
 ) -> Linearization:
     """Residuals and analytic Jacobians at the given parameters, whitened and weighted by the robust loss."""
-
-    columns = None if layout.unknowns is None else layout.unknowns.columns
+    unknowns = layout.unknowns
 
     def terms(views: Views) -> list[Array]:
         projection = views.projected()
         residual = view_residuals(views, projection)
-        jacobians = camera.derivatives(views.frames, projection, columns)
+        jacobians = camera.derivatives(views.frames, projection, unknowns.columns)
         by_camera, by_point = _whiten_columns(views, jacobians.camera), _whiten_columns(views, jacobians.point)
         costs = slot_costs(loss, residual)
         rows = [*residual, *by_camera[0], *by_camera[1], *by_point[0], *by_point[1]]
@@ -156,12 +145,8 @@ def linearize(
     residual, rows = rows[:2], rows[2:]
     width = (len(rows) - 6) // 2
     by_camera, by_point = [rows[:width], rows[width : 2 * width]], [rows[-6:-3], rows[-3:]]
-    found = Linearization(residual, by_camera, by_point, costs, inverse_depth)
-    unknowns = layout.unknowns
-    if unknowns is None or unknowns.priors is None:
-        return found
-    costs_of_priors = on_one_device(layout, prior_costs(unknowns, cameras))
-    return found._replace(priors=prior_terms(unknowns, cameras), prior_costs=costs_of_priors)
+    priors = prior_terms(unknowns, cameras)
+    return Linearization(residual, by_camera, by_point, costs, inverse_depth, priors, prior_costs(layout, cameras))
 
 
 def is_weightless(layout: Layout, linear: Linearization, cost: Float[Array, ""], loss: Loss) -> Bool[Array, ""]:
@@ -183,21 +168,15 @@ def only_free(layout: Layout, linear: Linearization, intrinsics: Intrinsics, *, 
         intrinsics: `fixed`: all intrinsics are constant.
         alone: whether cameras are optimised one by one, so that what they share must be constant.
     """
-    unknowns = layout.unknowns
-    zero = jnp.zeros_like(linear.residual[0])
-    by_camera, by_point = linear.camera_jacobian, linear.point_jacobian
-    if alone and unknowns is not None and unknowns.frame is not None:
-        by_camera = [[*[zero] * POSE_SIZE, *row[POSE_SIZE:]] for row in by_camera]
-    if (intrinsics == "fixed" and unknowns is None) or (
-        alone and unknowns is not None and unknowns.members is not None
-    ):
-        by_camera = [[*row[:POSE_SIZE], *[zero] * (len(row) - POSE_SIZE)] for row in by_camera]
-    if unknowns is not None and unknowns.free is not None:
-        free = take(jnp.asarray(unknowns.free), layout.slot_camera)
-        by_camera = [[jnp.where(free[k], column, zero) for k, column in enumerate(row)] for row in by_camera]
-    if unknowns is not None and unknowns.free_points is not None:
-        moves = take(jnp.asarray(unknowns.free_points), layout.slot_point)
-        by_point = [[jnp.where(moves, column, zero) for column in row] for row in by_point]
+    unknowns, zero = layout.unknowns, jnp.zeros_like(linear.residual[0])
+    constant = unknowns.constant(intrinsics, alone=alone)
+    free = unknowns.free.at_columns(layout.slot_camera)
+    moves = unknowns.free_points.at_columns(layout.slot_point)
+    by_camera = [
+        [zero if constant[k] else free.row(k).where(column, zero) for k, column in enumerate(row)]
+        for row in linear.camera_jacobian
+    ]
+    by_point = [[moves.where(column, zero) for column in row] for row in linear.point_jacobian]
     return linear._replace(camera_jacobian=by_camera, point_jacobian=by_point)
 
 

@@ -20,7 +20,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.linear.step import Step
-from jaxba.model.linearize import Reference, observation_costs, slot_frames, with_prior_costs
+from jaxba.model.linearize import Reference, observation_costs, prior_costs, slot_frames
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide
 from jaxba.refinement.midpoints import refine_from_starts
@@ -151,13 +151,11 @@ def comparison(
     matters = predicted > NEGLIGIBLE * cost
     previous = PreviousPoints.of(layout, points, reference)
     terms = previous.costs if options.refinement.points else reference.costs
-    if reference.prior_costs is not None:
-        terms = jnp.concatenate([terms, reference.prior_costs])
     return Comparison(
         layout=layout,
         cameras=cameras,
         cost=cost,
-        terms=terms,
+        terms=jnp.concatenate([terms, *reference.prior_costs]),
         previous=previous,
         step=step,
         options=options,
@@ -204,15 +202,16 @@ def _refined(
 ) -> tuple[Float[Array, "3 points"], Float[Array, " terms"]]:
     """The points after embedded iterations, if there are any, and the terms of the cost there."""
     layout, loss, refinement = against.layout, against.options.loss, against.options.refinement
+    of_priors = prior_costs(layout, cameras)
     if not refinement.points:
-        return points, with_prior_costs(layout, cameras, observation_costs(layout, cameras, points, loss))
-    arguments = layout, slot_frames(layout, cameras), points, loss, against.options.refinement.points, against.previous
+        return points, jnp.concatenate([observation_costs(layout, cameras, points, loss), *of_priors])
+    arguments = layout, slot_frames(layout, cameras), points, loss, refinement.points, against.previous
     min_decrease = jnp.where(full_step, -jnp.inf, POINT_DECREASE * predicted)
     if refinement.starts == "step":
         points, costs = refine_points(*arguments, min_decrease)
     else:
         points, costs = refine_from_starts(*arguments, jnp.where(full_step, against.starts, 0), min_decrease)
-    return points, with_prior_costs(layout, cameras, costs)
+    return points, jnp.concatenate([costs, *of_priors])
 
 
 def select(which: Bool[Array, ""], new: Any, old: Any) -> Any:

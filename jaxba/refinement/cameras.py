@@ -9,7 +9,7 @@ from jaxtyping import Float
 from jaxba.linear.cholesky import solve_positive
 from jaxba.model import camera
 from jaxba.model.linearize import linearize, observation_costs, only_free
-from jaxba.model.priors import prior_costs, prior_terms
+from jaxba.model.priors import costs_of, prior_terms
 from jaxba.problem.options import DIAGONAL_MAXIMUM, DIAGONAL_MINIMUM, StepOptions
 from jaxba.refinement.retraction import keep_focal_signs
 from jaxba.runtime import loops
@@ -46,28 +46,26 @@ def refine_cameras(
     products = sum_over_devices(layout, tree_sum(outer_sum(gathered[..., :width], gathered), tuple(levels)))
     blocks, gradient = products[:, :, :width], products[:, :, width]
     unknowns = layout.unknowns
-    if unknowns is not None and unknowns.priors is not None:
-        terms = prior_terms(unknowns, cameras, alone=True)
+    for terms in prior_terms(unknowns, cameras, alone=True):
         blocks, gradient = blocks + terms.blocks, gradient + terms.gradient
     diagonal = jnp.clip(jnp.diagonal(blocks, axis1=1, axis2=2), DIAGONAL_MINIMUM, DIAGONAL_MAXIMUM)
     # not fused with its uses: XLA would recompute the sums in each of them
     each_sum = lambda costs: tree_sum(costs[:, None], layout.camera_levels)[:, 0]
     own_cost = lambda costs: sum_over_devices(layout, compute_unfused(each_sum, costs, index=layout.slot_camera))
 
-    def of_priors(cameras: Array) -> Array | float:
-        return 0.0 if unknowns is None or unknowns.priors is None else prior_costs(unknowns, cameras)
+    def whole_cost(costs: Array, cameras: Array) -> Array:
+        return sum((costs_of(priors, unknowns, cameras) for priors in unknowns.priors), own_cost(costs))
 
-    before = own_cost(linear.costs) + of_priors(cameras)
+    before = whole_cost(linear.costs, cameras)
 
     def attempt(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         best, done, attempt_number = carry
         damped = blocks + (dampings[attempt_number] * diagonal)[:, :, None] * jnp.eye(width, dtype=blocks.dtype)
         step = -components_first(solve_positive(damped, gradient))
-        step = step if layout.unknowns is None else layout.unknowns.expanded(step)
         # the Jacobian, and so the step, is in manifold coordinates
-        trial = camera.moved(cameras, step)
+        trial = camera.moved(cameras, unknowns.expanded(step), unknowns)
         costs = observation_costs(layout, trial, points, options.loss)
-        better = (own_cost(costs) + of_priors(trial) < before) & ~done & keep_focal_signs(cameras, trial)
+        better = (whole_cost(costs, trial) < before) & ~done & keep_focal_signs(cameras, trial)
         return jnp.where(better, trial, best), done | better, attempt_number + 1
 
     # a loop instead of unrolled attempts: half as much to compile

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
@@ -54,47 +53,19 @@ def midpoints(layout: Layout, frames: camera.Frames, undistortions: int = UNDIST
 def _ray_terms(undistortions: int, views: Views) -> list[Array]:
     """Of every observation the six lower entries of `I - u u^T`, row by row, and the three of `(I - u u^T) c`."""
     frame = views.frames
-    undistorted = (_undistorted if frame.models is None else _undistorted_by_model)(views, undistortions)
+    undistorted = frame.model.undistorted(list(frame.lens), frame.which, list(views.pixels), undistortions)
     inverse_norm = 1 / jnp.sqrt(undistorted[0] * undistorted[0] + undistorted[1] * undistorted[1] + 1)
     camera_ray = [undistorted[0] * inverse_norm, undistorted[1] * inverse_norm, -inverse_norm]
     to_world = lambda vector: [sum(frame.rotation[j][i] * vector[j] for j in range(3)) for i in range(3)]
     offset = list(frame.translation)
-    if frame.from_rig is not None:  # first from the camera to its frame
-        turn, m = frame.from_rig[:9], frame.from_rig[9:]
-        back = lambda vector: [sum(turn[3 * j + i] * vector[j] for j in range(3)) for i in range(3)]
-        camera_ray, offset = back(camera_ray), [t + b for t, b in zip(offset, back(m), strict=True)]
+    for place in frame.places:  # first from the camera to its frame
+        back = lambda vector, place=place: [sum(place[3 * j + i] * vector[j] for j in range(3)) for i in range(3)]
+        camera_ray, offset = back(camera_ray), [t + b for t, b in zip(offset, back(place[9:]), strict=True)]
     ray, center = to_world(camera_ray), [-x for x in to_world(offset)]
     along = sum(ray[i] * center[i] for i in range(3))
     matrix = [(1.0 if i == j else 0.0) - ray[i] * ray[j] for i in range(3) for j in range(i + 1)]
     right = [center[i] - ray[i] * along for i in range(3)]
     return [jnp.where(views.mask, row, jnp.zeros_like(row)) for row in [*matrix, *right]]
-
-
-def _undistorted(views: Views, iterations: int) -> list[Array]:
-    """The points of the plane z = -1 that BAL lenses see at the pixels, by fixed-point iterations."""
-    focal, k1, k2 = views.frames.lens
-    scaled = [row.astype(focal.dtype) / focal for row in views.pixels]
-    plane = scaled
-    for _ in range(iterations):
-        squared = plane[0] * plane[0] + plane[1] * plane[1]
-        factor = 1 / (1 + squared * (k1 + squared * k2))
-        plane = [row * factor for row in scaled]
-    return plane
-
-
-def _undistorted_by_model(views: Views, iterations: int) -> list[Array]:
-    """The same for lenses of any camera model, by Newton's method from the optical axis."""
-    frame, lens = views.frames, list(views.frames.lens)
-    depth = -jnp.ones_like(lens[0])
-    pixel_at = lambda x, y: camera.model_pixel(frame, lens, x, y, depth)
-    x, y = jnp.zeros_like(lens[0]), jnp.zeros_like(lens[0])
-    for _ in range(iterations):
-        found, by_x = jax.jvp(lambda x, y=y: pixel_at(x, y), (x,), (jnp.ones_like(x),))
-        _, by_y = jax.jvp(lambda y, x=x: pixel_at(x, y), (y,), (jnp.ones_like(y),))
-        u, v = (value - pixel for value, pixel in zip(found, views.pixels, strict=True))
-        inverse = 1 / (by_x[0] * by_y[1] - by_x[1] * by_y[0])
-        x, y = x - inverse * (by_y[1] * u - by_y[0] * v), y - inverse * (by_x[0] * v - by_x[1] * u)
-    return [x, y]
 
 
 class Starts(NamedTuple):
@@ -136,8 +107,7 @@ def choose_starts(
     )
     diverged = (own_lost > 0) | has_receded(own_inverse_depth, previous.inverse_depth_sum)
     possible = (lost == 0) & ~has_receded(other_inverse_depth, previous.inverse_depth_sum) & jnp.isfinite(costs)
-    if layout.unknowns is not None and layout.unknowns.free_points is not None:
-        possible = possible & layout.unknowns.free_points
+    possible = layout.unknowns.free_points.where(possible, False)
     better = possible & ((costs < own) | diverged)
     return Starts(jnp.where(better, middle, points), jnp.where(possible & ~better, middle, points))
 

@@ -35,6 +35,7 @@ from jaxba.runtime.fusion import compute_in_one_loop
 from jaxba.structure.devices import sum_over_devices
 from jaxba.structure.layout import Layout
 from jaxba.structure.segment_sums import point_sums
+from jaxba.structure.sharing import Mask
 
 INITIAL_DAMPING = 1e-6
 """Relative damping of a point's first step: Gauss-Newton except for parallel rays."""
@@ -124,8 +125,6 @@ def refine_points(
     """
     one_pass = point_passes(layout, frames)
     before = previous or PreviousPoints.unknown(layout, points)
-    free = None if layout.unknowns is None else layout.unknowns.free_points
-    constant = () if free is None else (jnp.asarray(free),)
 
     def terms(views: Views, front: Array) -> list[Array]:
         found = point_terms(views, loss)
@@ -146,7 +145,7 @@ def refine_points(
         damping = jnp.where(diverged, now.damping, jnp.where(accepted, now.damping / DAMPING_FACTOR, grown))
         best = jnp.where(accepted, now.trial, now.points)
         system = jnp.where(accepted, jnp.stack(system), now.system)
-        trial = jnp.stack(compute_in_one_loop(_moved, best, system, damping, *constant))
+        trial = jnp.stack(compute_in_one_loop(_moved, best, system, damping, layout.unknowns.free_points))
         return _Search(
             points=jnp.where(diverged, before.points, best),
             costs=least,
@@ -176,12 +175,12 @@ def refine_points(
     return search.points, search.costs
 
 
-def _moved(points: Array, system: Array, damping: Array, *free: Array) -> list[Array]:
+def _moved(points: Array, system: Array, damping: Array, free: Mask) -> list[Array]:
     """Points after a damped step of their own systems; those that are not free stay."""
     matrix = [entry * (1 + damping) if k in (0, 2, 5) else entry for k, entry in enumerate(system[:6])]
     factor = cholesky3(matrix)
     after = [x - d for x, d in zip(points, factor.backward(factor.forward(list(system[6:]))), strict=True)]
-    return [jnp.where(moves, new, old) for moves in free for new, old in zip(after, points, strict=True)] or after
+    return [free.where(new, old) for new, old in zip(after, points, strict=True)]
 
 
 def has_receded(inverse_depth_sum: Float[Array, " points"], before: Float[Array, " points"]) -> Bool[Array, " points"]:

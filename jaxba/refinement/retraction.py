@@ -17,8 +17,10 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxba.model import camera
+from jaxba.problem.camera_models import BAL
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
+from jaxba.rotations import left_jacobian
 from jaxba.structure.layout import Layout
 
 MAX_FOCAL_CHANGE = 0.3
@@ -44,18 +46,16 @@ def move_cameras(
     on_manifold = options.coordinates.rotation == "manifold"
     moved = camera.moved(cameras, step, unknowns) if on_manifold else cameras + step
     plain = options.coordinates.lens_step == "file" or options.intrinsics == "fixed"
-    if plain or (unknowns is not None and unknowns.models is not None):
+    if plain or unknowns.models != (BAL,):
         return moved
     growth = step[6] / cameras[6]
     near = jnp.abs(growth) <= MAX_FOCAL_CHANGE  # false for a focal length of zero
     for row, power in ((7, 2), (8, 4)):
         # (k / f^power + its change to first order) times the new f^power
         kept = (1 + growth) ** power * (moved[row] - power * growth * cameras[row])
-        free = near
-        if unknowns is not None and row - POSE_SIZE not in unknowns.columns:
+        if row - POSE_SIZE not in unknowns.columns:
             continue
-        if unknowns is not None and unknowns.free is not None:
-            free = near & unknowns.free[POSE_SIZE + unknowns.columns.index(row - POSE_SIZE)]
+        free = unknowns.free.row(POSE_SIZE + unknowns.columns.index(row - POSE_SIZE)).where(near, False)
         moved = moved.at[row].set(jnp.where(free, kept, moved[row]))
     return moved
 
@@ -77,6 +77,6 @@ def step_between(
     """The step for which `move_cameras` leads from `cameras` to `moved`, to first order."""
     change = moved - cameras
     if options.coordinates.rotation == "manifold":
-        jacobian = camera.left_jacobian(cameras[:3])
+        jacobian = left_jacobian(cameras[:3])
         change = change.at[:3].set(jnp.einsum("ijc,jc->ic", jacobian, change[:3], precision="highest"))
     return change

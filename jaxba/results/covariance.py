@@ -29,7 +29,7 @@ from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
 from jaxba.problem.facing import facing_away
 from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
-from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, lens_size
+from jaxba.problem.intrinsics import POSE_SIZE, lens_size
 from jaxba.problem.labels import Part, part_names
 from jaxba.problem.losses import Loss
 from jaxba.problem.options import Coordinates, StepOptions
@@ -177,16 +177,15 @@ def _changes(
     """`Covariance.changes`. With a step w, d of its frame and v, e of its extrinsics, a camera in a rig turns by
     `M w + v` and moves by `M d + v x M t_r + e`; of a scene shifted by -o, `t = t' - R o`."""
     unknowns = layout.unknowns
-    width = POSE_SIZE + LENS_SIZE if unknowns is None else unknowns.width
-    changes = np.tile(np.eye(POSE_SIZE, width), (len(rotations), 1, 1))
-    if unknowns is not None and unknowns.in_rigs:
+    changes = np.tile(np.eye(POSE_SIZE, unknowns.width), (len(rotations), 1, 1))
+    if unknowns.in_rigs:
         assert problem.rigs is not None
         turn = np.asarray(problem.rigs.rotation)
         changes[:, :3, :3] = changes[:, 3:6, 3:6] = turn
         moved = np.einsum("nij,nj->ni", turn, np.asarray(problem.cameras)[:, 3:6])
         by_extrinsics = np.tile(np.eye(EXTRINSICS_SIZE), (len(rotations), 1, 1))
         by_extrinsics[:, 3:, :3] = [-_cross(one) for one in moved]
-        start = unknowns.size - EXTRINSICS_SIZE
+        start = unknowns.lens_size
         for place, column in enumerate(unknowns.columns):
             if column >= start:
                 changes[:, :, POSE_SIZE + place] = by_extrinsics[:, :, column - start]
@@ -203,18 +202,12 @@ def _linear(layout: Layout, problem: BundleProblem, options: StepOptions) -> Lin
 def _unknown_index(problem: BundleProblem, layout: Layout) -> tuple[np.ndarray, int]:
     """The unknown of each number in a camera's block, -1 where it is constant, and how many there are."""
     unknowns = layout.unknowns
-    width = POSE_SIZE + LENS_SIZE if unknowns is None else unknowns.width
-    cameras = problem.num_cameras
-    index = np.arange(cameras * width).reshape(cameras, width)
-    free = np.tile(np.asarray(layout.camera_seen)[:, None], (1, width))
-    if unknowns is not None:
-        index = np.asarray(unknowns.index(cameras))
-        if unknowns.free is not None:
-            free &= np.asarray(unknowns.free).T
-    used, place = np.unique(index[free], return_inverse=True)
+    index = np.asarray(unknowns.numbers.index).reshape(problem.num_cameras, -1)
+    free = np.asarray(layout.camera_seen)[:, None] & np.asarray(unknowns.free.values).T
+    _, first, place = np.unique(index[free], return_index=True, return_inverse=True)
     found = np.full(index.shape, -1)
-    found[free] = place
-    return found, len(used)
+    found[free] = np.argsort(np.argsort(first))[place]
+    return found, len(first)
 
 
 class _System(NamedTuple):
@@ -276,8 +269,8 @@ def _system(
     used = place >= 0
     at = np.repeat(rows, index.shape[1])
     parts, height = [csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))], len(rows)
-    if linear.priors is not None:
-        parts, height = [*parts, _prior_rows(index, count, np.asarray(linear.priors.blocks))], height + index.size
+    for priors in linear.priors:
+        parts, height = [*parts, _prior_rows(index, count, np.asarray(priors.blocks))], height + index.size
     place = np.repeat(3 * point[:, None] + np.arange(3), 2, axis=0).ravel()
     seen, starts = np.bincount(point, minlength=points) > 0, np.searchsorted(point, np.arange(points + 1))
     by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (height, 3 * points))
@@ -370,8 +363,7 @@ def _of_lenses(
     unknowns = layout.unknowns
     lenses = problem.lenses
     size = lens_size(lenses)
-    columns = range(size) if unknowns is None else unknowns.columns
-    place = [(k, column) for k, column in enumerate(columns) if column < size]
+    place = [(k, column) for k, column in enumerate(unknowns.columns) if column < size]
     of_camera = _lens_of(problem)
     count = problem.num_cameras if lenses is None else len(lenses.free)
     found = np.full((count, size, size), np.nan)

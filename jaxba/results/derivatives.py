@@ -45,9 +45,10 @@ from jaxba.model.linearize import cost, linearize, only_free
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.facing import facing_away
 from jaxba.problem.freedoms import RESOLVED, SIMILARITY, determined_directions, free_directions
-from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE
+from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.problem.rigs import EXTRINSICS_SIZE
+from jaxba.rotations import compose_left, rotation_matrix
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import check_x64, numerics, refuse_traces
 from jaxba.solver.options import SolveOptions, checked_options
@@ -193,8 +194,7 @@ class Symmetries(NamedTuple):
 def _symmetries(solved: BundleProblem, layout: Layout) -> Symmetries:
     order, determined = np.asarray(layout.points), determined_directions(solved)
     cameras, points = free_directions(solved)
-    if layout.unknowns is not None:
-        cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
+    cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
     # only what of it is not already a motion of points along their rays
     points = np.einsum("pij,kpj->kpi", determined, points)
     real = order < solved.num_points
@@ -225,14 +225,12 @@ def _solve_transposed(
 ) -> tuple[SolveInputs, Array]:
     state = initial_state(layout, solved, options, jnp.float64)
     unknowns, order = layout.unknowns, layout.points
-    width = POSE_SIZE + LENS_SIZE if unknowns is None else unknowns.width
     count = state.cameras.shape[1]
     seen = jnp.asarray(layout.camera_seen)[:, None]
 
     def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
         """On the unknowns that a minimum determines, orthogonally."""
-        cameras = jnp.where(seen, y[0], 0)
-        cameras = cameras if unknowns is None else unknowns.project(cameras)
+        cameras = unknowns.project(jnp.where(seen, y[0], 0))
         points = jnp.einsum("pij,jp->ip", still.points, y[1], precision="highest")
         along = jnp.einsum("kcw,cw->k", still.gauge_cameras, cameras, precision="highest")
         along = along + jnp.einsum("kip,ip->k", still.gauge_points, points, precision="highest")
@@ -245,22 +243,21 @@ def _solve_transposed(
         """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
         cameras = state.cameras + _start_of_constants(layout, of_frames(theta.cameras))
         points = state.points + _start_of_points(solved, still, jnp.asarray(theta.points), order)
-        rows = y[0].T if unknowns is None else unknowns.expanded(y[0].T)
-        return camera.moved(cameras, rows, unknowns), points + y[1]
+        return camera.moved(cameras, unknowns.expanded(y[0].T), unknowns), points + y[1]
 
     def of_frames(cameras: AnyArray) -> Array:
         """Cameras as the inputs have them, as those of the state."""
-        if unknowns is None or not unknowns.in_rigs:
+        if not unknowns.in_rigs:
             return jnp.asarray(cameras)
         place = state.cameras[-EXTRINSICS_SIZE:]
-        turn, rows = camera.rotation_matrix(place[:3]), jnp.asarray(cameras).T
+        turn, rows = rotation_matrix(place[:3]), jnp.asarray(cameras).T
         moved = jnp.einsum("jic,jc->ic", turn, rows[3:6] - place[3:], precision="highest")
-        return jnp.concatenate([camera.compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place]).T
+        return jnp.concatenate([compose_left(-place[:3], rows[:3]), moved, rows[POSE_SIZE:], place]).T
 
     def found(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
         """Parameters as the solution has them."""
         cameras, points = moved(y, theta)
-        if unknowns is None or not unknowns.in_rigs:
+        if not unknowns.in_rigs:
             return cameras, points
         own = cameras[POSE_SIZE:-EXTRINSICS_SIZE]
         return jnp.concatenate([*camera.poses(cameras, unknowns), own]), points
@@ -268,13 +265,13 @@ def _solve_transposed(
     def objective(y: tuple[Array, Array], theta: SolveInputs) -> Array:
         pixels = jnp.where(layout.slot_mask, jnp.asarray(theta.observations).T[:, slots], 0)
         here = replace(layout, pixels=pixels)
-        if unknowns is not None and unknowns.priors is not None and theta.positions is not None:
-            priors = replace(unknowns.priors, positions=theta.positions)
+        if theta.positions is not None:
+            priors = tuple(replace(one, positions=theta.positions) for one in unknowns.priors)
             here = replace(here, unknowns=replace(unknowns, priors=priors))
         return cost(here, *moved(y, theta), options.loss)
 
     gradient = jax.grad(objective)
-    zero = jnp.zeros((count, width)), jnp.zeros_like(state.points)
+    zero = jnp.zeros((count, unknowns.width)), jnp.zeros_like(state.points)
     # the cotangents in the unknowns
     _, pull = jax.vjp(lambda y: found(y, inputs), zero)
     of_points = jnp.where(order < solved.num_points, 1.0, 0.0)
@@ -299,15 +296,10 @@ def _solve_transposed(
 def _start_of_constants(layout: Layout, cameras: Array) -> Array:
     """Zero, with the derivative of the solution's constant numbers by those of the start."""
     unknowns = layout.unknowns
-    constant = jnp.zeros(cameras.shape, bool)
-    if unknowns is not None and unknowns.free is not None:
-        every = jnp.ones((unknowns.width, cameras.shape[0]), cameras.dtype)
-        free = unknowns.expanded(jnp.where(jnp.asarray(unknowns.free), every, 0))
-        constant = free.T == 0
-    elif unknowns is not None:
-        constant = unknowns.expanded(jnp.ones((unknowns.width, cameras.shape[0]))).T == 0
+    every = jnp.ones((unknowns.width, cameras.shape[0]), cameras.dtype)
+    constant = unknowns.expanded(unknowns.free.where(every, 0)).T == 0
     unseen = jnp.broadcast_to(~jnp.asarray(layout.camera_seen)[:, None], constant.shape)
-    if unknowns is not None and unknowns.members is not None:  # its lens may be that of a camera that is seen
+    if unknowns.lenses.several:  # its lens may be that of a camera that is seen
         unseen = unseen.at[:, POSE_SIZE:].set(False)
     constant = constant | unseen
     kept = jnp.where(constant, cameras, 0)
@@ -330,8 +322,7 @@ def _gauss_newton(
     coordinates = RotationCoordinates.of(cameras, options)
     eliminated = eliminate_points(layout, linear, damping, options)
     system = camera_system(layout, linear, eliminated, coordinates, damping, options)
-    frames = camera.frames(cameras)
-    anchor = Anchor(jnp.asarray(frames.rotation), jnp.asarray(frames.translation), points)
+    anchor = Anchor(rotation_matrix(cameras[:3]), cameras[3:6], points)
 
     def inverse(right: tuple[Array, Array]) -> tuple[Array, Array]:
         by_points: PointSystem = eliminated._replace(solved=[-x for x in eliminated.factor.forward(list(right[1]))])

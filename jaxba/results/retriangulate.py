@@ -157,9 +157,7 @@ def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 poin
 
     starts = [origin + factor * (start - origin) for factor in START_DISTANCES] + [midpoints(layout, frames)]
     (points, costs), _ = lax.scan(try_start, (start, own), jnp.stack(starts))
-    unknowns = layout.unknowns
-    if unknowns is not None and unknowns.free_points is not None:
-        costs = jnp.where(unknowns.free_points, costs, own)
+    costs = layout.unknowns.free_points.where(costs, own)
     moved = own - costs > jnp.maximum(MIN_RELATIVE_GAIN * own, MIN_GAIN * jnp.mean(costs))
     before = jnp.sum(own)
     # XLA may sum the same numbers in two orders: where nothing moves the cost stays to the last digit

@@ -14,7 +14,7 @@ from jaxba.problem.bundle_problem import CAMERA_SIZE, BundleProblem
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.structure.camera_ordering import camera_order, is_banded
-from jaxba.structure.density import has_dense_shape, has_small_capacitance
+from jaxba.structure.density import has_small_capacitance, is_dense
 from jaxba.structure.observation_order import ObservationOrder
 
 
@@ -170,10 +170,7 @@ def predict(problem: BundleProblem, observations: ObservationOrder | None = None
 
 def _is_dense(observations: ObservationOrder) -> bool:
     """Whether the explicit solver forms the system as one dense product, or uses Woodbury's identity."""
-    columns = observations.num_observed_points + 1
-    if not has_dense_shape(observations.tracks, observations.num_cameras, columns):
-        return False
-    return not observations.num_repeated_pairs
+    return is_dense(observations, observations.num_cameras, observations.num_observed_points + 1)
 
 
 class PairCounts(NamedTuple):

@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 
 class Agreement:
-    """Sizes that the layouts of all shards must share, found by repeated rounds.
+    """What a layout asks by name, with what it needs itself: here that of the only shard, which needs nothing more."""
 
-    A layout asks for a size, a list of keys or a sum by name, and gives its own. It gets that of all shards from the
-    round before, or its own in the first one.
-    """
+    def within(self, name: str) -> Agreement:
+        """The same for a part, whose names begin with that of the part."""
+        return self
+
+    def size(self, name: str, own: int) -> int:
+        """The largest of a number in all shards."""
+        return own
+
+    def others(self, name: str, own: Callable[[], np.ndarray]) -> np.ndarray:
+        """Sorted keys of all shards; none if there are no others."""
+        return np.zeros(0, np.int64)
+
+    def union(self, name: str, own: np.ndarray) -> np.ndarray:
+        """The sorted union of keys, sorted ones, in all shards."""
+        return own
+
+    def total(self, name: str, own: Any) -> Any:
+        """The sum over all shards of an array or a sparse matrix."""
+        return own
+
+
+ALONE = Agreement()
+
+
+class Round(Agreement):
+    """What one of several shards needs, and what all need as far as it is known from the round before."""
 
     def __init__(self, known: dict[str, Any], found: dict[str, Any] | None = None, prefix: str = "") -> None:
         self._known = known
@@ -20,22 +44,26 @@ class Agreement:
         self.found: dict[str, Any] = {} if found is None else found
 
     def within(self, name: str) -> Agreement:
-        """The same for a part, whose names begin with that of the part."""
-        return Agreement(self._known, self.found, f"{self._prefix}{name}.")
+        """See `Agreement`."""
+        return Round(self._known, self.found, f"{self._prefix}{name}.")
 
     def size(self, name: str, own: int) -> int:
-        """The largest of a number in all shards."""
+        """See `Agreement`."""
         self.found[self._prefix + name] = own
         return max(own, self._known.get(self._prefix + name, own))
 
+    def others(self, name: str, own: Callable[[], np.ndarray]) -> np.ndarray:
+        """See `Agreement`."""
+        return self.union(name, np.unique(own()))
+
     def union(self, name: str, own: np.ndarray) -> np.ndarray:
-        """The sorted union of keys in all shards."""
+        """See `Agreement`."""
         key = self._prefix + "union " + name
         self.found[key] = own
         return np.union1d(own, self._known.get(key, own))
 
     def total(self, name: str, own: Any) -> Any:
-        """The sum over all shards of an array or a sparse matrix."""
+        """See `Agreement`."""
         key = self._prefix + "total " + name
         self.found[key] = own
         return self._known.get(key, own)
@@ -65,8 +93,3 @@ class Agreement:
             return np.array_equal(a, b)
 
         return one.keys() == other.keys() and all(equal(one[key], other[key]) for key in one)
-
-
-def size_of(agreement: Agreement | None, name: str, own: int) -> int:
-    """`Agreement.size`, or the own number if there is only one shard."""
-    return own if agreement is None else agreement.size(name, own)

@@ -10,11 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 
-from jaxba.structure.agreement import Agreement, size_of
+from jaxba.structure.agreement import Agreement
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.observation_order import ObservationOrder
+from jaxba.structure.sharing import Sharing
 from jaxba.structure.sum_trees import fitting_width, sorted_by, sum_tree
 from jaxba.structure.track_buckets import Slots
 from jaxba.typing import AnyArray, register_pytree
@@ -48,16 +49,12 @@ class ClusterLayout:
     pairs: PairLayout
     """Pairs of coarse slots of one point, which form the blocks of the coarse system."""
 
-    tied: Bool[AnyArray, "clusters lenses"] | None
-    """Which clusters have a shared lens, each at most one: their changes of it are one unknown. None: nothing is
-    tied."""
+    lenses: Sharing
+    """Clusters of cameras with one and the same lens: their changes of it are one unknown."""
 
 
 def cluster_layout(
-    observations: ObservationOrder,
-    slots: Slots,
-    shared_lens: Bool[np.ndarray, "cameras lenses"] | None = None,
-    agreement: Agreement | None = None,
+    observations: ObservationOrder, slots: Slots, lenses: Sharing, agreement: Agreement
 ) -> ClusterLayout:
     """Clusters the cameras and lists the pairs of clusters with common points.
 
@@ -66,24 +63,23 @@ def cluster_layout(
     Args:
         observations: the sorted observations of the problem.
         slots: their slots.
-        shared_lens: which cameras have which lens of those that several have.
+        lenses: cameras that share a lens.
         agreement: with the other shards of a problem, which have the same clusters.
     """
     from jaxba.structure.agglomeration import agglomerate, shared_points  # SciPy: its import takes 0.2 s
 
-    camera, point = observations.camera, observations.point
-    cameras, points = observations.num_cameras, len(observations.tracks)
+    camera, point, cameras = observations.camera, observations.point, observations.num_cameras
+    points = len(observations.tracks)
     num_clusters = max(1, min(MAX_CLUSTERS, cameras // CLUSTER_CAMERAS))
-    shared = shared_points(camera, point, cameras, points)[0]
-    shared = shared if agreement is None else agreement.total("shared points", shared)
+    shared = agreement.total("shared points", shared_points(camera, point, cameras, points)[0])
     label = agglomerate(shared, cameras, num_clusters)
-    tied = None
-    if shared_lens is not None:
-        tied = np.hstack([shared_lens, ~shared_lens.any(axis=1, keepdims=True)])
-        parts, split = np.unique(label * tied.shape[1] + tied.argmax(axis=1), return_inverse=True)
-        pure = len(parts) <= 2 * MAX_CLUSTERS
-        label, tied = (split, np.eye(tied.shape[1], dtype=bool)[parts % tied.shape[1], :-1]) if pure else (label, None)
-    clusters = int(label.max()) + 1
+    of_lens = np.where(np.isin(lenses.index, lenses.owners), lenses.index, cameras)
+    parts, split = np.unique(label * (cameras + 1) + of_lens, return_inverse=True)
+    names = -1 - np.arange(int(label.max()) + 1)  # clusters that have no lens in common
+    if len(parts) <= 2 * MAX_CLUSTERS:
+        label, lens = split, parts % (cameras + 1)
+        names = np.where(lens < cameras, lens, -1 - np.arange(len(parts)))
+    clusters = len(names)
     order = sorted_by(label[camera], clusters)
     order = order[sorted_by(point[order], points)]
     keys = point[order].astype(np.int64) * clusters + label[camera[order]]
@@ -91,19 +87,18 @@ def cluster_layout(
     keys, counts = keys[first], np.diff(first, append=len(keys))
     seen_by = np.bincount(keys // clusters, minlength=points)
     start = np.cumsum(seen_by) - seen_by
-    coarse, count = np.arange(len(keys)), size_of(agreement, "coarse", len(keys))
-    part = lambda name: None if agreement is None else agreement.within(name)
-    width = size_of(agreement, "width", fitting_width(counts))
+    coarse, count = np.arange(len(keys)), agreement.size("coarse", len(keys))
+    width = agreement.size("width", fitting_width(counts))
     counts = np.append(counts, np.zeros(count + 1 - len(keys), counts.dtype))
-    firsts = np.append(slots.slot[order][first], np.full(count + 1 - len(keys), slots.empty))
+    first_slots = np.append(slots.slot[order][first], np.full(count + 1 - len(keys), slots.empty))
     keyed = (keys % clusters, coarse, seen_by, start, clusters, count)
     return ClusterLayout(
         label=label.astype(np.int32),
         members=cluster_members(label, clusters, int(np.bincount(label).max())),
-        levels=sum_tree(slots.slot[order], counts, slots.empty, width, agreement=part("slots")),
-        point=slots.point[firsts],
-        pairs=pair_layout(*keyed, factor=True, banded=False, agreement=part("pairs")),
-        tied=tied,
+        levels=sum_tree(slots.slot[order], counts, slots.empty, width, agreement=agreement.within("slots")),
+        point=slots.point[first_slots],
+        pairs=pair_layout(*keyed, factor=True, banded=False, agreement=agreement.within("pairs")),
+        lenses=Sharing.of(names),
     )
 
 

@@ -8,15 +8,14 @@ scattered.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Int
 
-from jaxba.structure.agreement import Agreement, size_of
+from jaxba.structure.agreement import ALONE, Agreement
 from jaxba.structure.camera_ordering import MIN_BAND_CAMERAS, Band, band_of, camera_order, is_banded
 from jaxba.structure.padding import Capacity, room_for
-from jaxba.structure.sum_trees import TREE_WIDTH, Room, chunks_at_most, prefix_levels, sorted_by, sum_tree
+from jaxba.structure.sum_trees import TREE_WIDTH, Exact, Room, chunks_at_most, prefix_levels, sorted_by, sum_tree
 from jaxba.typing import AnyArray, register_pytree
 
 PAIR_CHUNKS = (4, 8)
@@ -89,7 +88,7 @@ def pair_layout(
     factor: bool,
     banded: bool = True,
     capacity: Capacity | None = None,
-    agreement: Agreement | None = None,
+    agreement: Agreement = ALONE,
 ) -> PairLayout:
     """Lists all pairs of observations of one point, sorted by the block that they add to.
 
@@ -115,57 +114,42 @@ def pair_layout(
     if twice.size:
         left, right = np.concatenate([left, right[twice]]), np.concatenate([right, left[twice]])
         rows, columns = np.concatenate([rows, columns[twice]]), np.concatenate([columns, rows[twice]])
+    others = np.divmod(agreement.others("blocks", lambda: rows.astype(np.int64) * cameras + columns), cameras)
     rank, reach = np.arange(cameras), cameras
-    everywhere = rows, columns  # the blocks of all shards
-    if agreement is not None:
-        own = np.unique(rows.astype(np.int64) * cameras + columns)
-        everywhere = np.divmod(agreement.union("blocks", own), cameras)
-    if capacity is None and factor and banded and cameras >= MIN_BAND_CAMERAS:
-        covisible = np.zeros((cameras, cameras), bool)
-        covisible[everywhere] = True
-        row, column = np.nonzero(covisible)
-        rank, reach = camera_order(row, column, cameras)
-    banded = banded and is_banded(cameras, reach)
+    if factor and banded and capacity is None:
+        rank, reach = _band_order((rows, columns), others, cameras)
+    banded = is_banded(cameras, reach)
     if banded:  # from here on rows and columns are ranks of cameras, and the lower triangle is that of the ranks
         ranks = rank.astype(np.int32)
         rows, columns = ranks[rows], ranks[columns]
         swap = rows < columns
         left, right = np.where(swap, right, left), np.where(swap, left, right)
         rows, columns = np.maximum(rows, columns), np.minimum(rows, columns)
-    else:
-        rank = np.arange(cameras)
-    blocks = _BlockList.of(rows, columns, cameras)
+    listed = rank[others[0]], rank[others[1]]
     if capacity is not None:
-        blocks = blocks.with_all(cameras)
-    if agreement is not None:
-        first, second = rank[everywhere[0]], rank[everywhere[1]]
-        blocks = blocks.with_these(np.maximum(first, second) * np.int64(cameras) + np.minimum(first, second))
-    keys, counts, order = blocks
-    diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
-    room = None if capacity is None else room_for(counts, capacity.pairs, capacity.points)
+        listed = np.tril_indices(cameras)
+    listed = np.maximum(*listed) * np.int64(cameras) + np.minimum(*listed)
+    keys, counts, order = _sorted_by_block(rows, columns, cameras, listed)
+    room = Exact.of(counts) if capacity is None else room_for(counts, capacity.pairs, capacity.points)
+    largest = PAIR_BATCH if capacity is None else -(-PAIR_BATCH // 2)  # smaller ones, of which the last is rarely full
 
-    def number_of(width: int) -> int:
-        chunks = int((-(-counts // width)).sum()) if room is None else chunks_at_most(room.items, len(keys), width)
-        return size_of(agreement, f"chunks of {width}", chunks)
-
+    number_of = lambda width: agreement.size(f"chunks of {width}", room.chunks(room.items, counts, width))
     width = min(PAIR_CHUNKS, key=lambda w: number_of(w) * (w + PAIR_ITEM_COST))
-    width = max(1, min(width, size_of(agreement, "pairs", int(counts.max())) if room is None else room.most))
+    width = max(1, min(width, agreement.size("pairs", room.most)))
     chunks = -(-counts // width)
     # position of each pair in the chunks: pairs of one block are contiguous, and a block starts a new chunk
     shift = width * (np.cumsum(chunks) - chunks) - (np.cumsum(counts) - counts)
     position = np.repeat(shift.astype(np.int32), counts) + np.arange(len(left), dtype=np.int32)
-    most = number_of(width)  # largest number of chunks
-    largest = PAIR_BATCH if room is None else -(-PAIR_BATCH // 2)  # smaller ones, of which the last is rarely full
-    batches = max(1, -(-most // (largest - 1)))
-    batch = max(1, -(-most // batches))  # chunks of a batch, without the one that is padding
-    used = None if room is None else np.array(max(1, -(-int(chunks.sum()) // batch)), np.int32)
+    batches = max(1, -(-number_of(width) // (largest - 1)))
+    batch = max(1, -(-number_of(width) // batches))  # chunks of a batch, without the one that is padding
+    used = None if capacity is None else np.array(max(1, -(-int(chunks.sum()) // batch)), np.int32)
     position += position // (width * batch) * width
     padded = []
     for side in (left, right):
         array = np.full(batches * (batch + 1) * width, empty, np.int32)
         array[position] = row_index[side[order]]
         padded.append(array.reshape(batches, batch + 1, width))
-    most_of_block = None if room is None else -(-room.most // width)
+    most_of_block = None if capacity is None else -(-room.most // width)
     sums, levels, by_sums = _batch_sums(chunks, batches, batch, most_of_block, agreement)
     keys = keys[by_sums]
     table = None
@@ -173,16 +157,14 @@ def pair_layout(
         table = np.full(cameras * cameras, len(keys), np.int32)
         table[keys] = np.arange(len(keys))
         table = table.reshape(cameras, cameras)
-    by_rank = np.argsort(rank)
-    in_order = np.argsort(keys)
-    on_diagonal = in_order[np.searchsorted(keys, diagonal, sorter=in_order)][rank]
+    row, column = np.divmod(keys, cameras)
+    on_diagonal = np.empty(cameras, np.int32)
+    on_diagonal[row[row == column]] = np.flatnonzero(row == column)
+    on_diagonal = on_diagonal[rank]
     block_camera = np.full(len(keys) + 1, cameras, np.int32)
     block_camera[on_diagonal] = np.arange(cameras)
-    block_row, block_column = (np.append(by_rank[part], 0).astype(np.int32) for part in np.divmod(keys, cameras))
-    mirrored = np.flatnonzero(block_row[:-1] != block_column[:-1])
-    targets = np.concatenate([block_row[:-1], block_column[mirrored]])
-    items = np.concatenate([np.arange(len(keys)), len(keys) + 1 + mirrored])
-    by_target = np.argsort(targets, kind="stable")
+    by_rank = np.argsort(rank)
+    block_row, block_column = (np.append(by_rank[part], 0).astype(np.int32) for part in (row, column))
     return PairLayout(
         left=padded[0],
         right=padded[1],
@@ -192,11 +174,36 @@ def pair_layout(
         block_camera=block_camera,
         block_row=block_row,
         block_column=block_column,
-        product_levels=sum_tree(items[by_target], np.bincount(targets, minlength=cameras), len(keys), TREE_WIDTH),
-        diagonal=on_diagonal.astype(np.int32),
+        product_levels=_product_levels(block_row[:-1], block_column[:-1], cameras),
+        diagonal=on_diagonal,
         table=table,
         band=band_of(keys, rank, reach) if banded else None,
     )
+
+
+def _band_order(
+    blocks: tuple[np.ndarray, np.ndarray], others: tuple[np.ndarray, np.ndarray], cameras: int
+) -> tuple[Int[np.ndarray, " cameras"], int]:
+    """Rank of each camera and bandwidth where the blocks are a band, else the given order and all cameras."""
+    given = np.arange(cameras)
+    if cameras < MIN_BAND_CAMERAS:
+        return given, cameras
+    covisible = np.zeros((cameras, cameras), bool)
+    covisible[blocks] = covisible[others] = True
+    row, column = np.nonzero(covisible)
+    rank, reach = camera_order(row, column, cameras)
+    return (rank, reach) if is_banded(cameras, reach) else (given, cameras)
+
+
+def _product_levels(
+    row: Int[np.ndarray, " blocks"], column: Int[np.ndarray, " blocks"], cameras: int
+) -> tuple[Int[np.ndarray, "_ _"], ...]:
+    """`PairLayout.product_levels` for the cameras of blocks."""
+    mirrored = np.flatnonzero(row != column)
+    targets = np.concatenate([row, column[mirrored]])
+    items = np.concatenate([np.arange(len(row)), len(row) + 1 + mirrored])
+    by_target = np.argsort(targets, kind="stable")
+    return sum_tree(items[by_target], np.bincount(targets, minlength=cameras), len(row), TREE_WIDTH)
 
 
 def _pairs_of_tracks(
@@ -224,7 +231,7 @@ def _batch_sums(
     batches: int,
     batch: int,
     most: int | None,
-    agreement: Agreement | None = None,
+    agreement: Agreement = ALONE,
 ) -> tuple[Int[np.ndarray, "batches partial width"], tuple[Int[np.ndarray, "_ _"], ...], Int[np.ndarray, " blocks"]]:
     """Partial sums within each batch, how these are summed to the blocks and one more that is empty, and their order.
 
@@ -242,7 +249,7 @@ def _batch_sums(
     starts_sum = within % TREE_WIDTH == 0
     sum_batch, target = own_batch[starts_sum], block[starts_sum]  # batch and block of each partial sum
     counts = np.bincount(sum_batch, minlength=batches)
-    partial = size_of(agreement, "partial", int(counts.max()))
+    partial = agreement.size("partial", int(counts.max()))
     if most is not None:  # nearly always a batch has sums of few blocks; at worst it has as many sums as chunks
         bound = chunks_at_most(batch, len(chunks), TREE_WIDTH)
         usual = min(bound, batch // TREE_WIDTH + 5 * len(chunks) // (2 * batches) + 1)
@@ -253,8 +260,8 @@ def _batch_sums(
     items, empty = sum_batch * (partial + 1) + number, batches * (partial + 1) - 1
     counts = np.bincount(target, minlength=len(chunks) + 1)
     if most is None:
-        part = None if agreement is None else agreement.within("sums")
-        return sums, sum_tree(items, counts, empty, TREE_WIDTH, agreement=part), np.arange(len(chunks))
+        levels = sum_tree(items, counts, empty, TREE_WIDTH, agreement=agreement.within("sums"))
+        return sums, levels, np.arange(len(chunks))
     touched = min(batches, (most - 1) // batch + 2)  # most batches over which the chunks of one block are spread
     room = Room(batches * partial, chunks_at_most(most, touched, TREE_WIDTH))
     order = np.argsort(-counts, kind="stable")
@@ -268,44 +275,30 @@ def _since(marks: Bool[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
     return np.arange(len(marks)) - np.repeat(first, np.diff(first, append=len(marks)))
 
 
-class _BlockList(NamedTuple):
-    """The non-zero blocks of the lower triangle, and the pairs that add to them."""
+def _sorted_by_block(
+    rows: Int[np.ndarray, " pairs"],
+    columns: Int[np.ndarray, " pairs"],
+    cameras: int,
+    listed: Int[np.ndarray, " more"],
+) -> tuple[Int[np.ndarray, " blocks"], Int[np.ndarray, " blocks"], Int[np.ndarray, " pairs"]]:
+    """Keys `row * cameras + column` of non-zero blocks, sorted, their numbers of pairs, and pairs sorted by block.
 
-    keys: Int[np.ndarray, " blocks"]
-    """`row * cameras + column` of each block, sorted; all diagonal blocks are listed."""
-
-    counts: Int[np.ndarray, " blocks"]
-    """Number of pairs of each block."""
-
-    order: Int[np.ndarray, " pairs"]
-    """Pairs sorted by block; the sort is stable."""
-
-    @classmethod
-    def of(cls, rows: Int[np.ndarray, " pairs"], columns: Int[np.ndarray, " pairs"], cameras: int) -> _BlockList:
-        """Sorts pairs by their blocks."""
-        diagonal = np.arange(cameras, dtype=np.int64) * (cameras + 1)
-        if cameras**2 <= MAX_COUNTED_BLOCKS:
-            pair_keys = rows * np.int32(cameras) + columns
-            counts = np.bincount(pair_keys, minlength=cameras**2)
-            listed = counts > 0
-            listed[diagonal] = True
-            keys = np.flatnonzero(listed)
-            return cls(keys, counts[keys], sorted_by(pair_keys, cameras**2))
-        # by column, then by row
-        order = sorted_by(columns, cameras)
-        order = order[sorted_by(rows[order], cameras)]
-        keys = rows[order].astype(np.int64) * cameras + columns[order]
-        first = np.flatnonzero(np.diff(keys, prepend=-1))
-        counts = np.diff(first, append=len(keys))
-        return cls(keys[first], counts, order).with_these(diagonal)
-
-    def with_these(self, wanted: Int[np.ndarray, " more"]) -> _BlockList:
-        """The same list with further blocks, which have no pairs."""
-        keys = np.union1d(self.keys, wanted)
-        counts = np.zeros(len(keys), np.int64)
-        counts[np.searchsorted(keys, self.keys)] = self.counts
-        return self._replace(keys=keys, counts=counts)
-
-    def with_all(self, cameras: int) -> _BlockList:
-        """The same list with every block of the lower triangle."""
-        return self.with_these(np.ravel_multi_index(np.tril_indices(cameras), (cameras, cameras)))
+    Blocks on the diagonal and those of the keys `listed` are there also if they have no pairs. The sort is stable.
+    """
+    listed = np.append(listed, np.arange(cameras, dtype=np.int64) * (cameras + 1))
+    if cameras**2 <= MAX_COUNTED_BLOCKS:
+        pair_keys = rows * np.int32(cameras) + columns
+        counts = np.bincount(pair_keys, minlength=cameras**2)
+        has_pairs = counts > 0
+        has_pairs[listed] = True
+        keys = np.flatnonzero(has_pairs)
+        return keys, counts[keys], sorted_by(pair_keys, cameras**2)
+    # by column, then by row
+    order = sorted_by(columns, cameras)
+    order = order[sorted_by(rows[order], cameras)]
+    keys = rows[order].astype(np.int64) * cameras + columns[order]
+    first = np.flatnonzero(np.diff(keys, prepend=-1))
+    every = np.union1d(keys[first], listed)
+    counts = np.zeros(len(every), np.int64)
+    counts[np.searchsorted(every, keys[first])] = np.diff(first, append=len(keys))
+    return every, counts, order

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from jaxba.structure.observation_order import ObservationOrder
+
 MIN_DENSITY = 0.1
 """Smallest number of pairs, per point and cameras squared, for which a dense matrix product is cheaper. Measured: it is
 17 times as fast per operation as products of listed pairs, and computes each of them twice."""
@@ -44,16 +46,12 @@ def has_dense_shape(tracks: np.ndarray, cameras: int, columns: int) -> bool:
     return bool(dense or has_small_capacitance(columns, cameras))
 
 
-def is_dense(camera: np.ndarray, point: np.ndarray, tracks: np.ndarray, cameras: int, columns: int) -> bool:
+def is_dense(observations: ObservationOrder, cameras: int, columns: int) -> bool:
     """Whether one dense product is cheaper than listed pairs. Impossible if a camera sees a point twice.
 
     Args:
-        camera: camera of each observation; observations are sorted by point, then by camera.
-        point: point of each observation.
-        tracks: number of observations of each point.
-        cameras: number of cameras.
+        observations: of the problem.
+        cameras: number of cameras, including padding.
         columns: number of points in layout order, including padding.
     """
-    if not has_dense_shape(tracks, cameras, columns):
-        return False
-    return not np.any((camera[1:] == camera[:-1]) & (point[1:] == point[:-1]))
+    return has_dense_shape(observations.tracks, cameras, columns) and not observations.num_repeated_pairs

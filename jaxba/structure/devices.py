@@ -24,17 +24,21 @@ T = TypeVar("T")
 
 def sum_over_devices(layout: Layout, values: T) -> T:
     """The sum of an array, or of each of a pytree, over all devices."""
-    return values if layout.axis is None else lax.psum(values, layout.axis)
+    for axis in layout.axes:
+        values = lax.psum(values, axis)
+    return values
 
 
 def max_over_devices(layout: Layout, value: Array) -> Array:
     """The largest value of any device."""
-    return value if layout.axis is None else lax.pmax(value, layout.axis)
+    for axis in layout.axes:
+        value = lax.pmax(value, axis)
+    return value
 
 
 def on_one_device(layout: Layout, values: T) -> T:
     """The values on the first device and zeros on the others: a term that is no sum over points, before a sum."""
-    if layout.axis is None:
-        return values
-    first = lax.axis_index(layout.axis) == 0
-    return jax.tree.map(lambda x: jnp.where(first, x, jnp.zeros_like(x)), values)
+    for axis in layout.axes:
+        first = lax.axis_index(axis) == 0
+        values = jax.tree.map(lambda x, first=first: jnp.where(first, x, jnp.zeros_like(x)), values)
+    return values

@@ -30,7 +30,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.structure.agreement import Agreement, size_of
+from jaxba.structure.agreement import ALONE, Agreement
 from jaxba.structure.camera_clusters import ClusterLayout, cluster_layout
 from jaxba.structure.covisibility import PairLayout, pair_layout
 from jaxba.structure.density import is_dense
@@ -96,14 +96,14 @@ class Layout(ArrayRecord):
     partitions: Partition | None
     """Random partitions of the cameras, along a leading axis; None if no method uses them."""
 
-    unknowns: Unknowns | None
-    """Camera models, and what is shared or constant; None if all numbers of all BAL cameras and points are unknown."""
+    unknowns: Unknowns
+    """Camera models, and what is shared or constant."""
 
     buckets: tuple[Bucket, ...] = field(metadata={"static": True})
     """Shape of each bucket; empty for a layout with fixed capacity."""
 
-    axis: str | None = field(default=None, metadata={"static": True})
-    """Axis of the mesh over which points are divided (structure/devices.py); None: all are here."""
+    axes: tuple[str, ...] = field(default=(), metadata={"static": True})
+    """Axis of the mesh over which points are divided (structure/devices.py); none: all are here."""
 
     @property
     def num_slots(self) -> int:
@@ -132,7 +132,7 @@ def build_layout(
     capacity: Capacity | None = None,
     fixed_intrinsics: bool = False,
     observations: ObservationOrder | None = None,
-    agreement: Agreement | None = None,
+    agreement: Agreement = ALONE,
 ) -> Layout:
     """Assigns a problem's observations to slots and builds the index arrays of their sums.
 
@@ -165,69 +165,61 @@ def build_layout(
         raise ValueError(f"the problem is larger than the capacity: {capacity}")
     cameras = problem.num_cameras if capacity is None else capacity.cameras
     observations = observations or ObservationOrder.of(problem)
-    camera, point, tracks = observations.camera, observations.point, observations.tracks
-    order, start = observations.order, observations.start
+    camera, tracks, order = observations.camera, observations.tracks, observations.order
     seen = np.bincount(camera, minlength=cameras)
-    part = lambda name: None if agreement is None else agreement.within(name)
-    is_seen = seen > 0 if agreement is None else agreement.total("seen", seen) > 0
+    is_seen = agreement.total("seen", seen) > 0
 
-    assignment = bucket_slots(tracks, part("buckets")) if capacity is None else padded_slots(tracks, capacity)
-    slot, slot_point, empty = assignment.slot, assignment.point, assignment.empty
-    slots = len(slot_point)
+    slots = bucket_slots(tracks, agreement.within("buckets")) if capacity is None else padded_slots(tracks, capacity)
+    slot, empty, count = slots.slot, slots.empty, len(slots.point)
 
     def in_slots(values: np.ndarray, otherwise: Any = 0) -> np.ndarray:
         """Values of the sorted observations, which are their first axis, as the last axis of the slots."""
-        found = np.full((*values.shape[1:], slots), otherwise, values.dtype)
+        found = np.full((*values.shape[1:], count), otherwise, values.dtype)
         found[..., slot] = np.moveaxis(values, 0, -1)
         return found
 
     in_order = lambda values: in_slots(np.asarray(values, np.float64)[order])
     room = None if capacity is None else room_for(seen, capacity.usual_observations(len(camera)), capacity.points)
     by_camera = sorted_by(camera, cameras)
-    levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, part("cameras"))
+    levels = sum_tree(slot[by_camera], seen, empty, CAMERA_CHUNK, room, agreement.within("cameras"))
     camera_levels = with_spare_row(levels, empty)
-    slot_grid = None
-    columns = len(assignment.points)
-    if pairs and factor and grid and _is_dense(camera, point, tracks, cameras, columns, agreement):
-        slot_grid = np.full((columns, cameras), empty, np.int32)
-        slot_grid[slot_point[slot], camera] = slot
-    pair_lists = None
-    unknowns = unknowns_of(problem, is_seen, assignment.points, fixed=fixed_intrinsics, agreement=agreement)
-    if pairs and slot_grid is None:
+    unknowns = unknowns_of(problem, is_seen, slots.points, fixed=fixed_intrinsics, agreement=agreement)
+    pair_lists = slot_grid = drawn_partitions = camera_clusters = None
+    dense = pairs and factor and grid and is_dense(observations, cameras, len(slots.points))
+    if agreement.size("listed pairs", int(not dense)) == 0:  # in all shards or none
+        slot_grid = np.full((len(slots.points), cameras), empty, np.int32)
+        slot_grid[slots.point[slot], camera] = slot
+    elif pairs:
         slots_by_camera = camera_levels[0].ravel()
-        sorted_index = np.zeros(slots, np.int32)  # camera-sorted index of each slot
+        sorted_index = np.zeros(count, np.int32)  # camera-sorted index of each slot
         sorted_index[slots_by_camera] = np.arange(len(slots_by_camera))
-        empty_index = int(sorted_index[empty])
         pair_lists = pair_layout(
             camera,
             sorted_index[slot],
             tracks,
-            start,
+            observations.start,
             cameras,
-            empty_index,
+            int(sorted_index[empty]),
             factor=factor,
-            banded=unknowns is None or unknowns.frame is None,
+            banded=not unknowns.poses.several,
             capacity=capacity,
-            agreement=part("pairs"),
+            agreement=agreement.within("pairs"),
         )
-    drawn_partitions = None
     if partitions is not None:
         if pair_lists is None:
             raise ValueError("partitions need pairs that are listed: pairs=True, factor=False")
-        drawn_partitions = partition_layout(observations, assignment, pair_lists, partitions)
-    camera_clusters = None
+        drawn_partitions = partition_layout(observations, slots, pair_lists, partitions)
     if clusters:
-        shared = None if unknowns is None or unknowns.members is None else np.asarray(unknowns.members)
-        camera_clusters = cluster_layout(observations, assignment, shared, part("clusters"))
+        camera_clusters = cluster_layout(observations, slots, unknowns.lenses, agreement.within("clusters"))
     return Layout(
         slot_camera=in_slots(camera.astype(np.int32)),
-        slot_point=slot_point,
+        slot_point=slots.point,
         slot_mask=in_slots(np.ones(len(camera), bool)),
         observation=in_slots(order.astype(np.int32), problem.num_observations),
         pixels=in_order(problem.observations),
         whitening=None if problem.whitening is None else in_order(problem.whitening),
-        points=assignment.points,
-        point_levels=assignment.levels,
+        points=slots.points,
+        point_levels=slots.levels,
         camera_levels=camera_levels,
         camera_seen=is_seen,
         pairs=pair_lists,
@@ -235,7 +227,7 @@ def build_layout(
         clusters=camera_clusters,
         partitions=drawn_partitions,
         unknowns=unknowns,
-        buckets=assignment.buckets,
+        buckets=slots.buckets,
     )
 
 
@@ -244,7 +236,7 @@ def layout_for(
     options: StepOptions,
     capacity: Capacity | None = None,
     observations: ObservationOrder | None = None,
-    agreement: Agreement | None = None,
+    agreement: Agreement = ALONE,
 ) -> Layout:
     """The layout with exactly the parts that a step with these options needs. Arguments as for `build_layout`."""
     return build_layout(
@@ -258,19 +250,6 @@ def layout_for(
         observations=observations,
         agreement=agreement,
     )
-
-
-def _is_dense(
-    camera: np.ndarray,
-    point: np.ndarray,
-    tracks: np.ndarray,
-    cameras: int,
-    columns: int,
-    agreement: Agreement | None,
-) -> bool:
-    """`is_dense`, of all shards or none."""
-    own = is_dense(camera, point, tracks, cameras, columns)
-    return size_of(agreement, "listed pairs", int(not own)) == 0
 
 
 def num_partitions(layout: Layout) -> int:

@@ -16,7 +16,7 @@ from jaxtyping import Int
 
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
-from jaxba.structure.agreement import Agreement
+from jaxba.structure.agreement import Round
 from jaxba.structure.devices import AXIS
 from jaxba.structure.layout import Layout, layout_for
 
@@ -60,10 +60,10 @@ def sharded_layout(
     """
     known: dict[str, Any] = {}
     for _ in range(MAX_ROUNDS):
-        agreements = [Agreement(known) for _ in shards]
+        agreements = [Round(known) for _ in shards]
         layouts = [layout_for(shard, options, agreement=one) for shard, one in zip(shards, agreements, strict=True)]
-        found = Agreement.merged(merge([one.found for one in agreements]))
-        if Agreement.same(found, known):
-            return [replace(layout, axis=AXIS) for layout in layouts]
+        found = Round.merged(merge([one.found for one in agreements]))
+        if Round.same(found, known):
+            return [replace(layout, axes=(AXIS,)) for layout in layouts]
         known = found
     raise RuntimeError("the layouts of shards do not agree")

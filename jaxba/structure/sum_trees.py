@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.structure.agreement import Agreement, size_of
+from jaxba.structure.agreement import ALONE, Agreement
 
 TREE_WIDTH = 8
 """Width of the chunks on all levels but the first."""
@@ -26,6 +26,23 @@ class Room(NamedTuple):
     most: int
     """Largest number of items of one target."""
 
+    def chunks(self, items: int, counts: Int[np.ndarray, " targets"], width: int) -> int:
+        """Room for the chunks of so many items at most, for any number of each target."""
+        return chunks_at_most(items, len(counts), width)
+
+
+class Exact(Room):
+    """The numbers of the data themselves, so that shapes depend on them."""
+
+    @classmethod
+    def of(cls, counts: Int[np.ndarray, " targets"]) -> Exact:
+        """Of targets with so many items."""
+        return cls(int(counts.sum()), int(counts.max(initial=1)))
+
+    def chunks(self, items: int, counts: Int[np.ndarray, " targets"], width: int) -> int:
+        """The chunks of targets with so many items."""
+        return int((-(-counts // width)).sum())
+
 
 def sum_tree(
     items: np.ndarray,
@@ -33,7 +50,7 @@ def sum_tree(
     empty: int,
     width: int,
     room: Room | None = None,
-    agreement: Agreement | None = None,
+    agreement: Agreement = ALONE,
 ) -> tuple[np.ndarray, ...]:
     """The summation tree of `items`, with chunks of `width` on the first level and of `TREE_WIDTH` on the others.
 
@@ -54,16 +71,16 @@ def sum_tree(
         ValueError: the items exceed the room.
     """
     levels = []
-    space, most = room or Room(len(items), int(counts.max(initial=1)))
+    room = room or Exact.of(counts)
+    space, most = room
     if len(items) > space or counts.max(initial=0) > most:
         raise ValueError(f"no room for {len(items)} items, {counts.max(initial=0)} of one target, in {room}")
-    most = size_of(agreement, "most", most)
+    most = agreement.size("most", most)
     while True:
         width = max(1, min(width, most))
-        chunks = -(-counts // width)
-        used, last = int(chunks.sum()), most <= width
-        space = used if room is None else chunks_at_most(space, len(counts), width)
-        space = size_of(agreement, f"level {len(levels)}", space)
+        chunks, last = -(-counts // width), most <= width
+        space = room.chunks(space, counts, width)
+        space = agreement.size(f"level {len(levels)}", space)
         rows = np.arange(len(counts)) if last else np.cumsum(chunks) - chunks
         total = len(counts) if last else space + 1
         target = np.repeat(np.arange(len(counts)), counts)
@@ -73,7 +90,7 @@ def sum_tree(
         levels.append(level)
         if last:
             return tuple(levels)
-        items, counts, empty = np.arange(used), chunks, total - 1
+        items, counts, empty = np.arange(int(chunks.sum())), chunks, total - 1
         most, width = -(-most // width), TREE_WIDTH
 
 

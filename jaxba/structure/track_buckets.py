@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from jaxba.structure.agreement import Agreement, size_of
+from jaxba.structure.agreement import ALONE, Agreement
 from jaxba.structure.padding import POINT_CHUNK, Capacity, room_for
 from jaxba.structure.sum_trees import prefix_levels
 
@@ -61,21 +61,16 @@ class Slots(NamedTuple):
     """An empty slot."""
 
 
-def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement | None = None) -> Slots:
+def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement = ALONE) -> Slots:
     """Puts points of similar track length into buckets of shape `tiles x t x n`.
 
     Args:
         tracks: number of observations of each point; observations are sorted by point.
         agreement: with the other shards of a problem, which have the same buckets.
     """
-    values, counts = np.unique(tracks[tracks > 0], return_counts=True)
-    if agreement is not None:
-        values = agreement.union("track lengths", values)
-        own = np.zeros(len(values), np.int64)
-        own[np.searchsorted(values, np.unique(tracks[tracks > 0]))] = counts
-        counts = np.array(
-            [agreement.size(f"points of {length}", int(n)) for length, n in zip(values, own, strict=True)]
-        )
+    values = agreement.union("track lengths", 1 + np.flatnonzero(np.bincount(tracks)[1:]))
+    own = np.bincount(tracks, minlength=int(values.max(initial=0)) + 1)[values]
+    counts = np.array([agreement.size(f"points of {length}", int(n)) for length, n in zip(values, own, strict=True)])
     lengths = _bucket_lengths(values, counts)
     which = np.searchsorted(lengths, tracks)
     column = np.zeros(len(tracks), np.int64)  # index of a point in its bucket
@@ -84,7 +79,7 @@ def bucket_slots(tracks: Int[np.ndarray, " points"], agreement: Agreement | None
     for number, length in enumerate(lengths):
         members = np.flatnonzero((which == number) & (tracks > 0))
         column[members] = np.arange(len(members))
-        wanted = size_of(agreement, f"bucket {number}", len(members))
+        wanted = agreement.size(f"bucket {number}", len(members))
         wanted += number == 0  # one padding point, so that there always is an empty slot
         tile = TILE if wanted >= TILED_POINTS else wanted
         tiles = -(-wanted // tile)

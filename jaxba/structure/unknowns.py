@@ -19,122 +19,129 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.camera_models import CameraModel
+from jaxba.problem.camera_models import BAL, CameraModel
 from jaxba.problem.frames import free_poses
-from jaxba.problem.intrinsics import POSE_SIZE, lens_size
+from jaxba.problem.intrinsics import LENS_SIZE, POSE_SIZE, Lenses, lens_size
 from jaxba.problem.labels import part_name
+from jaxba.problem.options import Intrinsics
 from jaxba.problem.priors import Priors
-from jaxba.structure.agreement import Agreement, size_of
+from jaxba.problem.rigs import EXTRINSICS_SIZE
+from jaxba.structure.agreement import Agreement
+from jaxba.structure.sharing import Mask, Sharing
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 
 @register_pytree
 @dataclass(frozen=True, eq=False, repr=False)
 class Unknowns(ArrayRecord):
-    """The unknowns of a problem, where they are not just all numbers of all BAL cameras and points."""
+    """The unknowns of a problem: of cameras and points, which are optimised, and which are the same."""
 
-    members: Bool[AnyArray, "cameras lenses"] | None
-    """Whether an observed camera has this lens, for each lens that several observed cameras have; None if there is
-    none."""
+    poses: Sharing
+    """Cameras that move together: those of a frame."""
 
-    frame: Int[AnyArray, " cameras"] | None
-    """Frame of each camera; None if no observed cameras move together."""
+    lenses: Sharing
+    """Observed cameras that have a lens in common of which something is optimised."""
 
-    free: Bool[AnyArray, "width cameras"] | None
-    """Which unknowns of each camera's block are optimised; None: all."""
+    free: Mask
+    """Which unknowns of each camera's block are optimised, [width, cameras]."""
 
-    free_points: Bool[AnyArray, " points"] | None
-    """Which points are optimised, in layout order; None: all."""
+    free_points: Mask
+    """Which points are optimised, in layout order."""
 
-    model: Int[AnyArray, " cameras"] | None
-    """Camera model of each camera, a position in `models`; None if there is only one."""
+    model: Int[AnyArray, " cameras"]
+    """Camera model of each camera, a position in `models`."""
 
-    priors: Priors | None
-    """Priors, with a row for each camera also of what is known of lenses: a shared lens has its weight in one of them;
-    None if there are none."""
+    priors: tuple[Priors, ...]
+    """Priors if there are any, with a row for each camera also of what is known of lenses: a shared lens has its weight
+    in one of them."""
 
-    models: tuple[CameraModel, ...] | None = field(metadata={"static": True})
-    """Camera models; None if all are BAL's."""
+    models: tuple[CameraModel, ...] = field(metadata={"static": True})
+    """Camera models."""
 
     all_shared: bool = field(metadata={"static": True})
-    """Whether every observed camera has one of these lenses."""
+    """Whether every observed camera has a lens in common with others."""
 
     columns: tuple[int, ...] = field(metadata={"static": True})
-    """Numbers of a lens that are part of a camera's block, ascending."""
+    """Numbers of a lens, and then of extrinsics, that are part of a camera's block, ascending."""
 
-    size: int = field(metadata={"static": True})
-    """Number of all intrinsics of a camera, and of its extrinsics if it is in a rig."""
+    lens_size: int = field(metadata={"static": True})
+    """Number of all intrinsics of a camera."""
 
-    in_rigs: bool = field(default=False, metadata={"static": True})
+    in_rigs: bool = field(metadata={"static": True})
     """Whether poses are those of frames, and the last numbers of a camera its extrinsics (problem/rigs.py)."""
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """First parameter of each pose of a camera after its first: of its extrinsics in a rig."""
+        return (POSE_SIZE + self.lens_size,) * self.in_rigs
+
+    @property
+    def size(self) -> int:
+        """Number of all intrinsics of a camera, and of its extrinsics if it is in a rig."""
+        return self.lens_size + EXTRINSICS_SIZE * self.in_rigs
 
     @property
     def shared(self) -> bool:
         """Whether several cameras have a number in common: of a lens, or the pose of a frame."""
-        return self.members is not None or self.frame is not None
+        return self.poses.several or self.lenses.several
+
+    @property
+    def plain(self) -> bool:
+        """Whether all numbers of BAL cameras and points are optimised, each by itself, and nothing else."""
+        whole = self.models == (BAL,) and len(self.columns) == self.size
+        return whole and self.free.everywhere and self.free_points.everywhere and not (self.shared or self.priors)
 
     @property
     def width(self) -> int:
         """Number of unknowns in a camera's block."""
         return POSE_SIZE + len(self.columns)
 
-    def index(self, cameras: int) -> Int[Array, "cameras width"]:
-        """A number for each unknown of each camera's block, the same for those that are one, below cameras x width."""
-        number, every = jnp.arange(self.width), jnp.arange(cameras)
-        frame = every if self.frame is None else jnp.asarray(self.frame)
-        lens = every
-        if self.members is not None:
-            members = jnp.asarray(self.members)
-            first = jnp.argmax(members, axis=0)[jnp.argmax(members, axis=1)]  # the first camera with the same lens
-            lens = jnp.where(jnp.any(members, axis=1), first, every)
-        return jnp.where(number < POSE_SIZE, frame[:, None], lens[:, None]) * self.width + number
+    @property
+    def numbers(self) -> Sharing:
+        """Which unknowns of all blocks, flattened, are the same."""
+        return Sharing.joined((self.poses, POSE_SIZE), (self.lenses, len(self.columns)))
 
-    def total(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "lenses numbers"]:
-        """Sums over the cameras of each shared lens: the product with `T^T`."""
-        assert self.members is not None
-        return jnp.matmul(self.members.T.astype(values.dtype), values, precision="highest")
+    def _each(self, name: str, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
+        if not self.shared:
+            return x
+        parts = (self.poses, x[:, :POSE_SIZE]), (self.lenses, x[:, POSE_SIZE:])
+        return jnp.concatenate([getattr(sharing, name)(part) for sharing, part in parts], axis=1)
 
-    def spread(
-        self, values: Float[Array, "lenses numbers"], own: Float[Array, "cameras numbers"]
-    ) -> Float[Array, "cameras numbers"]:
-        """The values of its shared lens for each camera that has one, its own for the others: the product with T."""
-        assert self.members is not None
-        at = jnp.argmax(jnp.asarray(self.members), axis=1)
-        return jnp.where(jnp.any(self.members, axis=1)[:, None], values[at], own)
+    def sums(self, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
+        """For each number the sum over the cameras that have it in common."""
+        return self._each("sums", x)
 
-    def mean(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "cameras numbers"]:
-        """The mean over the cameras with the same lens."""
-        count = jnp.sum(jnp.asarray(self.members), axis=0, dtype=values.dtype)
-        return self.spread(self.total(values) / count[:, None], values)
+    def shares(self, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
+        """An equal part of each number for each camera that has it in common with others."""
+        return self._each("shares", x)
 
     def project(self, x: Float[Array, "cameras width"]) -> Float[Array, "cameras width"]:
         """The orthogonal projection P on the range of T, without what is constant."""
-        if self.free is not None:
-            x = jnp.where(jnp.asarray(self.free).T, x, jnp.zeros_like(x))
-        pose, lens = x[:, :POSE_SIZE], x[:, POSE_SIZE:]
-        pose = pose if self.frame is None else self.frame_mean(pose)
-        return jnp.concatenate([pose, lens if self.members is None else self.mean(lens)], axis=1)
+        return self._each("mean", self.free.where(x.T, 0).T)
 
-    def frame_total(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "cameras numbers"]:
-        """Sums over the cameras of each frame, for each of its cameras."""
-        assert self.frame is not None
-        return jax.ops.segment_sum(values, self.frame, num_segments=len(values))[jnp.asarray(self.frame)]
+    def constant(self, intrinsics: Intrinsics, *, alone: bool) -> tuple[bool, ...]:
+        """Which columns of the blocks are constant for all cameras.
 
-    def frame_mean(self, values: Float[Array, "cameras numbers"]) -> Float[Array, "cameras numbers"]:
-        """The mean over the cameras of each frame."""
-        return self.frame_total(values) / self.frame_total(jnp.ones_like(values[:, :1]))
+        Args:
+            intrinsics: `fixed`: all intrinsics are.
+            alone: whether cameras are optimised one by one, so that what some of them share is.
+        """
+        shared = alone and self.lenses.several
+        lens = (shared or (intrinsics == "fixed" and column < self.lens_size) for column in self.columns)
+        return (*(alone and self.poses.several,) * POSE_SIZE, *lens)
 
     def restricted(
         self, changes: Float[AnyArray, "*steps parameters cameras"]
     ) -> Float[AnyArray, "*steps width cameras"]:
         """The unknowns of changes of all numbers of cameras."""
+        if len(self.columns) == self.size:
+            return changes
         rows = [*range(POSE_SIZE), *(POSE_SIZE + column for column in self.columns)]
         return changes[..., np.array(rows), :]
 
@@ -153,8 +160,8 @@ def unknowns_of(
     order: Int[np.ndarray, " points"],
     *,
     fixed: bool,
-    agreement: Agreement | None = None,
-) -> Unknowns | None:
+    agreement: Agreement,
+) -> Unknowns:
     """The unknowns of a problem, for its layout.
 
     Args:
@@ -163,73 +170,70 @@ def unknowns_of(
         order: point of the problem at each position in layout order; out of range for padding.
         fixed: whether all intrinsics are constant.
         agreement: with the other shards of the problem, some of whose points may be constant.
-
-    Returns:
-        None if all numbers of all cameras and points are optimised, as in BAL.
     """
-    lenses, constants = problem.lenses, problem.constants
-    plain = lenses is None and constants is None and problem.priors is None and problem.rigs is None
-    if plain and not fixed:
-        return None
-    count, in_rigs = problem.num_cameras, problem.rigs is not None
-    index = np.arange(count) if lenses is None else np.asarray(lenses.index)
-    lens_free = np.ones((count, lens_size(lenses)), bool) if lenses is None else np.asarray(lenses.free)[index]
-    lens_free = lens_free & (not fixed)
+    lenses = problem.lenses or Lenses(np.arange(problem.num_cameras), np.ones((problem.num_cameras, LENS_SIZE), bool))
+    padding, index = len(seen) - problem.num_cameras, np.asarray(lenses.index)
     poses_free = free_poses(problem)
-    lens_free = np.hstack([lens_free, poses_free[:, POSE_SIZE:]])
+    lens_free = np.hstack([np.asarray(lenses.free)[index] & (not fixed), poses_free[:, POSE_SIZE:]])
     columns = tuple(np.flatnonzero(lens_free.any(axis=0)).tolist())
-    free_points = None
-    if constants is not None and size_of(agreement, "constant points", int(np.asarray(constants.points).any())):
-        free_points = np.append(~np.asarray(constants.points), True)[np.minimum(order, problem.num_points)]
-    members = model = frame = None
-    if in_rigs:
-        frame = _frames(problem, seen[:count])
-    shared, times = np.unique(index[seen[:count]], return_counts=True)
-    shared = shared[times > 1]
-    if lenses is not None and columns and len(shared):
-        members = (index[:, None] == shared) & seen[:count, None]
-    all_shared = bool((times > 1).all())
     free = np.hstack([poses_free[:, :POSE_SIZE], lens_free[:, columns]])
-    models = None if lenses is None or lenses.all_bal else lenses.models
-    if models is not None and len(models) > 1:
-        assert lenses is not None
-        assert lenses.model is not None
-        model = np.asarray(lenses.model)[index]
-    priors = None if problem.priors is None else _camera_priors(problem, index, seen)
-    free_numbers = None if free.all() else free.T
-    size = lens_free.shape[1]
+    free = np.pad(free, ((0, padding), (0, 0)), constant_values=True)
+    held = np.zeros(problem.num_points, bool) if problem.constants is None else np.asarray(problem.constants.points)
+    any_held = agreement.size("constant points", int(held.any()))
+    apart = -1 - np.arange(len(seen))  # names of cameras that have nothing in common
+    padded = lambda names: np.where(seen, np.pad(names, (0, padding)), apart)
+    shares = Sharing.of(padded(index))
+    model = np.zeros(problem.num_cameras, np.int32) if lenses.model is None else np.asarray(lenses.model)[index]
     return Unknowns(
-        members, frame, free_numbers, free_points, model, priors, models, all_shared, columns, size, in_rigs
+        poses=Sharing.of(apart if problem.rigs is None else padded(_frames(problem))),
+        lenses=shares if columns else Sharing.of(apart),
+        free=Mask.of(free.T),
+        free_points=Mask(np.append(~held, True)[np.minimum(order, problem.num_points)], not any_held),
+        model=np.pad(model, (0, padding)),
+        priors=_camera_priors(problem, index, seen),
+        models=lenses.models,
+        all_shared=bool(np.isin(shares.index, shares.owners)[seen].all()),
+        columns=columns,
+        lens_size=lens_size(lenses),
+        in_rigs=problem.rigs is not None,
     )
 
 
-def _frames(problem: BundleProblem, seen: np.ndarray) -> Int[np.ndarray, " cameras"]:
-    """The frame of each camera; unobserved cameras get frames of their own."""
+def _frames(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
+    """The frame of each camera."""
     assert problem.rigs is not None
-    frame = np.asarray(problem.rigs.frame).astype(np.int64)
-    frame = np.where(seen, frame, frame.max(initial=0) + 1 + np.arange(len(frame)))
-    _, frame = np.unique(frame, return_inverse=True)
     if problem.constants is not None:
         held = np.asarray(problem.constants.poses)[:, 3:]
         bad = np.flatnonzero(held.any(axis=1) & ~held.all(axis=1) & problem.rigs.turned)
         if bad.size:
             name = part_name(problem.labels, "image", int(bad[0]))
             raise ProblemError(f"part of the translation of {name} is constant, which is turned in its rig")
-    return frame.astype(np.int32)
+    return np.asarray(problem.rigs.frame)
 
 
-def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> Priors:
+def _camera_priors(problem: BundleProblem, index: np.ndarray, seen: np.ndarray) -> tuple[Priors, ...]:
     """Cameras that nothing sees have no priors: they are not optimised."""
     priors = problem.priors
-    assert priors is not None
+    if priors is None:
+        return ()
     observed = np.flatnonzero(seen[: len(index)])
     first = np.zeros(len(index), bool)
     first[observed[np.unique(index[observed], return_index=True)[1]]] = True
     seen = seen[: len(index), None, None]
-    return replace(
+    whole = replace(
         priors,
         position_whitening=np.asarray(priors.position_whitening) * seen,
         rotation_whitening=np.asarray(priors.rotation_whitening) * seen,
         lenses=np.asarray(priors.lenses)[index],
         lens_weight=np.asarray(priors.lens_weight)[index] * first[:, None],
     )
+    return (whole,)
+
+
+NONE_SHARED = Sharing.of(np.zeros(0, np.int32))
+ALL_FREE = Mask(np.zeros(0, bool), True)
+
+BAL_UNKNOWNS = Unknowns(
+    NONE_SHARED, NONE_SHARED, ALL_FREE, ALL_FREE, np.zeros(0, np.int32), (), (BAL,), False, (0, 1, 2), LENS_SIZE, False
+)
+"""Those of BAL cameras, all of whose numbers are optimised, however many there are."""

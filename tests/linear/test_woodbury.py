@@ -9,7 +9,7 @@ import pytest
 import support
 
 from jaxba import StepOptions, build_layout, initial_state, lm_step, random_scene, scene_like
-from jaxba.linear import reduced_system
+from jaxba.linear import factored
 from jaxba.linear.schur import CameraSystem
 from jaxba.linear.woodbury import capacitance_solve
 from jaxba.runtime.process import single_blas_thread
@@ -135,7 +135,7 @@ def test_a_step_by_way_of_the_points_is_the_step_by_way_of_the_cameras(monkeypat
     assert has_few_points(*layout.grid.shape)
     before = initial_state(layout, problem, StepOptions())
     one = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
-    monkeypatch.setattr(reduced_system, "has_few_points", lambda points, cameras: False)
+    monkeypatch.setattr(factored, "has_few_points", lambda points, cameras: False)
     other = lm_step(layout, before, jnp.asarray(damping), StepOptions())[0]
     moved = lambda after: jax.tree.leaves(jax.tree.map(lambda a, b: np.asarray(a - b), after, before))
     for found, truth in zip(moved(one), moved(other), strict=True):

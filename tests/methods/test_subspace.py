@@ -12,11 +12,10 @@ import support
 from support import solve, start, step
 from textbook_cg import PRECONDITIONERS, SIZE, by_hand, right, spd
 
-from jaxba import LMState, StepOptions, make_method, make_policy, random_scene
+from jaxba import LMState, StepOptions, make_method, make_policy, random_scene, rotations
 from jaxba.methods.deeplm import GlobalConjugateGradients
 from jaxba.methods.poba import PowerSeries
 from jaxba.methods.subspace import on_manifold, with_previous
-from jaxba.model import camera
 from jaxba.problem.options import ConjugateGradients, Refinement
 from jaxba.scenes import SceneConfig
 
@@ -76,7 +75,7 @@ def test_changes_of_the_file_are_turned_to_the_manifold():
     turned = np.asarray(on_manifold(jnp.asarray(cameras), jnp.asarray(change)))
     small = 1e-6
     for k in range(2):
-        moved = camera.compose_left(jnp.asarray(small * turned[k, :, :3].T), jnp.asarray(cameras[:3]))
+        moved = rotations.compose_left(jnp.asarray(small * turned[k, :, :3].T), jnp.asarray(cameras[:3]))
         np.testing.assert_allclose((np.asarray(moved) - cameras[:3]) / small, change[k, :3], rtol=1e-4, atol=1e-5)
         np.testing.assert_array_equal(turned[k, :, 3:], change[k, 3:].T)
 

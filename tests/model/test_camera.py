@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from jaxba import rotations
 from jaxba.model import camera
 from jaxba.problem import geometry
 
-THRESHOLD = np.sqrt(camera.SMALL_ANGLE_SQUARED)
+THRESHOLD = np.sqrt(rotations.SMALL_ANGLE_SQUARED)
 ANGLES = [0.0, 1e-160, 1e-12, 1e-8, 1e-4, *(THRESHOLD * np.array([0.5, 1 - 1e-9, 1.0, 1 + 1e-9, 2.0])), 0.03, 0.5, 1.0]
 ANGLES += [2.0, 3.0, np.pi - 1e-7, np.pi, np.pi + 1e-7, 4.0]
 """From nothing through the switch to the series, to half a turn and past it."""
@@ -40,21 +41,21 @@ def matrices(function, w: np.ndarray) -> np.ndarray:
 
 def test_rotation_matrices_are_those_of_scipy():
     w = vectors([*ANGLES, 6.0, 2 * np.pi, 10.0])
-    np.testing.assert_allclose(matrices(camera.rotation_matrix, w), Rotation.from_rotvec(w).as_matrix(), atol=4e-15)
+    np.testing.assert_allclose(matrices(rotations.rotation_matrix, w), Rotation.from_rotvec(w).as_matrix(), atol=4e-15)
 
 
 def test_rotation_matrices_are_orthogonal_with_determinant_one():
-    found = matrices(camera.rotation_matrix, vectors())
+    found = matrices(rotations.rotation_matrix, vectors())
     np.testing.assert_allclose(found @ found.transpose(0, 2, 1), np.broadcast_to(IDENTITY, found.shape), atol=4e-15)
     np.testing.assert_allclose(np.linalg.det(found), 1, atol=4e-15)
 
 
 def test_zero_rotation_is_exactly_the_identity():
-    assert np.array_equal(matrices(camera.rotation_matrix, np.zeros((1, 3)))[0], IDENTITY)
+    assert np.array_equal(matrices(rotations.rotation_matrix, np.zeros((1, 3)))[0], IDENTITY)
 
 
 def test_rotation_is_differentiable_at_zero_with_the_generators_as_derivative():
-    derivative = jax.jacfwd(lambda w: camera.rotation_matrix(w[:, None])[..., 0])(jnp.zeros(3))
+    derivative = jax.jacfwd(lambda w: rotations.rotation_matrix(w[:, None])[..., 0])(jnp.zeros(3))
     for k in range(3):
         np.testing.assert_array_equal(np.asarray(derivative)[:, :, k], np.cross(IDENTITY, IDENTITY[k]).T * -1)
 
@@ -62,7 +63,7 @@ def test_rotation_is_differentiable_at_zero_with_the_generators_as_derivative():
 def test_left_jacobian_is_the_derivative_of_the_exponential():
     """`exp(w + h e) exp(w)^-1 = exp(J h e)`, by central differences on the group; error h^2 + eps / h."""
     w, h = vectors(), 1e-5
-    found = matrices(camera.left_jacobian, w)
+    found = matrices(rotations.left_jacobian, w)
     for k in range(3):
         ahead, behind = (Rotation.from_rotvec(w + s * h * IDENTITY[k]) for s in (1, -1))
         np.testing.assert_allclose(found[:, :, k], (ahead * behind.inv()).as_rotvec() / (2 * h), atol=2e-10)
@@ -76,19 +77,19 @@ def test_left_jacobian_is_the_mean_of_the_rotations_on_the_way():
         0.5 * weight * Rotation.from_rotvec(0.5 * (node + 1) * w).as_matrix()
         for node, weight in zip(nodes, weights, strict=True)
     )
-    np.testing.assert_allclose(matrices(camera.left_jacobian, w), mean, atol=1e-14)
+    np.testing.assert_allclose(matrices(rotations.left_jacobian, w), mean, atol=1e-14)
 
 
 def test_left_jacobian_inverse_is_the_inverse():
     w = vectors([*ANGLES, 5.0])
-    product = matrices(camera.left_jacobian, w) @ matrices(camera.left_jacobian_inverse, w)
+    product = matrices(rotations.left_jacobian, w) @ matrices(rotations.left_jacobian_inverse, w)
     np.testing.assert_allclose(product, np.broadcast_to(IDENTITY, product.shape), atol=2e-14)
 
 
 def test_left_jacobian_inverse_is_the_derivative_of_the_logarithm():
     """`log(exp(h e) exp(w)) = w + J^-1 h e`, by central differences, away from half a turn where the log jumps."""
     w, h = vectors([a for a in ANGLES if a < 3.1]), 1e-5
-    found = matrices(camera.left_jacobian_inverse, w)
+    found = matrices(rotations.left_jacobian_inverse, w)
     for k in range(3):
         ahead, behind = (Rotation.from_rotvec(s * h * IDENTITY[k]) * Rotation.from_rotvec(w) for s in (1, -1))
         np.testing.assert_allclose(found[:, :, k], (ahead.as_rotvec() - behind.as_rotvec()) / (2 * h), atol=1e-9)
@@ -99,7 +100,7 @@ def test_composition_is_that_of_scipy():
     some = vectors([0.0, 1e-12, 1e-8, THRESHOLD * (1 - 1e-9), THRESHOLD * (1 + 1e-9), 0.3, 2.5, np.pi])
     step, w = np.repeat(some, len(some), axis=0), np.tile(some, (len(some), 1))
     step, w = np.vstack([step, -some]), np.vstack([w, some])
-    found = np.array(camera.compose_left(jnp.asarray(step.T), jnp.asarray(w.T))).T
+    found = np.array(rotations.compose_left(jnp.asarray(step.T), jnp.asarray(w.T))).T
     expected = Rotation.from_rotvec(step) * Rotation.from_rotvec(w)
     np.testing.assert_allclose(Rotation.from_rotvec(found).as_matrix(), expected.as_matrix(), atol=1e-14)
     assert np.linalg.norm(found, axis=1).max() <= np.pi * (1 + 1e-14)
@@ -108,7 +109,7 @@ def test_composition_is_that_of_scipy():
 
 def test_composition_with_a_tiny_step_loses_no_digit_of_the_step():
     step = 1e-9 * vectors([1.0])
-    found = np.asarray(camera.compose_left(jnp.asarray(step.T), jnp.zeros((3, len(step))))).T
+    found = np.asarray(rotations.compose_left(jnp.asarray(step.T), jnp.zeros((3, len(step))))).T
     np.testing.assert_allclose(found, step, rtol=1e-14)  # a cosine in between would leave 7 digits of 16
 
 
@@ -116,17 +117,17 @@ def test_composition_with_a_tiny_step_loses_no_digit_of_the_step():
 @given(st.lists(st.floats(-3, 3), min_size=6, max_size=6))
 def test_composition_multiplies_matrices(numbers):
     step, w = np.array(numbers[:3]), np.array(numbers[3:])
-    found = np.asarray(camera.compose_left(jnp.asarray(step[:, None]), jnp.asarray(w[:, None]))).T
+    found = np.asarray(rotations.compose_left(jnp.asarray(step[:, None]), jnp.asarray(w[:, None]))).T
     both = geometry.rotation_matrices(np.stack([step, w]))
     np.testing.assert_allclose(geometry.rotation_matrices(found)[0], both[0] @ both[1], atol=2e-14)
 
 
 def test_single_precision_stays_single():
     w = jnp.asarray(vectors().T, jnp.float32)
-    functions = [camera.rotation_matrix, camera.left_jacobian, camera.left_jacobian_inverse]
+    functions = [rotations.rotation_matrix, rotations.left_jacobian, rotations.left_jacobian_inverse]
     assert {f(w).dtype for f in functions} == {jnp.dtype("float32")}
-    assert camera.compose_left(w, w).dtype == jnp.float32
-    found = np.moveaxis(np.asarray(camera.rotation_matrix(w)), -1, 0)
+    assert rotations.compose_left(w, w).dtype == jnp.float32
+    found = np.moveaxis(np.asarray(rotations.rotation_matrix(w)), -1, 0)
     np.testing.assert_allclose(found, Rotation.from_rotvec(vectors()).as_matrix(), atol=1e-6)
 
 

@@ -252,9 +252,9 @@ def test_clusters_are_split_by_shared_lenses_whose_columns_they_have_in_common()
     problem = with_lenses(scene, np.arange(64) % 2, np.ones((2, 3), bool))
     layout = layout_for(problem, StepOptions(linear_solver="implicit"))
     assert layout.clusters is not None
-    assert layout.clusters.tied is not None
-    of_cluster = np.asarray(layout.clusters.tied)[np.asarray(layout.clusters.label)]
-    np.testing.assert_array_equal(of_cluster, np.asarray(layout.unknowns.members))
+    assert layout.clusters.lenses.several
+    of_cluster = np.asarray(layout.clusters.lenses.members)[np.asarray(layout.clusters.label)]
+    np.testing.assert_array_equal(of_cluster, np.asarray(layout.unknowns.lenses.members))
     # the two changes that all cameras of a lens have in common cost few iterations
     rules = (ConjugateGradients(name) for name in ("two-level", "schur-jacobi"))
     two_level, plain = (
@@ -296,7 +296,6 @@ def test_fixed_intrinsics_are_no_unknowns_and_leave_a_band_a_band():
     scene = random_scene(SceneConfig(cameras=100, points=500, mean_track=4.0), seed=0)
     one = with_lenses(scene, np.zeros(100, int), np.ones((1, 3), bool))
     layout = layout_for(one, StepOptions(intrinsics="fixed"))
-    assert layout.unknowns is not None
     assert not layout.unknowns.shared
     assert layout.pairs is not None
     assert layout.pairs.band is not None

@@ -12,8 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxba
-from jaxba import SceneConfig, SolveOptions, Tolerances, differentiable_solve, inputs_of
-from jaxba.model import camera
+from jaxba import SceneConfig, SolveOptions, Tolerances, differentiable_solve, inputs_of, rotations
 from jaxba.problem import geometry
 from jaxba.problem.frames import in_frames, out_of_frames
 from jaxba.problem.freedoms import determined_directions, fixed_freedoms, free_directions
@@ -187,7 +186,7 @@ def test_what_determines_a_point_are_rays_that_are_not_parallel():
 
 def invariants(cameras: jax.Array, points: jax.Array) -> jax.Array:
     """Numbers that no similarity changes: ratios of distances of points and of cameras, an angle, focal lengths."""
-    rotation = jnp.moveaxis(camera.rotation_matrix(cameras[:, :3].T), 2, 0)
+    rotation = jnp.moveaxis(rotations.rotation_matrix(cameras[:, :3].T), 2, 0)
     center = lambda at: -rotation[at].T @ cameras[at, 3:6]
     length = lambda x: jnp.sqrt(jnp.sum(x * x))
     base = length(points[0] - points[11])
