@@ -33,7 +33,6 @@ from jaxba.game.random_scenes import (
     MOST_POINTS,
     PAPER_START,
     SceneClass,
-    _angle_axis,
     make_scenes,
 )
 from jaxba.game.rollout import Trajectories, play
@@ -44,6 +43,7 @@ from jaxba.lm.records import LMState
 from jaxba.lm.step import lm_step
 from jaxba.problem import geometry
 from jaxba.problem.options import Refinement
+from jaxba.rotations import angle_axis
 from jaxba.structure.layout import partition_of
 
 LIMIT = 25
@@ -135,7 +135,7 @@ def test_angle_axis_vectors_are_those_of_scipy(angle):
     axes = np.vstack([axes, np.eye(3), -np.eye(3)])
     axes /= np.linalg.norm(axes, axis=1, keepdims=True)
     rotation = Rotation.from_rotvec(angle * axes)
-    found = np.array(_angle_axis(jnp.asarray(rotation.as_matrix())))
+    found = np.array(angle_axis(jnp.asarray(rotation.as_matrix())))
     assert (np.linalg.norm(found, axis=1) <= np.pi + 1e-12).all()
     assert (Rotation.from_rotvec(found) * rotation.inv()).magnitude().max() < 1e-7 * angle + 1e-13
     if angle < np.pi - 1e-6:  # beyond, either sign of the axis is right within rounding
