@@ -243,6 +243,13 @@ def _projected(cameras, points):
 # Losses once more: loss_function.h of Ceres, `rho(s)` and `rho'(s)` for scale a
 
 
+def distort(plane: np.ndarray, intrinsics: np.ndarray) -> np.ndarray:
+    """Pixels of image plane coordinates p, [n, 2], under (f, k1, k2), [n, 3]: `f (1 + k1 |p|^2 + k2 |p|^4) p`."""
+    square = np.sum(plane**2, axis=1)
+    focal, k1, k2 = intrinsics.T
+    return (focal * (1 + square * (k1 + square * k2)))[:, None] * plane
+
+
 def published_loss(name: str, scale: float, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Value and derivative as Ceres defines them."""
     a, b = scale, scale**2

@@ -208,7 +208,7 @@ def test_derivatives_equal_central_differences(kind):
     def pixels(turn: np.ndarray, cameras: np.ndarray, points: np.ndarray) -> np.ndarray:
         rotation = geometry.rotation_matrices(turn) @ geometry.rotation_matrices(cameras[:, :3])
         local = np.einsum("nij,nj->ni", rotation, points) + cameras[:, 3:6]
-        return geometry.distort(local[:, :2] / -local[:, 2:], cameras[:, 6:])
+        return support.distort(local[:, :2] / -local[:, 2:], cameras[:, 6:])
 
     def central(parameter: int, k: int, h: np.ndarray) -> np.ndarray:
         ends = []
@@ -235,7 +235,7 @@ def test_derivatives_equal_central_differences(kind):
 def test_pixels_equal_the_host_camera(kind):
     cameras, points = scenes()[kind]
     local = np.einsum("nij,nj->ni", geometry.rotation_matrices(cameras[:, :3]), points) + cameras[:, 3:6]
-    expected = geometry.distort(local[:, :2] / -local[:, 2:], cameras[:, 6:])
+    expected = support.distort(local[:, :2] / -local[:, 2:], cameras[:, 6:])
     tolerance = 1e-12 * np.maximum(1, 1 / np.abs(local[:, 2]))[:, None]
     assert (np.abs(analytic(cameras, points)[0] - expected) <= tolerance * np.abs(expected).max(axis=1)[:, None]).all()
 

@@ -135,7 +135,7 @@ def test_every_camera_ends_where_scipy_ends_on_that_camera_alone():
         def residuals(x: np.ndarray, points=points, seen=seen) -> np.ndarray:
             local = points @ geometry.rotation_matrices(x[None, :3])[0].T + x[3:6]
             intrinsics = np.broadcast_to(x[6:], (len(points), 3))
-            return (geometry.distort(local[:, :2] / -local[:, 2:], intrinsics) - seen).ravel()
+            return (support.distort(local[:, :2] / -local[:, 2:], intrinsics) - seen).ravel()
 
         best = least_squares(
             residuals, problem.cameras[camera], x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14, max_nfev=2000

@@ -106,7 +106,7 @@ def test_every_point_ends_where_scipy_ends_on_that_point_alone(loss):
 
         def residuals(x: np.ndarray, cameras=cameras, seen=seen) -> np.ndarray:
             local = rotations[cameras] @ x + problem.cameras[cameras, 3:6]
-            r = geometry.distort(local[:, :2] / -local[:, 2:], problem.cameras[cameras, 6:]) - seen
+            r = support.distort(local[:, :2] / -local[:, 2:], problem.cameras[cameras, 6:]) - seen
             if loss.trivial:
                 return r.ravel()
             squared = np.sum(r**2, axis=1)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from support import same_bits, solve
 
 from jaxba import BundleProblem, StepOptions, build_layout
-from jaxba.problem import geometry
 from jaxba.problem.intrinsics import Lenses
 from jaxba.problem.options import Coordinates
 from jaxba.refinement.retraction import MAX_FOCAL_CHANGE, move_cameras, step_between
@@ -70,7 +69,7 @@ def test_a_zoom_along_which_the_image_stays_changes_no_pixel(growth):
     local = np.column_stack([rng.normal(size=(20, 2)), -rng.uniform(2, 9, size=20)])
     turn = Rotation.from_rotvec([0.3, -0.2, 0.9])
     camera = np.array([*turn.as_rotvec(), 0.1, 0.2, 0.3, 500.0, 0.15, -0.08])
-    seen = lambda camera, local: geometry.distort(-local[:, :2] / local[:, 2:], np.tile(camera[6:], (20, 1)))
+    seen = lambda camera, local: support.distort(-local[:, :2] / local[:, 2:], np.tile(camera[6:], (20, 1)))
     step = np.zeros((9, 1))
     step[6:, 0] = camera[6] * growth, 2 * camera[7] * growth, 4 * camera[8] * growth
     points = turn.inv().apply(local - camera[3:6])

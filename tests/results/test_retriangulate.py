@@ -73,7 +73,7 @@ def test_what_is_found_is_a_minimum_of_that_point_alone():
 
         def residual(x: np.ndarray, cameras=cameras, pixels=pixels) -> np.ndarray:
             local = Rotation.from_rotvec(cameras[:, :3]).apply(x) + cameras[:, 3:6]
-            return (geometry.distort(-local[:, :2] / local[:, 2:], cameras[:, 6:]) - pixels).ravel()
+            return (support.distort(-local[:, :2] / local[:, 2:], cameras[:, 6:]) - pixels).ravel()
 
         best = least_squares(residual, problem.points[point], method="lm", xtol=1e-14, ftol=1e-14).cost
         np.testing.assert_allclose(point_costs(problem, Loss())[point], best, rtol=1e-8)
