@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from jaxba.io.files import StrPath
-from jaxba.io.foreign.cameras import ForeignLens
-from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.foreign.cameras import BROWN, FISHEYE, ForeignLens
 from jaxba.io.foreign.json_records import Record
 from jaxba.io.foreign.views import UNDEFINED, Landmark, View, build, checked_pose, part
 from jaxba.io.notes import note_unused
@@ -50,8 +49,8 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     """The problem of a whole result of OpenMVG.
 
     Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. `pinhole`,
-    `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. Of the others in `MODELS` pixels are
-    undistorted once and intrinsics stay.
+    `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. The intrinsics of the others in `MODELS`
+    stay as they are.
 
     Raises:
         ProblemError: the file lacks a part, names a camera model that is not in `MODELS`, or views share a pose; one
@@ -108,8 +107,9 @@ def _lens(model: str, data: Record) -> ForeignLens:
     numbers = data.get(key).vector(count) if key else []
     focal, size = data.get("focal_length").number(), (data.get("width").number(), data.get("height").number())
     x, y = data.get("principal_point").vector(2)
-    distortion = Distortion.of(numbers, model == "fisheye")
-    return ForeignLens(data.where, (focal, focal), (x, y), distortion, (True, count > 0, count > 1), size)
+    fisheye = model == "fisheye"
+    distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
+    return ForeignLens(data.where, (focal, focal), (x, y), distortion, fisheye, (True, count > 0, count > 1), size)
 
 
 def _landmarks(structure: Record) -> Iterator[Landmark]:

@@ -16,8 +16,7 @@ import numpy as np
 from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import TRACKS
-from jaxba.io.foreign.cameras import ALL_FREE, ForeignLens, assemble
-from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.foreign.cameras import ForeignLens, assemble
 from jaxba.io.foreign.json_records import Record
 from jaxba.io.notes import note, note_unused
 from jaxba.io.text import finite_numbers
@@ -61,8 +60,8 @@ def recognises(document: Record) -> bool:
 def from_document(document: Record, path: StrPath) -> BundleProblem:
     """The problem of the first reconstruction of a file, which is the largest, and of the tracks beside it.
 
-    `perspective`, `simple_radial` and `radial` cameras are optimised; of `brown`, `fisheye` and `fisheye_opencv` pixels
-    are undistorted once and intrinsics stay. Images share the lens of their camera. Images and tracks that are not
+    `perspective`, `simple_radial` and `radial` cameras are optimised; intrinsics of `brown`, `fisheye` and
+    `fisheye_opencv` stay as they are. Images share the lens of their camera. Images and tracks that are not
     reconstructed are ignored; of repeated observations the last one counts.
 
     Raises:
@@ -160,14 +159,14 @@ def _lens(camera: Record) -> ForeignLens:
         focal = (camera.get("focal").number(),) * 2
         offset = (0.0, 0.0)
         count = 2
-    radial = tuple(optional(f"k{power}") for power in range(1, count + 1))
-    tangential = (optional("p1"), optional("p2")) if model == "brown" else (0.0, 0.0)
+    names = [*(f"k{power}" for power in range(1, count + 1)), *(("p1", "p2") if model == "brown" else ())]
     return ForeignLens(
         camera.where,
         (side * focal[0], side * focal[1]),
         (width / 2 + side * offset[0], height / 2 + side * offset[1]),
-        Distortion(radial, tangential, fisheye=model.startswith("fisheye")),
-        (True, True, count > 1) if model in ("simple_radial", "radial", "perspective") else ALL_FREE,
+        {name: optional(name) for name in names},
+        model.startswith("fisheye"),
+        (True, True, count > 1),
         (width, height),
     )
 
