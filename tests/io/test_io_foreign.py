@@ -318,6 +318,7 @@ OPENSFM = {
         '"focal": -0.75',
         "camera v2 maker 0 has focal length -1200, which must",
     ),
+    "a key twice": ('"width": 1600', '"width": 1600, "width": 1601', "the key 'width' is there twice in one object"),
     "no width": ('"width": 1600', '"width": 0', "camera v2 maker 0 has no width and height"),
     "no rotation": ('"rotation"', '"turn"', "shot a shot 0.jpg has no rotation"),
     "short point": (

@@ -35,7 +35,7 @@ _FIELDS = ("f", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "r", "0")
 _FIELDS_R9T = ("f", *(f"R{row}{column}" for row in "123" for column in "123"), "tx", "ty", "tz", "r", "0")
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite then is refused or left out
 def read_nvm(path: StrPath) -> BundleProblem:
     """Reads the first model of a VisualSFM file.
 
@@ -94,7 +94,8 @@ def _undistorted(
     residuals (y upwards) into those of the measured pixels to first order."""
     measured = pixels / focal
     square = r * (measured**2).sum(axis=1)
-    good = (1 + 3 * square > 0) & ((1 + square) * (1 + 3 * square) >= _SMALLEST_DETERMINANT)
+    determinant = (1 + square) * (1 + 3 * square)
+    good = (1 + 3 * square > 0) & (determinant >= _SMALLEST_DETERMINANT) & np.isfinite(determinant)
     moved = np.where(good[:, None], focal * (1 + square)[:, None] * measured, np.nan)
     measured = measured * COLMAP_FLIP[:2]
     turned = 2 * r[:, None, None] * measured[:, :, None] * measured[:, None, :]
