@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import codecs
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain
+from typing import Any
 
 from jaxba.io.files import READ_ERRORS, StrPath, display_name, open_input, reason
 from jaxba.problem.bundle_problem import ProblemError
@@ -60,6 +62,24 @@ def decode(data: bytes) -> str:
     mark = next((mark for mark in MARKS if data.startswith(mark)), b"")
     text = data[len(mark) :].decode(MARKS.get(mark, "utf-8"))
     return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def parse_json(text: str | bytes) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        ProblemError: a key is there twice in one object, so that one of its values would count for nothing.
+        ValueError, RecursionError: as `json.loads`.
+    """
+    return json.loads(text, object_pairs_hook=_unique)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ProblemError(f"the key {next(key for key in keys if keys.count(key) > 1)!a} is there twice in one object")
+    return found
 
 
 def utf8(blocks: Iterator[bytes], name: str) -> Iterator[bytes]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io.encoding import decode
+from jaxba.io.encoding import decode, parse_json
 from jaxba.io.files import StrPath, display_name, open_output, reason, sidecar_path
 from jaxba.io.poses import Poses, read_poses
 from jaxba.problem.bundle_problem import ProblemError
@@ -89,7 +89,7 @@ def read_sidecar(path: StrPath) -> Sidecar:
     """
     side = sidecar_path(path)
     try:
-        contents = json.loads(decode(side.read_bytes()))
+        contents = parse_json(decode(side.read_bytes()))
         calibration = Calibration(**{**contents["calibration"], "offset": tuple(contents["calibration"]["offset"])})
         frames = tuple(int(number) for number in contents["frames"])
     except OSError as error:

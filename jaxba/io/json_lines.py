@@ -16,6 +16,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from jaxba.io.encoding import parse_json
 from jaxba.problem.bundle_problem import ProblemError
 
 _log = logging.getLogger(__name__)
@@ -90,7 +91,7 @@ def read(path: str | os.PathLike[str], kind: type[T]) -> list[T]:
         if not line.strip():
             continue
         try:
-            found.append(from_plain(kind, json.loads(line)))
+            found.append(from_plain(kind, parse_json(line)))
         except (ProblemError, OverflowError) as error:
             raise ProblemError(f"{path}, line {number}: {error}") from None
         except (ValueError, RecursionError):  # no JSON or no UTF-8

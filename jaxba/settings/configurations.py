@@ -96,16 +96,38 @@ def parse(text: str, name: str, *, as_text: bool = False) -> Any:
         as_text: whether all scalars stay the text that they are, as names must: `000010`, `1_000`, `yes`, `null`.
 
     Raises:
-        SettingsError: not YAML.
+        SettingsError: not YAML, or a mapping has a key twice.
     """
     import yaml
 
+    loader = (yaml.BaseLoader if as_text else yaml.SafeLoader)(text)
+    where = lambda mark: f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
     try:
-        return yaml.load(text, yaml.BaseLoader if as_text else yaml.SafeLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
-        raise SettingsError(f"{name}{where}: not YAML") from None
+        node = loader.get_single_node()
+        twice = _twice(node)
+        if twice is not None:
+            raise SettingsError(f"{name}{where(twice.start_mark)}: {twice.value} is there twice")
+        return None if node is None else loader.construct_document(node)
+    except (yaml.YAMLError, RecursionError) as error:
+        raise SettingsError(f"{name}{where(getattr(error, 'problem_mark', None))}: not YAML") from None
+
+
+def _twice(root: Any) -> Any:
+    """A key that a mapping below a node of YAML has twice, so that one of its values would not count; or None."""
+    waiting, known = [root], set()
+    while waiting:
+        node = waiting.pop()
+        if id(node) in known or not isinstance(getattr(node, "value", ""), list):
+            continue
+        known.add(id(node))  # nodes with an alias may hold themselves
+        pairs = [pair for pair in node.value if isinstance(pair, tuple)]
+        waiting += [part for pair in pairs for part in pair] or node.value
+        keys = set()
+        for key, _ in pairs:
+            if (key.tag, str(key.value)) in keys:
+                return key
+            keys.add((key.tag, str(key.value)))
+    return None
 
 
 def _folder(kind: Kind) -> Path:

@@ -101,7 +101,9 @@ def test_appending_after_a_cut_leaves_a_readable_file(tmp_path):
     assert [r.repeat for r in json_lines.read(path, Record)] == [0, 5]
 
 
-@pytest.mark.parametrize("bad", ['{"problem": "a"', "[]", '{"problem": "a"}', "\u00ff\u00fe"])
+@pytest.mark.parametrize(
+    "bad", ['{"problem": "a"', "[]", '{"problem": "a"}', '{"problem": "a", "problem": "b"}', "\u00ff\u00fe"]
+)
 def test_malformed_line_elsewhere_is_one_clear_error(tmp_path, bad):
     path = tmp_path / "results.jsonl"
     line = json.dumps(json_lines.plain(make_record()))

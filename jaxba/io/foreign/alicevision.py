@@ -11,10 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxba.io.files import StrPath
-from jaxba.io.foreign.cameras import FIXED, ForeignLens
-from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.foreign.cameras import BROWN, FISHEYE, FIXED, ForeignLens
 from jaxba.io.foreign.json_records import Record
-from jaxba.io.foreign.views import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.io.foreign.views import UNDEFINED, Landmark, build, checked_pose, part
 from jaxba.io.notes import note, note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -55,8 +54,8 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     """The problem of a scene of AliceVision.
 
     Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. Intrinsics without
-    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Of the others
-    in `DISTORTIONS` pixels are undistorted once and intrinsics stay.
+    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Those of
+    the others in `DISTORTIONS` stay as they are.
 
     Raises:
         ProblemError: the file lacks a part, names a model that is not in `DISTORTIONS`, or views are of a rig; one line
@@ -69,7 +68,7 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         rig, pose, intrinsic = (value.get(key, UNDEFINED).integer() for key in ("rigId", "poseId", "intrinsicId"))
         if rig >= 0 and rig != UNDEFINED and not independent:
             value.fail("is of a rig of several cameras, whose poses depend on it; rigs are not read")
-        views[number] = View(pose, intrinsic)
+        views[number] = pose, intrinsic
     intrinsics = dict(_numbered(part(document, "intrinsics", _PROGRAM), "intrinsicId", "intrinsic"))
     poses, locked = {}, 0
     for number, value in _numbered(part(document, "poses", _PROGRAM), "poseId", "pose"):
@@ -113,9 +112,10 @@ def _lens(value: Record, version: tuple[int, ...]) -> ForeignLens:
     x, y = value.get("principalPoint").vector(2)
     if version >= (1, 2, 1):
         x, y = x + width / 2, y + height / 2
-    distortion = Distortion.of(numbers, model == "fisheye4")
+    fisheye = model == "fisheye4"
+    distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
     free = FIXED if value.get("locked", False).flag() else (True, count > 0, count > 1)
-    return ForeignLens(value.where, _focal(value, version, width), (x, y), distortion, free, (width, height))
+    return ForeignLens(value.where, _focal(value, version, width), (x, y), distortion, fisheye, free, (width, height))
 
 
 def _focal(value: Record, version: tuple[int, ...], width: float) -> tuple[float, float]:
@@ -146,4 +146,4 @@ def _landmarks(structure: Record) -> Iterator[tuple[Landmark, list[float]]]:
             pixels.append(seen.get("x").vector(2))
             if seen.has("scale"):
                 scales.append(seen.get("scale").number())
-        yield Landmark(value.get("X").vector(3), views, pixels), scales
+        yield (value.get("X").vector(3), views, pixels), scales

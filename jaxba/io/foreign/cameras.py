@@ -1,27 +1,29 @@
 """From the cameras of other programs to a problem: lenses in pixels, poses that look down +z with y downwards.
 
 This is the convention of COLMAP, VisualSFM, OpenSfM, OpenMVG and AliceVision. BAL's camera looks down -z with y
-upwards, has no principal point, one focal length, and two coefficients of distortion.
+upwards, has no principal point, one focal length, and two coefficients of distortion. Lenses with more of it become
+those of `jaxba.CAMERA_MODELS`: Brown's FULL_OPENCV, and OPENCV_FISHEYE.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.foreign.distortion import Distortion
 from jaxba.io.notes import note, note_center
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.camera_models import CAMERA_MODELS
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
-from jaxba.problem.intrinsics import LENS_SIZE, Lenses
+from jaxba.problem.intrinsics import Lenses
 
-ALL_FREE = (True, True, True)
 FIXED = (False, False, False)
+
+BROWN, FISHEYE = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
+"""Coefficients of the two kinds of distortion, in the order in which OpenMVG and AliceVision write them."""
 
 
 @dataclass(frozen=True)
@@ -32,24 +34,34 @@ class ForeignLens:
     """How messages call it, such as `intrinsic 3`."""
 
     focal: tuple[float, float]
-    """Focal lengths along x and y, pixels. Their ratio stays as it is."""
+    """Focal lengths along x and y, pixels. Their ratio stays as it is where the distortion is BAL's."""
 
     center: tuple[float, float] = (0.0, 0.0)
     """Principal point in the coordinates of the observations; it stays as it is."""
 
-    distortion: Distortion = field(default_factory=Distortion)
-    """Where BAL has no such distortion, pixels are undistorted once, and the lens stays as it is."""
+    distortion: Mapping[str, float] = field(default_factory=dict)
+    """Coefficients by their names in the camera models; those that are missing are zero."""
 
-    free: tuple[bool, bool, bool] = ALL_FREE
-    """Which of f, k1 and k2 may be optimised, if the distortion is BAL's, or inverse: its pixels do not depend on f."""
+    fisheye: bool = False
+    """Whether radii are angles."""
+
+    free: tuple[bool, bool, bool] = (True, True, True)
+    """Which of f, k1 and k2 may be optimised, if the distortion is BAL's; other lenses stay as they are."""
 
     size: tuple[float, float] | None = None
     """Width and height of the image, pixels, if the principal point is measured from its corner."""
 
+    @property
+    def is_bal(self) -> bool:
+        """Whether BAL's k1 and k2 say all of the distortion."""
+        return not self.fisheye and not any(k for name, k in self.distortion.items() if name not in ("k1", "k2"))
 
-class _Observed(NamedTuple):
-    pixels: np.ndarray  # (n, 2) undistorted, relative to the principal point, x to the right, y down
-    whitening: np.ndarray  # (n, 2, 2)
+    @property
+    def model(self) -> str:
+        """The camera model that has all of its numbers."""
+        if self.fisheye:
+            return "OPENCV_FISHEYE"
+        return "RADIAL" if self.is_bal and self.focal[0] == self.focal[1] else "FULL_OPENCV"
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
@@ -63,12 +75,12 @@ def assemble(
     pixels: Float[np.ndarray, "observations 2"],
     camera_index: Int[np.ndarray, " observations"],
     point_index: Int[np.ndarray, " observations"],
+    whitening: Float[np.ndarray, "observations 2 2"] | None = None,
 ) -> BundleProblem:
     """The problem of cameras in the convention of this module.
 
-    Observations without a direction in their lens are left out, with a warning that counts them. Where a lens has a
-    distortion that BAL lacks, residuals are weighted so that to first order they are those of the distorted image, in
-    pixels, as `read_colmap` does.
+    Where the distortion of all lenses is BAL's, so are those of the problem; else all are of the other models. Pixels
+    that are not finite are left out, with a warning that counts them.
 
     Args:
         path: of the file, for messages.
@@ -80,67 +92,63 @@ def assemble(
         pixels: observations, x to the right, y down.
         camera_index: camera of each observation.
         point_index: point of each observation.
+        whitening: matrices that multiply the residuals of lenses of BAL; None: the identity.
 
     Raises:
         ProblemError: a lens is impossible, no observation is left, or something is not finite.
     """
     name = display_name(path)
-    intrinsics, free = np.zeros((len(lenses), LENS_SIZE)), np.zeros((len(lenses), LENS_SIZE), bool)
-    observations, whitening = np.full(pixels.shape, np.nan), np.tile(np.eye(2), (len(pixels), 1, 1))
-    lens_seen = np.asarray(lens_of)[camera_index]
-    order = np.argsort(lens_seen, kind="stable")
-    groups = np.split(order, np.searchsorted(lens_seen[order], np.arange(1, len(lenses))))
-    for number, (lens, seen) in enumerate(zip(lenses, groups, strict=True)):
+    for lens in lenses:
         _check(lens, name)
         if lens.size is not None:
             note_center(path, lens.label, lens.center, lens.size)
-        plain = lens.distortion.is_bal
-        coefficients = (*lens.distortion.radial, 0.0, 0.0)[:2] if plain else (0.0, 0.0)
-        intrinsics[number] = [lens.focal[0], *coefficients]
-        free[number] = lens.free if plain or lens.distortion.inverse else FIXED
-        observations[seen], whitening[seen] = _observed(lens, pixels[seen])
-    kept = np.flatnonzero(np.isfinite(np.column_stack([observations, whitening.reshape(-1, 4)])).all(axis=1))
+    bal = all(lens.is_bal for lens in lenses)
+    names = ["BAL" if bal else lens.model for lens in lenses]
+    models = tuple(CAMERA_MODELS[model] for model in dict.fromkeys(names))
+    intrinsics = np.zeros((len(lenses), max(map(len, models))))
+    free = np.zeros(intrinsics.shape, bool)
+    for at, (lens, model) in enumerate(zip(lenses, names, strict=True)):
+        (fx, fy), (cx, cy), (f, k1, k2) = lens.focal, lens.center, lens.free if lens.is_bal else FIXED
+        values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens.distortion}
+        moves = {"f": f, "fx": f, "fy": f, "k1": k1, "k2": k2}
+        for place, parameter in enumerate(CAMERA_MODELS[model].parameters):
+            intrinsics[at, place], free[at, place] = values.get(parameter, 0.0), moves.get(parameter, False)
+    lens_of = np.asarray(lens_of)
+    observations = pixels
+    if bal:
+        focal, centers = (np.array([getattr(lens, name) for lens in lenses]) for name in ("focal", "center"))
+        ratio = (focal / focal[:, :1])[lens_of][camera_index]
+        observations = (pixels - centers[lens_of][camera_index]) / ratio * COLMAP_FLIP[:2]
+        whitening = ratio[:, :, None] * (np.eye(2) if whitening is None else whitening)
+    kept = np.flatnonzero(np.isfinite(observations).all(axis=1))
     if len(kept) < len(pixels):
         note(path, f"{len(pixels) - len(kept)} of {len(pixels)} observations left out: beyond the range of their lens")
     if not len(kept):
         raise ProblemError(f"{name}: no camera sees a point")
     unshared = len(np.unique(lens_of)) == len(lens_of)
-    cameras = np.hstack(
-        [angle_axis(np.diag(COLMAP_FLIP) @ rotations), translations * COLMAP_FLIP, intrinsics[np.asarray(lens_of)]]
-    )
+    model_of = None if bal else np.array([list(dict.fromkeys(names)).index(model) for model in names])
+    poses = [angle_axis(np.diag(COLMAP_FLIP) @ rotations), translations * COLMAP_FLIP]
     try:
         return BundleProblem.create(
-            cameras,
+            np.hstack([*poses, intrinsics[lens_of]]),
             points,
-            observations[kept] * COLMAP_FLIP[:2],
+            observations[kept],
             np.asarray(camera_index)[kept],
             np.asarray(point_index)[kept],
-            covariance=_covariance(whitening[kept]),
-            lenses=None if unshared and free.all() else Lenses(np.asarray(lens_of), free),
+            covariance=None if whitening is None else _covariance(whitening[kept]),
+            lenses=None if bal and unshared and free.all() else Lenses(lens_of, free, model_of, models),
         )
     except ProblemError as error:
         raise ProblemError(f"{name}: {error}") from error
 
 
 def _check(lens: ForeignLens, name: str) -> None:
-    numbers = [*lens.focal, *lens.center, *lens.distortion.radial, *lens.distortion.tangential]
+    numbers = [*lens.focal, *lens.center, *lens.distortion.values()]
     if not np.isfinite(numbers).all():
         raise ProblemError(f"{name}: {lens.label} has a number that is not finite")
     if not min(lens.focal) > 0:
         shown = " and ".join(f"{f:g}" for f in dict.fromkeys(lens.focal))
         raise ProblemError(f"{name}: {lens.label} has focal length {shown}, which must be positive")
-
-
-def _observed(lens: ForeignLens, pixels: np.ndarray) -> _Observed:
-    """Undistorted pixels with one focal length, and the weights that turn their residuals into those of the image."""
-    focal = np.array(lens.focal)
-    ratio = focal / focal[0]
-    centred = pixels - np.array(lens.center)
-    if lens.distortion.is_bal:
-        return _Observed(centred / ratio, np.broadcast_to(np.diag(ratio), (len(pixels), 2, 2)))
-    plane, derivative = lens.distortion.remove(centred / focal)
-    flip = np.diag(COLMAP_FLIP[:2])
-    return _Observed(focal[0] * plane, flip @ (ratio[:, None] * derivative) @ flip)
 
 
 def _covariance(whitening: np.ndarray) -> np.ndarray | None:

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io.encoding import read_text
+from jaxba.io.encoding import parse_json, read_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import ProblemError
@@ -136,12 +136,14 @@ def read_json(path: StrPath) -> Record:
     """The contents of a JSON file, decompressed; NaN and Infinity, which JSON lacks, are found when they are taken.
 
     Raises:
-        ProblemError: the file cannot be read, is no JSON, or is nested too deeply.
+        ProblemError: the file cannot be read, is no JSON, is nested too deeply, or an object has a key twice.
     """
     name = display_name(path)
     text = read_text(path)
     try:
-        return Record(json.loads(text), name)
+        return Record(parse_json(text), name)
+    except ProblemError as error:
+        raise ProblemError(f"{name}: {error}") from None
     except json.JSONDecodeError as error:
         raise ProblemError(f"{name} line {error.lineno}: not JSON: {error.msg}") from None
     except RecursionError:

@@ -18,22 +18,24 @@ from jaxtyping import Float, Int
 from jaxba.io.encoding import open_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign.cameras import FIXED, ForeignLens, assemble
-from jaxba.io.foreign.distortion import Distortion
 from jaxba.io.notes import note, note_origin
 from jaxba.io.text import LineReader, NumberReader, finite_numbers
 from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import are_rotations, translations
+from jaxba.problem.geometry import COLMAP_FLIP, are_rotations, translations
 from jaxba.typing import LARGEST_COUNT
 
 HEADERS = (b"NVM_V3", b"NVM_V3_R9T")
 """First words of the versions that are read."""
 
+_SMALLEST_DETERMINANT = 1e-6
+"""Of the derivative of the distortion; below it the image folds over itself."""
+
 _FIELDS = ("f", "qw", "qx", "qy", "qz", "cx", "cy", "cz", "r", "0")
 _FIELDS_R9T = ("f", *(f"R{row}{column}" for row in "123" for column in "123"), "tx", "ty", "tz", "r", "0")
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite then is refused or left out
 def read_nvm(path: StrPath) -> BundleProblem:
     """Reads the first model of a VisualSFM file.
 
@@ -63,24 +65,42 @@ def read_nvm(path: StrPath) -> BundleProblem:
         if tracks.end < values.size and values[tracks.end] > 0:  # the number of images of the next model, or 0
             note(path, "only the first model of the file is read")
     note_origin(path, tracks.pixels)
-    lenses, lens_of = _lenses(images, calibration)
-    seen = tracks.points, tracks.pixels, tracks.camera_index, tracks.point_index
-    return assemble(path, lenses, lens_of, *_poses(images, matrices), *seen)
+    lenses, lens_of, coefficients = _lenses(images, calibration)
+    focal = np.array([lens.focal for lens in lenses])
+    of_views = lens_of[tracks.camera_index]
+    pixels, whitening = _undistorted(tracks.pixels, focal[of_views], coefficients[of_views])
+    seen = tracks.points, pixels, tracks.camera_index, tracks.point_index
+    return assemble(path, lenses, lens_of, *_poses(images, matrices), *seen, whitening)
 
 
 def _lenses(
     images: Float[np.ndarray, "images numbers"], calibration: list[float] | None
-) -> tuple[list[ForeignLens], Int[np.ndarray, " images"]]:
-    """The lenses, and that of each image."""
+) -> tuple[list[ForeignLens], Int[np.ndarray, " images"], Float[np.ndarray, " lenses"]]:
+    """The lenses without distortion, the lens of each image, and r of each lens."""
     if calibration is not None:
         fx, _, fy, _, r = calibration
-        lens = ForeignLens("FixedK", (fx, fy), distortion=_distortion(r), free=FIXED)
-        return [lens], np.zeros(len(images), np.int64)
+        return [ForeignLens("FixedK", (fx, fy), free=FIXED)], np.zeros(len(images), np.int64), np.array([r])
     lenses = [
-        ForeignLens(f"image {image}", (f, f), distortion=_distortion(r), free=(True, r == 0, r == 0))
+        ForeignLens(f"image {image}", (f, f), free=(True, r == 0, r == 0))
         for image, (f, *_, r, _) in enumerate(images.tolist())
     ]
-    return lenses, np.arange(len(lenses))
+    return lenses, np.arange(len(lenses)), images[:, -2]
+
+
+def _undistorted(
+    pixels: Float[np.ndarray, "n 2"], focal: Float[np.ndarray, "n 2"], r: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
+    """Undistorted pixels, NaN beyond the radius at which the image folds over itself, and the matrices that turn their
+    residuals (y upwards) into those of the measured pixels to first order."""
+    measured = pixels / focal
+    square = r * (measured**2).sum(axis=1)
+    determinant = (1 + square) * (1 + 3 * square)
+    good = (1 + 3 * square > 0) & (determinant >= _SMALLEST_DETERMINANT) & np.isfinite(determinant)
+    moved = np.where(good[:, None], focal * (1 + square)[:, None] * measured, np.nan)
+    measured = measured * COLMAP_FLIP[:2]
+    turned = 2 * r[:, None, None] * measured[:, :, None] * measured[:, None, :]
+    derivative = np.where(good[:, None, None], (1 + square)[:, None, None] * np.eye(2) + turned, np.eye(2))
+    return np.where(r[:, None] == 0, pixels, moved), np.linalg.inv(derivative)
 
 
 def _poses(
@@ -95,10 +115,6 @@ def _poses(
     largest = np.abs(quaternions).max(axis=1, keepdims=True)  # without it squares overflow
     rotations = Rotation.from_quat(quaternions / largest).as_matrix()
     return rotations, translations(rotations, images[:, 5:8])
-
-
-def _distortion(r: float) -> Distortion:
-    return Distortion(radial=(r,), inverse=True) if r else Distortion()
 
 
 def _header(lines: LineReader) -> tuple[bool, list[float] | None]:

@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from jaxba.io.files import StrPath
-from jaxba.io.foreign.cameras import ForeignLens
-from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.foreign.cameras import BROWN, FISHEYE, ForeignLens
 from jaxba.io.foreign.json_records import Record
-from jaxba.io.foreign.views import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.io.foreign.views import UNDEFINED, Landmark, build, checked_pose, part
 from jaxba.io.notes import note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -50,8 +49,8 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     """The problem of a whole result of OpenMVG.
 
     Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. `pinhole`,
-    `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. Of the others in `MODELS` pixels are
-    undistorted once and intrinsics stay.
+    `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. The intrinsics of the others in `MODELS`
+    stay as they are.
 
     Raises:
         ProblemError: the file lacks a part, names a camera model that is not in `MODELS`, or views share a pose; one
@@ -64,7 +63,7 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         for flag, what in PRIORS.items():
             unused[what] += data.get(flag, False).flag()
         pose, intrinsic = (data.get(one, UNDEFINED).integer() for one in ("id_pose", "id_intrinsic"))
-        views[data.get("id_view", key).integer()] = View(pose, intrinsic)
+        views[data.get("id_view", key).integer()] = pose, intrinsic
     intrinsics = _intrinsics(part(document, "intrinsics", _PROGRAM))
     poses = {}
     for key, value in _map(part(document, "extrinsics", _PROGRAM), "pose"):
@@ -108,12 +107,13 @@ def _lens(model: str, data: Record) -> ForeignLens:
     numbers = data.get(key).vector(count) if key else []
     focal, size = data.get("focal_length").number(), (data.get("width").number(), data.get("height").number())
     x, y = data.get("principal_point").vector(2)
-    distortion = Distortion.of(numbers, model == "fisheye")
-    return ForeignLens(data.where, (focal, focal), (x, y), distortion, (True, count > 0, count > 1), size)
+    fisheye = model == "fisheye"
+    distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
+    return ForeignLens(data.where, (focal, focal), (x, y), distortion, fisheye, (True, count > 0, count > 1), size)
 
 
 def _landmarks(structure: Record) -> Iterator[Landmark]:
     for key, value in _map(structure, "landmark"):
         seen = list(_map(value.get("observations"), f"landmark {key}: observation in view"))
         pixels = [one.get("x").vector(2) for _, one in seen]
-        yield Landmark(value.get("X").vector(3), [view for view, _ in seen], pixels)
+        yield value.get("X").vector(3), [view for view, _ in seen], pixels

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Container
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import TRACKS
-from jaxba.io.foreign.cameras import ALL_FREE, ForeignLens, assemble
-from jaxba.io.foreign.distortion import Distortion
+from jaxba.io.foreign.cameras import ForeignLens, assemble
 from jaxba.io.foreign.json_records import Record
 from jaxba.io.notes import note, note_unused
 from jaxba.io.text import finite_numbers
@@ -44,13 +42,6 @@ CONTROL_POINTS = ("ground_control_points.json", "gcp_list.txt")
 """Files of control points beside a reconstruction."""
 
 
-class _Observations(NamedTuple):
-    images: list[str]
-    tracks: list[str]
-    pixels: list[tuple[float, float]]
-    unused: dict[str, int]
-
-
 def recognises(document: Record) -> bool:
     """Whether a JSON document is a list of reconstructions, or one of them."""
     first = document.value[0] if isinstance(document.value, list) and document.value else document.value
@@ -61,8 +52,8 @@ def recognises(document: Record) -> bool:
 def from_document(document: Record, path: StrPath) -> BundleProblem:
     """The problem of the first reconstruction of a file, which is the largest, and of the tracks beside it.
 
-    `perspective`, `simple_radial` and `radial` cameras are optimised; of `brown`, `fisheye` and `fisheye_opencv` pixels
-    are undistorted once and intrinsics stay. Images share the lens of their camera. Images and tracks that are not
+    `perspective`, `simple_radial` and `radial` cameras are optimised; intrinsics of `brown`, `fisheye` and
+    `fisheye_opencv` stay as they are. Images share the lens of their camera. Images and tracks that are not
     reconstructed are ignored; of repeated observations the last one counts.
 
     Raises:
@@ -95,8 +86,8 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     points = {key: point.get("coordinates").vector(3) for key, point in document.get("points").entries("point")}
     if not shots or not points:
         document.fail(f"has no {'points' if shots else 'shots'}")
-    seen = _read_tracks(_tracks_beside(path), shots, set(points))
-    note_unused(path, document.unknown(PARTS) | _unused(document, path) | seen.unused)
+    seen, unused = _read_tracks(_tracks_beside(path), shots, set(points))
+    note_unused(path, document.unknown(PARTS) | _unused(document, path) | unused)
     from scipy.spatial.transform import Rotation
 
     rotations = Rotation.from_rotvec(np.array(turns)).as_matrix()
@@ -106,7 +97,7 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     point_number = {key: at for at, key in enumerate(points)}
     lens_number = {key: at for at, key in enumerate(lenses)}
     lens_of = np.array([lens_number[key] for key in lens_keys])
-    camera_index = np.array([shots[image] for image in seen.images])
+    camera_index = np.array([shots[image] for image, _ in seen])
     size = np.array([lens.size for lens in lenses.values()])[lens_of][camera_index]
     return assemble(
         path,
@@ -115,9 +106,9 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         rotations,
         np.array(shifts),
         np.array(list(points.values())),
-        size.max(axis=1)[:, None] * np.array(seen.pixels) + size / 2,
+        size.max(axis=1)[:, None] * np.array(list(seen.values())) + size / 2,
         camera_index,
-        np.array([point_number[track] for track in seen.tracks]),
+        np.array([point_number[track] for _, track in seen]),
     )
 
 
@@ -160,14 +151,14 @@ def _lens(camera: Record) -> ForeignLens:
         focal = (camera.get("focal").number(),) * 2
         offset = (0.0, 0.0)
         count = 2
-    radial = tuple(optional(f"k{power}") for power in range(1, count + 1))
-    tangential = (optional("p1"), optional("p2")) if model == "brown" else (0.0, 0.0)
+    names = [*(f"k{power}" for power in range(1, count + 1)), *(("p1", "p2") if model == "brown" else ())]
     return ForeignLens(
         camera.where,
         (side * focal[0], side * focal[1]),
         (width / 2 + side * offset[0], height / 2 + side * offset[1]),
-        Distortion(radial, tangential, fisheye=model.startswith("fisheye")),
-        (True, True, count > 1) if model in ("simple_radial", "radial", "perspective") else ALL_FREE,
+        {name: optional(name) for name in names},
+        model.startswith("fisheye"),
+        (True, True, count > 1),
         (width, height),
     )
 
@@ -179,8 +170,10 @@ def _tracks_beside(path: StrPath) -> Path:
     return there[0]
 
 
-def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -> _Observations:
-    """The observations of reconstructed images and points."""
+def _read_tracks(
+    path: StrPath, shots: Container[str], points: Container[str]
+) -> tuple[dict[tuple[str, str], tuple[float, float]], dict[str, int]]:
+    """The pixels of reconstructed images and points by image and track, and what else the file holds."""
     name = display_name(path)
     lines = read_text(path).split("\n")
     version, first = 0, 0
@@ -206,6 +199,5 @@ def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -
         found[image, track] = x, y
     if not found:
         raise ProblemError(f"{name}: no image of the reconstruction sees a point of it")
-    images, tracks = zip(*found, strict=True)
-    unused = {"scales of key-points": len(found)} if len(scales) > 1 else {}  # OpenSfM divides residuals by them
-    return _Observations(list(images), list(tracks), list(found.values()), unused)
+    # OpenSfM divides residuals by scales
+    return found, {"scales of key-points": len(found)} if len(scales) > 1 else {}
