@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import typing
-import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +24,6 @@ from jaxba.game.scene_bank import Bank, Split, make_banks, select
 from jaxba.game.statistics import Ratio, paired_ratio
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
-from jaxba.runtime.atomic import atomic_write
 from jaxba.solver.methods import DEFAULT_METHOD, make_method
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig
@@ -259,18 +256,12 @@ def _play(
 
 
 def _write_runs(path: Path, runs: dict[str, Runs]) -> None:
-    fields = lambda name, number, run: {f"{name}/{number}/{field}": x for field, x in run._asdict().items()}
-    parts = [fields(name, k, run) for name, banks in runs.items() for k, run in enumerate(banks)]
-    _write(path, {name: x for arrays in parts for name, x in arrays.items()})  # in the order of the table
+    banks = ((f"{name}/{k}", run) for name, played in runs.items() for k, run in enumerate(played))  # as in the table
+    checkpoint.write_arrays(path, {f"{at}/{field}": x for at, run in banks for field, x in run._asdict().items()})
 
 
 def _write_banks(path: Path, splits: list[Split]) -> None:
-    _write(path, {name.replace(".", "/"): x for name, x in checkpoint.pack(splits).items()})
-
-
-def _write(path: Path, arrays: dict[str, Any]) -> None:
-    with atomic_write(path) as file:
-        np.savez(file, **arrays)
+    checkpoint.write_arrays(path, {name.replace(".", "/"): x for name, x in checkpoint.pack(splits).items()})
 
 
 def read_banks(path: Path) -> list[Split]:
@@ -279,36 +270,37 @@ def read_banks(path: Path) -> list[Split]:
     Raises:
         TrainError: another version wrote them, or the file is damaged.
     """
-    with _opened(path) as file:
-        classes = sorted({int(name.split("/")[0]) for name in file.files})
-        return [_named_tuple(Split, f"{number}/", file) for number in classes]
+    arrays = _read(path)
+    classes = dict.fromkeys(name.partition("/")[0] for name in arrays)
+    return [_named_tuple(path, Split, f"{number}/", arrays) for number in classes]
 
 
 def _read_runs(path: Path) -> dict[str, Runs]:
-    with _opened(path) as file:
-        found: dict[str, Runs] = {}
-        for rule, number in dict.fromkeys(tuple(name.split("/")[:2]) for name in file.files):
-            found.setdefault(rule, []).append(_named_tuple(Trajectories, f"{rule}/{number}/", file, np.asarray))
-        return found
+    arrays = _read(path)
+    found: dict[str, Runs] = {}
+    for bank in dict.fromkeys(name.rpartition("/")[0] for name in arrays):
+        run = _named_tuple(path, Trajectories, f"{bank}/", arrays, np.asarray)
+        found.setdefault(bank.rpartition("/")[0], []).append(run)
+    return found
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _read(path: Path) -> dict[str, np.ndarray]:
     try:
-        with path.open("rb") as stream, np.load(stream) as file:
-            yield file
-    except KeyError as error:
-        raise TrainError(f"{path}: written by another version ({error.args[0]}); begin in a new folder") from None
-    except (zipfile.BadZipFile, ValueError, EOFError):
-        raise TrainError(f"{path}: damaged; begin in a new folder") from None
+        return checkpoint.read_arrays(path)
+    except checkpoint.CheckpointError as error:
+        raise TrainError(f"{path}: {error}; begin in a new folder") from None
 
 
 def _named_tuple(
-    kind: Any, prefix: str, arrays: Mapping[str, np.ndarray], make: Callable[[Any], Any] = jnp.asarray
+    path: Path, kind: Any, prefix: str, arrays: Mapping[str, np.ndarray], make: Callable[[Any], Any] = jnp.asarray
 ) -> Any:
     """Rebuilds nested named tuples from the types of their fields."""
     values = {}
     for name, inner in typing.get_type_hints(kind).items():
-        nested = isinstance(inner, type) and hasattr(inner, "_fields")
-        values[name] = _named_tuple(inner, f"{prefix}{name}/", arrays, make) if nested else make(arrays[prefix + name])
+        if isinstance(inner, type) and hasattr(inner, "_fields"):
+            values[name] = _named_tuple(path, inner, f"{prefix}{name}/", arrays, make)
+        elif (key := prefix + name) in arrays:
+            values[name] = make(arrays[key])
+        else:
+            raise TrainError(f"{path}: written by another version ({key} is missing); begin in a new folder")
     return kind(**values)
