@@ -122,20 +122,19 @@ class Task:
         """Trained policies and their twins without weights beside the baselines, relative to the best costs of all."""
         tolerance, limit = self.config.game.tolerance, self.config.game.max_iterations
         trained = [self.policy(actor) for actor in actors]
-        play = lambda policy: _play(self.config, self.held_out, {"": (policy, self.game.options)})[""]
-        groups = {
-            TRAINED: [play(policy) for policy in trained],
-            WEIGHTLESS: [play(without_weights(policy)) for policy in trained],
-        }
-        alone = {f"{name} {k + 1}": run for name, runs in groups.items() for k, run in enumerate(runs)}
+        groups = {TRAINED: trained, WEIGHTLESS: [without_weights(policy) for policy in trained]}
+        numbered = {f"{name} {k + 1}": one for name, policies in groups.items() for k, one in enumerate(policies)}
+        steps = {name: (policy, self.game.options) for name, policy in numbered.items()}
+        alone = play_all(self.config.bank.classes, self.held_out, steps, limit)
         best = best_costs({**alone, **self.baseline_runs}, self.held_out)
         found = scores(alone, self.baseline_runs, self.held_out, tolerance, limit)
         means = {name: [found.pop(f"{name} {k + 1}") for k in range(len(actors))] for name in groups}
         each = {f"{TRAINED} {k + 1}": one for k, one in enumerate(means[TRAINED])} if len(actors) > 1 else {}
         mean = {name: Score(*(float(x) for x in np.mean(rows, axis=0))) for name, rows in means.items()}
         taken = lambda runs: np.log([np.minimum(iterations_to(run, best, tolerance), limit) for run in runs])
-        ours, ratios, by_agent = taken(groups[TRAINED]), {}, {}
-        others = {WEIGHTLESS: groups[WEIGHTLESS], **{name: [run] for name, run in self.baseline_runs.items()}}
+        played = lambda name: [alone[f"{name} {k + 1}"] for k in range(len(actors))]
+        ours, ratios, by_agent = taken(played(TRAINED)), {}, {}
+        others = {WEIGHTLESS: played(WEIGHTLESS), **{name: [run] for name, run in self.baseline_runs.items()}}
         for name, runs in others.items():
             theirs = taken(runs)
             ratios[name] = paired_ratio(np.exp(ours.mean(axis=0)), np.exp(theirs.mean(axis=0)))
@@ -208,7 +207,7 @@ def _baseline_runs(
         limits = rules.tolerance, rules.max_iterations
         found = best_constant_action(config.bank.classes, banks, rules.agent, game.options, *limits)
         policies[CONSTANT] = found, game.options
-    runs = _play(config, held_out, policies)
+    runs = play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
     _write_runs(path, runs)
     return runs
 
@@ -247,12 +246,6 @@ def baseline_policies(
         elif has_embedded:
             found[name] = make_policy(rule), embedded
     return found
-
-
-def _play(
-    config: TrainConfig, held_out: tuple[Bank, ...], policies: Mapping[str, tuple[DampingPolicy, StepOptions]]
-) -> dict[str, Runs]:
-    return play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
 
 
 def _write_runs(path: Path, runs: dict[str, Runs]) -> None:
