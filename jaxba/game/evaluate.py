@@ -66,17 +66,9 @@ def evaluate(
     tolerance: float = 1e-3,
     limit: int = 40,
 ) -> Score:
-    """Plays a policy on every scene of the banks.
-
-    Args:
-        kinds: classes of the banks.
-        banks: scenes.
-        policy: chooses lambda.
-        options: of the step.
-        tolerance: relative to the best known cost.
-        limit: largest number of linear solves of a scene.
-    """
-    runs = [play(kind, bank, policy, options, limit) for kind, bank in zip(kinds, banks, strict=True)]
+    """The score of a policy on every scene of the banks, with at most `limit` linear solves of each. The tolerance is
+    relative to the best known cost."""
+    runs = play_all(kinds, banks, {"": (policy, options)}, limit)[""]
     return score(runs, [np.asarray(bank.best_cost) for bank in banks], tolerance, limit)
 
 
@@ -94,13 +86,7 @@ def best_constant_action(
 ) -> ConstantAction:
     """The constant action with the fewest mean iterations: what an agent must beat to have learned something.
 
-    Args:
-        kinds: classes of the banks.
-        banks: scenes to search on, those of training.
-        config: what an action means, and the guard.
-        options: of the agent's step.
-        tolerance: relative to the best known cost.
-        limit: largest number of linear solves of a scene.
+    The banks are those of training; `config` says what an action means, for the rest see `evaluate`.
     """
     tried = [ConstantAction((action,), config) for action in CONSTANT_ACTIONS]
     return min(tried, key=lambda one: evaluate(kinds, banks, one, options, tolerance, limit).mean)

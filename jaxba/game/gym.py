@@ -28,54 +28,6 @@ except ModuleNotFoundError:
     raise ImportError("this needs Gymnasium: pip install jaxba[gym]") from None
 
 
-def observation_space(game: Game) -> spaces.Box:
-    """Bounds of one scene's observation."""
-    agent = game.config.agent
-    limit = FEATURE_LIMIT if agent.observation == "scale-free" else np.inf
-    return spaces.Box(-limit, limit, (game.observation_size - game.privileged_size,), np.float32)
-
-
-def action_space(game: Game) -> spaces.Box:
-    """Bounds of one scene's action."""
-    return spaces.Box(-1.0, 1.0, (game.action_size,), np.float32)
-
-
-class _Compiled:
-    """`reset` and `step` of a game with NumPy arrays. The game is an argument of the compiled functions, so that its
-    banks are not constants in them."""
-
-    def __init__(self, game: Game) -> None:
-        self.game = game
-        self.dtype = game.banks[0].initial_cost.dtype
-
-    def reset(self, random: np.random.Generator, mask: np.ndarray | None = None) -> np.ndarray:
-        """New episodes, where the mask is true if one is given: the first observations of all that are under way."""
-        with numerics(self.dtype, single_blas=False):
-            key = jax.random.key(int(random.integers(2**31)))
-            if mask is None:
-                self.state, observation = _reset(self.game, key)
-            else:
-                self.state, observation = _reset_some(self.game, self.state, key, mask)
-            return np.array(self._seen(observation))
-
-    def step(self, action: np.ndarray, waiting: np.ndarray | None = None) -> Any:
-        """One iteration of every scene that is not waiting: a `Step` of NumPy arrays."""
-        with numerics(self.dtype, single_blas=False):
-            given = jnp.asarray(action, jnp.float32)
-            if waiting is None:
-                self.state, step = _step(self.game, self.state, given)
-            else:
-                self.state, step = _step_some(self.game, self.state, given, ~waiting)
-            step = step._replace(
-                observation=self._seen(step.observation), final_observation=self._seen(step.final_observation)
-            )
-            return jax.tree.map(np.array, step)  # copies, which callers may keep and write to
-
-    def _seen(self, observation: Array) -> Array:
-        """Without what only critics see."""
-        return observation[:, : self.game.observation_size - self.game.privileged_size]
-
-
 _reset = jit(lambda game, key: game.reset(key))
 _step = jit(lambda game, state, action: game.step(state, action))
 
@@ -118,10 +70,13 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self.num_envs = game.num_envs
-        self.single_observation_space, self.single_action_space = observation_space(game), action_space(game)
+        limit = FEATURE_LIMIT if game.config.agent.observation == "scale-free" else np.inf
+        self._features = game.observation_size - game.privileged_size  # not what only critics see
+        self.single_observation_space = spaces.Box(-limit, limit, (self._features,), np.float32)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (game.action_size,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._compiled: _Compiled | None = _Compiled(game)
+        self._game: Game | None = game
         self._observation: np.ndarray | None = None  # the last one that was returned; None before the first reset
         self._ended = np.zeros(self.num_envs, bool)  # episodes that no other one has followed yet
 
@@ -139,7 +94,11 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
         if mask is not None and self._observation is None:
             raise gymnasium.error.ResetNeeded("call reset without a mask before the first one with a mask")
         super().reset(seed=seed)
-        observation = self._game().reset(self.np_random, mask)
+        game = self._opened()
+        with numerics(game.banks[0].initial_cost.dtype, single_blas=False):
+            key = jax.random.key(int(self.np_random.integers(2**31)))
+            again = _reset(game, key) if mask is None else _reset_some(game, self._state, key, mask)
+            self._state, observation = again[0], np.array(again[1][:, : self._features])
         if mask is None:
             mask = np.ones(self.num_envs, bool)
         elif self._observation is not None:
@@ -168,23 +127,28 @@ class GymVectorGame(gymnasium.vector.VectorEnv):
             ended = np.flatnonzero(self._ended).tolist()
             raise gymnasium.error.ResetNeeded(f"episodes {ended} have ended: call reset with a reset_mask before step")
         actions = _actions(actions, self.action_space.shape)
-        if self.autoreset_mode == AutoresetMode.SAME_STEP:
-            step = self._game().step(actions)
-            done = step.terminated | step.truncated
-            observation, infos = step.observation, _infos(step, done)
+        game, same_step = self._opened(), self.autoreset_mode == AutoresetMode.SAME_STEP
+        with numerics(game.banks[0].initial_cost.dtype, single_blas=False):
+            given = game, self._state, jnp.asarray(actions, jnp.float32)
+            self._state, found = _step(*given) if same_step else _step_some(*given, ~self._ended)
+            step: Any = jax.tree.map(np.array, found)  # copies, which callers may keep and write to
+        done, last = step.terminated | step.truncated, step.final_observation[:, : self._features]
+        if same_step:
+            observation, infos = step.observation[:, : self._features], _infos(step, last, done)
         else:
-            step = self._game().step(actions, self._ended)
-            done = self._ended = step.terminated | step.truncated
-            observation, infos = step.final_observation, _metrics(step, done)
+            self._ended = done
+            observation, infos = last, _metrics(step, done)
         self._observation = observation.copy()
         return observation, step.reward.astype(np.float64), step.terminated, step.truncated, infos
 
     def close_extras(self, **kwargs: Any) -> None:
         """Releases the memory of the scenes."""
-        self._compiled = None
+        self._game = self._state = None
 
-    def _game(self) -> _Compiled:
-        return _open(self._compiled)
+    def _opened(self) -> Game:
+        if self._game is None:
+            raise gymnasium.error.ClosedEnvironmentError("this environment was closed")
+        return self._game
 
 
 class GymGame(gymnasium.Env):
@@ -202,8 +166,8 @@ class GymGame(gymnasium.Env):
         """
         if game.num_envs != 1:
             raise ValueError(f"a GymGame needs a game with one environment, this one has {game.num_envs}")
-        self.observation_space, self.action_space = observation_space(game), action_space(game)
-        self._compiled: _Compiled | None = _Compiled(game)
+        self._one = GymVectorGame(game)
+        self.observation_space, self.action_space = self._one.single_observation_space, self._one.single_action_space
         self._running = False
 
     def reset(
@@ -216,9 +180,9 @@ class GymGame(gymnasium.Env):
             options: not used.
         """
         super().reset(seed=seed)
-        observation = self._game().reset(self.np_random)[0]
+        observation, info = self._one.reset(seed=seed)
         self._running = True
-        return observation, {}
+        return observation[0], info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One iteration.
@@ -228,24 +192,16 @@ class GymGame(gymnasium.Env):
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("call reset before step: no episode is under way")
-        step = self._game().step(_actions(action, self.action_space.shape)[None])
-        terminated, truncated = bool(step.terminated[0]), bool(step.truncated[0])
+        observation, reward, (terminated,), (truncated,), infos = self._one.step(np.asarray(action)[None])
         self._running = not (terminated or truncated)
-        info = {} if self._running else {name: float(values[0]) for name, values in step.metrics.items()}
-        return step.final_observation[0], float(step.reward[0]), terminated, truncated, info
+        if not self._running:
+            observation = infos["final_obs"]
+            infos = {name: float(x[0]) for name, x in infos["final_info"].items() if not name.startswith("_")}
+        return observation[0], float(reward[0]), bool(terminated), bool(truncated), infos
 
     def close(self) -> None:
         """Releases the memory of the scenes."""
-        self._compiled = None
-
-    def _game(self) -> _Compiled:
-        return _open(self._compiled)
-
-
-def _open(compiled: _Compiled | None) -> _Compiled:
-    if compiled is None:
-        raise gymnasium.error.ClosedEnvironmentError("this environment was closed")
-    return compiled
+        self._one.close()
 
 
 def _actions(action: Any, shape: tuple[int, ...] | None) -> np.ndarray:
@@ -257,13 +213,13 @@ def _actions(action: Any, shape: tuple[int, ...] | None) -> np.ndarray:
     return np.clip(array, -1, 1)
 
 
-def _infos(step: Any, done: np.ndarray) -> dict[str, Any]:
+def _infos(step: Any, observation: np.ndarray, done: np.ndarray) -> dict[str, Any]:
     """In the form of gymnasium's own vector environments: an array per name, and the mask of its entries as `_name`."""
     if not done.any():
         return {}
     last = np.full(len(done), None, dtype=object)
     for k in np.flatnonzero(done):
-        last[k] = step.final_observation[k].copy()
+        last[k] = observation[k].copy()
     final = {"final_obs": last, "_final_obs": done.copy()}
     return {**final, "final_info": _metrics(step, done), "_final_info": done.copy()}
 

@@ -164,13 +164,6 @@ class TooFewScenes(ValueError):
     """Too few of the scenes drawn are usable. The message is one line for a person."""
 
 
-class Draft(NamedTuple):
-    """All scenes of one class, and which of them are usable."""
-
-    bank: Bank
-    usable: np.ndarray
-
-
 @for_traces
 def solve_scenes(
     kind: SceneClass,
@@ -182,8 +175,8 @@ def solve_scenes(
     on_rule: Callable[[str], None] = lambda _: None,
     warm_share: float = 0.0,
     tolerance: float = 1e-3,
-) -> Draft:
-    """Solves scenes with every rule.
+) -> tuple[Bank, Bool[np.ndarray, " scenes"]]:
+    """Solves scenes with every rule, and tells which of them are usable.
 
     Args:
         kind: class of the scenes.
@@ -216,7 +209,7 @@ def solve_scenes(
     soonest = np.min([reach(run.costs, best, 1e-3) for run in runs.values()], axis=0)
     floor = SMALLEST_COST * np.asarray(info.observations)
     usable = (ratio > MIN_RATIO) & (ratio < MAX_RATIO) & (soonest <= EASY_ENOUGH) & (best > floor)
-    return Draft(bank, usable)
+    return bank, usable
 
 
 class Split(NamedTuple):
@@ -258,13 +251,13 @@ def make_banks(
         )
         if kind.family == "windows":
             seed = int(jax.random.randint(class_key, (), 0, 2**31 - 1))
-            parts = [solved(scenes) for scenes in read_windows(config.problems, kind, count, seed, config.dtype)]
-            banks = [select(made.bank, made.usable) for made in parts]
+            parts = read_windows(config.problems, kind, count, seed, config.dtype)
+            banks = [select(*solved(scenes)) for scenes in parts]
         else:
-            made = solved(make_scenes(kind, class_key, count, config.dtype))
-            rows = np.flatnonzero(made.usable)
+            made, usable = solved(make_scenes(kind, class_key, count, config.dtype))
+            rows = np.flatnonzero(usable)
             held = held_out_count(len(rows))
-            banks = [select(made.bank, part) for part in (rows[held:], rows[:held])]
+            banks = [select(made, part) for part in (rows[held:], rows[:held])]
         if any(not len(bank.initial_cost) for bank in banks):
             usable = sum(len(bank.initial_cost) for bank in banks)
             raise TooFewScenes(f"only {usable} of {count} scenes of {where} are usable: draw more")

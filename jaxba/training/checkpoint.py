@@ -1,20 +1,15 @@
-"""Checkpoints: a tree of arrays and JSON metadata, written atomically.
+"""Checkpoints: a tree of arrays and JSON metadata in one `.npz` file, written atomically.
 
-Orbax writes into a temporary folder and renames it, so that a checkpoint with its final name is complete. A tree is
-stored as a flat mapping from paths to NumPy arrays; every leaf that is restored must have the expected shape and type.
+A tree is stored as a flat mapping from paths to NumPy arrays; every leaf that is restored must have the expected shape
+and type.
 """
 
 from __future__ import annotations
 
-import errno
-import gc
 import json
-import logging
-import os
 import shutil
-import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxba.runtime import distributed
+from jaxba.runtime.atomic import TEMPORARY, atomic_write
 
-_PREFIX = "step_"
+_PREFIX, _SUFFIX = "step_", ".npz"
 _METADATA = "metadata"
 
 
@@ -90,12 +86,37 @@ def _is_key(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes an `.npz` file, whole or not at all. Raises OSError."""
+    with atomic_write(path) as file:
+        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of an `.npz` file, in their order in the file.
+
+    Raises:
+        CheckpointError: the file is damaged.
+        OSError: it cannot be opened.
+    """
+    with path.open("rb") as stream:
+        try:
+            with np.load(stream) as file:
+                return dict(file)
+        except Exception:  # zipfile and NumPy name no set of errors for damaged files; checksums tell the rest
+            raise CheckpointError("damaged") from None
+
+
+def _path(folder: Path, step: int) -> Path:
+    return (folder / f"{_PREFIX}{step}{_SUFFIX}").absolute()
+
+
 def steps(folder: Path) -> list[int]:
-    """Numbers of the complete checkpoints in a folder, in order."""
+    """Numbers of the complete checkpoints in a folder, in order; those of earlier versions too, which were folders."""
     if not folder.is_dir():
         return []
-    names = [item.name.removeprefix(_PREFIX) for item in folder.iterdir() if item.name.startswith(_PREFIX)]
-    return sorted(int(name) for name in names if name.isdigit())
+    names = [item.name.removesuffix(_SUFFIX) for item in folder.iterdir() if item.name.startswith(_PREFIX)]
+    return sorted({int(number) for name in names if (number := name.removeprefix(_PREFIX)).isdigit()})
 
 
 def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, Any], keep: int) -> None:
@@ -112,67 +133,18 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
         CheckpointError: it cannot be written; those before are still there.
         OSError: the folder cannot be created.
     """
-    import orbax.checkpoint as ocp
-
     folder.mkdir(parents=True, exist_ok=True)
-    content = {**arrays, _METADATA: np.frombuffer(json.dumps(metadata).encode(), np.uint8)}
-    path = (folder / f"{_PREFIX}{step}").absolute()
-    reason = ""
-    with _quiet_tasks():
-        try:
-            with ocp.StandardCheckpointer(**_alone()) as checkpointer:
-                checkpointer.save(path, content, force=True)
-                checkpointer.wait_until_finished()
-        except Exception as error:  # of a full disk Orbax makes a ValueError with a page of text
-            full = os.strerror(errno.ENOSPC)
-            reason = full if full in str(error) else _reason(error)
-        if reason:
-            gc.collect()  # asyncio reports errors of tasks when these are collected
-    if reason:
-        sys.excepthook = _without_closed_loops(sys.excepthook)  # callbacks of the same failure still come in
-        raise CheckpointError(f"{path} cannot be written: {reason}")
-    complete = {f"{_PREFIX}{number}" for number in [n for n in steps(folder) if n <= step][-keep:]}
-    for item in folder.iterdir():
-        if item.name.startswith(_PREFIX) and item.name not in complete:
-            shutil.rmtree(item, ignore_errors=True)
-
-
-def _alone() -> dict[str, Any]:
-    """Options by which Orbax does not wait for other processes, of which none calls it."""
-    import orbax.checkpoint as ocp
-
-    if jax.process_count() == 1:
-        return {}
-    one = ocp.options.MultiprocessingOptions(
-        primary_host=jax.process_index(), active_processes={jax.process_index()}, barrier_sync_key_prefix="jaxba"
-    )
-    return {"multiprocessing_options": one}
-
-
-@contextmanager
-def _quiet_tasks() -> Iterator[None]:
-    """In which errors of Orbax's tasks and threads are not reported with a page of text each: the first is raised."""
-    loggers = [logging.getLogger(name) for name in ("absl", "asyncio")]
-    before, hook = [logger.disabled for logger in loggers], sys.excepthook
+    path = _path(folder, step)
+    if path.is_dir():  # no checkpoint, and in the way of one
+        shutil.rmtree(path, ignore_errors=True)
     try:
-        for logger in loggers:
-            logger.disabled = True
-        sys.excepthook = lambda *_: None  # of callbacks from C++
-        yield
-    finally:
-        sys.excepthook = hook
-        for logger, disabled in zip(loggers, before, strict=True):
-            logger.disabled = disabled
-
-
-def _without_closed_loops(hook: Callable[..., Any]) -> Callable[..., Any]:
-    """The hook for all errors but those of callbacks that come when their event loop is gone."""
-
-    def report(kind: type[BaseException], error: BaseException, traceback: Any) -> None:
-        if not (kind is RuntimeError and str(error) == "Event loop is closed"):
-            hook(kind, error, traceback)
-
-    return report
+        write_arrays(path, {**arrays, _METADATA: np.frombuffer(json.dumps(metadata).encode(), np.uint8)})
+    except OSError as error:
+        raise CheckpointError(f"{path} cannot be written: {error.strerror or error}") from None
+    kept = {_path(folder, number).name for number in [n for n in steps(folder) if n <= step][-keep:]}
+    for item in folder.iterdir():
+        if item.name not in kept and (item.name.startswith(_PREFIX) or fnmatch(item.name, TEMPORARY.format("*"))):
+            shutil.rmtree(item, ignore_errors=True) if item.is_dir() else item.unlink(missing_ok=True)
 
 
 def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -181,18 +153,10 @@ def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, A
     Raises:
         CheckpointError: it cannot be read.
     """
-    import orbax.checkpoint as ocp
-
-    path = (folder / f"{_PREFIX}{step}").absolute()
+    path = _path(folder, step)
     try:
-        with ocp.Checkpointer(ocp.PyTreeCheckpointHandler(**_alone()), **_alone()) as checkpointer:
-            content = checkpointer.restore(path)
-        arrays = {name: np.asarray(value) for name, value in content.items()}
+        arrays = read_arrays(path)
         return arrays, dict(json.loads(arrays.pop(_METADATA).tobytes()))
-    except Exception as error:  # Orbax names no set of errors for damaged files
-        raise CheckpointError(f"{path} cannot be read: {_reason(error)}") from None
-
-
-def _reason(error: Exception) -> str:
-    """The first line of an error."""
-    return next(iter(str(error).splitlines()), "") or type(error).__name__
+    except (OSError, KeyError, ValueError) as error:
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        raise CheckpointError(f"{path} cannot be read: {reason}") from None

@@ -12,7 +12,6 @@ devices as before. Of several processes the first one alone evaluates, reads and
 
 from __future__ import annotations
 
-import glob
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -102,13 +101,10 @@ def prepare_folder(
         overrides: `key=value` of a resumed run.
 
     Raises:
-        TrainError: a new run would overwrite another one, there is no run to resume or its configuration differs, or
-            the folder's name contains * ? [, which Orbax reads as a pattern.
+        TrainError: a new run would overwrite another one, there is no run to resume, or its configuration differs.
         SettingsError: the configuration in the folder cannot be read.
     """
     path = folder / CONFIG
-    if glob.escape(name := str(folder.absolute())) != name:  # Orbax would take the name for a pattern
-        raise TrainError(f"{folder}: checkpoints cannot be kept where a name holds one of * ? [")
     if path.is_file() and not resume and _others(folder):
         raise TrainError(f"{folder} holds a run already; --resume goes on with it, --out names another folder")
     if resume:

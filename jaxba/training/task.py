@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import typing
-import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +24,6 @@ from jaxba.game.scene_bank import Bank, Split, make_banks, select
 from jaxba.game.statistics import Ratio, paired_ratio
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
-from jaxba.runtime.atomic import atomic_write
 from jaxba.solver.methods import DEFAULT_METHOD, make_method
 from jaxba.training import checkpoint
 from jaxba.training.config import TrainConfig
@@ -125,20 +122,19 @@ class Task:
         """Trained policies and their twins without weights beside the baselines, relative to the best costs of all."""
         tolerance, limit = self.config.game.tolerance, self.config.game.max_iterations
         trained = [self.policy(actor) for actor in actors]
-        play = lambda policy: _play(self.config, self.held_out, {"": (policy, self.game.options)})[""]
-        groups = {
-            TRAINED: [play(policy) for policy in trained],
-            WEIGHTLESS: [play(without_weights(policy)) for policy in trained],
-        }
-        alone = {f"{name} {k + 1}": run for name, runs in groups.items() for k, run in enumerate(runs)}
+        groups = {TRAINED: trained, WEIGHTLESS: [without_weights(policy) for policy in trained]}
+        numbered = {f"{name} {k + 1}": one for name, policies in groups.items() for k, one in enumerate(policies)}
+        steps = {name: (policy, self.game.options) for name, policy in numbered.items()}
+        alone = play_all(self.config.bank.classes, self.held_out, steps, limit)
         best = best_costs({**alone, **self.baseline_runs}, self.held_out)
         found = scores(alone, self.baseline_runs, self.held_out, tolerance, limit)
         means = {name: [found.pop(f"{name} {k + 1}") for k in range(len(actors))] for name in groups}
         each = {f"{TRAINED} {k + 1}": one for k, one in enumerate(means[TRAINED])} if len(actors) > 1 else {}
         mean = {name: Score(*(float(x) for x in np.mean(rows, axis=0))) for name, rows in means.items()}
         taken = lambda runs: np.log([np.minimum(iterations_to(run, best, tolerance), limit) for run in runs])
-        ours, ratios, by_agent = taken(groups[TRAINED]), {}, {}
-        others = {WEIGHTLESS: groups[WEIGHTLESS], **{name: [run] for name, run in self.baseline_runs.items()}}
+        played = lambda name: [alone[f"{name} {k + 1}"] for k in range(len(actors))]
+        ours, ratios, by_agent = taken(played(TRAINED)), {}, {}
+        others = {WEIGHTLESS: played(WEIGHTLESS), **{name: [run] for name, run in self.baseline_runs.items()}}
         for name, runs in others.items():
             theirs = taken(runs)
             ratios[name] = paired_ratio(np.exp(ours.mean(axis=0)), np.exp(theirs.mean(axis=0)))
@@ -211,7 +207,7 @@ def _baseline_runs(
         limits = rules.tolerance, rules.max_iterations
         found = best_constant_action(config.bank.classes, banks, rules.agent, game.options, *limits)
         policies[CONSTANT] = found, game.options
-    runs = _play(config, held_out, policies)
+    runs = play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
     _write_runs(path, runs)
     return runs
 
@@ -252,25 +248,13 @@ def baseline_policies(
     return found
 
 
-def _play(
-    config: TrainConfig, held_out: tuple[Bank, ...], policies: Mapping[str, tuple[DampingPolicy, StepOptions]]
-) -> dict[str, Runs]:
-    return play_all(config.bank.classes, held_out, policies, config.game.max_iterations)
-
-
 def _write_runs(path: Path, runs: dict[str, Runs]) -> None:
-    fields = lambda name, number, run: {f"{name}/{number}/{field}": x for field, x in run._asdict().items()}
-    parts = [fields(name, k, run) for name, banks in runs.items() for k, run in enumerate(banks)]
-    _write(path, {name: x for arrays in parts for name, x in arrays.items()})  # in the order of the table
+    banks = ((f"{name}/{k}", run) for name, played in runs.items() for k, run in enumerate(played))  # as in the table
+    checkpoint.write_arrays(path, {f"{at}/{field}": x for at, run in banks for field, x in run._asdict().items()})
 
 
 def _write_banks(path: Path, splits: list[Split]) -> None:
-    _write(path, {name.replace(".", "/"): x for name, x in checkpoint.pack(splits).items()})
-
-
-def _write(path: Path, arrays: dict[str, Any]) -> None:
-    with atomic_write(path) as file:
-        np.savez(file, **arrays)
+    checkpoint.write_arrays(path, {name.replace(".", "/"): x for name, x in checkpoint.pack(splits).items()})
 
 
 def read_banks(path: Path) -> list[Split]:
@@ -279,36 +263,37 @@ def read_banks(path: Path) -> list[Split]:
     Raises:
         TrainError: another version wrote them, or the file is damaged.
     """
-    with _opened(path) as file:
-        classes = sorted({int(name.split("/")[0]) for name in file.files})
-        return [_named_tuple(Split, f"{number}/", file) for number in classes]
+    arrays = _read(path)
+    classes = dict.fromkeys(name.partition("/")[0] for name in arrays)
+    return [_named_tuple(path, Split, f"{number}/", arrays) for number in classes]
 
 
 def _read_runs(path: Path) -> dict[str, Runs]:
-    with _opened(path) as file:
-        found: dict[str, Runs] = {}
-        for rule, number in dict.fromkeys(tuple(name.split("/")[:2]) for name in file.files):
-            found.setdefault(rule, []).append(_named_tuple(Trajectories, f"{rule}/{number}/", file, np.asarray))
-        return found
+    arrays = _read(path)
+    found: dict[str, Runs] = {}
+    for bank in dict.fromkeys(name.rpartition("/")[0] for name in arrays):
+        run = _named_tuple(path, Trajectories, f"{bank}/", arrays, np.asarray)
+        found.setdefault(bank.rpartition("/")[0], []).append(run)
+    return found
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _read(path: Path) -> dict[str, np.ndarray]:
     try:
-        with path.open("rb") as stream, np.load(stream) as file:
-            yield file
-    except KeyError as error:
-        raise TrainError(f"{path}: written by another version ({error.args[0]}); begin in a new folder") from None
-    except (zipfile.BadZipFile, ValueError, EOFError):
-        raise TrainError(f"{path}: damaged; begin in a new folder") from None
+        return checkpoint.read_arrays(path)
+    except checkpoint.CheckpointError as error:
+        raise TrainError(f"{path}: {error}; begin in a new folder") from None
 
 
 def _named_tuple(
-    kind: Any, prefix: str, arrays: Mapping[str, np.ndarray], make: Callable[[Any], Any] = jnp.asarray
+    path: Path, kind: Any, prefix: str, arrays: Mapping[str, np.ndarray], make: Callable[[Any], Any] = jnp.asarray
 ) -> Any:
     """Rebuilds nested named tuples from the types of their fields."""
     values = {}
     for name, inner in typing.get_type_hints(kind).items():
-        nested = isinstance(inner, type) and hasattr(inner, "_fields")
-        values[name] = _named_tuple(inner, f"{prefix}{name}/", arrays, make) if nested else make(arrays[prefix + name])
+        if isinstance(inner, type) and hasattr(inner, "_fields"):
+            values[name] = _named_tuple(path, inner, f"{prefix}{name}/", arrays, make)
+        elif (key := prefix + name) in arrays:
+            values[name] = make(arrays[key])
+        else:
+            raise TrainError(f"{path}: written by another version ({key} is missing); begin in a new folder")
     return kind(**values)

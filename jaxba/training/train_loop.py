@@ -11,6 +11,7 @@ devices: a collective for each class of scenes in a vector step and two in an up
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -189,15 +190,8 @@ def start_agents(
         mesh: static; of one axis `devices.AXIS`, or None for one device.
     """
 
-    def run(env: Environment, keys: Array) -> LoopState:
-        return jax.vmap(lambda key: start(sac, loop, env, key))(keys)
-
-    if mesh is None:
-        return run(env, keys)
-    spread = jax.shard_map(
-        run, mesh=mesh, in_specs=(P(), agent_shares(env)), out_specs=state_shares(env), check_vma=False
-    )
-    return spread(env, keys)
+    run = lambda env, keys: jax.vmap(lambda key: start(sac, loop, env, key))(keys)
+    return _spread(run, mesh, agent_shares(env), state_shares(env))(env, keys)
 
 
 @functools.partial(jit, static_argnames=("sac", "loop", "mesh"), donate_argnames=("state",))
@@ -206,16 +200,15 @@ def run_agents(
 ) -> tuple[LoopState, dict[str, Float[Array, " agents"]]]:
     """`run_chunk` for the agents of `start_agents`; the state is donated, too."""
 
-    def run(env: Environment, state: LoopState) -> tuple[LoopState, dict[str, Array]]:
-        return jax.vmap(lambda one: run_chunk(sac, loop, env, one))(state)
+    run = lambda env, state: jax.vmap(lambda one: run_chunk(sac, loop, env, one))(state)
+    return _spread(run, mesh, state_shares(env), (state_shares(env), agent_shares(env)))(env, state)
 
+
+def _spread(run: Callable[..., Any], mesh: Mesh | None, shares: Any, found: Any) -> Callable[..., Any]:
+    """The function of an environment and something else over a mesh, if there is one."""
     if mesh is None:
-        return run(env, state)
-    shares = state_shares(env)
-    spread = jax.shard_map(
-        run, mesh=mesh, in_specs=(P(), shares), out_specs=(shares, agent_shares(env)), check_vma=False
-    )
-    return spread(env, state)
+        return run
+    return jax.shard_map(run, mesh=mesh, in_specs=(P(), shares), out_specs=found, check_vma=False)
 
 
 def agent_shares(env: Environment) -> P:
