@@ -49,6 +49,7 @@ from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.solve import Solution, solve
+from jaxba.typing import InputError
 
 DEFAULTS = SolveOptions()
 """Defaults of the options, those of `jaxba.solve`."""
@@ -290,7 +291,7 @@ def _run(args: Arguments) -> int:
     try:  # the others read, print and write nothing
         with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
             return _solve(replace(args, output=None, log=None, covariance=None))
-    except (MainFailedError, ProblemError, common.UsageError):  # which the first one reports
+    except (MainFailedError, InputError):  # which the first one reports
         return common.BAD_INPUT
 
 
@@ -351,7 +352,7 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
     check_outputs(args.output, outputs, path, read)
     if args.view:
-        view.check_extra()
+        common.check_extra(view.VIEWER)
     with common.notes_printed():
         problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
         problem = constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)

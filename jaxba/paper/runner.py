@@ -25,14 +25,15 @@ from jaxba.paper.rows import NEAR, Row
 from jaxba.paper.schedule import LENGTH
 from jaxba.paper.store import Play, Store
 from jaxba.peers import require
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import LinearSolverChoice, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.loop import IterationRecord
-from jaxba.solver.names import SolverName, SolverNameError, parse_solver
+from jaxba.solver.names import SolverName, parse_solver
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.record import Record
 from jaxba.solver.solve import solve
+from jaxba.typing import InputError
 
 LIMIT = profile.ITERATION_LIMIT
 
@@ -219,7 +220,7 @@ class Runner:
                         if self.store.solve(source.name, method.label(seed), repeat) is None:
                             try:
                                 self._solve(source, method, seed, repeat, limit)
-                            except (ProblemError, SolverNameError) as error:
+                            except InputError as error:
                                 self.report(f"{source.name} by {method.name}: left out: {error}")
 
     def _solve(self, source: Source, method: Method, seed: int, repeat: int, limit: int) -> None:
