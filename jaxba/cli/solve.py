@@ -304,7 +304,12 @@ def _run_main(args: Arguments) -> int:
 def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
-    path, problem = _in_all_processes(args) if _is_divided(args) else _checked(args)
+    if _is_divided(args):
+        from jaxba.runtime.distributed import together
+
+        path, problem = together(lambda: _checked(args))
+    else:
+        path, problem = _checked(args)
     common.prepare_process(untraced=not _is_divided(args))
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
@@ -336,15 +341,8 @@ def _is_divided(args: Arguments) -> bool:
     return args.devices is not None or args.processes is not None or args.distributed
 
 
-def _in_all_processes(args: Arguments) -> tuple[str | None, BundleProblem]:
-    """What the first process checks and reads."""
-    from jaxba.runtime.distributed import together
-
-    return together(lambda: _checked(args))
-
-
 def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
-    """The path of the problem and the problem, after all checks of files."""
+    """The path of the problem and the problem, after all checks of files; the first process does this for all."""
     path = _path(args.problem)
     named = args.record is None or args.record.endswith(".npz")
     common.require(named, f"--record {args.record}: a recording ends in .npz")

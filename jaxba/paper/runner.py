@@ -3,6 +3,7 @@ them."""
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -114,7 +115,6 @@ class Runner:
         self.store = Store(folder)
         self.done = 0
         """Number of solves, plays and trainings that this process has done."""
-        self._test: Bank | None = None
         self._read: tuple[Source, BundleProblem] | None = None
 
     # Policies
@@ -167,11 +167,10 @@ class Runner:
 
     # Work
 
+    @functools.cached_property
     def test_scenes(self) -> Bank:
         """The scenes of the tables, generated when first needed."""
-        if self._test is None:
-            self._test = agents.scenes(self.config, self.folder, self.report)[1]
-        return self._test
+        return agents.scenes(self.config, self.folder, self.report)[1]
 
     def play(self, method: Method) -> None:
         """Solves the scenes of the tables with a method, unless the folder has the result."""
@@ -182,7 +181,7 @@ class Runner:
             policy, options = method.build(seed)
             settings = agents.train_config(self.config, agents.OURS, 0)
             options = replace(options, intrinsics=settings.bank.intrinsics).step_options(policy)
-            bank = self.test_scenes()
+            bank = self.test_scenes
             self.report(f"{method.label(seed)} on {len(bank.initial_cost)} scenes")
             started = time.perf_counter()
             found = play(settings.bank.classes[0], bank, policy, options, LIMIT)
