@@ -169,18 +169,16 @@ def _check(args: Arguments) -> None:
 def _build(args: Arguments) -> int:
     _check(args)
     from jaxba.kitti.build import build
-    from jaxba.kitti.result_cache import ResultCache
 
     with common.notes_printed():
         sequence, poses = _inputs(args)
     _check_apart([args.out], sequence, args)
     options = BuildOptions(**{field.name: getattr(args, field.name) for field in fields(BuildOptions)})
     console = common.console()
-    work = args.work or Path(strip_compression(args.out)).with_suffix(".work")
-    cache = ResultCache(Path(work))
+    work = Path(args.work or Path(strip_compression(args.out)).with_suffix(".work"))
     try:
         with _progress(console) as report:
-            built = build(sequence, options, cache, poses, report)
+            built = build(sequence, options, work, poses, report)
         parts = _parts(built, args)
         _check_apart([path for _, path in parts], sequence, args)
         for part, path in parts:

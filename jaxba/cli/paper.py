@@ -58,15 +58,13 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _paper(args: Arguments) -> int:
-    from rich.console import Console
-
     from jaxba.cli.overwriting import check_apart
     from jaxba.paper import config as configs
     from jaxba.paper.report import CLAIMS
     from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
     from jaxba.settings.configurations import find
 
-    console = Console(soft_wrap=True, highlight=False)
+    console = common.console()
     if args.list:
         for entry in TABLES_AND_FIGURES.values():
             console.print(f"{entry.name:12} {entry.title}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +15,6 @@ from jaxba.kitti.initial_poses import drift
 from jaxba.kitti.keyframes import choose
 from jaxba.kitti.odometry import views_of_poses, visual_odometry
 from jaxba.kitti.options import BuildOptions
-from jaxba.kitti.result_cache import ResultCache
 from jaxba.kitti.sequence import Sequence
 from jaxba.kitti.triangulate import Filters
 
@@ -40,23 +40,23 @@ class Built:
 def build(
     sequence: Sequence,
     options: BuildOptions,
-    cache: ResultCache,
+    work: Path,
     poses_of_frames: Callable[[tuple[int, ...]], Float[np.ndarray, "frames 3 4"]] | None,
     report: Report,
 ) -> Built:
-    """Makes the problem of a sequence. Equal arguments give equal numbers, whatever the cache holds.
+    """Makes the problem of a sequence. Equal arguments give equal numbers, whatever that folder holds.
 
     Args:
         sequence: the frames.
         options: of tracks, key-frames, poses and points.
-        cache: of the results of single frames.
+        work: folder of the results of single frames.
         poses_of_frames: camera-to-world poses of frames by their numbers; needed where the initial poses are given.
         report: called with the progress.
 
     Raises:
         ProblemError: an image cannot be read, frames share too little, or the camera does not move.
     """
-    every, linked = link(sequence, options, cache, report)
+    every, linked = link(sequence, options, work, report)
     numbers = tuple(sequence.numbers[i] for i in linked)
     chosen = choose(every, len(numbers), options.keyframes, sequence.calibration, numbers)
     frames = tuple(numbers[i] for i in chosen)

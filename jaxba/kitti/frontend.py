@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from jaxba.kitti.images import image_reader, spare_bits, stamp
 from jaxba.kitti.klt import TrackedPoints, detect_corners, track
 from jaxba.kitti.opencv import cv2
 from jaxba.kitti.options import BuildOptions
-from jaxba.kitti.result_cache import ResultCache, digest
+from jaxba.kitti.result_cache import cached, digest
 from jaxba.kitti.sequence import Sequence
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.problem.bundle_problem import ProblemError
@@ -22,9 +23,7 @@ Report = Callable[[str, int, int], None]
 """Called with the name of a stage, how much of it is done, and how much there is."""
 
 
-def link(
-    sequence: Sequence, options: BuildOptions, cache: ResultCache, report: Report
-) -> tuple[Tracks, tuple[int, ...]]:
+def link(sequence: Sequence, options: BuildOptions, work: Path, report: Report) -> tuple[Tracks, tuple[int, ...]]:
     """Tracks over the frames that are linked with the first one, and the positions of these in the sequence.
 
     The images of the tracks are positions among them. A frame that cannot be linked with one of the `reach` frames
@@ -34,11 +33,11 @@ def link(
         ProblemError: an image cannot be read, or frames cannot be linked: the message names them.
     """
     stamps = [stamp(path) for path in sequence.images]
-    return (_track_points if options.features == "klt" else _match_features)(sequence, options, cache, report, stamps)
+    return (_track_points if options.features == "klt" else _match_features)(sequence, options, work, report, stamps)
 
 
 def _match_features(
-    sequence: Sequence, options: BuildOptions, cache: ResultCache, report: Report, stamps: list[str]
+    sequence: Sequence, options: BuildOptions, work: Path, report: Report, stamps: list[str]
 ) -> tuple[Tracks, tuple[int, ...]]:
     read = image_reader(sequence)
     kind = (options.features, options.keypoints, cv2.__version__, spare_bits(sequence))
@@ -48,13 +47,13 @@ def _match_features(
     for j, number in enumerate(sequence.numbers):
         report("key-points and matches", j, len(sequence))
         key = digest("points", kind, stamps[j])
-        recent.append(cache.get(f"points-{number:06d}-{key}", KeyPoints, lambda j=j: detect(read(j), *kind[:2])))
+        recent.append(cached(work, f"points-{number:06d}-{key}", KeyPoints, lambda j=j: detect(read(j), *kind[:2])))
         pixels.append(recent[-1].pixels)
         for i in range(max(j - options.reach, 0), j):
             key = digest("match", kind, stamps[i], stamps[j], asdict(sequence.calibration), options.seed)
             name = f"match-{sequence.numbers[i]:06d}-{number:06d}-{key}"
             make = lambda a=recent[i - j - 1], b=recent[-1]: _verify(a, b, sequence, options.seed)
-            matches[i, j] = np.stack(cache.get(name, Verified, make), axis=1)
+            matches[i, j] = np.stack(cached(work, name, Verified, make), axis=1)
     linked = [0]
     for j in range(1, len(sequence)):
         before = [i for i in linked if j - i <= options.reach]
@@ -80,21 +79,21 @@ def _verify(a: KeyPoints, b: KeyPoints, sequence: Sequence, seed: int) -> Verifi
 
 
 def _track_points(
-    sequence: Sequence, options: BuildOptions, cache: ResultCache, report: Report, stamps: list[str]
+    sequence: Sequence, options: BuildOptions, work: Path, report: Report, stamps: list[str]
 ) -> tuple[Tracks, tuple[int, ...]]:
     read = image_reader(sequence)
     count, calibration = options.keypoints, sequence.calibration
     own = (count, options.reach, options.min_matches, options.seed)
     key = digest("klt", own, asdict(calibration), cv2.__version__, stamps[0])
     name = f"klt-{sequence.numbers[0]:06d}-{key}"
-    points = cache.get(name, TrackedPoints, lambda: detect_corners(read(0), count))
+    points = cached(work, name, TrackedPoints, lambda: detect_corners(read(0), count))
     linked, seen, failed = [0], [points], {}
     for j in range(1, len(sequence)):
         report("tracking", j, len(sequence))
         i = linked[-1]
         key = digest(key, stamps[i], stamps[j])
         make = lambda i=i, j=j, points=points: track(read(i), read(j), points, count, calibration, options.seed)
-        found = cache.get(f"klt-{sequence.numbers[j]:06d}-{key}", TrackedPoints, make)
+        found = cached(work, f"klt-{sequence.numbers[j]:06d}-{key}", TrackedPoints, make)
         if int(found.old) < options.min_matches:
             failed[j] = int(found.old)
             if j - i >= options.reach or (j == len(sequence) - 1 and len(linked) == 1):
