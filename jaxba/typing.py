@@ -21,6 +21,10 @@ SHOWN = 8
 """Most items of a tuple that `outline` shows."""
 
 
+class InputError(ValueError):
+    """What a user gave cannot be used. The message is one line for the user, and commands print it alone."""
+
+
 class ArrayRecord:
     """Base of dataclasses of arrays, which are made with `eq=False, repr=False`. Two are equal if they are of one class
     and all their arrays and other values are equal, with NaN equal to NaN. Shown with types and shapes, in one line."""

@@ -73,7 +73,8 @@ def test_no_public_function_hides_a_module():
     modules = {module.name for module in pkgutil.iter_modules(jaxba.__path__)}
     assert not {name for name in modules if inspect.isfunction(getattr(jaxba, name, None))}
     # where no room has the name of a function, and every other module stands in a room, there is none to hide
-    assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == {"__init__.py", "rotations.py", "typing.py", "py.typed"}
+    alone = {"__init__.py", "rotations.py", "typing.py", "py.typed"}
+    assert {path.name for path in PACKAGE.iterdir() if path.is_file()} == alone
 
 
 NEED_VISER = {f"jaxba.viewer.{name}" for name in ("curve", "extra", "layers", "live", "page", "panel", "stage")}

@@ -194,7 +194,7 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
 
 @dataclass(frozen=True)
 class Suite:
-    """Content of a suite file; the command line replaces what it gives."""
+    """Content of a suite file; the command line replaces what it gives, by the options of the same names."""
 
     problems: tuple[str, ...] = ()
     """Names or paths, in which $VARIABLES and wildcards are expanded."""
@@ -203,13 +203,8 @@ class Suite:
     """Names of solvers."""
 
     tolerance: float | None = None
-    """As `Arguments.tolerance`."""
-
     repeats: int | None = None
-    """As `Arguments.repeats`."""
-
     max_iterations: int | None = None
-    """As `Arguments.max_iterations`."""
 
 
 def _with_suite(args: Arguments) -> Arguments:

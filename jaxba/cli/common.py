@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import gc
+import importlib
 import os
 import shlex
 import signal
@@ -17,6 +18,7 @@ from typing import Any, NoReturn
 from jaxba.cli.options import BAD_INPUT, Arguments, parse
 from jaxba.cli.streams import UnwritableStreamError, tolerant_streams
 from jaxba.runtime.interrupt import ENDED, INTERRUPTED, Interrupt
+from jaxba.typing import InputError
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 """Errors of a disk that is full or may not be written: no fault of the program, wherever they come up."""
@@ -29,7 +31,7 @@ _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 """Write bits of a file mode; they are checked separately, since `os.access` allows root to write without them."""
 
 
-class UsageError(ValueError):
+class UsageError(InputError):
     """Invalid arguments. The message is one line for the user."""
 
 
@@ -84,16 +86,9 @@ def _run(main: Callable[[Arguments], int], parsed: Arguments | str | None) -> in
         return 0
     if isinstance(parsed, str):
         return print_error(parsed)
-    from jaxba.damping.policy_file import PolicyFileError
-    from jaxba.damping.registry import UnknownPolicyError
-    from jaxba.problem.bundle_problem import ProblemError
-    from jaxba.solver.methods import UnknownMethodError
-    from jaxba.solver.names import SolverNameError
-
-    names = (UnknownPolicyError, UnknownMethodError, SolverNameError)
     try:
         return main(parsed)
-    except (ProblemError, UsageError, PolicyFileError, *names) as error:
+    except InputError as error:
         return print_error(str(error))
     except Exception as error:
         from jaxba.runtime.process import missing_platform, out_of_memory
@@ -201,6 +196,14 @@ def use_compilation_cache(untraced: bool = False) -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+def check_extra(module: str) -> None:
+    """Raises a UsageError that names the package to install, if a module of jaxba needs one that is missing."""
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise UsageError(str(error)) from None
 
 
 def require(fulfilled: bool, message: str) -> None:

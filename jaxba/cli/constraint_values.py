@@ -6,7 +6,7 @@ The file is read as text alone: `000010` is a name, and a number where a number 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,25 +19,6 @@ NAMED = 3
 
 PARTS = ("positions", "stddev", "loss", "loss_scale", "align")
 """Keys of `position_priors`."""
-
-
-class PositionPriors(NamedTuple):
-    """What `position_priors` says."""
-
-    images: list[str]
-    """Names or ids."""
-
-    positions: Float[np.ndarray, "n 3"]
-    """Of each image, in the units of `stddev`."""
-
-    stddev: Float[np.ndarray, "n 3"]
-    """Standard deviations along x, y and z."""
-
-    loss: Loss
-    """Robust loss of the squared whitened distance."""
-
-    align: bool
-    """Whether the scene is first moved, turned and scaled to the positions."""
 
 
 def names_of(names: Sequence[str]) -> str:
@@ -59,9 +40,12 @@ def parse_items(value: Any, what: str) -> list[str]:
     return items
 
 
-def parse_position_priors(value: Any) -> PositionPriors:
-    """The value of `position_priors`. `stddev` is one number, three (x, y, z), a mapping from each image to one or
-    three, or a list of these in the order of the positions.
+def parse_position_priors(value: Any) -> tuple[list[str], Float[np.ndarray, "2 n 3"], dict[str, Any]]:
+    """The value of `position_priors`: names or ids of images, their positions and standard deviations along x, y and z,
+    and the arguments `loss` and `align` of `with_position_priors`.
+
+    `stddev` is one number, three (x, y, z), a mapping from each image to one or three, or a list of these in the order
+    of the positions.
 
     Raises:
         ValueError: something that this cannot be; one line that names the key and the image.
@@ -78,13 +62,10 @@ def parse_position_priors(value: Any) -> PositionPriors:
         raise ValueError(f"positions: must be a mapping from images to [x, y, z], not {_written(given)}")
     images = parse_items(list(given), "names or ids of images")
     places = [_numbers(f"positions: {image}", place, "three numbers", (3,)) for image, place in given.items()]
-    return PositionPriors(
-        images,
-        np.array(places),
-        _stddev(value.get("stddev", "1"), images),
-        Loss(value.get("loss", "squared"), float(_numbers("loss_scale", value.get("loss_scale", "1"), "a number", ()))),
-        _truth("align", value.get("align", "true")),
-    )
+    stddev = _stddev(value.get("stddev", "1"), images)
+    scale = _numbers("loss_scale", value.get("loss_scale", "1"), "a number", ())
+    loss, align = Loss(value.get("loss", "squared"), float(scale)), _truth("align", value.get("align", "true"))
+    return images, np.stack([places, stddev]), {"loss": loss, "align": align}
 
 
 def _written(value: Any) -> str:

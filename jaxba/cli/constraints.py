@@ -10,7 +10,7 @@ from typing import Any, get_args
 import numpy as np
 
 from jaxba.cli.common import UsageError, counted
-from jaxba.cli.constraint_values import PositionPriors, names_of, parse_items, parse_position_priors
+from jaxba.cli.constraint_values import names_of, parse_items, parse_position_priors
 from jaxba.io.notes import report
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.checks import shown
@@ -130,7 +130,7 @@ def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: boo
     labels = problem.labels
     names = frozenset() if labels is None else frozenset(labels.names)
     if key == "position_priors":
-        return _with_positions(problem, where, parse_position_priors(value), names, strict)
+        return _with_positions(problem, where, value, names, strict)
     items = parse_items(value, KEYS[key])
     if key == "constant_numbers":
         return hold(problem, numbers=items)
@@ -144,15 +144,16 @@ def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: boo
 
 
 def _with_positions(
-    problem: BundleProblem, where: str, given: PositionPriors, names: Container[str], strict: bool
+    problem: BundleProblem, where: str, value: Any, names: Container[str], strict: bool
 ) -> BundleProblem:
     """The problem with the positions of its own images; a note says which others there are."""
+    given, (positions, stddev), how = parse_position_priors(value)
     labels = problem.labels
     ids = range(problem.num_cameras) if labels is None else set(labels.images.tolist())
-    wanted = _meant(given.images, names)
+    wanted = _meant(given, names)
     known = [one in names or one in ids for one in wanted]
     ours = np.flatnonzero(known)
-    others = [image for image, ok in zip(given.images, known, strict=True) if not ok]
+    others = [image for image, ok in zip(given, known, strict=True) if not ok]
     if not len(ours):
         raise ValueError(f"none of the images is in the problem: {names_of(others) or 'no positions'}")
     if others:
@@ -161,11 +162,5 @@ def _with_positions(
             raise ValueError(text)
         report([f"{where}: left out {text}"])
     images: Any = [wanted[at] for at in ours]
-    return with_position_priors(
-        problem,
-        given.positions[ours],
-        stddev=given.stddev[ours],
-        images=images if labels is None else labels.positions("image", images).tolist(),
-        loss=given.loss,
-        align=given.align,
-    )
+    at = images if labels is None else labels.positions("image", images).tolist()
+    return with_position_priors(problem, positions[ours], stddev=stddev[ours], images=at, **how)

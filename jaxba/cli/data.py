@@ -103,10 +103,9 @@ def _download(args: Download) -> int:
     if not args.names:
         raise common.UsageError("name a problem or a family; jaxba-data list shows them")
     entries, folder = select(args.names), data_folder()
-    try:
-        from jaxba.datasets.bal import download
-    except ImportError as error:
-        raise common.UsageError(str(error)) from None
+    common.check_extra("jaxba.datasets.bal.download")
+    from jaxba.datasets.bal import download
+
     console = common.console()
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
     status = 0

@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,15 +25,18 @@ from jaxba.io.notes import note, note_center
 from jaxba.io.poses import read_poses
 from jaxba.kitti import evaluate
 from jaxba.kitti.assemble import Assembled, sidecar_contents, windows
+from jaxba.kitti.options import BuildOptions, Features
 from jaxba.kitti.sequence import files_of, read_sequence
 from jaxba.kitti.trajectory import path_length
-from jaxba.kitti.triangulate import Filters
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import write_text
 
 EVALUATE = "evaluate"
 """First argument of the subcommand; a folder of this name can be given as ./evaluate."""
+
+DEFAULTS = BuildOptions()
+"""Defaults of the options of the same names."""
 
 
 @options
@@ -49,16 +53,16 @@ class Arguments:
     frames: Annotated[str, "A:B:STEP"] = ":"
     """Range of frame numbers, without the end, such as 0:200."""
 
-    features: Literal["sift", "orb", "klt"] = "sift"
+    features: Features = DEFAULTS.features
     """sift, orb: match key-points. klt: track corners from frame to frame."""
 
-    keypoints: int = 2000
+    keypoints: int = DEFAULTS.keypoints
     """Key-points per frame at most."""
 
-    reach: int = 3
+    reach: int = DEFAULTS.reach
     """Previous frames with which each frame is matched."""
 
-    min_matches: int = 40
+    min_matches: int = DEFAULTS.min_matches
     """Verified matches between two frames at least."""
 
     keyframes: Annotated[str, "RULE"] = "auto"
@@ -72,19 +76,19 @@ class Arguments:
     """True poses, 12 numbers per line for every frame from 0, or 13, the first of them the frame. With --start vo only
     the error of the start is computed from them."""
 
-    rotation_sigma: float = 0.1
+    rotation_sigma: float = DEFAULTS.rotation_sigma
     """Error of noisy-poses: standard deviation per axis and key-frame, degrees."""
 
-    translation_sigma: float = 0.05
+    translation_sigma: float = DEFAULTS.translation_sigma
     """The same per axis and key-frame, relative to the distance from the previous key-frame."""
 
-    min_angle: float = 1.0
+    min_angle: float = DEFAULTS.min_angle
     """Smallest triangulation angle of a point, degrees."""
 
-    max_error: float = 3.0
+    max_error: float = DEFAULTS.max_error
     """Largest reprojection error of an observation before the noise of noisy-poses, pixels."""
 
-    min_views: int = 2
+    min_views: int = DEFAULTS.min_views
     """Key-frames that observe a point at least."""
 
     window: int | None = None
@@ -103,7 +107,7 @@ class Arguments:
     work: Annotated[str | None, "FOLDER"] = None
     """Intermediate results, with which an interrupted run continues. Default: NAME.work."""
 
-    seed: int = 0
+    seed: int = DEFAULTS.seed
     """Seed of all random numbers."""
 
 
@@ -159,37 +163,22 @@ def _check(args: Arguments) -> None:
     check_output(args.out)
     is_bal = by_ending(args.out) in (None, FORMATS[0])
     common.require(is_bal, f"--out {args.out}: the problem is a BAL file, such as kitti00.txt.bz2")
-    try:
-        from jaxba.kitti import opencv  # noqa: F401 - the error names the package to install
-    except ImportError as error:
-        raise common.UsageError(str(error)) from None
+    common.check_extra("jaxba.kitti.opencv")
 
 
 def _build(args: Arguments) -> int:
     _check(args)
-    from jaxba.kitti.build import BuildOptions, build
-    from jaxba.kitti.frontend import FrontEndOptions
-    from jaxba.kitti.result_cache import ResultCache
+    from jaxba.kitti.build import build
 
     with common.notes_printed():
         sequence, poses = _inputs(args)
     _check_apart([args.out], sequence, args)
-    front = FrontEndOptions(args.features, args.keypoints, args.reach, args.min_matches, args.seed)
-    options = BuildOptions(
-        front,
-        args.keyframes,
-        args.start,
-        args.rotation_sigma,
-        args.translation_sigma,
-        Filters(args.min_angle, args.max_error),
-        args.min_views,
-    )
+    options = BuildOptions(**{field.name: getattr(args, field.name) for field in fields(BuildOptions)})
     console = common.console()
-    work = args.work or Path(strip_compression(args.out)).with_suffix(".work")
-    cache = ResultCache(Path(work))
+    work = Path(args.work or Path(strip_compression(args.out)).with_suffix(".work"))
     try:
-        with _Progress(console) as progress:
-            built = build(sequence, options, cache, poses, progress.report)
+        with _progress(console) as report:
+            built = build(sequence, options, work, poses, report)
         parts = _parts(built, args)
         _check_apart([path for _, path in parts], sequence, args)
         for part, path in parts:
@@ -356,30 +345,23 @@ def _table(title: str, first: str, *columns: str) -> Any:
     return table
 
 
-class _Progress:
-    """A progress bar on a terminal; otherwise a line for every stage."""
+@contextmanager
+def _progress(console: Any) -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar on a terminal, otherwise a line for every stage: a function of the stage, what is done and the
+    total."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    def __init__(self, console: Any) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task, now = bar.add_task("starting", total=None), ""
 
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self.console = console
-        self._bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self._stage = ""
+        def report(stage: str, done: int, total: int) -> None:
+            nonlocal now
+            if stage != now:
+                now = stage
+                bar.reset(task, description=stage)
+                if not console.is_terminal:
+                    console.print(stage if total <= 1 else f"{stage} ({total})")
+            bar.update(task, completed=done, total=total)
 
-    def __enter__(self) -> _Progress:
-        self._bar.start()
-        self._task = self._bar.add_task("starting", total=None)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def report(self, stage: str, done: int, total: int) -> None:
-        """Updates the progress: `done` of `total` units of a stage."""
-        if stage != self._stage:
-            self._stage = stage
-            self._bar.reset(self._task, description=stage)
-            if not self.console.is_terminal:
-                self.console.print(stage if total <= 1 else f"{stage} ({total})")
-        self._bar.update(self._task, completed=done, total=total)
+        yield report

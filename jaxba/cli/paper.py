@@ -58,16 +58,13 @@ def run(argv: Sequence[str] | None = None) -> int:
 
 
 def _paper(args: Arguments) -> int:
-    from rich.console import Console
-
     from jaxba.cli.overwriting import check_apart
     from jaxba.paper import config as configs
     from jaxba.paper.report import CLAIMS
     from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
-    from jaxba.settings import SettingsError
     from jaxba.settings.configurations import find
 
-    console = Console(soft_wrap=True, highlight=False)
+    console = common.console()
     if args.list:
         for entry in TABLES_AND_FIGURES.values():
             console.print(f"{entry.name:12} {entry.title}")
@@ -78,10 +75,7 @@ def _paper(args: Arguments) -> int:
         if name not in TABLES_AND_FIGURES:
             raise common.UsageError(f"--only {name}: unknown; known: {', '.join(TABLES_AND_FIGURES)}")
     name = args.config or (FAST if args.fast else FULL)
-    try:
-        config = configs.load(name)
-    except SettingsError as error:
-        raise common.UsageError(str(error)) from None
+    config = configs.load(name)
     stem = Path(name).stem
     folder = Path(args.out or Path("runs") / ("paper" if stem == FULL else f"paper-{stem}"))
     report = Path(args.report or folder / REPORT)
@@ -99,7 +93,7 @@ def _open(folder: Path, config: Any) -> None:
     """Creates the folder and writes the configuration there, or checks that the folder has the same configuration.
 
     Raises:
-        UsageError: the folder has another configuration, or cannot be written.
+        InputError: the folder has another configuration, or cannot be written.
     """
     from jaxba import settings
     from jaxba.paper import config as configs
@@ -109,10 +103,7 @@ def _open(folder: Path, config: Any) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if path.is_file():
-            try:
-                other = settings.differences(configs.load(str(path)), config)
-            except settings.SettingsError as error:
-                raise common.UsageError(str(error)) from None
+            other = settings.differences(configs.load(str(path)), config)
             if other:
                 raise common.UsageError(f"{folder} holds a run with another {other[0]}; --out names another folder")
         else:

@@ -36,7 +36,7 @@ def start(args: Devices) -> list[Any]:
         The devices, those of all processes; none for JAX's default one, if no option is given.
 
     Raises:
-        UsageError: bad options, or they cannot be met.
+        InputError: bad options, or they cannot be met.
     """
     named = [x is not None for x in (args.coordinator, args.processes, args.process)]
     if not (any(named) or args.distributed or args.devices is not None):
@@ -49,9 +49,6 @@ def start(args: Devices) -> list[Any]:
     if any(named) and args.distributed:
         raise common.UsageError("--distributed finds what --coordinator, --processes and --process name: give one")
     keep_memory()  # sets how JAX starts
-    try:
-        if args.distributed or any(named):
-            distributed.initialize(args.coordinator, args.processes, args.process)
-        return distributed.use_devices(args.devices)
-    except distributed.DistributedError as error:
-        raise common.UsageError(str(error)) from None
+    if args.distributed or any(named):
+        distributed.initialize(args.coordinator, args.processes, args.process)
+    return distributed.use_devices(args.devices)

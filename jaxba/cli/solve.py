@@ -49,6 +49,7 @@ from jaxba.solver.names import SolverName, parse_policy, split_refinement
 from jaxba.solver.options import Dtype, SolveOptions
 from jaxba.solver.prepare import DEFAULT_POLICY
 from jaxba.solver.solve import Solution, solve
+from jaxba.typing import InputError
 
 DEFAULTS = SolveOptions()
 """Defaults of the options, those of `jaxba.solve`."""
@@ -290,7 +291,7 @@ def _run(args: Arguments) -> int:
     try:  # the others read, print and write nothing
         with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
             return _solve(replace(args, output=None, log=None, covariance=None))
-    except (MainFailedError, ProblemError, common.UsageError):  # which the first one reports
+    except (MainFailedError, InputError):  # which the first one reports
         return common.BAD_INPUT
 
 
@@ -303,7 +304,12 @@ def _run_main(args: Arguments) -> int:
 def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
-    path, problem = _in_all_processes(args) if _is_divided(args) else _checked(args)
+    if _is_divided(args):
+        from jaxba.runtime.distributed import together
+
+        path, problem = together(lambda: _checked(args))
+    else:
+        path, problem = _checked(args)
     common.prepare_process(untraced=not _is_divided(args))
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
@@ -335,15 +341,8 @@ def _is_divided(args: Arguments) -> bool:
     return args.devices is not None or args.processes is not None or args.distributed
 
 
-def _in_all_processes(args: Arguments) -> tuple[str | None, BundleProblem]:
-    """What the first process checks and reads."""
-    from jaxba.runtime.distributed import together
-
-    return together(lambda: _checked(args))
-
-
 def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
-    """The path of the problem and the problem, after all checks of files."""
+    """The path of the problem and the problem, after all checks of files; the first process does this for all."""
     path = _path(args.problem)
     named = args.record is None or args.record.endswith(".npz")
     common.require(named, f"--record {args.record}: a recording ends in .npz")
@@ -351,7 +350,7 @@ def _checked(args: Arguments) -> tuple[str | None, BundleProblem]:
     read = {"the file of --constraints": args.constraints, "the file of --policy": policy_file(args.policy)}
     check_outputs(args.output, outputs, path, read)
     if args.view:
-        view.check_extra()
+        common.check_extra(view.VIEWER)
     with common.notes_printed():
         problem = random_scene(DEFAULT_SCENES[DEFAULT_SCENE], 0) if path is None else _read(args, path)
         problem = constrained(problem, args.constant, args.gauge, args.constraints, strict=args.strict)

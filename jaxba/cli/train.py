@@ -14,6 +14,7 @@ from jaxba.cli import common, processes
 from jaxba.cli.options import options
 from jaxba.runtime.interrupt import Interrupt
 from jaxba.training.view import TrainingView
+from jaxba.typing import InputError
 
 if TYPE_CHECKING:
     from jaxba.bench.tables import Table
@@ -102,7 +103,7 @@ def _train(args: Arguments, command: str) -> int:
         return _run(args, devices, command)
     except MainFailedError:
         return common.BAD_INPUT
-    except common.UsageError:  # that all processes have found
+    except InputError:  # that all processes have found
         if is_main():
             raise
         return common.BAD_INPUT
@@ -117,18 +118,15 @@ def _prepare(args: Arguments, folder: Path, name: str) -> Any:
 
     overrides = tuple(item for group in args.overrides for item in group)
     overrides += () if args.seeds is None else (f"seeds={args.seeds}",)
-    try:
-        config = None if args.resume and args.config is None else configs.load(name, overrides)
-        if args.problems and config is None:
-            raise common.UsageError("--problems: a resumed run has its scenes in its folder")
-        if args.problems and config is not None:
-            config = configs.with_problems(config, _check_problems(args.problems))
-        if config is not None and not args.resume:  # the configuration of a run that goes on is its own
-            read = {"the file of --config": [configurations.find("train", name)]}
-            check_apart({"--out": [folder / driver.CONFIG]}, read)
-        return driver.prepare_folder(folder, config, args.resume, overrides)
-    except (configs.SettingsError, driver.TrainError) as error:
-        raise common.UsageError(str(error)) from None
+    config = None if args.resume and args.config is None else configs.load(name, overrides)
+    if args.problems and config is None:
+        raise common.UsageError("--problems: a resumed run has its scenes in its folder")
+    if args.problems and config is not None:
+        config = configs.with_problems(config, _check_problems(args.problems))
+    if config is not None and not args.resume:  # the configuration of a run that goes on is its own
+        read = {"the file of --config": [configurations.find("train", name)]}
+        check_apart({"--out": [folder / driver.CONFIG]}, read)
+    return driver.prepare_folder(folder, config, args.resume, overrides)
 
 
 def _board(args: Arguments, folder: Path, config: Any) -> Any:
@@ -136,20 +134,14 @@ def _board(args: Arguments, folder: Path, config: Any) -> Any:
     if not args.wandb:
         return None
     from jaxba import settings
-    from jaxba.training.driver import TrainError
     from jaxba.training.wandb_log import WandbLog
 
-    try:
-        return WandbLog(args.wandb, folder, settings.plain(config))
-    except TrainError as error:
-        raise common.UsageError(str(error)) from None
+    return WandbLog(args.wandb, folder, settings.plain(config))
 
 
 def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
-    from jaxba.game import scene_bank
     from jaxba.runtime import process
     from jaxba.runtime.distributed import is_main, together
-    from jaxba.settings import SettingsError
     from jaxba.training import driver, task
     from jaxba.training.placement import Placement
 
@@ -194,8 +186,6 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
         except KeyboardInterrupt:
             console.print(f"interrupted; go on from the last checkpoint with {_again(folder)}")
             return common.INTERRUPTED
-        except (driver.TrainError, SettingsError, scene_bank.TooFewScenes) as error:
-            raise common.UsageError(str(error)) from None
         except OSError as error:
             raise common.UsageError(
                 f"{error.filename or folder}: {error.strerror or error}; go on with {_again(folder)}"

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
     Play = Callable[[str, int], Recording]
 
+VIEWER = "jaxba.viewer.extra"
+"""Module that needs viser."""
+
 NAMED = 5
 """Worst images that are printed."""
 
@@ -82,7 +85,7 @@ def _run(args: Arguments, play: Play | None) -> int:
     _check_host(args.host)
     common.check_writable("--html", args.html)
     _check_apart(args)
-    check_extra()
+    common.check_extra(VIEWER)
     from jaxba.viewer import sources
 
     with common.notes_printed():
@@ -134,14 +137,6 @@ def _check_apart(args: Arguments) -> None:
     images = [] if args.images is None else [one for one in Path(args.images).rglob("*") if one.suffix != ".html"]
     read = {PROBLEM: files, "the file of --poses": [args.poses], "an image": images}
     check_apart({"--html": [args.html]}, {**read, "the file of --policy": [policy_file(args.policy or "")]})
-
-
-def check_extra() -> None:
-    """Raises a UsageError that names the package to install, if viser is missing."""
-    try:
-        import jaxba.viewer.extra  # noqa: F401
-    except ImportError as error:
-        raise common.UsageError(str(error)) from None
 
 
 def announce(viewer: Viewer) -> None:

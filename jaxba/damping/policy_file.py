@@ -16,6 +16,7 @@ from jaxba.damping.agent_config import config_from
 from jaxba.damping.features import observation_size
 from jaxba.damping.learned import Layer, LearnedPolicy
 from jaxba.runtime.atomic import atomic_write
+from jaxba.typing import InputError
 
 FORMAT = "jaxba-policy-1"
 """Kind and version of a policy file, in its metadata."""
@@ -24,7 +25,7 @@ LARGEST_FILE = 1 << 20
 """Largest size of a policy file in bytes."""
 
 
-class PolicyFileError(ValueError):
+class PolicyFileError(InputError):
     """A file that is not a usable policy. The message is one line for a person."""
 
 

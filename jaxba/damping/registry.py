@@ -12,6 +12,7 @@ from jaxba.damping.learned import ConstantAction, LearnedPolicy, boldest
 from jaxba.damping.policy import DampingPolicy
 from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
+from jaxba.typing import InputError
 
 LEARNED, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-plain", "learned-driver"
 """The shipped policies: for a step with embedded iterations; for lambda alone (`learned+refine0`); and for lambda alone
@@ -65,7 +66,7 @@ CONSTANT = "constant"
 """Prefix of `constant:VALUE`."""
 
 
-class UnknownPolicyError(ValueError):
+class UnknownPolicyError(InputError):
     """A name that is not a policy. The message is one line for a person."""
 
 

@@ -30,6 +30,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.options import Intrinsics, Refinement, StepOptions, check_count
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import for_traces
+from jaxba.typing import InputError
 
 PORTFOLIO = ("ceres", "gtsam", "theseus")
 """Rules whose lowest cost is the best known one, each with point iterations."""
@@ -160,10 +161,6 @@ class BankConfig:
         _ = self.options  # raises ValueError if impossible
 
 
-class TooFewScenes(ValueError):
-    """Too few of the scenes drawn are usable. The message is one line for a person."""
-
-
 @for_traces
 def solve_scenes(
     kind: SceneClass,
@@ -239,7 +236,7 @@ def make_banks(
         tolerance: of the game; it does not change which scenes are usable.
 
     Raises:
-        TooFewScenes: no scene of a class would be left to train on.
+        InputError: no scene of a class would be left to train on.
     """
     splits = []
     for number, (kind, count) in enumerate(zip(config.classes, config.scenes, strict=True)):
@@ -260,7 +257,7 @@ def make_banks(
             banks = [select(made, part) for part in (rows[held:], rows[:held])]
         if any(not len(bank.initial_cost) for bank in banks):
             usable = sum(len(bank.initial_cost) for bank in banks)
-            raise TooFewScenes(f"only {usable} of {count} scenes of {where} are usable: draw more")
+            raise InputError(f"only {usable} of {count} scenes of {where} are usable: draw more")
         splits.append(Split(*banks))
     return splits
 

@@ -3,48 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxba.kitti.assemble import Assembled, assemble
-from jaxba.kitti.frontend import FrontEndOptions, Report, link
+from jaxba.kitti.frontend import Report, link
 from jaxba.kitti.initial_poses import drift
 from jaxba.kitti.keyframes import choose
 from jaxba.kitti.odometry import views_of_poses, visual_odometry
-from jaxba.kitti.result_cache import ResultCache
+from jaxba.kitti.options import BuildOptions
 from jaxba.kitti.sequence import Sequence
 from jaxba.kitti.triangulate import Filters
-
-Start = Literal["vo", "poses", "noisy-poses"]
-
-
-@dataclass(frozen=True)
-class BuildOptions:
-    """Options of `build`."""
-
-    front: FrontEndOptions = field(default_factory=FrontEndOptions)
-    """Options of the tracks."""
-
-    keyframes: str = "auto"
-    """`auto`, `all` or N for every N-th frame."""
-
-    start: Start = "vo"
-    """Source of the initial poses."""
-
-    rotation_sigma: float = 0.1
-    """Of `noisy-poses`: degrees per key-frame."""
-
-    translation_sigma: float = 0.05
-    """Of `noisy-poses`: relative to the length of the motion."""
-
-    filters: Filters = field(default_factory=Filters)
-    """Options of the points."""
-
-    min_views: int = 2
-    """Observations that a point needs."""
 
 
 @dataclass(frozen=True)
@@ -68,27 +40,27 @@ class Built:
 def build(
     sequence: Sequence,
     options: BuildOptions,
-    cache: ResultCache,
+    work: Path,
     poses_of_frames: Callable[[tuple[int, ...]], Float[np.ndarray, "frames 3 4"]] | None,
     report: Report,
 ) -> Built:
-    """Makes the problem of a sequence. Equal arguments give equal numbers, whatever the cache holds.
+    """Makes the problem of a sequence. Equal arguments give equal numbers, whatever that folder holds.
 
     Args:
         sequence: the frames.
         options: of tracks, key-frames, poses and points.
-        cache: of the results of single frames.
+        work: folder of the results of single frames.
         poses_of_frames: camera-to-world poses of frames by their numbers; needed where the initial poses are given.
         report: called with the progress.
 
     Raises:
         ProblemError: an image cannot be read, frames share too little, or the camera does not move.
     """
-    linked = link(sequence, options.front, cache, report)
-    numbers = tuple(sequence.numbers[i] for i in linked.frames)
-    chosen = choose(linked.tracks, len(numbers), options.keyframes, sequence.calibration, numbers)
+    every, linked = link(sequence, options, work, report)
+    numbers = tuple(sequence.numbers[i] for i in linked)
+    chosen = choose(every, len(numbers), options.keyframes, sequence.calibration, numbers)
     frames = tuple(numbers[i] for i in chosen)
-    tracks = linked.tracks.restrict(chosen)
+    tracks, filters = every.restrict(chosen), Filters(options.min_angle, options.max_error)
     restarts: tuple[int, ...] = ()
     moved = None
     if options.start == "vo":
@@ -96,8 +68,8 @@ def build(
             tracks,
             len(frames),
             sequence.calibration,
-            options.filters,
-            options.front.seed,
+            filters,
+            options.seed,
             frames,
             lambda done: report("visual odometry", done, len(frames)),
         )
@@ -107,9 +79,9 @@ def build(
         poses = poses_of_frames(frames)
         views = views_of_poses(poses)
         if options.start == "noisy-poses":
-            noisy = drift(poses, options.rotation_sigma, options.translation_sigma, options.front.seed)
+            noisy = drift(poses, options.rotation_sigma, options.translation_sigma, options.seed)
             moved = views_of_poses(noisy)
     report("triangulation", 0, 1)
-    whole = assemble(tracks, views, sequence.calibration, frames, options.filters, options.min_views, moved)
+    whole = assemble(tracks, views, sequence.calibration, frames, filters, options.min_views, moved)
     dropped = tuple(sorted(set(sequence.numbers) - set(numbers)))
     return Built(whole, len(sequence), dropped, tracks.count, restarts)

@@ -34,29 +34,20 @@ def calibration_files(folder: Path) -> list[Path]:
     return [folder / name for name in FILES] + [folder.absolute().parent / name for name in ABOVE]
 
 
-def find_calibration(folder: Path) -> Path:
-    """The file of the calibration of a sequence's folder.
-
-    Raises:
-        ProblemError: there is none.
-    """
-    for place in calibration_files(folder):
-        if place.is_file():
-            return place
-    raise ProblemError(
-        f"{display_name(folder)}: has no calibration ({' or '.join(FILES)}); --calibration names another"
-    )
-
-
 def read_calibration(path: StrPath, camera: int = 0) -> Calibration:
     """Calibration of a camera from a file, or from the folder of a sequence.
 
     Raises:
         ProblemError: there is none, or it is malformed.
     """
-    path = find_calibration(Path(path)) if Path(path).is_dir() else Path(path)
-    name = display_name(path)
-    matrix = _matrix([line for _, line in lines_of(path)], name, camera)
+    place: Path | None = Path(path)
+    if place.is_dir():
+        place = next((one for one in calibration_files(place) if one.is_file()), None)
+    if place is None:
+        name, known = display_name(path), " or ".join(FILES)
+        raise ProblemError(f"{name}: has no calibration ({known}); --calibration names another")
+    name = display_name(place)
+    matrix = _matrix([line for _, line in lines_of(place)], name, camera)
     fx, fy = float(matrix[0, 0]), float(matrix[1, 1])
     zeros = matrix[[0, 1, 2, 2], [1, 0, 0, 1]]
     if not (fx > 0 and fy > 0 and matrix[2, 2] == 1 and not zeros.any()):

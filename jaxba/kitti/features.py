@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.io.frames import Calibration
 from jaxba.kitti.opencv import cv2
-
-Features = Literal["sift", "orb", "klt"]
+from jaxba.kitti.options import Features
 
 SIFT_CONTRAST = 0.02
 """Contrast threshold, half of OpenCV's: asphalt and shadow have little contrast."""

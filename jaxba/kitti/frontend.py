@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import NamedTuple
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 
-from jaxba.kitti.features import Features, KeyPoints, Verified, detect, epipolar_inliers, match
+from jaxba.kitti.features import KeyPoints, Verified, detect, epipolar_inliers, match
 from jaxba.kitti.images import image_reader, spare_bits, stamp
 from jaxba.kitti.klt import TrackedPoints, detect_corners, track
 from jaxba.kitti.opencv import cv2
-from jaxba.kitti.result_cache import ResultCache, digest
+from jaxba.kitti.options import BuildOptions
+from jaxba.kitti.result_cache import cached, digest
 from jaxba.kitti.sequence import Sequence
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
 from jaxba.problem.bundle_problem import ProblemError
@@ -21,62 +22,23 @@ from jaxba.problem.bundle_problem import ProblemError
 Report = Callable[[str, int, int], None]
 """Called with the name of a stage, how much of it is done, and how much there is."""
 
-MIN_MATCHES = 40
-"""Verified matches that link two frames: random matches of textured images reach some 15 inliers."""
 
+def link(sequence: Sequence, options: BuildOptions, work: Path, report: Report) -> tuple[Tracks, tuple[int, ...]]:
+    """Tracks over the frames that are linked with the first one, and the positions of these in the sequence.
 
-@dataclass(frozen=True)
-class FrontEndOptions:
-    """Options of the tracks."""
-
-    features: Features = "sift"
-    """Kind of key-points, or `klt` for points tracked by Lucas-Kanade."""
-
-    keypoints: int = 2000
-    """Largest number of key-points of a frame."""
-
-    reach: int = 3
-    """Number of earlier frames that a frame is matched with; for KLT, of bad frames in a row after which it fails."""
-
-    min_matches: int = MIN_MATCHES
-    """Verified matches that link two frames."""
-
-    seed: int = 0
-    """Seed of every random sample."""
-
-
-class Linked(NamedTuple):
-    """Tracks over the frames that are linked with the first one."""
-
-    tracks: Tracks  # images are positions in `frames`
-    frames: tuple[int, ...]  # positions in the sequence
-
-
-class _Step(NamedTuple):
-    """Result of tracking points from one frame to the next."""
-
-    tracks: np.ndarray
-    pixels: np.ndarray
-    next_track: np.ndarray
-    old: np.ndarray  # how many points were tracked, shape ()
-
-
-def link(sequence: Sequence, options: FrontEndOptions, cache: ResultCache, report: Report) -> Linked:
-    """Tracks over a sequence.
-
-    A frame that cannot be linked with one of the `reach` frames before it is left out; too many such frames in a row
-    are an error.
+    The images of the tracks are positions among them. A frame that cannot be linked with one of the `reach` frames
+    before it is left out; too many such frames in a row are an error.
 
     Raises:
         ProblemError: an image cannot be read, or frames cannot be linked: the message names them.
     """
     stamps = [stamp(path) for path in sequence.images]
-    return (_track_points if options.features == "klt" else _match_features)(sequence, options, cache, report, stamps)
+    return (_track_points if options.features == "klt" else _match_features)(sequence, options, work, report, stamps)
 
 
 def _match_features(
-    sequence: Sequence, options: FrontEndOptions, cache: ResultCache, report: Report, stamps: list[str]
-) -> Linked:
+    sequence: Sequence, options: BuildOptions, work: Path, report: Report, stamps: list[str]
+) -> tuple[Tracks, tuple[int, ...]]:
     read = image_reader(sequence)
     kind = (options.features, options.keypoints, cv2.__version__, spare_bits(sequence))
     recent: deque[KeyPoints] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
@@ -85,13 +47,13 @@ def _match_features(
     for j, number in enumerate(sequence.numbers):
         report("key-points and matches", j, len(sequence))
         key = digest("points", kind, stamps[j])
-        recent.append(cache.get(f"points-{number:06d}-{key}", KeyPoints, lambda j=j: detect(read(j), *kind[:2])))
+        recent.append(cached(work, f"points-{number:06d}-{key}", KeyPoints, lambda j=j: detect(read(j), *kind[:2])))
         pixels.append(recent[-1].pixels)
         for i in range(max(j - options.reach, 0), j):
             key = digest("match", kind, stamps[i], stamps[j], asdict(sequence.calibration), options.seed)
             name = f"match-{sequence.numbers[i]:06d}-{number:06d}-{key}"
             make = lambda a=recent[i - j - 1], b=recent[-1]: _verify(a, b, sequence, options.seed)
-            matches[i, j] = np.stack(cache.get(name, Verified, make), axis=1)
+            matches[i, j] = np.stack(cached(work, name, Verified, make), axis=1)
     linked = [0]
     for j in range(1, len(sequence)):
         before = [i for i in linked if j - i <= options.reach]
@@ -107,7 +69,7 @@ def _match_features(
         for (i, j), found in matches.items()
         if i in position and j in position and len(found) >= options.min_matches
     }
-    return Linked(join_matches([pixels[i] for i in linked], strong), tuple(linked))
+    return join_matches([pixels[i] for i in linked], strong), tuple(linked)
 
 
 def _verify(a: KeyPoints, b: KeyPoints, sequence: Sequence, seed: int) -> Verified:
@@ -117,39 +79,36 @@ def _verify(a: KeyPoints, b: KeyPoints, sequence: Sequence, seed: int) -> Verifi
 
 
 def _track_points(
-    sequence: Sequence, options: FrontEndOptions, cache: ResultCache, report: Report, stamps: list[str]
-) -> Linked:
+    sequence: Sequence, options: BuildOptions, work: Path, report: Report, stamps: list[str]
+) -> tuple[Tracks, tuple[int, ...]]:
     read = image_reader(sequence)
     count, calibration = options.keypoints, sequence.calibration
-    key = digest("klt", asdict(options), asdict(calibration), cv2.__version__, stamps[0])
+    own = (count, options.reach, options.min_matches, options.seed)
+    key = digest("klt", own, asdict(calibration), cv2.__version__, stamps[0])
     name = f"klt-{sequence.numbers[0]:06d}-{key}"
-    points = cache.get(name, TrackedPoints, lambda: detect_corners(read(0), count))
+    points = cached(work, name, TrackedPoints, lambda: detect_corners(read(0), count))
     linked, seen, failed = [0], [points], {}
     for j in range(1, len(sequence)):
         report("tracking", j, len(sequence))
         i = linked[-1]
         key = digest(key, stamps[i], stamps[j])
-
-        def make(i: int = i, j: int = j, points: TrackedPoints = points) -> _Step:
-            found, old = track(read(i), read(j), points, count, calibration, options.seed)
-            return _Step(*found, np.array(old))
-
-        step = cache.get(f"klt-{sequence.numbers[j]:06d}-{key}", _Step, make)
-        if int(step.old) < options.min_matches:
-            failed[j] = int(step.old)
+        make = lambda i=i, j=j, points=points: track(read(i), read(j), points, count, calibration, options.seed)
+        found = cached(work, f"klt-{sequence.numbers[j]:06d}-{key}", TrackedPoints, make)
+        if int(found.old) < options.min_matches:
+            failed[j] = int(found.old)
             if j - i >= options.reach or (j == len(sequence) - 1 and len(linked) == 1):
                 _fail(sequence, options, i, failed)
             continue
-        points = TrackedPoints(*step[:3])
+        points = found
         linked.append(j)
         seen.append(points)
         failed = {}
     image = np.repeat(np.arange(len(seen)), [len(p.tracks) for p in seen])
     tracks = np.concatenate([p.tracks for p in seen])
-    return Linked(make_tracks(image, tracks, np.concatenate([p.pixels for p in seen])), tuple(linked))
+    return make_tracks(image, tracks, np.concatenate([p.pixels for p in seen])), tuple(linked)
 
 
-def _fail(sequence: Sequence, options: FrontEndOptions, frame: int, counts: dict[int, int]) -> None:
+def _fail(sequence: Sequence, options: BuildOptions, frame: int, counts: dict[int, int]) -> None:
     number = sequence.numbers
     shares = ", ".join(f"{count} with frame {number[j]}" for j, count in sorted(counts.items()))
     raise ProblemError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import zlib
 from collections.abc import Callable
@@ -32,19 +33,15 @@ def image_reader(sequence: Sequence) -> Reader:
         ImportError: OpenCV is missing.
         ProblemError: (when called) an image cannot be read or has another size.
     """
-    shape: list[tuple[int, ...]] = []
-    spare: list[int] = []
+    size, spare = functools.cache(lambda: image_size(sequence)), functools.cache(lambda: spare_bits(sequence))
 
     def read(index: int) -> np.ndarray:
         image = _decode(sequence.images[index])
-        if not shape:
-            shape.append(image.shape if index == 0 else _decode(sequence.images[0]).shape)
-        if image.shape != shape[0]:
-            sizes = [f"{s[1]} x {s[0]}" for s in (image.shape, shape[0])]
+        if image.shape != size()[::-1]:
+            sizes = [f"{width:g} x {height:g}" for width, height in (image.shape[::-1], size())]
             raise ProblemError(f"{display_name(sequence.images[index])}: is {sizes[0]} pixels, the first is {sizes[1]}")
         if image.dtype != np.uint8:
-            spare[:] = spare or [spare_bits(sequence)]
-            image = np.minimum(image >> spare[0], 2**GREY_BITS - 1).astype(np.uint8)
+            image = np.minimum(image >> spare(), 2**GREY_BITS - 1).astype(np.uint8)
         return image
 
     return read

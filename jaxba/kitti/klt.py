@@ -37,17 +37,18 @@ class TrackedPoints(NamedTuple):
     tracks: Int[np.ndarray, " n"]  # numbers of their tracks, ascending
     pixels: Float[np.ndarray, "n 2"]
     next_track: np.ndarray  # number of the next new track, shape ()
+    old: np.ndarray  # how many of the points were tracked from the image before, shape ()
 
 
 def detect_corners(image: np.ndarray, count: int) -> TrackedPoints:
     """Corners of the first image."""
-    return _replenish(image, TrackedPoints(np.empty(0, np.int64), np.empty((0, 2)), np.array(0)), count)
+    return _replenish(image, TrackedPoints(np.empty(0, np.int64), np.empty((0, 2)), np.array(0), np.array(0)), count)
 
 
 def track(
     before: np.ndarray, after: np.ndarray, points: TrackedPoints, count: int, calibration: Calibration, seed: int
-) -> tuple[TrackedPoints, int]:
-    """The points in the next image, with new corners in empty cells of the grid, and how many are old.
+) -> TrackedPoints:
+    """The points in the next image, with new corners in empty cells of the grid.
 
     Args:
         before: grey image of `points`.
@@ -60,8 +61,8 @@ def track(
     found, good = _lucas_kanade(before, after, points.pixels)
     kept = np.flatnonzero(good)
     kept = kept[epipolar_inliers(points.pixels[kept], found[kept], calibration, seed)]
-    old = TrackedPoints(points.tracks[kept], found[kept], points.next_track)
-    return _replenish(after, old, count), len(kept)
+    old = TrackedPoints(points.tracks[kept], found[kept], points.next_track, np.array(len(kept)))
+    return _replenish(after, old, count)
 
 
 def _lucas_kanade(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -109,4 +110,5 @@ def _replenish(image: np.ndarray, points: TrackedPoints, count: int) -> TrackedP
         np.concatenate([points.tracks, first + np.arange(len(new))]),
         np.concatenate([points.pixels, np.stack([x[new], y[new]], axis=1).astype(np.float64)]),
         np.array(first + len(new)),
+        points.old,
     )

@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxba.io.frames import Calibration
 from jaxba.kitti.features import essential
-from jaxba.kitti.frontend import MIN_MATCHES
 from jaxba.kitti.keyframes import parallax, relative_rotation
 from jaxba.kitti.opencv import cv2
+from jaxba.kitti.options import MIN_MATCHES
 from jaxba.kitti.tracks import Tracks
 from jaxba.kitti.triangulate import Filters, Observations, Triangulated, Views, triangulate
 from jaxba.problem.bundle_problem import ProblemError

@@ -28,35 +28,29 @@ def digest(*parts: object) -> str:
     return hashlib.sha256("\0".join(map(repr, (VERSION, *parts))).encode()).hexdigest()[:16]
 
 
-class ResultCache:
-    """A folder of named tuples of arrays, one `.npz` file each."""
+def cached(folder: Path, name: str, kind: type[Result], make: Callable[[], Result]) -> Result:
+    """The tuple that a folder has by this name; computed and stored if there is none, or it cannot be read.
 
-    def __init__(self, folder: Path) -> None:
-        """Creates the folder. Raises ProblemError if that fails."""
-        self.folder = folder
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ProblemError(f"cannot make {display_name(folder)}: {reason(error)}") from None
+    Args:
+        folder: of `.npz` files; made if it is not there.
+        name: of the file, without suffix; contains a `digest` of everything that the result depends on.
+        kind: a named tuple of arrays.
+        make: computes the tuple.
 
-    def get(self, name: str, kind: type[Result], make: Callable[[], Result]) -> Result:
-        """The stored tuple of this name; computed and stored if there is none, or it cannot be read.
-
-        Args:
-            name: of the file, without suffix; contains a `digest` of everything that the result depends on.
-            kind: a named tuple of arrays.
-            make: computes the tuple.
-
-        Raises:
-            ProblemError: the file cannot be written, or what `make` raises.
-        """
-        path = self.folder / f"{name}.npz"
-        try:
-            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
-                return kind(*(file[field] for field in kind._fields))  # type: ignore[attr-defined]
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            pass
-        result = make()
-        with open_output(path) as stream:
-            np.savez(stream, **result._asdict())  # type: ignore[attr-defined]
-        return result
+    Raises:
+        ProblemError: the file cannot be written, or what `make` raises.
+    """
+    path = folder / f"{name}.npz"
+    try:
+        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            return kind(*(file[field] for field in kind._fields))  # type: ignore[attr-defined]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        pass
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ProblemError(f"cannot make {display_name(folder)}: {reason(error)}") from None
+    result = make()
+    with open_output(path) as stream:
+        np.savez(stream, **result._asdict())  # type: ignore[attr-defined]
+    return result

@@ -118,22 +118,19 @@ def trained(
         The policy, and whether it was trained by this call.
 
     Raises:
-        ProblemError: the training cannot start or continue; the message is one line.
+        InputError: the training cannot start or continue; the message is one line.
     """
     own = folder / "agents" / f"{agent.name}-{seed}"
     if (own / POLICY).is_file():
         return load_policy(own / POLICY), False
     wanted = train_config(config, agent, seed)
     begun = (own / driver.CONFIG).is_file()
-    try:
-        settings = driver.prepare_folder(own, wanted, resume=begun)
-        _copy_shared_scenes(config, agent, folder, own, report)
-        work = task.build(settings, own)
-        played = work.game if agent.problems else game(config, agent, settings, scenes(config, folder, report)[0])
-        note = lambda rows: report(f"{agent.name} {seed + 1}: {rows[0]['chunk']} of {settings.chunks} parts")
-        outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
-    except (driver.TrainError, train_configs.SettingsError) as error:
-        raise ProblemError(str(error)) from None
+    settings = driver.prepare_folder(own, wanted, resume=begun)
+    _copy_shared_scenes(config, agent, folder, own, report)
+    work = task.build(settings, own)
+    played = work.game if agent.problems else game(config, agent, settings, scenes(config, folder, report)[0])
+    note = lambda rows: report(f"{agent.name} {seed + 1}: {rows[0]['chunk']} of {settings.chunks} parts")
+    outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
     (best,) = outcome.best  # of one agent
     save_policy(own / POLICY, work.policy(best.actor), {"config": train_configs.to_yaml(settings)})
     shutil.rmtree(own / driver.CHECKPOINTS, ignore_errors=True)

@@ -3,6 +3,7 @@ them."""
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -25,14 +26,15 @@ from jaxba.paper.rows import NEAR, Row
 from jaxba.paper.schedule import LENGTH
 from jaxba.paper.store import Play, Store
 from jaxba.peers import require
-from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import LinearSolverChoice, StepOptions
 from jaxba.runtime import process
 from jaxba.solver.loop import IterationRecord
-from jaxba.solver.names import SolverName, SolverNameError, parse_solver
+from jaxba.solver.names import SolverName, parse_solver
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.record import Record
 from jaxba.solver.solve import solve
+from jaxba.typing import InputError
 
 LIMIT = profile.ITERATION_LIMIT
 
@@ -113,7 +115,6 @@ class Runner:
         self.store = Store(folder)
         self.done = 0
         """Number of solves, plays and trainings that this process has done."""
-        self._test: Bank | None = None
         self._read: tuple[Source, BundleProblem] | None = None
 
     # Policies
@@ -166,11 +167,10 @@ class Runner:
 
     # Work
 
+    @functools.cached_property
     def test_scenes(self) -> Bank:
         """The scenes of the tables, generated when first needed."""
-        if self._test is None:
-            self._test = agents.scenes(self.config, self.folder, self.report)[1]
-        return self._test
+        return agents.scenes(self.config, self.folder, self.report)[1]
 
     def play(self, method: Method) -> None:
         """Solves the scenes of the tables with a method, unless the folder has the result."""
@@ -181,7 +181,7 @@ class Runner:
             policy, options = method.build(seed)
             settings = agents.train_config(self.config, agents.OURS, 0)
             options = replace(options, intrinsics=settings.bank.intrinsics).step_options(policy)
-            bank = self.test_scenes()
+            bank = self.test_scenes
             self.report(f"{method.label(seed)} on {len(bank.initial_cost)} scenes")
             started = time.perf_counter()
             found = play(settings.bank.classes[0], bank, policy, options, LIMIT)
@@ -219,7 +219,7 @@ class Runner:
                         if self.store.solve(source.name, method.label(seed), repeat) is None:
                             try:
                                 self._solve(source, method, seed, repeat, limit)
-                            except (ProblemError, SolverNameError) as error:
+                            except InputError as error:
                                 self.report(f"{source.name} by {method.name}: left out: {error}")
 
     def _solve(self, source: Source, method: Method, seed: int, repeat: int, limit: int) -> None:

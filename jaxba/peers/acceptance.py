@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from jaxba.linear.step import Step
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import Proposal, initial_state, try_step
 from jaxba.model.linearize import linearize
-from jaxba.peers.ceres import Run, step_of
+from jaxba.peers.ceres import Run
 from jaxba.peers.colmap import pyceres
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
@@ -61,23 +61,14 @@ class AcceptAnyStep(pyceres.CostFunction):
         return True
 
 
-class ReportedByCeres(NamedTuple):
-    """The numbers of a step that only Ceres knows."""
+Reported = tuple[Any, Any, Any]
+"""The numbers of a step that only Ceres knows: the largest gradient entry before the step, and the iterations and the
+forcing term of conjugate gradients, 0 for a direct linear solver."""
 
-    gradient_max: Any  # largest gradient entry before the step
-    cg_iterations: Any  # 0 for a direct linear solver
-    forcing: Any  # forcing term of conjugate gradients, 0 for a direct linear solver
 
-    @classmethod
-    def empty(cls) -> ReportedByCeres:
-        """Zeros of the right types, for compilation."""
-        return cls(np.float64(0), np.int32(0), np.float64(0))
-
-    @classmethod
-    def from_summaries(cls, summaries: list[Any], mode: str) -> ReportedByCeres:
-        """From Ceres' summaries of the start and of the iteration."""
-        step = step_of(summaries[1], summaries[0], np.nan, np.nan, mode)
-        return cls(np.float64(step.gradient_max), np.int32(step.cg_iterations), np.float64(step.forcing))
+def reported(step: StepInfo) -> Reported:
+    """Those of Ceres' record of a step."""
+    return np.float64(step.gradient_max), np.int32(step.cg_iterations), np.float64(step.forcing)
 
 
 class StepAcceptance:
@@ -106,22 +97,22 @@ class StepAcceptance:
         self.accept_any = AcceptAnyStep()
         run.colmap.add_point_cost(self.accept_any, int(problem.point_index[0]))
 
-    def evaluate(self, before: Any, damping: float, reported: ReportedByCeres) -> tuple[LMState, StepInfo]:
+    def evaluate(self, before: Any, damping: float, numbers: Reported) -> tuple[LMState, StepInfo]:
         """The next state after the step from the parameters `before` to Ceres' current ones, and the step's record.
 
         Args:
             before: parameters before the step, as `ColmapProblem.parameters` returns them.
             damping: lambda of the step.
-            reported: Ceres' numbers of the step.
+            numbers: Ceres' numbers of the step.
         """
         after = self.run.colmap.parameters()
         return _evaluate(
-            self.layout, self.state, before, after, np.float64(damping), reported, self.min_gain, options=self.options
+            self.layout, self.state, before, after, np.float64(damping), numbers, self.min_gain, options=self.options
         )
 
-    def apply(self, before: Any, damping: float, reported: ReportedByCeres) -> StepInfo:
+    def apply(self, before: Any, damping: float, numbers: Reported) -> StepInfo:
         """As `evaluate`, and moves Ceres' problem to the next state, or back to `before` after a rejection."""
-        self.state, step = jax.block_until_ready(self.evaluate(before, damping, reported))
+        self.state, step = jax.block_until_ready(self.evaluate(before, damping, numbers))
         if not step.accepted:
             self.run.colmap.restore(before)
             return step
@@ -143,7 +134,7 @@ def _evaluate(
     before: Any,
     after: Any,
     damping: Float[Array, ""],
-    reported: ReportedByCeres,
+    numbers: Reported,
     min_gain: Float[Array, ""],
     options: StepOptions,
 ) -> tuple[LMState, StepInfo]:
@@ -162,7 +153,7 @@ def _evaluate(
     residual, change = jnp.stack(linear.residual), jnp.stack(jacobian_product(layout, linear, cameras.T, points))
     slope = -jnp.sum(residual * change)
     damped = slope - jnp.sum(change * change)
-    proposal = Proposal(Step(cameras, points, slope, damped, *reported), linear.reference, jnp.zeros((), bool))
+    proposal = Proposal(Step(cameras, points, slope, damped, *numbers), linear.reference, jnp.zeros((), bool))
     return try_step(layout, state, damping, proposal, options, min_gain)
 
 

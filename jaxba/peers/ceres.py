@@ -141,26 +141,10 @@ class Run:
 
 def step_info(cost: float, damping: float, **known: Any) -> StepInfo:
     """The record of a rejected step. Fields that are not given in `known` are NaN or neutral values."""
-    fields: dict[str, Any] = {
-        "cost": cost,
-        "previous_cost": cost,
-        "candidate_cost": np.nan,
-        "predicted": np.nan,
-        "gain_ratio": np.nan,
-        "accepted": False,
-        "damping": damping,
-        "gradient_max": np.nan,
-        "step_norm": np.nan,
-        "parameter_norm": np.nan,
-        "cg_iterations": 0,
-        "forcing": 0.0,
-        "step_fraction": 1.0,
-        "damping_fraction": np.nan,
-        "weightless": False,
-        "repairs": 0,
-        "camera_rounds": 0,
-        "point_iterations": 0,
-    }
+    fields: dict[str, Any] = dict.fromkeys(StepInfo._fields, np.nan)
+    fields |= {"cost": cost, "previous_cost": cost, "damping": damping, "forcing": 0.0, "step_fraction": 1.0}
+    fields |= dict.fromkeys(("accepted", "weightless"), False)
+    fields |= dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), 0)
     return StepInfo(**{**fields, **known})
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from jaxba.damping import DampingPolicy, ProblemInfo
 from jaxba.lm.records import KINDS, StepInfo
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.peers.acceptance import ReportedByCeres, StepAcceptance
-from jaxba.peers.ceres import Callback, Run, solver_options, step_info
+from jaxba.peers.acceptance import StepAcceptance, reported
+from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import StepOptions
@@ -99,9 +99,8 @@ def drive_ceres(
         damping = float(carry.damping)
         # everything is compiled before the clock starts
         acceptance = StepAcceptance(run, embedded or StepOptions(), policy.min_gain)
-        same = run.colmap.parameters()
-        jax.block_until_ready(acceptance.evaluate(same, damping, ReportedByCeres.empty()))
         null_step = _null_step(run.cost, damping)
+        jax.block_until_ready(acceptance.evaluate(run.colmap.parameters(), damping, reported(null_step)))
         # twice, since the state that a policy returns may differ in type from its initial state
         warm = _after_step(policy, carry, null_step, tolerances, max_iterations)
         jax.block_until_ready(_after_step(policy, warm, null_step, tolerances, max_iterations))
@@ -128,7 +127,8 @@ def _iterate(
     pyceres.solve(options, run.colmap.ceres, pyceres.SolverSummary())
     if len(summaries) < 2 or not summaries[1].step_is_successful:  # no step could be computed
         return _null_step(run.cost, damping, *(summary.gradient_max_norm for summary in summaries[:1]))
-    return acceptance.apply(before, damping, ReportedByCeres.from_summaries(summaries, mode))
+    step = step_of(summaries[1], summaries[0], np.nan, np.nan, mode)
+    return acceptance.apply(before, damping, reported(step))
 
 
 def _null_step(cost: float, damping: float, gradient_max: float = np.nan) -> StepInfo:

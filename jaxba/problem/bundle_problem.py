@@ -18,7 +18,7 @@ from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_siz
 from jaxba.problem.labels import Labels
 from jaxba.problem.priors import Priors, checked_priors
 from jaxba.problem.rigs import Rigs, checked_rigs
-from jaxba.typing import AnyArray, ArrayRecord, register_pytree
+from jaxba.typing import AnyArray, ArrayRecord, InputError, register_pytree
 
 CAMERA_SIZE = 9
 """Parameters of a BAL camera: angle-axis (3, radians), translation (3), f (pixels), k1, k2."""
@@ -27,7 +27,7 @@ POINT_SIZE = 3
 """Parameters of a point: x, y, z in scene units."""
 
 
-class ProblemError(ValueError):
+class ProblemError(InputError):
     """The input is not a valid bundle adjustment problem. The message is one line for the user."""
 
 

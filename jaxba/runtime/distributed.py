@@ -22,6 +22,8 @@ import numpy as np
 from jax._src import distributed as runtime  # its key-value store has no public name
 from jax.experimental import multihost_utils
 
+from jaxba.typing import InputError
+
 T = TypeVar("T")
 
 START_S = 300
@@ -32,7 +34,6 @@ PATIENCE_S = 5
 
 HEARTBEAT_S = 30
 """Seconds after which a process that was not heard of counts as dead, and JAX ends the others. JAX's default is 100."""
-
 
 WAIT_MS = 1 << 30
 """Milliseconds, twelve days, that processes wait for what the first one does. Gloo's collectives wait for half an
@@ -46,10 +47,6 @@ LOST_WORDS = ("Gloo", "NCCL", "coordination service", "CoordinationService")
 have no class of their own."""
 
 _done = itertools.count()
-
-
-class DistributedError(ValueError):
-    """Processes or devices that cannot be used. The message is one line for a person."""
 
 
 class MainFailedError(Exception):
@@ -67,12 +64,12 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
         process: number of this one, from 0. Without all three JAX finds them under Slurm, Open MPI and Kubernetes.
 
     Raises:
-        DistributedError: bad arguments, none were found, or the first process cannot be reached or use its port.
+        InputError: bad arguments, none were found, or the first process cannot be reached or use its port.
         RuntimeError: JAX has computed already.
     """
     given = [x is not None for x in (coordinator, processes, process)]
     if any(given) and not all(given):
-        raise DistributedError("coordinator, number of processes and number of this process must be given together")
+        raise InputError("coordinator, number of processes and number of this process must be given together")
     if coordinator is not None and processes is not None and process is not None:
         _check(coordinator, processes, process)
     jax.config.update("jax_enable_preemption_service", False)  # it would catch SIGTERM, and the process live on
@@ -86,7 +83,7 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
                 heartbeat_timeout_seconds=HEARTBEAT_S,
             )
     except ValueError as error:
-        raise DistributedError(f"no coordinator was given, and JAX found none: {error}") from None
+        raise InputError(f"no coordinator was given, and JAX found none: {error}") from None
 
 
 @contextlib.contextmanager
@@ -112,10 +109,10 @@ def _deadline(seconds: float) -> Iterator[None]:
 def _check(coordinator: str, processes: int, process: int) -> None:
     """Refuses what would end the process inside JAX's runtime with a page of text."""
     if not 0 <= process < processes:
-        raise DistributedError(f"process {process} is none of 0 to {processes - 1}")
+        raise InputError(f"process {process} is none of 0 to {processes - 1}")
     host, _, number = coordinator.rpartition(":")
     if not host or not number.isdecimal() or not 0 < int(number) < 2**16:
-        raise DistributedError(f"coordinator must be HOST:PORT, not {coordinator!r}")
+        raise InputError(f"coordinator must be HOST:PORT, not {coordinator!r}")
     port = int(number)
     if process == 0:
         with socket.socket() as probe:
@@ -123,7 +120,7 @@ def _check(coordinator: str, processes: int, process: int) -> None:
             try:
                 probe.bind(("", port))
             except OSError as error:
-                raise DistributedError(f"coordinator {coordinator}: {error.strerror or error}") from None
+                raise InputError(f"coordinator {coordinator}: {error.strerror or error}") from None
         return
     deadline = time.monotonic() + START_S
     while True:
@@ -133,7 +130,7 @@ def _check(coordinator: str, processes: int, process: int) -> None:
         except OSError as error:
             if time.monotonic() > deadline:
                 reason = f"no answer for {START_S} s ({error.strerror or error})"
-                raise DistributedError(f"coordinator {coordinator}: {reason}") from None
+                raise InputError(f"coordinator {coordinator}: {reason}") from None
             time.sleep(0.2)
 
 
@@ -156,12 +153,12 @@ def use_devices(count: int | None) -> list[jax.Device]:
         count: in each process. None: one, or all that there are if there are several processes.
 
     Raises:
-        DistributedError: a process has fewer.
+        InputError: a process has fewer.
     """
     if count is not None:
         count = int(count)
         if count < 1:
-            raise DistributedError(f"at least one device is needed, not {count}")
+            raise InputError(f"at least one device is needed, not {count}")
         if count > 1:
             with contextlib.suppress(RuntimeError):  # JAX has started
                 jax.config.update("jax_num_cpu_devices", count)
@@ -171,7 +168,7 @@ def use_devices(count: int | None) -> list[jax.Device]:
         found = jax.local_devices()
     if count is not None and len(found) < count:
         kind = found[0].platform.upper()
-        raise DistributedError(f"{count} devices asked for, {len(found)} of kind {kind} found")
+        raise InputError(f"{count} devices asked for, {len(found)} of kind {kind} found")
     own = lambda process: [x for x in jax.devices() if x.process_index == process][:count]
     return [device for process in range(jax.process_count()) for device in own(process)]
 

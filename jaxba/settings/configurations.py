@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 
 from jaxba.io.encoding import decode
 from jaxba.io.files import display_name, reason, visible
+from jaxba.typing import InputError
 
 Kind: TypeAlias = Literal["train", "paper", "bench"]
 """Command that reads a configuration, and its folder's name."""
@@ -23,7 +24,7 @@ BASE = "extends"
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
-class SettingsError(ValueError):
+class SettingsError(InputError):
     """Settings that cannot be used. The message is one line for a person."""
 
 

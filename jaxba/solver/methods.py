@@ -14,6 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
 from jaxba.lm.method import PLAIN, StepMethod
+from jaxba.typing import InputError
 
 DEFAULT_METHOD = PLAIN.name
 """The method of a solver name without one."""
@@ -30,7 +31,7 @@ SHIPPED = {
 """Where the classes of the package's own methods are."""
 
 
-class UnknownMethodError(ValueError):
+class UnknownMethodError(InputError):
     """A name is not that of a method. The message is one line for the user."""
 
 

@@ -17,6 +17,7 @@ from jaxba.damping.registry import BOLD, BOLD_DRIVER, BOLD_PLAIN, LEARNED, LEARN
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.solver.methods import DEFAULT_METHOD, METHODS, UnknownMethodError, make_method
 from jaxba.solver.options import Dtype, SolveOptions
+from jaxba.typing import InputError
 
 DTYPES = get_args(Dtype)
 """Known floating point types; the first is the default."""
@@ -28,7 +29,7 @@ PEERS = {"pyceres": ("dense", "sparse", "iterative", f"dense{INNER}", f"sparse{I
 """Peer libraries and their modes."""
 
 
-class SolverNameError(ValueError):
+class SolverNameError(InputError):
     """A name is not that of a solver. The message is one line for the user."""
 
 

@@ -32,6 +32,7 @@ from jaxba.training.config import TrainConfig, load, to_yaml
 from jaxba.training.log import Log, Row
 from jaxba.training.placement import Placement
 from jaxba.training.train_loop import LoopState, agent_shares, run_agents, start_agents, state_shares
+from jaxba.typing import InputError
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -46,7 +47,7 @@ SCORE = "training/score"
 """The metric by which policies are chosen: lower is better."""
 
 
-class TrainError(ValueError):
+class TrainError(InputError):
     """A run that cannot start or continue. The message is one line for a person."""
 
 

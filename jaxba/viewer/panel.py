@@ -126,16 +126,16 @@ class Viewer:
         size = gui.add_slider("size of points", 0.001, 0.03, 0.001, POINT_SIZE)
         worst = {name: (stage, camera) for stage in self.stages for name, camera in worst_images(stage)}
         picked = gui.add_dropdown("worst images", (NOTHING, *worst))
-        layers = [(name, what) for name, what in LAYERS if any(what in stage.layers() for stage in self.stages)]
+        layers = [(name, what) for name, what in LAYERS if any(what in stage.layers.names() for stage in self.stages)]
         self._about = gui.add_markdown("Click on an image, or choose one of the worst.")
         self._picture = gui.add_image(np.full((1, 1, 3), 255, np.uint8), visible=False)
         self._slider.on_update(lambda _: self._show(iteration=int(self._slider.value)))
         colour.on_update(lambda _: self._show(colour=colour.value))
         picked.on_update(lambda _: self.choose(*worst.get(picked.value, (self.stages[0], None))))
-        size.on_update(lambda _: self._each(lambda stage: stage.size_points(size.value)))
+        size.on_update(lambda _: self._each(lambda stage: stage.layers.size("points", size.value)))
         for name, what in layers:
             box = gui.add_checkbox(name, True)
-            box.on_update(lambda _, box=box, what=what: self._each(lambda stage: stage.layer(what, box.value)))
+            box.on_update(lambda _, box=box, what=what: self._each(lambda stage: stage.layers.show(what, box.value)))
         self._tell()
 
     def _each(self, change: Callable[[Stage], None]) -> None:

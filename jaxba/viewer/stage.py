@@ -77,7 +77,7 @@ class Stage:
         self._set_limits()
         self.image_planes = geometry.frusta_of(last, None if shown.looks is None else shown.looks.sizes)
         self._size = self._size_of_frusta(last)
-        self._layers = Layers(server, f"/{key}", (ASIDE * place, 0.0, 0.0))
+        self.layers = Layers(server, f"/{key}", (ASIDE * place, 0.0, 0.0))
         self._draw()
 
     def colour_choices(self) -> list[str]:
@@ -115,27 +115,10 @@ class Stage:
         self.chosen = camera
         self._draw()
 
-    def layer(self, name: str, visible: bool) -> None:
-        """Shows or hides `start`, `truth` or `path`."""
-        self._layers.show(name, visible)
-
-    def layers(self) -> set[str]:
-        """The layers that there are."""
-        return self._layers.names()
-
-    def size_points(self, size: float) -> None:
-        """Draws points in another size."""
-        self._layers.size("points", size)
-
-    @property
-    def drawn(self) -> dict[int, Any]:
-        """Frusta by the numbers of their images."""
-        return self._layers.frusta
-
     def load_images(self) -> int:
         """Puts images into the frusta, and returns how many there were."""
         found = 0
-        for camera, handle in list(self.drawn.items()):
+        for camera, handle in list(self.layers.frusta.items()):
             image = self.shown.image(camera)
             if image is not None:
                 handle.image, found = image, found + 1
@@ -165,7 +148,7 @@ class Stage:
         self._track_limits = limits(measures.tracks.astype(float))
 
     def _draw(self) -> None:
-        layers, problem, measures, similarity = self._layers, self.problem, self.measures, self._similarity
+        layers, problem, measures, similarity = self.layers, self.problem, self.measures, self._similarity
         points = similarity.points(np.asarray(problem.points)[self.points])
         poses = similarity.poses(camera_poses(problem.cameras))
         with self._server.atomic():
@@ -215,15 +198,15 @@ class Stage:
 
     def _mark(self, problem: BundleProblem, measures: Measures, poses: np.ndarray) -> None:
         if self.chosen is None:
-            self._layers.remove("chosen")
+            self.layers.remove("chosen")
             return
         camera = self.chosen
         own = np.asarray(problem.point_index)[np.asarray(problem.camera_index) == camera]
         points = self._similarity.points(np.asarray(problem.points)[own])
-        self._layers.cloud("chosen points", points, CHOSEN, 1.8 * POINT_SIZE)
+        self.layers.cloud("chosen points", points, CHOSEN, 1.8 * POINT_SIZE)
         segments, _ = geometry.residual_segments(problem, self.image_planes, measures.residuals, camera)
         depth = geometry.depth_of_image(self.image_planes.half[camera : camera + 1], self._size)[0]
-        self._layers.lines("chosen residuals", self._on_page(poses[camera], segments, depth), RESIDUAL, 2.0)
+        self.layers.lines("chosen residuals", self._on_page(poses[camera], segments, depth), RESIDUAL, 2.0)
 
     def _draw_start(self) -> None:
         start = self.shown.problem
@@ -233,14 +216,14 @@ class Stage:
         around = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
         spokes = np.stack([apex, corners], axis=2)
         points = self._similarity.points(np.asarray(start.points)[self.points])
-        self._layers.cloud("start points", points, START, 0.6 * POINT_SIZE)
-        self._layers.lines("start cameras", np.concatenate([around, spokes], axis=1).reshape(-1, 2, 3), START, 1.0)
+        self.layers.cloud("start points", points, START, 0.6 * POINT_SIZE)
+        self.layers.lines("start cameras", np.concatenate([around, spokes], axis=1).reshape(-1, 2, 3), START, 1.0)
 
     def _label(self, points: Float[np.ndarray, "n 3"]) -> None:
         if self._caption:
             words = [self.shown.name, *([self.numbers("\n")] if self._caption == "numbers" else [])]
             text = "\n".join(words)
-            self._layers.label(text, (0.0, 0.0, float(np.percentile(points[:, 2], 95)) + 0.3))
+            self.layers.label(text, (0.0, 0.0, float(np.percentile(points[:, 2], 95)) + 0.3))
 
     def numbers(self, between: str = ", ") -> str:
         """The iteration shown, in words: cost, lambda, gain, seconds; of a problem its error.

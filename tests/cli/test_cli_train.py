@@ -18,9 +18,9 @@ from safetensors import safe_open
 from jaxba.cli.train import run
 from jaxba.damping.policy_file import load_policy
 from jaxba.game import groups, rollout
-from jaxba.game.scene_bank import TooFewScenes
 from jaxba.training import log, task
 from jaxba.training.config import load
+from jaxba.typing import InputError
 
 TINY = [
     *("chunks=4", "evaluate_every=2", "checkpoint_every=1", "envs=[8]"),
@@ -239,7 +239,7 @@ def test_a_resumed_run_of_other_settings_is_refused(folder, capsys):
 
 def test_a_bank_without_useful_scenes_is_one_line(capsys, tmp_path, monkeypatch):
     def none(*_args, **_kwargs):
-        raise TooFewScenes("only 0 of 9 scenes are usable: draw more")
+        raise InputError("only 0 of 9 scenes are usable: draw more")
 
     monkeypatch.setattr(task, "make_banks", none)
     assert "draw more" in error_of(capsys, *COMMAND, "--out", str(tmp_path / "run"))

@@ -135,7 +135,8 @@ def test_tracked_points_are_where_the_geometry_says(rendered):
     first, second = (cv2.imread(str(image(rendered[SMALL], i)), 0) for i in (0, 1))
     calibration = Calibration(SMALL.fx, SMALL.fy, SMALL.cx, SMALL.cy)
     points = klt.detect_corners(first, 600)
-    after, old = klt.track(first, second, points, 600, calibration, 0)
+    after = klt.track(first, second, points, 600, calibration, 0)
+    old = int(after.old)
     assert old > 100
     assert (np.diff(after.tracks) > 0).all()
     _, a, b = np.intersect1d(points.tracks, after.tracks, return_indices=True)

@@ -8,7 +8,7 @@ import jax
 import pytest
 
 from jaxba.runtime import distributed
-from jaxba.runtime.distributed import DistributedError
+from jaxba.typing import InputError
 
 
 @pytest.mark.parametrize(
@@ -22,7 +22,7 @@ from jaxba.runtime.distributed import DistributedError
     ],
 )
 def test_what_does_not_name_a_process_is_one_line(arguments, message):
-    with pytest.raises(DistributedError, match=message) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         distributed.initialize(*arguments)
     assert "\n" not in str(caught.value)
 
@@ -32,18 +32,18 @@ def test_a_port_that_is_taken_or_that_nobody_listens_at_is_named(monkeypatch):
     with socket.socket() as taken:
         taken.bind(("", 0))
         address = f"localhost:{taken.getsockname()[1]}"
-        with pytest.raises(DistributedError, match=rf"{address}: no answer for 0.1 s \(Connection refused\)"):
+        with pytest.raises(InputError, match=rf"{address}: no answer for 0.1 s \(Connection refused\)"):
             distributed.initialize(address, 2, 1)
         taken.listen()
-        with pytest.raises(DistributedError, match=f"{address}: Address already in use"):
+        with pytest.raises(InputError, match=f"{address}: Address already in use"):
             distributed.initialize(address, 2, 0)
 
 
 def test_more_devices_than_there_are_and_none_are_one_line():
     count = len(jax.local_devices())
-    with pytest.raises(DistributedError, match=rf"{count + 1} devices asked for, {count} of kind \w+ found"):
+    with pytest.raises(InputError, match=rf"{count + 1} devices asked for, {count} of kind \w+ found"):
         distributed.use_devices(count + 1)
-    with pytest.raises(DistributedError, match="at least one device is needed, not 0"):
+    with pytest.raises(InputError, match="at least one device is needed, not 0"):
         distributed.use_devices(0)
 
 

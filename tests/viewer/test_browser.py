@@ -181,7 +181,7 @@ def test_a_click_on_a_frustum_marks_its_points(browser, viewer):
     before = like(settled(browser), ORANGE)
     body = browser.find_element(By.TAG_NAME, "body")
     chosen = lambda: viewer.stages[0].chosen is not None
-    colours = {tuple(handle.color) for handle in viewer.stages[0].drawn.values()}
+    colours = {tuple(handle.color) for handle in viewer.stages[0].layers.frusta.values()}
     pixels = scene(browser)
     near = np.min([np.abs(pixels - np.array(colour)).max(axis=2) for colour in colours], axis=0) < 25
     rows, columns = np.nonzero(near)

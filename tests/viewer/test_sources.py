@@ -73,7 +73,7 @@ def test_a_true_path_in_another_frame_lies_on_the_cameras(model, tmp_path):
     ],
 )
 def test_jaxba_view_says_in_one_line_what_is_wrong(words, message, capsys, monkeypatch):
-    monkeypatch.setattr(view, "check_extra", lambda: None)
+    monkeypatch.setattr(view.common, "check_extra", lambda module: None)
     assert view.run(words) == 2
     said = capsys.readouterr().err
     assert message in said.lower()

@@ -12,6 +12,7 @@ import requests
 from urllib3.exceptions import HTTPError
 
 from jaxba.io.files import display_name, reason
+from jaxba.typing import InputError
 
 TIMEOUT_S = 30.0
 """Time without any data from the server after which a download fails."""
@@ -23,7 +24,7 @@ Report = Callable[[int, int | None], object]
 """Called with the bytes received so far, and the size of the whole file or None if the server does not report it."""
 
 
-class DownloadError(ValueError):
+class DownloadError(InputError):
     """A download that failed. The message is one line for the user."""
 
 
