@@ -137,8 +137,8 @@ def _apply(problem: BundleProblem, where: str, key: str, value: Any, strict: boo
     of_images = key in ("constant_poses", "constant_rotations")
     wanted: Any = "all" if value == "all" else _meant(items, names if of_images else ())
     if labels is not None and wanted != "all":
-        at = labels.points_at if key == "constant_points" else labels.lenses_at
-        wanted = labels.images_at(wanted) if of_images else at(wanted)
+        other = "point" if key == "constant_points" else "lens"
+        wanted = labels.positions("image" if of_images else other, wanted)
     part = key.removeprefix("constant_")
     return hold(problem, **{"lenses" if part == "cameras" else part: wanted})
 
@@ -165,7 +165,7 @@ def _with_positions(
         problem,
         given.positions[ours],
         stddev=given.stddev[ours],
-        images=images if labels is None else labels.images_at(images).tolist(),
+        images=images if labels is None else labels.positions("image", images).tolist(),
         loss=given.loss,
         align=given.align,
     )

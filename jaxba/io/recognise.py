@@ -110,10 +110,7 @@ def _are_poses(begin: bytes) -> bool:
     lines = [line.split() for line in begin.splitlines() if line.strip()]
     whole = lines[:-1] if len(lines) > 1 and not begin.endswith(b"\n") else lines
     try:
-        return bool(whole) and {len(line) for line in whole} <= set(_POSE_WIDTHS) and all(map(_numbers, whole))
+        numbers = [[float(word) for word in line] for line in whole]
     except ValueError:
         return False
-
-
-def _numbers(words: list[bytes]) -> bool:
-    return bool([float(word) for word in words])
+    return bool(whole) and {len(line) for line in numbers} <= set(_POSE_WIDTHS)

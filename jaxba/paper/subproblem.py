@@ -41,20 +41,7 @@ def sub_problem(
     keep &= tracks[point_index] >= MIN_TRACK
     if not keep.any():
         raise ProblemError(f"no point is seen by two of these {len(kept)} cameras")
-    used = np.flatnonzero(tracks >= MIN_TRACK)
-    return problem.replace(
-        cameras=np.asarray(problem.cameras)[kept],
-        points=np.asarray(problem.points)[used],
-        observations=np.asarray(problem.observations)[keep],
-        camera_index=np.searchsorted(kept, camera_index[keep]).astype(np.int32),
-        point_index=np.searchsorted(used, point_index[keep]).astype(np.int32),
-        whitening=None if problem.whitening is None else np.asarray(problem.whitening)[keep],
-        lenses=None if problem.lenses is None else problem.lenses.of(kept),
-        constants=None if problem.constants is None else problem.constants.of(kept, used),
-        rigs=None if problem.rigs is None else problem.rigs.of(kept),
-        priors=None,
-        labels=None,
-    )
+    return problem.subset(keep, kept, np.flatnonzero(tracks >= MIN_TRACK))
 
 
 def neighbouring_cameras(problem: BundleProblem, count: int) -> Int[np.ndarray, " cameras"]:

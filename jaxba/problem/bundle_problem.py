@@ -185,11 +185,39 @@ class BundleProblem(ArrayRecord):
         """The same problem with some fields replaced, without new checks."""
         return replace(self, **changes)
 
-    def of_observations(self, kept: Any) -> BundleProblem:
-        """The same problem with a subset of its observations; cameras and points keep their places."""
+    def subset(
+        self,
+        observations: Any,
+        cameras: Int[np.ndarray, " _"] | None = None,
+        points: Int[np.ndarray, " _"] | None = None,
+    ) -> BundleProblem:
+        """The problem with some of its observations and, if they are given, of its cameras and points.
+
+        Args:
+            observations: a mask or positions; they name no other cameras and points than those that stay.
+            cameras: positions, ascending; None: all. Lenses and frames keep their numbers, priors are left out.
+            points: positions, ascending; None: all. With these or cameras there are no labels.
+        """
         names = ("observations", "camera_index", "point_index", "whitening")
         arrays = {name: getattr(self, name) for name in names}
-        return replace(self, **{name: np.asarray(x)[kept] for name, x in arrays.items() if x is not None})
+        found = replace(self, **{name: np.asarray(x)[observations] for name, x in arrays.items() if x is not None})
+        if self.constants is not None:
+            of_both = (slice(None) if kept is None else kept for kept in (cameras, points))
+            found = replace(found, constants=self.constants.of(*of_both))
+        if points is not None:
+            index = np.searchsorted(points, found.point_index).astype(np.int32)
+            found = replace(found, points=np.asarray(self.points)[points], point_index=index, labels=None)
+        if cameras is None:
+            return found
+        return replace(
+            found,
+            cameras=np.asarray(self.cameras)[cameras],
+            camera_index=np.searchsorted(cameras, found.camera_index).astype(np.int32),
+            lenses=None if self.lenses is None else self.lenses.of(cameras),
+            rigs=None if self.rigs is None else self.rigs.of(cameras),
+            priors=None,
+            labels=None,
+        )
 
 
 def _floats(name: str, values: Any, width: int) -> np.ndarray:

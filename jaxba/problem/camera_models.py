@@ -209,22 +209,12 @@ def _equirectangular(lens: Sequence[Any], x: Any, y: Any, z: Any) -> Pixel:
     return width * (xp.atan2(x, z) / (2 * pi) + 0.5), height * (xp.atan2(y, xp.sqrt(x * x + z * z)) / pi + 0.5)
 
 
-def _distorted(to_plane: Callable[..., Pixel], distort: Callable[..., Pixel], focals: int) -> Callable[..., Pixel]:
-    """A model that projects to the plane, distorts there, and scales to pixels."""
-    return functools.partial(_project_distorted, to_plane, distort, focals)
-
-
-def _project_distorted(
-    to_plane: Callable[..., Pixel],
-    distort: Callable[..., Pixel],
-    focals: int,
-    lens: Sequence[Any],
-    x: Any,
-    y: Any,
-    z: Any,
+def _distorted(
+    to_plane: Callable[..., Pixel], distort: Callable[..., Pixel], focals: int, lens: Sequence[Any], *place: Any
 ) -> Pixel:
+    """The pixel of a model that projects to the plane, distorts there, and scales to pixels."""
     cx, cy, *coefficients = lens[focals:]
-    u, v = distort(*to_plane(x, y, z), *coefficients)
+    u, v = distort(*to_plane(*place), *coefficients)
     return lens[0] * u + cx, lens[focals - 1] * v + cy
 
 
@@ -233,27 +223,25 @@ _ONE, _TWO = "f cx cy", "fx fy cx cy"
 BAL = register_camera_model("BAL", "f k1 k2", _bal)
 """The model of BAL, with analytic derivatives in a solve where all lenses are of it."""
 
-register_camera_model("SIMPLE_PINHOLE", _ONE, _distorted(_perspective, _no_distortion, 1))
-register_camera_model("PINHOLE", _TWO, _distorted(_perspective, _no_distortion, 2))
-register_camera_model("SIMPLE_RADIAL", f"{_ONE} k1", _distorted(_perspective, _polynomial, 1))
-register_camera_model("RADIAL", f"{_ONE} k1 k2", _distorted(_perspective, _polynomial, 1))
-register_camera_model("OPENCV", f"{_TWO} k1 k2 p1 p2", _distorted(_perspective, _brown, 2))
-register_camera_model("OPENCV_FISHEYE", f"{_TWO} k1 k2 k3 k4", _distorted(_equidistant, _polynomial, 2))
-register_camera_model("FULL_OPENCV", f"{_TWO} k1 k2 p1 p2 k3 k4 k5 k6", _distorted(_perspective, _rational, 2))
-register_camera_model("FOV", f"{_TWO} omega", _distorted(_perspective, _field_of_view, 2))
-register_camera_model("SIMPLE_RADIAL_FISHEYE", f"{_ONE} k1", _distorted(_equidistant, _polynomial, 1))
-register_camera_model("RADIAL_FISHEYE", f"{_ONE} k1 k2", _distorted(_equidistant, _polynomial, 1))
-register_camera_model(
-    "THIN_PRISM_FISHEYE", f"{_TWO} k1 k2 p1 p2 k3 k4 sx1 sy1", _distorted(_equidistant, _thin_prism, 2)
-)
-register_camera_model(
-    "RAD_TAN_THIN_PRISM_FISHEYE",
-    f"{_TWO} k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
-    _distorted(_equidistant, _rad_tan_thin_prism, 2),
-)
+for _name, _focals, _coefficients, _to_plane, _distort in (
+    ("SIMPLE_PINHOLE", 1, "", _perspective, _no_distortion),
+    ("PINHOLE", 2, "", _perspective, _no_distortion),
+    ("SIMPLE_RADIAL", 1, "k1", _perspective, _polynomial),
+    ("RADIAL", 1, "k1 k2", _perspective, _polynomial),
+    ("OPENCV", 2, "k1 k2 p1 p2", _perspective, _brown),
+    ("OPENCV_FISHEYE", 2, "k1 k2 k3 k4", _equidistant, _polynomial),
+    ("FULL_OPENCV", 2, "k1 k2 p1 p2 k3 k4 k5 k6", _perspective, _rational),
+    ("FOV", 2, "omega", _perspective, _field_of_view),
+    ("SIMPLE_RADIAL_FISHEYE", 1, "k1", _equidistant, _polynomial),
+    ("RADIAL_FISHEYE", 1, "k1 k2", _equidistant, _polynomial),
+    ("THIN_PRISM_FISHEYE", 2, "k1 k2 p1 p2 k3 k4 sx1 sy1", _equidistant, _thin_prism),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 2, "k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3", _equidistant, _rad_tan_thin_prism),
+    ("SIMPLE_FISHEYE", 1, "", _equidistant, _no_distortion),
+    ("FISHEYE", 2, "", _equidistant, _no_distortion),
+):
+    _project = functools.partial(_distorted, _to_plane, _distort, _focals)
+    register_camera_model(_name, f"{(_ONE, _TWO)[_focals - 1]} {_coefficients}", _project)
 register_camera_model("SIMPLE_DIVISION", f"{_ONE} k", _division)
 register_camera_model("DIVISION", f"{_TWO} k", _division)
-register_camera_model("SIMPLE_FISHEYE", _ONE, _distorted(_equidistant, _no_distortion, 1))
-register_camera_model("FISHEYE", _TWO, _distorted(_equidistant, _no_distortion, 2))
 register_camera_model("EUCM", f"{_TWO} alpha beta", _enhanced_unified)
 register_camera_model("EQUIRECTANGULAR", "width height", _equirectangular)

@@ -14,10 +14,10 @@ SHOWN = 60
 """Characters of a wrong value that a message shows."""
 
 
-def shown(value: Any) -> str:
+def shown(value: Any, longest: int = SHOWN) -> str:
     """A value as a message shows it: on one line, and not too long."""
     text = " ".join(repr(value).split())
-    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+    return text if len(text) <= longest else f"{text[: longest - 3]}..."
 
 
 def plain_array(name: str, values: Any) -> np.ndarray:

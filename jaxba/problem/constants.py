@@ -27,7 +27,7 @@ class Constants(ArrayRecord):
     points: Bool[AnyArray, " points"]
     """Constant points."""
 
-    def of(self, cameras: Any = slice(None), points: Any = slice(None)) -> Constants:
+    def of(self, cameras: Any, points: Any) -> Constants:
         """The same for a subset of the cameras and points."""
         return Constants(np.asarray(self.poses)[cameras], np.asarray(self.points)[points])
 

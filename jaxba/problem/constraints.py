@@ -225,7 +225,7 @@ def positions_of(
     if chosen.dtype.kind in "US":
         if problem.labels is None or what != "image":
             raise ValueError(f"this problem has no names for a {what}: give positions")
-        return problem.labels.images_at(chosen.tolist())
+        return problem.labels.positions("image", chosen.tolist())
     if chosen.size and chosen.dtype.kind not in "iu":
         raise ValueError(f"each {what} is given by its position, not by {shown(chosen.tolist()[0])}")
     bad = chosen[(chosen < 0) | (chosen >= count)]

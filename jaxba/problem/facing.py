@@ -65,7 +65,7 @@ def aside_text(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> str:
 
 def without_views_of(problem: BundleProblem, away: Int[np.ndarray, " away"]) -> BundleProblem:
     """The problem without the observations of some cameras. Cameras and points keep their places."""
-    return problem.of_observations(~np.isin(problem.camera_index, away)) if len(away) else problem
+    return problem.subset(~np.isin(problem.camera_index, away)) if len(away) else problem
 
 
 def _sees_mirrored(problem: BundleProblem) -> Bool[np.ndarray, " cameras"]:

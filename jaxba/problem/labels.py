@@ -11,6 +11,8 @@ from jaxtyping import Int, Integer
 
 from jaxba.typing import ArrayRecord
 
+Part = Literal["image", "lens", "point"]
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Labels(ArrayRecord):
@@ -28,24 +30,22 @@ class Labels(ArrayRecord):
     points: Integer[np.ndarray, " points"]
     """Ids of points."""
 
-    def images_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
-        """Positions of images by name or id.
+    def positions(self, kind: Part, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
+        """Positions of parts by id, of images also by name.
 
         Raises:
-            ValueError: there is no such image; one line.
+            ValueError: there is no such part; one line.
         """
-        return _at({**_by_id(self.images), **{name: at for at, name in enumerate(self.names)}}, wanted, "image")
-
-    def lenses_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
-        """Positions of lenses by id. Raises as `images_at`."""
-        return _at(_by_id(self.lenses), wanted, "camera")
-
-    def points_at(self, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
-        """Positions of points by id. Raises as `images_at`."""
-        return _at(_by_id(self.points), wanted, "point")
-
-
-Part = Literal["image", "lens", "point"]
+        ids = {"image": self.images, "lens": self.lenses, "point": self.points}[kind]
+        known: dict[int | str, int] = {number: at for at, number in enumerate(ids.tolist())}
+        if kind == "image":
+            known |= {name: at for at, name in enumerate(self.names)}
+        wanted = list(wanted)
+        missing = [one for one in wanted if isinstance(one, bool) or one not in known]
+        if missing:
+            more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
+            raise ValueError(f"there is no {'camera' if kind == 'lens' else kind} {missing[0]!r}{more}")
+        return np.array([known[one] for one in wanted], np.int64)
 
 
 def part_name(labels: Labels | None, kind: Part, at: int | np.integer) -> str:
@@ -61,16 +61,3 @@ def part_names(labels: Labels | None, kind: Part, which: Int[np.ndarray, " n"], 
     """The same for some parts of a kind; of more than `named` the first ones."""
     more = f" and {len(which) - named} more" if len(which) > named else ""
     return ", ".join(part_name(labels, kind, at) for at in which[:named]) + more
-
-
-def _by_id(ids: Integer[np.ndarray, " n"]) -> dict[int | str, int]:
-    return {int(number): at for at, number in enumerate(ids)}
-
-
-def _at(known: dict[int | str, int], wanted: Iterable[int | str], what: str) -> np.ndarray:
-    wanted = list(wanted)
-    missing = [one for one in wanted if isinstance(one, bool) or one not in known]
-    if missing:
-        more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise ValueError(f"there is no {what} {missing[0]!r}{more}")
-    return np.array([known[one] for one in wanted], np.int64)

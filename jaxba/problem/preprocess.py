@@ -182,14 +182,7 @@ def drop_invalid(problem: BundleProblem, min_depth: float = POBA_MIN_DEPTH) -> B
     keep &= tracks[point_index] >= MIN_TRACK
     if not keep.any():
         raise ProblemError(f"no point is seen by two cameras from at least {min_depth} away: nothing would be left")
-    used = tracks >= MIN_TRACK
-    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
-    return problem.of_observations(keep).replace(
-        points=np.asarray(problem.points)[used],
-        point_index=number[point_index[keep]],
-        constants=None if problem.constants is None else problem.constants.of(points=used),
-        labels=None,
-    )
+    return problem.subset(keep, points=np.flatnonzero(tracks >= MIN_TRACK))
 
 
 def poba_start(problem: BundleProblem, seed: int | np.random.Generator = POBA_SEED) -> BundleProblem:

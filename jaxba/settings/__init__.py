@@ -14,6 +14,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from jaxba.problem.checks import shown
 from jaxba.settings.configurations import SettingsError
 
 Settings = TypeVar("Settings")
@@ -139,8 +140,5 @@ def _type_of(kind: type, key: Any, path: str) -> Any:
     return known[key]
 
 
-def _show(value: Any, longest: int = 40) -> str:
-    if isinstance(value, Mapping):
-        return "a mapping"
-    text = repr(value)
-    return text if len(text) <= longest else text[: longest - 3] + "..."
+def _show(value: Any) -> str:
+    return "a mapping" if isinstance(value, Mapping) else shown(value, 40)

@@ -34,18 +34,9 @@ def deal_points(tracks: Int[np.ndarray, " points"], shards: int) -> list[Int[np.
 
 def shard_of(problem: BundleProblem, points: Int[np.ndarray, " kept"]) -> BundleProblem:
     """The problem with all cameras and these points, ascending, and their observations."""
-    place = np.full(problem.num_points, -1, np.int32)
-    place[points] = np.arange(len(points), dtype=np.int32)
-    kept = np.flatnonzero(place[problem.point_index] >= 0)
-    return problem.replace(
-        points=np.asarray(problem.points)[points],
-        observations=np.asarray(problem.observations)[kept],
-        camera_index=np.asarray(problem.camera_index)[kept],
-        point_index=place[np.asarray(problem.point_index)[kept]],
-        whitening=None if problem.whitening is None else np.asarray(problem.whitening)[kept],
-        constants=None if problem.constants is None else problem.constants.of(points=points),
-        labels=None,
-    )
+    own = np.zeros(problem.num_points, bool)
+    own[points] = True
+    return problem.subset(own[problem.point_index], points=points)
 
 
 def sharded_layout(

@@ -13,14 +13,15 @@ from support import DATA, needs_data
 from jaxba import read_colmap, write_colmap
 from jaxba.io.colmap import binary, text
 from jaxba.io.colmap.files import read_model
-from jaxba.io.colmap.model import CAMERA_MODELS, NO_POINT, SENSORS, Camera, Model
+from jaxba.io.colmap.model import MODELS, NO_POINT, SENSORS, Camera, Model
+from jaxba.problem.camera_models import CAMERA_MODELS
 
 pycolmap = pytest.importorskip("pycolmap", reason="needs the extra: pip install jaxba[ceres]")
 
 pytestmark = pytest.mark.extra
 
 REAL = ("bulani7", "crane8", "mc949", "ranjith", "yding")
-KINDS = [kind for kind in CAMERA_MODELS if kind != "EQUIRECTANGULAR"]
+KINDS = [kind for kind in MODELS if kind != "EQUIRECTANGULAR"]
 FILES = ("cameras", "images", "points3D", "rigs", "frames")
 
 
@@ -95,21 +96,21 @@ def test_every_number_is_the_one_that_colmap_reads(tmp_path, layout, options):
     same_numbers(read_model(folder), pycolmap.Reconstruction(str(folder)))
 
 
-@pytest.mark.parametrize("kind", CAMERA_MODELS)
+@pytest.mark.parametrize("kind", MODELS)
 def test_camera_models_are_colmaps(kind):
     camera = pycolmap.Camera.create_from_model_name(1, kind, 1000.0, 1024, 768)
-    number, size, focals = CAMERA_MODELS[kind]
-    assert (int(camera.model), len(camera.params)) == (number, size)
-    assert list(camera.focal_length_idxs()) == list(range(focals))
-    if focals:
-        params = camera.params * np.arange(1, size + 1)
+    model = CAMERA_MODELS[kind]
+    assert (int(camera.model), len(camera.params)) == (MODELS.index(kind), len(model))
+    assert tuple(camera.focal_length_idxs()) == model.focal
+    if model.focal:
+        params = camera.params * np.arange(1, len(model) + 1)
         camera.params = params
         ours = Camera(1, kind, 1024, 768, tuple(params.tolist()))
         assert ours.principal_point == (camera.principal_point_x, camera.principal_point_y)
 
 
 def test_all_camera_models_and_sensors_of_colmap_are_known():
-    assert set(CAMERA_MODELS) == set(pycolmap.CameraModelId.__members__) - {"INVALID"}
+    assert set(MODELS) == set(pycolmap.CameraModelId.__members__) - {"INVALID"}
     assert {name: int(kind) for name, kind in pycolmap.SensorType.__members__.items()} == {**SENSORS, "INVALID": -1}
 
 

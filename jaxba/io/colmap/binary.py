@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import numpy as np
 
 from jaxba.io.colmap import fields
-from jaxba.io.colmap.fields import Fields, Source
+from jaxba.io.colmap.fields import Fields
 from jaxba.io.colmap.model import KEY, POINT, TRACK, Image, Model, Points
 from jaxba.io.colmap.poses import pose_of
 from jaxba.problem.bundle_problem import ProblemError
@@ -18,7 +19,7 @@ _COUNT = struct.Struct("<Q")
 _LENGTH_AT = POINT.fields["length"][1] if POINT.fields else 0
 
 
-class _Bytes(Source):
+class _Bytes:
     """The bytes of a file, taken one after the other."""
 
     def __init__(self, data: bytes, name: str, record: str):
@@ -133,7 +134,7 @@ def _read_points(file: _Bytes) -> Points:
 def _read_image(file: _Bytes) -> Image:
     identity, *pose, camera = file.take(fields.IMAGE)
     image = Image(identity, pose_of(pose), camera, file.string(), np.empty(0, KEY))
-    return image.with_keys(file.array(KEY, f"key-points of {image}"))
+    return replace(image, keys=file.array(KEY, f"key-points of {image}"))
 
 
 def encode(model: Model) -> Iterator[tuple[str, bytes]]:

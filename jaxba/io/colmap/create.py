@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.colmap.model import CAMERA_MODELS, KEY, POINT, TRACK, Camera, Image, Model, Points
+from jaxba.io.colmap.model import KEY, MODELS, POINT, TRACK, Camera, Image, Model, Points
 from jaxba.io.colmap.poses import colmap_poses
 from jaxba.io.tracks import numbered
 from jaxba.problem import geometry
@@ -81,7 +81,7 @@ def _camera(number: int, lenses: Lenses, lens: int, numbers: np.ndarray, half: n
     model, (x, y) = lenses.model_of(lens), half.tolist()
     size = int(2 * x), int(2 * y)
     if not lenses.all_bal:
-        if model.name not in CAMERA_MODELS:
+        if model.name not in MODELS:
             raise ProblemError(f"cannot write {target}: COLMAP has no camera model {model.name}")
         return Camera(number, model.name, *size, tuple(numbers[: len(model)].tolist()))
     f, k1, k2 = numbers.tolist()

@@ -1,18 +1,22 @@
 """The fields of a COLMAP model's records, from which its text and its binary files are read and written.
 
-Both forms have the same fields in the same order. Source: COLMAP, doc/format.rst, and src/colmap/scene/
+Both forms have the same fields in the same order. A file of either has two methods, which raise ProblemError:
+`take(fields, what="")` gives the next values, which with `what` are all that is left of a record that is called so;
+`count(field, each)` gives the next value as the number of records of the fields `each` that follow.
+
+Source: COLMAP, doc/format.rst, and src/colmap/scene/
 reconstruction_io_binary.cc and reconstruction_io_text.cc.
 """
 
 from __future__ import annotations
 
 import struct
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from jaxba.io.colmap.model import CAMERA_MODELS, SENSORS, Camera, Frame, Image, Rig, Sensor
+from jaxba.io.colmap.model import MODELS, SENSORS, Camera, Frame, Image, Rig, Sensor
 from jaxba.io.colmap.poses import pose_of
+from jaxba.problem.camera_models import CAMERA_MODELS
 
 
 class Kinds(NamedTuple):
@@ -36,30 +40,17 @@ class Fields:
         self.struct = struct.Struct(f"<{codes}")
 
 
-class Source(ABC):
-    """A file in one of the two forms. Methods raise ProblemError."""
-
-    @abstractmethod
-    def take(self, fields: Fields, what: str = "") -> tuple[Any, ...]:
-        """The next values; with `what` they are all that is left of a record, and this is what it is called."""
-
-    @abstractmethod
-    def count(self, field: str, each: Fields) -> int:
-        """The next value as the number of records that follow."""
-
-
 _POSE_NAMES = "qw, qx, qy, qz, tx, ty, tz"
-_MODELS = {name: model.number for name, model in CAMERA_MODELS.items()}
-_NAMES = {number: name for name, number in _MODELS.items()}
+_NUMBERS = {name: number for number, name in enumerate(MODELS)}
 
 CAMERA = Fields(
     "CAMERA_ID, model, width, height",
     "IiQQ",
-    Kinds(_MODELS, "is an unknown camera model", " has an unknown model, number {}"),
+    Kinds(_NUMBERS, "is an unknown camera model", " has an unknown model, number {}"),
 )
 PARAMETERS = {
-    name: Fields(", ".join(f"parameter {k + 1}" for k in range(model.size)), model.size * "d")
-    for name, model in CAMERA_MODELS.items()
+    name: Fields(", ".join(f"parameter {k + 1}" for k in range(size)), size * "d")
+    for name, size in ((name, len(CAMERA_MODELS[name])) for name in MODELS)
 }
 POSE = Fields(_POSE_NAMES, 7 * "d")
 IMAGE = Fields(f"IMAGE_ID, {_POSE_NAMES}, CAMERA_ID", f"I{7 * 'd'}I")
@@ -76,12 +67,12 @@ FRAME = Fields(f"FRAME_ID, RIG_ID, {_POSE_NAMES}", f"II{7 * 'd'}")
 DATUM = Fields("type of a sensor, id of a sensor, id of a datum", "iIQ", SENSOR.kinds)
 
 
-def _read_camera(file: Source) -> Camera:
+def _read_camera(file: Any) -> Camera:
     identity, number, width, height = file.take(CAMERA)
-    return Camera(identity, _NAMES[number], width, height, file.take(PARAMETERS[_NAMES[number]], _NAMES[number]))
+    return Camera(identity, MODELS[number], width, height, file.take(PARAMETERS[MODELS[number]], MODELS[number]))
 
 
-def _read_rig(file: Source) -> Rig:
+def _read_rig(file: Any) -> Rig:
     (identity,) = file.take(RIG)
     sensors = []
     for number in range(file.count("number of sensors", SENSOR)):
@@ -91,7 +82,7 @@ def _read_rig(file: Source) -> Rig:
     return Rig(identity, tuple(sensors))
 
 
-def _read_frame(file: Source) -> Frame:
+def _read_frame(file: Any) -> Frame:
     identity, rig, *pose = file.take(FRAME)
     return Frame(
         identity, rig, pose_of(pose), tuple(file.take(DATUM) for _ in range(file.count("number of data", DATUM)))
@@ -113,7 +104,7 @@ def values(record: Camera | Image | Rig | Frame) -> Values:
     """The values of a record; those of an image without its name and key-points."""
     match record:
         case Camera():
-            yield CAMERA, (record.id, _MODELS[record.model], record.width, record.height)
+            yield CAMERA, (record.id, _NUMBERS[record.model], record.width, record.height)
             yield PARAMETERS[record.model], record.params
         case Image():
             yield IMAGE, (record.id, *record.pose.numbers, record.camera)

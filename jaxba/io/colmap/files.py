@@ -21,11 +21,6 @@ def is_colmap(path: StrPath) -> bool:
     return any((Path(path) / f"cameras{suffix}").is_file() for suffix in _FORMS)
 
 
-def is_binary(folder: StrPath) -> bool:
-    """Whether COLMAP would read the binary files of a folder."""
-    return _has(folder, ".bin")
-
-
 def read_model(folder: StrPath) -> Model:
     """Reads the files of a model, the binary ones where there are both, and checks its structure.
 
@@ -35,7 +30,7 @@ def read_model(folder: StrPath) -> Model:
     """
     if not is_colmap(folder):
         raise ProblemError(f"{display_name(folder)}: no directory with a COLMAP model (cameras.bin or cameras.txt)")
-    whole = [suffix for suffix in _FORMS if _has(folder, suffix)]
+    whole = [suffix for suffix in _FORMS if has_parts(folder, suffix)]
     suffix = whole[0] if whole else next(s for s in _FORMS if (Path(folder) / f"cameras{s}").is_file())
     here = [part for part in (*PARTS, *RIG_PARTS) if os.path.lexists(Path(folder) / (part + suffix))]
     for part in PARTS if set(here).isdisjoint(RIG_PARTS) else (*PARTS, *RIG_PARTS):
@@ -51,7 +46,8 @@ def read_model(folder: StrPath) -> Model:
     return model
 
 
-def _has(folder: StrPath, suffix: str) -> bool:
+def has_parts(folder: StrPath, suffix: str) -> bool:
+    """Whether a folder has all files of a model in a form; COLMAP reads the binary ones if it has them."""
     return all((Path(folder) / (part + suffix)).is_file() for part in PARTS)
 
 

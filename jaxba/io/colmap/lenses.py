@@ -13,10 +13,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io.colmap.model import CAMERA_MODELS, Camera, Model
-from jaxba.problem import camera_models
+from jaxba.io.colmap.model import Camera, Model
 from jaxba.problem.bundle_problem import ProblemError
-from jaxba.problem.camera_models import BAL
+from jaxba.problem.camera_models import BAL, CAMERA_MODELS
 from jaxba.problem.intrinsics import Lenses
 
 AS_BAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -32,7 +31,7 @@ def check_lens(model: Model, camera: Camera) -> None:
     Raises:
         ProblemError: it cannot be used; one line that names file and camera.
     """
-    focals = camera.params[: CAMERA_MODELS[camera.model].focals]
+    focals = camera.focals
     if not camera.possible or (focals and max(focals) / LARGEST_RATIO > min(focals)):
         shown = ", ".join(f"{value:g}" for value in camera.params)
         name = f"{model.file('cameras')}: camera {camera.id}"
@@ -57,11 +56,11 @@ def lenses_of(
     """
     bal = not refine_principal_point and all(camera.model in AS_BAL for camera in cameras)
     names = ["BAL"] if bal else sorted({camera.model for camera in cameras})
-    models = tuple(camera_models.CAMERA_MODELS[name] for name in names)
+    models = tuple(CAMERA_MODELS[name] for name in names)
     size = max(map(len, models))
     numbers, free = np.zeros((len(cameras), size)), np.zeros((len(cameras), size), bool)
     for at, camera in enumerate(cameras):
-        model = camera_models.CAMERA_MODELS[camera.model]
+        model = CAMERA_MODELS[camera.model]
         moves = [*model.focal, *model.distortion, *(model.principal_point if refine_principal_point else ())]
         if bal:
             places = [BAL.parameters.index(model.parameters[k]) for k in moves]
@@ -85,6 +84,6 @@ def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool)
     """
     if not bal:
         return replace(camera, params=tuple(lens[: len(camera.params)].tolist()))
-    names = camera_models.CAMERA_MODELS[camera.model].parameters
+    names = CAMERA_MODELS[camera.model].parameters
     new = {**dict(zip(names, camera.params, strict=True)), **dict(zip(BAL.parameters, lens.tolist(), strict=True))}
     return replace(camera, params=tuple(new[name] for name in names))

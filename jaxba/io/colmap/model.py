@@ -6,18 +6,18 @@ Source: COLMAP, doc/format.rst and doc/cameras.rst; numbers of models and sensor
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Shaped
 
 from jaxba.io.colmap.poses import Pose
 from jaxba.io.files import display_name
-from jaxba.problem import camera_models
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.camera_models import CAMERA_MODELS
 
 PARTS = ("cameras", "images", "points3D")
 """Files that every model has."""
@@ -29,24 +29,12 @@ RIG_PARTS = ("rigs", "frames")
 _LONGEST_NAME = 60  # of an image in messages
 
 
-class CameraModel(NamedTuple):
-    """A kind of lens."""
-
-    number: int  # in a binary file
-    size: int  # number of parameters
-    focals: int  # how many of them, from the first, are focal lengths
-
-
-_NUMBERED = (
+MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
     *("SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM", "EQUIRECTANGULAR"),
 )
-CAMERA_MODELS = {
-    name: CameraModel(number, len(camera_models.CAMERA_MODELS[name]), len(camera_models.CAMERA_MODELS[name].focal))
-    for number, name in enumerate(_NUMBERED)
-}
-"""All camera models by name. The principal point follows the focal lengths, if there are any."""
+"""Camera models of COLMAP, of which each has its place as its number in a binary file."""
 
 NO_ID = 2**32 - 1
 """COLMAP's id of no camera, image, rig or frame, and its index of no key-point."""
@@ -83,17 +71,20 @@ class Camera:
     params: tuple[float, ...]
 
     @property
+    def focals(self) -> list[float]:
+        """Its focal lengths; none of a panorama."""
+        return [self.params[k] for k in CAMERA_MODELS[self.model].focal]
+
+    @property
     def principal_point(self) -> tuple[float, float]:
         """Its pixel; not of a model without focal lengths."""
-        at = CAMERA_MODELS[self.model].focals
-        return self.params[at], self.params[at + 1]
+        x, y = CAMERA_MODELS[self.model].principal_point
+        return self.params[x], self.params[y]
 
     @property
     def possible(self) -> bool:
         """Whether all parameters are finite and focal lengths positive."""
-        return bool(np.isfinite(self.params).all()) and all(
-            f > 0 for f in self.params[: CAMERA_MODELS[self.model].focals]
-        )
+        return bool(np.isfinite(self.params).all()) and all(f > 0 for f in self.focals)
 
 
 @dataclass(frozen=True)
@@ -106,10 +97,6 @@ class Image:
     name: bytes
     keys: Shaped[np.ndarray, " keys"]
     """Of type `KEY`."""
-
-    def with_keys(self, keys: Shaped[np.ndarray, " keys"]) -> Image:
-        """The same image with other key-points."""
-        return replace(self, keys=keys)
 
     def __str__(self) -> str:
         name = display_name(self.name.decode("utf-8", "backslashreplace"))

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxba.io.colmap import lenses
 from jaxba.io.colmap.files import read_model
-from jaxba.io.colmap.model import CAMERA_MODELS, CAMERA_SENSOR, Camera, Frame, Image, Model
+from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Image, Model
 from jaxba.io.colmap.observations import Ordered, Views, find_views, ordered
 from jaxba.io.colmap.poses import Pose, bal_poses, composed, differ, pose_of, rotations, translations
 from jaxba.io.files import StrPath, display_name
@@ -87,7 +87,7 @@ def read_colmap_with_looks(folder: StrPath) -> tuple[BundleProblem, Looks]:
     report(assembled.notes, strict=False)
     cameras = [model.cameras[image.camera] for image in assembled.images]
     sizes = np.array([(one.width, one.height) for one in cameras], np.float64)
-    found = [one.principal_point if CAMERA_MODELS[one.model].focals else (np.nan, np.nan) for one in cameras]
+    found = [one.principal_point if one.focals else (np.nan, np.nan) for one in cameras]
     principal = np.where(np.isnan(found), sizes / 2, found)  # a panorama has its own in the middle
     return assembled.problem, Looks(model.points.heads["rgb"][assembled.points], sizes, principal)
 
@@ -130,7 +130,7 @@ def _hints(model: Model) -> list[str]:
     """What looks wrong in a model, one line each."""
     odd = []
     for camera in model.cameras.values():
-        if camera.width and camera.height and CAMERA_MODELS[camera.model].focals:
+        if camera.width and camera.height and camera.focals:
             at = np.array(camera.principal_point) / (float(camera.width), float(camera.height))
             if not ((at >= _EDGE) & (at <= 1 - _EDGE)).all():
                 odd.append(camera)

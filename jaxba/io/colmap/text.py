@@ -9,12 +9,13 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import numpy as np
 
 from jaxba.io.colmap import fields
-from jaxba.io.colmap.fields import Fields, Source
+from jaxba.io.colmap.fields import Fields
 from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model, Points
 from jaxba.io.colmap.poses import pose_of
 from jaxba.io.encoding import utf8
@@ -33,7 +34,7 @@ _HEADERS = {
 }
 
 
-class _Line(Source):
+class _Line:
     """The words of a line, taken one after the other; every error names the line and the field."""
 
     def __init__(self, place: str, text: bytes, record: str):
@@ -166,7 +167,7 @@ def _images(file: Iterator[_Line]) -> Iterator[tuple[_Line, Image]]:
         below = next(file, None)
         if below is not None and not _starts_image(below):
             below.about = str(image)
-            image = image.with_keys(_keys(below))
+            image = replace(image, keys=_keys(below))
             below = next(file, None)
         yield line, image
         line = below

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from jaxba.io.colmap.create import create_model, mean_errors
-from jaxba.io.colmap.files import is_binary, read_model, write_model
+from jaxba.io.colmap.files import has_parts, read_model, write_model
 from jaxba.io.colmap.lenses import with_lens
 from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Model, Points, Rig, Sensor
 from jaxba.io.colmap.poses import colmap_poses, composed, inverse
@@ -50,7 +50,7 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
     old = assembled.problem
     if counts != (old.num_cameras, old.num_points, old.num_observations):
         raise ProblemError(f"cannot write {target}: the problem is not one of {display_name(like)}")
-    text = model.suffix == ".txt" and not is_binary(folder)  # COLMAP ignores text files beside a binary model
+    text = model.suffix == ".txt" and not has_parts(folder, ".bin")  # COLMAP ignores text files beside a binary model
     _check_finite(model, assembled, problem, target)
     model = replace(model, cameras={**model.cameras, **_new_cameras(model, assembled, problem, bal, target)})
     model = _with_poses(_with_places(model, assembled, problem), assembled, problem)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxba.io.files import StrPath
 from jaxba.io.foreign.cameras import BROWN, FISHEYE, FIXED, ForeignLens
 from jaxba.io.foreign.json_records import Record
-from jaxba.io.foreign.views import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.io.foreign.views import UNDEFINED, Landmark, build, checked_pose, part
 from jaxba.io.notes import note, note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -68,7 +68,7 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         rig, pose, intrinsic = (value.get(key, UNDEFINED).integer() for key in ("rigId", "poseId", "intrinsicId"))
         if rig >= 0 and rig != UNDEFINED and not independent:
             value.fail("is of a rig of several cameras, whose poses depend on it; rigs are not read")
-        views[number] = View(pose, intrinsic)
+        views[number] = pose, intrinsic
     intrinsics = dict(_numbered(part(document, "intrinsics", _PROGRAM), "intrinsicId", "intrinsic"))
     poses, locked = {}, 0
     for number, value in _numbered(part(document, "poses", _PROGRAM), "poseId", "pose"):
@@ -146,4 +146,4 @@ def _landmarks(structure: Record) -> Iterator[tuple[Landmark, list[float]]]:
             pixels.append(seen.get("x").vector(2))
             if seen.has("scale"):
                 scales.append(seen.get("scale").number())
-        yield Landmark(value.get("X").vector(3), views, pixels), scales
+        yield (value.get("X").vector(3), views, pixels), scales

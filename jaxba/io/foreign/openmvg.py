@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from jaxba.io.files import StrPath
 from jaxba.io.foreign.cameras import BROWN, FISHEYE, ForeignLens
 from jaxba.io.foreign.json_records import Record
-from jaxba.io.foreign.views import UNDEFINED, Landmark, View, build, checked_pose, part
+from jaxba.io.foreign.views import UNDEFINED, Landmark, build, checked_pose, part
 from jaxba.io.notes import note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -63,7 +63,7 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         for flag, what in PRIORS.items():
             unused[what] += data.get(flag, False).flag()
         pose, intrinsic = (data.get(one, UNDEFINED).integer() for one in ("id_pose", "id_intrinsic"))
-        views[data.get("id_view", key).integer()] = View(pose, intrinsic)
+        views[data.get("id_view", key).integer()] = pose, intrinsic
     intrinsics = _intrinsics(part(document, "intrinsics", _PROGRAM))
     poses = {}
     for key, value in _map(part(document, "extrinsics", _PROGRAM), "pose"):
@@ -116,4 +116,4 @@ def _landmarks(structure: Record) -> Iterator[Landmark]:
     for key, value in _map(structure, "landmark"):
         seen = list(_map(value.get("observations"), f"landmark {key}: observation in view"))
         pixels = [one.get("x").vector(2) for _, one in seen]
-        yield Landmark(value.get("X").vector(3), [view for view, _ in seen], pixels)
+        yield value.get("X").vector(3), [view for view, _ in seen], pixels

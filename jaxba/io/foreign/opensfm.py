@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Container
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -41,13 +40,6 @@ PARTS = ("cameras", "shots", "points", "rig_cameras", "rig_instances", "biases",
 
 CONTROL_POINTS = ("ground_control_points.json", "gcp_list.txt")
 """Files of control points beside a reconstruction."""
-
-
-class _Observations(NamedTuple):
-    images: list[str]
-    tracks: list[str]
-    pixels: list[tuple[float, float]]
-    unused: dict[str, int]
 
 
 def recognises(document: Record) -> bool:
@@ -94,8 +86,8 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     points = {key: point.get("coordinates").vector(3) for key, point in document.get("points").entries("point")}
     if not shots or not points:
         document.fail(f"has no {'points' if shots else 'shots'}")
-    seen = _read_tracks(_tracks_beside(path), shots, set(points))
-    note_unused(path, document.unknown(PARTS) | _unused(document, path) | seen.unused)
+    seen, unused = _read_tracks(_tracks_beside(path), shots, set(points))
+    note_unused(path, document.unknown(PARTS) | _unused(document, path) | unused)
     from scipy.spatial.transform import Rotation
 
     rotations = Rotation.from_rotvec(np.array(turns)).as_matrix()
@@ -105,7 +97,7 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     point_number = {key: at for at, key in enumerate(points)}
     lens_number = {key: at for at, key in enumerate(lenses)}
     lens_of = np.array([lens_number[key] for key in lens_keys])
-    camera_index = np.array([shots[image] for image in seen.images])
+    camera_index = np.array([shots[image] for image, _ in seen])
     size = np.array([lens.size for lens in lenses.values()])[lens_of][camera_index]
     return assemble(
         path,
@@ -114,9 +106,9 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         rotations,
         np.array(shifts),
         np.array(list(points.values())),
-        size.max(axis=1)[:, None] * np.array(seen.pixels) + size / 2,
+        size.max(axis=1)[:, None] * np.array(list(seen.values())) + size / 2,
         camera_index,
-        np.array([point_number[track] for track in seen.tracks]),
+        np.array([point_number[track] for _, track in seen]),
     )
 
 
@@ -178,8 +170,10 @@ def _tracks_beside(path: StrPath) -> Path:
     return there[0]
 
 
-def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -> _Observations:
-    """The observations of reconstructed images and points."""
+def _read_tracks(
+    path: StrPath, shots: Container[str], points: Container[str]
+) -> tuple[dict[tuple[str, str], tuple[float, float]], dict[str, int]]:
+    """The pixels of reconstructed images and points by image and track, and what else the file holds."""
     name = display_name(path)
     lines = read_text(path).split("\n")
     version, first = 0, 0
@@ -205,6 +199,5 @@ def _read_tracks(path: StrPath, shots: Container[str], points: Container[str]) -
         found[image, track] = x, y
     if not found:
         raise ProblemError(f"{name}: no image of the reconstruction sees a point of it")
-    images, tracks = zip(*found, strict=True)
-    unused = {"scales of key-points": len(found)} if len(scales) > 1 else {}  # OpenSfM divides residuals by them
-    return _Observations(list(images), list(tracks), list(found.values()), unused)
+    # OpenSfM divides residuals by scales
+    return found, {"scales of key-points": len(found)} if len(scales) > 1 else {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterable, Mapping
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,33 +18,18 @@ UNDEFINED = 2**32 - 1
 """Number that stands for no pose or no intrinsic. Source: `UndefinedIndexT` in types.hpp of both programs."""
 
 
-class View(NamedTuple):
-    """An image."""
+Pose = tuple[Float[np.ndarray, "3 3"], list[float]]
+"""Rotation and centre of a camera whose frame is `rotation (X - center)`, x to the right, y down, z forward."""
 
-    pose: int
-    intrinsic: int
-
-
-class Pose(NamedTuple):
-    """A camera at `center` whose frame is `rotation (X - center)`, x to the right, y down, z forward."""
-
-    rotation: Float[np.ndarray, "3 3"]
-    center: list[float]
-
-
-class Landmark(NamedTuple):
-    """A point."""
-
-    position: list[float]
-    views: list[int]
-    pixels: list[list[float]]
+Landmark = tuple[list[float], list[int], list[list[float]]]
+"""A point: its position, the numbers of its views, and their pixels."""
 
 
 def checked_pose(record: Record, rotation: Float[np.ndarray, "3 3"], center: list[float]) -> Pose:
     """A pose after a check of its rotation. Raises ProblemError."""
     if not are_rotations(rotation[None])[0]:
         record.fail("has a rotation that is none")
-    return Pose(rotation, center)
+    return rotation, center
 
 
 def part(document: Record, key: str, program: str) -> Record:
@@ -64,7 +48,7 @@ def part(document: Record, key: str, program: str) -> Record:
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
 def build(
     path: StrPath,
-    views: Mapping[int, View],
+    views: Mapping[int, tuple[int, int]],
     poses: Mapping[int, Pose],
     intrinsics: Container[int],
     lens: Callable[[int], ForeignLens],
@@ -76,7 +60,7 @@ def build(
 
     Args:
         path: of the file, for messages.
-        views: by number.
+        views: numbers of pose and intrinsic by the number of a view.
         poses: by number; views without one are not reconstructed.
         intrinsics: their numbers; the same.
         lens: makes the lens of an intrinsic by its number.
@@ -87,12 +71,12 @@ def build(
     """
     name = display_name(path)
     points, seen_views, pixels, point_index = [], [], [], []
-    for number, landmark in enumerate(landmarks):
-        points.append(landmark.position)
-        seen_views += landmark.views
-        pixels += landmark.pixels
-        point_index += [number] * len(landmark.views)
-    there = sorted(key for key, view in views.items() if view.pose in poses and view.intrinsic in intrinsics)
+    for number, (position, seen_by, at) in enumerate(landmarks):
+        points.append(position)
+        seen_views += seen_by
+        pixels += at
+        point_index += [number] * len(seen_by)
+    there = sorted(key for key, (pose, intrinsic) in views.items() if pose in poses and intrinsic in intrinsics)
     seen = np.array(seen_views, dtype=np.int64)
     kept = np.isin(seen, np.array(there, dtype=np.int64))
     if not kept.all():
@@ -100,23 +84,21 @@ def build(
     if not kept.any():
         raise ProblemError(f"{name}: no view that has a pose and an intrinsic sees a point")
     names, camera_index = np.unique(seen[kept], return_inverse=True)
-    cameras = [views[key] for key in names.tolist()]
     owner: dict[int, int] = {}
-    for key, view in zip(names.tolist(), cameras, strict=True):
-        other = owner.setdefault(view.pose, key)
+    for key in names.tolist():
+        pose = views[key][0]
+        other = owner.setdefault(pose, key)
         if other != key:
-            raise ProblemError(
-                f"{name}: views {other} and {key} share pose {view.pose}, as in a rig; rigs are not read"
-            )
+            raise ProblemError(f"{name}: views {other} and {key} share pose {pose}, as in a rig; rigs are not read")
     if len(there) > len(names):
         note(path, f"{len(there) - len(names)} of {len(there)} views with a pose left out: they see no point")
-    used = sorted({view.intrinsic for view in cameras})
-    rotations = np.array([poses[view.pose].rotation for view in cameras])
-    centers = np.array([poses[view.pose].center for view in cameras])
+    of_cameras = [views[key][1] for key in names.tolist()]
+    used = sorted(set(of_cameras))
+    rotations, centers = (np.array([poses[pose][part] for pose in owner]) for part in (0, 1))
     return assemble(
         path,
         [lens(key) for key in used],
-        np.searchsorted(used, [view.intrinsic for view in cameras]),
+        np.searchsorted(used, of_cameras),
         rotations,
         translations(rotations, centers),
         np.array(points),
