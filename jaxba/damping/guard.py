@@ -14,6 +14,7 @@ After `patience` rejections in a row, or `max_rejections` in all, Ceres' rule ch
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -32,6 +33,10 @@ without having converged. Shortened steps do not count: in a narrow valley (the 
 was rejected twice after them, and Ceres' rule took over in iteration 8."""
 
 
+UNLIMITED = math.log10(LARGEST)
+"""log10 of the largest lambda of any rule: finite, as a state of the game must be."""
+
+
 class GuardState(NamedTuple):
     """What the guard remembers between iterations."""
 
@@ -42,7 +47,7 @@ class GuardState(NamedTuple):
 
 def initial_guard(config: AgentConfig, dtype: Any) -> GuardState:
     """Before the first iteration."""
-    return GuardState(jnp.asarray(config.first_low, dtype), jnp.asarray(jnp.inf, dtype), Rescue.begin(dtype))
+    return GuardState(jnp.asarray(config.first_low, dtype), jnp.asarray(UNLIMITED, dtype), Rescue.begin(dtype))
 
 
 def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> GuardState:
@@ -51,7 +56,7 @@ def update_guard(config: AgentConfig, guard: GuardState, step: StepInfo) -> Guar
     damping, failures = jnp.log10(step.damping), jnp.where(step.accepted, times_shortened(step), 1.0)
     lowest = jnp.where(is_inexact(step), damping, damping - config.descent)
     lowest = jnp.where(failures > 0, jnp.maximum(lowest, damping + config.escalate * failures), lowest)
-    highest = jnp.where(_is_overdamped(step), damping - 1, jnp.inf)
+    highest = jnp.where(_is_overdamped(step), damping - 1, UNLIMITED)
     decided = lambda limit: jnp.where(rescue.in_charge, rule, limit).astype(guard.lowest.dtype)
     return GuardState(decided(lowest), decided(highest), rescue)
 

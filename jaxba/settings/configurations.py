@@ -101,9 +101,9 @@ def parse(text: str, name: str, *, as_text: bool = False) -> Any:
     """
     import yaml
 
-    loader = (yaml.BaseLoader if as_text else yaml.SafeLoader)(text)
     where = lambda mark: f" line {mark.line + 1}" if mark and "\n" in text.strip() else ""
     try:
+        loader = (yaml.BaseLoader if as_text else yaml.SafeLoader)(text)
         node = loader.get_single_node()
         twice = _twice(node)
         if twice is not None:
