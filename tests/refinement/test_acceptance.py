@@ -242,7 +242,7 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
 
 @functools.partial(jax.jit, static_argnames=("options", "min_gain"))
 def _best_candidate(layout, cameras, points, cost, reference, whole, options, min_gain):
-    return best_candidate(comparison(layout, cameras, points, cost, reference, whole, options, min_gain, None))
+    return best_candidate(comparison(layout, cameras, points, cost, reference, whole, options, min_gain))
 
 
 def test_a_camera_whose_focal_length_would_change_its_sign_stays_where_it_was():

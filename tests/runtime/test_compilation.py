@@ -157,7 +157,7 @@ def test_candidates_one_by_one_are_those_of_the_loop(level):
             given = (layout, state, jax.numpy.asarray(damping), proposal._replace(step=step), options)
             call = lambda function, *arguments: function(*arguments)
             part = lambda function: program(function, "options", level=level)
-            parts = try_step_by_parts(call, part, *given, np.asarray(0.0), None)
+            parts = try_step_by_parts(call, part, *given, np.asarray(0.0))
             whole = jax.jit(try_step, static_argnums=4)(*given)
             chex.assert_trees_all_close(parts, whole, rtol=1e-7, atol=1e-10)
             seen.add((bool(whole[1].accepted), int(whole[1].repairs) > 0))
