@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 
 T = TypeVar("T")
 
@@ -39,9 +39,9 @@ def step_groups(function: Callable[..., T], *arguments: Any, shared: Any = None)
         if any(jax.tree.leaves(batched[0])):
             raise ValueError("arrays that all scenes share must not be batched")
         whole = lambda x, own: x if own else jnp.broadcast_to(x, (size, *x.shape))
-        flat = jax.tree.map(lambda x, own: whole(x, own).reshape(-1, *x.shape[1 + own :]), arguments, batched[1])
+        flat = jax.tree.map(lambda x, own: _joined(whole(x, own)), arguments, batched[1])
         found = _grouped(function, shared, flat)
-        found = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), found)
+        found = jax.tree.map(lambda x: x.reshape(size, len(x) // size, *x.shape[1:]), found)
         return found, jax.tree.map(lambda _: True, found)
 
     return grouped(shared, arguments)
@@ -60,4 +60,9 @@ def _grouped(function: Callable[..., T], shared: Any, arguments: Any) -> T:
     # factorisations at a time can deadlock if XLA has two threads
     rows = jnp.minimum(jnp.arange(-(-count // GROUP) * GROUP), count - 1).reshape(-1, GROUP)
     found = lax.map(lambda a: _at_once(function, shared, a), jax.tree.map(lambda x: x[rows], arguments))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], found)
+    return jax.tree.map(lambda x: _joined(x)[:count], found)
+
+
+def _joined(x: Array) -> Array:
+    """The first two axes of an array, perhaps an empty one, as one."""
+    return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
