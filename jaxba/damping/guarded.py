@@ -98,8 +98,10 @@ class Rescue(NamedTuple):
 
 GUARDED_DECADES = -8.0
 """log10 of the lambda of `Guarded`. On 512 training scenes of a game in which every part of an iteration cost its
-work, -9 was the best constant and -8 cost 0.3% more (three seeds); on real problems -8 was
-measured."""
+work, -9 was the best constant and -8 cost 0.3% more (three seeds); on real problems -8 was measured."""
+
+FREE_DESCENT = 11.0
+"""Decades by which the lambda of `Guarded` may fall: the range of an action, so only from above 1e3 in two steps."""
 
 
 @register_pytree
@@ -128,9 +130,9 @@ class Guarded:
     def propose(self, state: Rescue, step: StepInfo) -> tuple[Rescue, Array]:
         """See `DampingPolicy`."""
         least = smallest_decades(GUARDED_DECADES, state.worked.dtype)
-        state, rescue = state.after(step, patience=2, most=8)
+        state, rescue = state.after(step, AgentConfig.patience, AgentConfig.max_rejections)
         decades = jnp.log10(step.damping).astype(state.worked.dtype)
         failures = jnp.where(step.accepted, times_shortened(step), 1.0)
-        fallen = jnp.maximum(least, jnp.where(is_inexact(step), decades, decades - 11))  # from above 1e3 in two steps
-        own = jnp.where(failures > 0, decades + 0.5 * failures, fallen)
+        fallen = jnp.maximum(least, jnp.where(is_inexact(step), decades, decades - FREE_DESCENT))
+        own = jnp.where(failures > 0, decades + AgentConfig.escalate * failures, fallen)
         return state, jnp.clip(10 ** jnp.where(state.in_charge, rescue, own), 10**least, LARGEST)

@@ -24,13 +24,11 @@ rounded up to a power of two."""
 
 
 class Driver:
-    """Runs the iterations of a solve, and has the state after them."""
-
-    whole = True
-    """Whether it can run all iterations as one program."""
+    """What all ways to run the iterations of a solve have in common. Each has `begin`, which gives the state at the
+    start, and `finish`, which runs all iterations as one program, or `iterate`, which runs one, or both."""
 
     carry: Carry
-    """The state of the loop; from `begin` on."""
+    """The state of the loop; from `begin`, or `finish`, on."""
 
     quick_iterations = 0
     """Iterations in which some program was not fully optimised."""
@@ -44,36 +42,27 @@ class Driver:
         """Seconds of compilation so far."""
         return self.clock.seconds
 
-    def begin(self) -> LMState:
-        """The state at the start."""
-        raise NotImplementedError
-
-    def finish(self) -> tuple[StepInfo, Termination]:
-        """Runs to the end; the records of all iterations as one, and why it ended."""
-        self.carry, found = jax.block_until_ready(self._all())
+    def _ended(self, found: tuple[Carry, StepInfo]) -> tuple[StepInfo, Termination]:
+        """The records of all iterations as one, and why the solve ended."""
+        self.carry, columns = jax.block_until_ready(found)
         count = int(self.carry.iteration)
-        steps = jax.tree.map(lambda column: np.asarray(column)[:count], found)
+        steps = jax.tree.map(lambda column: np.asarray(column)[:count], columns)
         return steps, Termination(int(self.carry.termination))
-
-    def iterate(self) -> tuple[StepInfo, Termination]:
-        """One iteration: its record, of Python scalars, and whether it ended the solve."""
-        raise NotImplementedError
-
-    def _all(self) -> tuple[Carry, Any]:
-        raise NotImplementedError
 
 
 class Compiled(Driver):
     """All iterations as one program on one device."""
 
     def begin(self) -> LMState:
+        """The state at the start."""
         self._start = jax.block_until_ready(self.setup.initial(compile_and_run))
         return self._start
 
-    def _all(self) -> tuple[Carry, StepInfo]:
+    def finish(self) -> tuple[StepInfo, Termination]:
+        """Runs to the end; the records of all iterations as one, and why it ended."""
         setup = self.setup
         options = setup.policy, self.tolerances, setup.options, self.length, self.limit
-        return solve_loop(setup.layout, self._start, *options)
+        return self._ended(solve_loop(setup.layout, self._start, *options))
 
 
 class OnDevices(Driver):
@@ -84,13 +73,16 @@ class OnDevices(Driver):
         self._shards = shards
 
     def begin(self) -> LMState:
+        """The state at the start."""
         self.carry = self._shards.begin(self.setup.policy, self.limit)
         return jax.block_until_ready(self.carry.state)
 
-    def _all(self) -> tuple[Carry, StepInfo]:
-        return self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit, self.length)
+    def finish(self) -> tuple[StepInfo, Termination]:
+        """See `Compiled`."""
+        return self._ended(self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit, self.length))
 
     def iterate(self) -> tuple[StepInfo, Termination]:
+        """One iteration: its record, of Python scalars, and whether it ended the solve."""
         self.carry, step = self._shards.run(self.carry, self.setup.policy, self.tolerances, self.limit)
         step = jax.tree.map(lambda x: x.item(), jax.device_get(step))
         return step, Termination(int(self.carry.termination))

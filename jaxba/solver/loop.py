@@ -11,7 +11,7 @@ from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Termination
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.runtime.compilation import CompileClock
-from jaxba.solver.driver import Compiled, Driver, OnDevices
+from jaxba.solver.driver import Compiled, OnDevices
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Setup
 from jaxba.solver.stepwise import Stepwise, stages_of
@@ -84,9 +84,9 @@ def run(setup: Setup, options: SolveOptions, callback: Callback | None, watch: W
         elapsed = lambda: time.perf_counter() - began - watched - (driver.compile_s() - compiled)
         steps, records = None, []
         end = Termination.RUNNING if options.max_iterations else Termination.MAX_ITERATIONS
-        if alone and driver.whole and end == Termination.RUNNING:
+        if alone and end == Termination.RUNNING and not isinstance(driver, Stepwise):
             steps, end = driver.finish()
-        while end == Termination.RUNNING:
+        while end == Termination.RUNNING and not isinstance(driver, Compiled):
             step, end = driver.iterate()
             records.append(step)
             record = IterationRecord(len(records), elapsed(), step)
@@ -101,7 +101,7 @@ def run(setup: Setup, options: SolveOptions, callback: Callback | None, watch: W
     return Run(state, steps, end, initial_cost, driver.quick_iterations, driver.compile_s(), total_s)
 
 
-def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: bool) -> Driver:
+def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: bool) -> Compiled | OnDevices | Stepwise:
     """The way to run the iterations: in stages of compilation, or where somebody looks at them, from Python."""
     arguments = setup, options.tolerances, options.max_iterations, clock
     if setup.shards is not None:

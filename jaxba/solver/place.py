@@ -23,7 +23,7 @@ from jaxba.structure.conventions import items_first
 from jaxba.structure.layout import Layout
 from jaxba.typing import AnyArray
 
-NOBODY = np.zeros(0, int)
+NO_CAMERAS = np.zeros(0, int)
 """No cameras."""
 
 
@@ -81,7 +81,7 @@ class Placed(NamedTuple):
         return _with_constants(found, self.counted, constants, poses & poses[:, :1])
 
 
-def placed(problem: BundleProblem, away: Int[np.ndarray, " away"] = NOBODY) -> Placed:
+def placed(problem: BundleProblem, away: Int[np.ndarray, " away"] = NO_CAMERAS) -> Placed:
     """Places a problem.
 
     Args:

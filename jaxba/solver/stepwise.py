@@ -52,8 +52,6 @@ Call = Callable[..., Any]
 class Stepwise(Driver):
     """Iterations one at a time on one device, of programs at their own levels."""
 
-    whole = False
-
     def __init__(self, stages: Mapping[str, tuple[Stage, ...]], *arguments: Any) -> None:
         """
         Args:
@@ -77,9 +75,11 @@ class Stepwise(Driver):
         return set(self._levels.values()) == {"full"}
 
     def compile_s(self) -> float:
+        """See `Driver`."""
         return self._compile_s + self._programs.late_s
 
     def begin(self) -> LMState:
+        """The state at the start."""
         began, setup = time.perf_counter(), self.setup
         with self._programs as compile_programs:
             self._iterate(compile_programs, self._begin(compile_programs, setup.initial(compile_programs)))
@@ -93,6 +93,7 @@ class Stepwise(Driver):
         return state
 
     def iterate(self) -> tuple[StepInfo, Termination]:
+        """One iteration: its record, of Python scalars, and whether it ended the solve."""
         if self._levels != (now := self._levels_now()):
             self._levels, began = now, time.perf_counter()
             with self._programs:
