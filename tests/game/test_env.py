@@ -23,7 +23,6 @@ from jaxba.game.protocol import Environment
 from jaxba.game.scene_bank import Bank
 from jaxba.problem.options import Refinement
 
-
 _jitted_reset = jax.jit(lambda game, key: game.reset(key))
 _jitted_step = jax.jit(lambda game, state, action: game.step(state, action))
 
