@@ -62,7 +62,7 @@ def _flags_of_level_quick() -> str:
     return " ".join(f"--{name}={str(value).lower()}" for name, value in ast.literal_eval(told).items())
 
 
-WHOLE_ROOMS = ("lm", "solver", "results", "runtime")
+WHOLE_ROOMS = ("lm", "linear")
 """Of these rooms `-m sample` has the first case of each test, of the others the first test of each file."""
 
 

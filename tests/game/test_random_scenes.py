@@ -51,7 +51,7 @@ def test_a_class_that_is_too_large_or_too_small_is_refused(sizes):
 
 @pytest.mark.parametrize("kind", [KIND, pytest.param(SceneClass(6, 10, "paper"), id="paper")])
 def test_the_cost_of_a_start_is_what_numpy_says(kind):
-    scenes = make_scenes(kind, jax.random.key(2), 12)
+    scenes = make_scenes(kind, jax.random.key(2), 40)
     found = np.asarray(initial_costs(kind, scenes))
     tried = 0
     for k in range(12):

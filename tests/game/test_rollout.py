@@ -47,6 +47,7 @@ def test_the_bank_is_large_enough_to_test_with():
     assert 12 <= len(tiny_bank().initial_cost) <= 110
 
 
+@pytest.mark.slow
 def test_a_scene_is_played_as_it_is_solved():
     bank, found = tiny_bank(), played()
     for k in (0, 5):
@@ -95,6 +96,7 @@ def test_a_scene_of_the_largest_class_is_played_as_it_is_solved():
         np.testing.assert_allclose(found.costs[k, 1 : count + 1], alone.history.cost[:count], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_scenes_of_a_class_share_random_clusters():
     bank, options = tiny_bank(), make_method("stba:2").options(StepOptions())
     labels = partition_of(class_layout(KIND, options)).label
@@ -208,6 +210,7 @@ def test_a_paired_ratio_is_the_geometric_mean_with_the_interval_of_its_standard_
     np.testing.assert_allclose(np.log([found.low, found.high]), noise.mean() + np.array([-half, half]), atol=0.2 * half)
 
 
+@pytest.mark.slow
 def test_the_best_constant_action_has_the_fewest_iterations():
     bank = tiny_bank()
     best = best_constant_action([KIND], [bank], AGENT, StepOptions(), 1e-3, LIMIT)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import numpy as np
+import pytest
 import support
 from tiny_game import KIND, problem_of
 
@@ -13,6 +14,7 @@ from jaxba.game.scene_bank import MIN_OBSERVATIONS, draw, info_of, initial_costs
 from jaxba.game.scene_layout import scene_problem
 
 
+@pytest.mark.slow
 def test_a_scene_has_the_cost_of_its_start_and_no_more_than_what_is_observed():
     scenes = make_scenes(KIND, jax.random.key(5), 64)
     costs = initial_costs(KIND, scenes)

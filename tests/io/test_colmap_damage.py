@@ -361,6 +361,7 @@ def test_a_principal_point_at_the_edge_is_mentioned_and_not_refused(tmp_path):
         read_colmap(folder, strict=True)
 
 
+@pytest.mark.slow
 def test_a_benchmark_goes_on_after_models_that_cannot_be_read(tmp_path, capsys):
     bad, odd, good = (TextModel().write(tmp_path / name) for name in ("bad", "odd", "good"))
     head_with(1, "nan")(bad)

@@ -34,6 +34,7 @@ def test_an_implicit_step_keeps_to_the_stated_bytes_per_observation(dtype, share
     assert 0.5 * share * BYTES_PER_OBSERVATION < used < share * BYTES_PER_OBSERVATION
 
 
+@pytest.mark.slow
 def test_memory_of_an_implicit_step_grows_with_the_observations_only():
     options = StepOptions(linear_solver="implicit")
     sizes = [

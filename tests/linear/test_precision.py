@@ -16,7 +16,7 @@ from jaxba.structure.segment_sums import total
 
 @pytest.mark.parametrize(
     ("linear_solver", "dtype", "gap"),
-    [("explicit", "mixed", 1e-6), ("implicit", "float32", 1e-4)],
+    [("explicit", "mixed", 1e-6), pytest.param("implicit", "float32", 1e-4, marks=pytest.mark.slow)],
 )
 def test_every_type_ends_at_the_cost_of_float64(linear_solver, dtype, gap):
     problem = random_scene(replace(scene_like("random-150"), cameras=12, points=300, observations=1300), 3)

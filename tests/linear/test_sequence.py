@@ -69,7 +69,9 @@ def test_the_sequence_is_factored_as_a_band_and_has_several_clusters():
 
 
 @pytest.mark.parametrize("damping", [DAMPING, 1.0])
-@pytest.mark.parametrize("name", OPTIONS)
+@pytest.mark.parametrize(
+    "name", ["explicit", "implicit", *(pytest.param(x, marks=pytest.mark.slow) for x in ("sparse", "schur-jacobi"))]
+)
 def test_every_solver_takes_the_dense_normal_equation_step(name, damping):
     before, after, info = taken(name, damping)
     expected = truth(damping)
@@ -87,6 +89,7 @@ def test_every_solver_takes_the_dense_normal_equation_step(name, damping):
     assert np.linalg.norm(found[size:] - expected.step[size:]) <= 1e-8 * np.linalg.norm(expected.step[size:])
 
 
+@pytest.mark.slow
 def test_two_levels_need_at_most_half_the_iterations_of_one():
     one_level = int(taken("schur-jacobi", DAMPING)[2].cg_iterations)
     for name in ("sparse", "implicit"):

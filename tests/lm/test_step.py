@@ -52,11 +52,18 @@ PROBLEMS = {
     "odd": support.odd,
     "single": support.single,
 }
+REPEATING = (
+    *("explicit-angle-axis-identity", "implicit-angle-axis-diagonal", "implicit-manifold-identity"),
+    *("explicit-cameras-damped-by-10", "implicit-cameras-damped-by-0.01", "sparse-cameras-damped-by-0.01"),
+    *("identity-cameras-damped-by-0.01", "soft_l1", "cauchy"),
+)
+"""What the other kinds have in other combinations."""
+
 CASES = [
-    *(pytest.param(support.tiny, options, id=f"tiny-{kind}") for kind, options in KINDS.items()),
-    *(pytest.param(support.tiny, options, id=f"tiny-{solver}") for solver, options in SOLVERS.items()),
-    *(pytest.param(support.tiny, options, id=f"tiny-{name}") for name, options in SHARES.items()),
-    *(pytest.param(support.tiny, options, id=f"tiny-{loss}") for loss, options in LOSSES.items()),
+    *(
+        pytest.param(support.tiny, options, id=f"tiny-{kind}", marks=pytest.mark.slow if kind in REPEATING else ())
+        for kind, options in {**KINDS, **SOLVERS, **SHARES, **LOSSES}.items()
+    ),
     *(pytest.param(make, EXACT, id=name) for name, make in PROBLEMS.items()),
     pytest.param(support.tiny, replace(EXACT, intrinsics="fixed"), id="tiny-fixed-intrinsics"),
     pytest.param(support.odd, TO_THE_END, id="odd-implicit"),

@@ -115,7 +115,7 @@ def test_the_split_reduced_system_is_block_diagonal():
     assert np.abs(reduced(problem)[apart]).max() > 1
 
 
-@pytest.mark.parametrize("damping", [1e-3, 1.0, 30.0])
+@pytest.mark.parametrize("damping", [1e-3, 30.0])
 def test_repairs_shrink_error_and_residual_by_the_spectral_radius_of_the_jacobi_iteration(damping):
     """In the norm of B the error, and in that of B^-1 the residual, falls by at least the spectral radius of
     `B^-1 (B - S)`, which is below one."""
@@ -190,7 +190,7 @@ def test_an_inexact_step_predicts_what_its_own_linear_model_says(options):
 # DeepLM, global
 
 
-@pytest.mark.parametrize("damping", [1e-2, 1.0, 100.0])
+@pytest.mark.parametrize("damping", [1e-2, 100.0])
 @pytest.mark.parametrize("make", [support.tiny, support.odd, support.whitened], ids=["tiny", "odd", "whitened"])
 def test_global_deeplm_run_to_convergence_is_the_exact_step(make, damping):
     check_step(make(), NORMAL, damping)
@@ -255,6 +255,7 @@ def test_every_method_names_a_rule_that_exists(method):
     make_policy(make_method(method).rule)
 
 
+@pytest.mark.slow
 @needs_data
 def test_random_clusters_are_one_program_for_all_turns():
     """Ladybug-49 in clusters of 16: iterations draw different clusters and compile nothing new."""

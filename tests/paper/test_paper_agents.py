@@ -58,6 +58,7 @@ def split() -> Split:
         return make_banks(made, jax.random.key(0), made.options, 40)[0]
 
 
+@pytest.mark.slow
 def test_held_out_scenes_are_not_training_scenes(split):
     train, held_out = (set(map(bytes, np.asarray(bank.scenes.pixels))) for bank in split)
     assert len(train) == len(split.train.initial_cost)
@@ -70,6 +71,7 @@ def test_a_tenth_is_held_out_or_two_hundred_scenes_but_no_more_than_a_third(usab
     assert held_out_count(usable) == held
 
 
+@pytest.mark.slow
 def test_scenes_are_neither_solved_at_the_start_nor_unsolvable(split):
     for bank in split:
         ratio = np.asarray(bank.initial_cost) / np.asarray(bank.best_cost)
@@ -78,6 +80,7 @@ def test_scenes_are_neither_solved_at_the_start_nor_unsolvable(split):
         assert (np.asarray(bank.ceres_iterations) <= EASY_ENOUGH).all()  # the portfolio has only this rule
 
 
+@pytest.mark.slow
 def test_the_scenes_of_the_tables_are_not_used_in_training(split, monkeypatch, tmp_path):
     monkeypatch.setattr(agents, "_shared_scenes", lambda *_: split)
     train_on, test = agents.scenes(CONFIG, tmp_path, lambda _: None)

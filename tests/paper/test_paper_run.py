@@ -104,6 +104,7 @@ def test_one_table_in_an_empty_folder(finished):
     assert "Ladybug: DeepLM + ours over DeepLM" in claims
 
 
+@pytest.mark.slow
 def test_a_second_call_computes_nothing(finished, settings, capsys):
     before = (finished / PLAYS).read_bytes()
     assert run(command(settings, finished)) == 0

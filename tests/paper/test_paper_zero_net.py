@@ -53,6 +53,7 @@ def next_cost(episode, action: float) -> float:
     return float(jnp.log10(step.candidate_cost / step.previous_cost))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [0, 3, 7])
 @pytest.mark.parametrize("action", [-0.4, 0.1, 0.7])
 def test_the_derivative_of_the_next_cost_is_that_by_finite_differences(scene, action):
@@ -66,6 +67,7 @@ def test_the_derivative_of_the_next_cost_is_that_by_finite_differences(scene, ac
     assert float(step.damping) == pytest.approx(10 ** (-2 + 4 * action))
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_weight_follows_the_chain_rule():
     net = zero_net.initial_network(SMALL, AGENT, jax.random.key(0))
     episode = start(2)

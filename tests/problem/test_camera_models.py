@@ -47,7 +47,14 @@ def scene(*names: str, noise: float = 0.3, shared: bool = True) -> BundleProblem
     return problem.replace(observations=pixels + noise * rng.normal(size=pixels.shape))
 
 
-@pytest.mark.parametrize("names", [*((name,) for name in CAMERA_MODELS), MIXED], ids="+".join)
+COMMON = ("SIMPLE_RADIAL", "PINHOLE", "FULL_OPENCV", "OPENCV_FISHEYE", "FOV", "THIN_PRISM_FISHEYE")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [*(pytest.param((name,), marks=() if name in COMMON else pytest.mark.slow) for name in CAMERA_MODELS), MIXED],
+    ids="+".join,
+)
 def test_residuals_and_derivatives_are_those_of_the_host_and_of_differences(names):
     problem = scene(*names, shared=False)
     layout, state = support.start(problem, StepOptions(linear_solver="implicit"))

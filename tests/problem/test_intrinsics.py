@@ -247,6 +247,7 @@ def test_conjugate_gradients_find_the_step_of_the_dense_problem_with_shared_lens
     np.testing.assert_allclose(found[seen], wanted[seen], rtol=0, atol=1e-7 * np.abs(wanted).max())
 
 
+@pytest.mark.slow
 def test_clusters_are_split_by_shared_lenses_whose_columns_they_have_in_common():
     scene = random_scene(SceneConfig(cameras=64, points=300, mean_track=5.0), seed=0)
     problem = with_lenses(scene, np.arange(64) % 2, np.ones((2, 3), bool))

@@ -132,10 +132,14 @@ def unknown_step(problem: BundleProblem, names: dict, before, after) -> np.ndarr
     return np.array(found)
 
 
-@pytest.mark.parametrize("solver", ["explicit", "sparse", "implicit"])
-@pytest.mark.parametrize("make", [rigged, lambda: rigged(shared=False), stereo], ids=["shared", "own", "free"])
-def test_a_step_is_that_of_the_dense_problem_of_frames(solver, make):
-    problem = make()
+RIGGED = {"shared": rigged, "own": lambda: rigged(shared=False), "free": stereo}
+QUICK = [("shared", "explicit"), ("shared", "implicit"), ("own", "sparse"), ("free", "explicit"), ("free", "sparse")]
+REST = [("own", "explicit"), ("own", "implicit"), ("shared", "sparse"), ("free", "implicit")]
+
+
+@pytest.mark.parametrize(("make", "solver"), [*QUICK, *(pytest.param(*case, marks=pytest.mark.slow) for case in REST)])
+def test_a_step_is_that_of_the_dense_problem_of_frames(make, solver):
+    problem = RIGGED[make]()
     options = StepOptions(linear_solver=solver, conjugate_gradients=EXACT, coordinates=MANIFOLD)
     layout, before = support.start(problem, options)
     after, _ = support.step(layout, before, 1e-2, options, min_gain=-np.inf)
@@ -149,7 +153,7 @@ def test_a_step_is_that_of_the_dense_problem_of_frames(solver, make):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-7 * np.abs(wanted).max())
 
 
-@pytest.mark.parametrize("policy", ["ceres", "guarded"])
+@pytest.mark.parametrize("policy", [pytest.param("ceres", marks=pytest.mark.slow), "guarded"])
 def test_where_a_camera_is_in_its_rig_is_found(policy):
     problem = stereo()
     found = solve(problem, policy).problem

@@ -167,6 +167,7 @@ def test_from_both_starts_a_point_ends_at_the_cheaper_end_and_from_one_at_that_o
     same(both, np.where(second, apart[1], apart[0]))
 
 
+@pytest.mark.slow
 def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
     """Cameras that hardly move: the candidate is what points alone find from where they are."""
     home, points = wrong(2, 3.0)
@@ -184,6 +185,7 @@ def test_a_step_that_promises_little_starts_points_from_both(monkeypatch):
     assert costs[True] < costs[False] * (1 - 3e-5)
 
 
+@pytest.mark.slow
 def test_only_the_whole_step_asks_for_the_rays():
     """Points far away: they start from their rays where the step is whole, not where it is tried again shorter."""
     start = strayed(1e4)
@@ -199,6 +201,7 @@ def test_only_the_whole_step_asks_for_the_rays():
     assert costs[1] < 0.1 * costs[2]
 
 
+@pytest.mark.slow
 def test_points_that_lie_far_away_come_back_in_four_iterations_where_their_rays_are_asked():
     start, best = strayed(30.0), geometry.cost(solved())
     step = StepOptions(refinement=Refinement(points=3))

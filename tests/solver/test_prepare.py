@@ -23,6 +23,7 @@ def check_same(found: jaxba.BundleProblem, solution: jaxba.Solution) -> None:
     np.testing.assert_allclose(found.points, solution.problem.points, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_loop_of_steps_written_by_hand_is_the_solve():
     """With the rule of `Classic`: lambda is halved after a step with a good gain, doubled after any other."""
     rule = jaxba.Classic(initial=0.01)
@@ -51,6 +52,7 @@ def test_the_compiled_loop_is_the_solve(policy):
     check_same(prepared.problem_at(carry.state), solution)
 
 
+@pytest.mark.slow
 def test_two_problems_of_equal_shape_are_solved_at_once():
     problems = [support.paper(seed) for seed in (0, 1)]
     prepared = [prepare(problem, "ceres", OPTIONS) for problem in problems]

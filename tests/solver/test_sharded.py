@@ -71,7 +71,7 @@ def compare(problem: BundleProblem, policy: str, rtol: float = 1e-10, **options)
     [
         pytest.param("explicit", "ceres+embedded", marks=pytest.mark.slow),
         ("sparse", "ceres"),
-        ("implicit", "ceres+refine1"),
+        pytest.param("implicit", "ceres+refine1", marks=pytest.mark.slow),
         pytest.param("cg", "ceres", marks=pytest.mark.slow),
     ],
 )
@@ -102,6 +102,7 @@ def test_lenses_constants_and_priors_are_divided_too(linear_solver):
     assert support.same_bits(found.cameras[[0, 1, 5], 6:], np.tile(found.cameras[0, 6:], (3, 1)))
 
 
+@pytest.mark.slow
 def test_a_callback_sees_the_same_iterations_and_stops():
     problem, records = sequence(), []
     options = SolveOptions(linear_solver="implicit", devices=DEVICES, max_iterations=6)
@@ -137,7 +138,11 @@ def test_every_observation_is_on_one_device_and_each_has_its_share():
 
 @pytest.mark.parametrize(
     ("linear_solver", "policy", "stated"),
-    [("explicit", "ceres", 9), ("implicit", "ceres", 11), ("explicit", "guarded", 15)],
+    [
+        ("explicit", "ceres", 9),
+        pytest.param("implicit", "ceres", 11, marks=pytest.mark.slow),
+        pytest.param("explicit", "guarded", 15, marks=pytest.mark.slow),
+    ],
 )
 def test_an_iteration_has_the_stated_number_of_sums_over_devices(linear_solver, policy, stated):
     setup = set_up(sequence(), policy, SolveOptions(linear_solver=linear_solver, devices=DEVICES))
@@ -190,6 +195,7 @@ def run_two(file, output) -> tuple[list[int], list[str]]:
     return [process.returncode for process in started], printed
 
 
+@pytest.mark.slow
 def test_two_processes_solve_as_one_and_end_together(tmp_path):
     file = tmp_path / "scene.txt"
     jaxba.write_problem(sequence(), file)
@@ -204,6 +210,7 @@ def test_two_processes_solve_as_one_and_end_together(tmp_path):
     np.testing.assert_allclose(geometry.cost(jaxba.read_problem(tmp_path / "out.txt")), one, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_ends_the_other_with_one_line(tmp_path):
     file = tmp_path / "scene.txt"
     jaxba.write_problem(sequence(), file)

@@ -68,6 +68,7 @@ def test_the_compiled_loop_and_the_stepwise_one_are_the_same_solve(policy):
     assert all(np.ndim(value) == 0 and not isinstance(value, jax.Array) for value in records[0].step)
 
 
+@pytest.mark.slow
 def test_a_batch_of_solves_equals_a_loop_of_solves():
     """Scenes end after different numbers of iterations; those that are done must rest while the others go on."""
     options, tolerances = StepOptions(), Tolerances()

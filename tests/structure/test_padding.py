@@ -312,6 +312,7 @@ def check_same(padded, plain, rtol: float = 1e-9) -> None:
     np.testing.assert_allclose(padded.problem.points, plain.problem.points, rtol=1e-5, atol=1e-6)
 
 
+SLOW_KINDS = ("tiny", "loss", "fixed intrinsics")
 KINDS = {
     "tiny": (support.tiny, StepOptions()),
     "dense product": (lambda: support.paper(0), StepOptions()),
@@ -321,7 +322,7 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", [pytest.param(x, marks=pytest.mark.slow if x in SLOW_KINDS else ()) for x in KINDS])
 def test_a_padded_solve_equals_the_one_of_the_given_sizes(kind):
     make, options = KINDS[kind]
     check_same(stepwise(make(), "ceres", options, pad=True), stepwise(make(), "ceres", options))

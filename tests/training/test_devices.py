@@ -73,6 +73,7 @@ def alone(tmp_path_factory) -> tuple[Path, Outcome]:
     return folder, run(folder, 1)
 
 
+@pytest.mark.slow
 def test_environments_on_two_devices_are_those_on_one(alone, tmp_path):
     outcome = run(tmp_path / "two", DEVICES)
     close(outcome.state, alone[1].state)
@@ -82,6 +83,7 @@ def test_environments_on_two_devices_are_those_on_one(alone, tmp_path):
     assert [x.data.shape for x in episodes.addressable_shards] == [(1, ENVS // 2)] * 2
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_on_another_number_of_devices_and_back(alone, tmp_path):
     folder, stop = tmp_path / "run", lambda: True
     assert not run(folder, DEVICES, stop=stop).finished
