@@ -214,7 +214,7 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
         if once.accepted:  # then nothing is tried again
             assert (info.repairs, info.step_fraction) == (0, 1)
             # another program, which rounds in another order, and this lambda divides rounding by 1e-8
-            chex.assert_trees_all_close(after, same, rtol=1e-6, atol=1e-6)
+            chex.assert_trees_all_close(after, same, rtol=1e-9, atol=1e-9)
             continue
         chex.assert_trees_all_equal(same, before, strict=True)
         if not info.accepted:
@@ -232,10 +232,10 @@ def test_a_refused_step_is_taken_at_a_quarter_or_less_of_its_length():
             cameras, points = before.cameras + share * whole.cameras, before.points + share * whole.points
             costs.append(float(_cost(layout, cameras, points, PLAIN.loss)))
         assert not min(costs[:-1]) < before.cost  # no longer share would have done
-        np.testing.assert_allclose(after.cameras, cameras, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(after.points, points, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(info.predicted, whole.predicted(jnp.asarray(share)), rtol=1e-6)
-        np.testing.assert_allclose(info.cost, costs[-1], rtol=1e-6)
+        np.testing.assert_allclose(after.cameras, cameras, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(after.points, points, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(info.predicted, whole.predicted(jnp.asarray(share)), rtol=1e-10)
+        np.testing.assert_allclose(info.cost, costs[-1], rtol=1e-10)
         assert after.cost < before.cost
     assert saved >= 3
 
@@ -291,14 +291,14 @@ def test_camera_rounds_never_make_a_candidate_worse_and_mend_some():
         plain = step(layout, before, BOLD, PLAIN)[1]
         mended = step(layout, before, BOLD, rounds)[1]
         # two programs under a lambda that divides rounding by 1e-8, though not in directions that cost much
-        np.testing.assert_allclose(mended.predicted, plain.predicted, rtol=1e-8)
-        assert not mended.candidate_cost > plain.candidate_cost * (1 + 1e-6)
+        np.testing.assert_allclose(mended.predicted, plain.predicted, rtol=1e-10)
+        assert not mended.candidate_cost > plain.candidate_cost * (1 + 1e-10)
         better += bool(mended.candidate_cost < 0.9 * plain.candidate_cost)
         if plain.gain_ratio > GOOD_GAIN or plain.candidate_cost > MAX_COST_RATIO * before.cost:
             trusted += 1  # the model was right, or it is past mending
             assert mended.repairs == 0
         if mended.repairs == 0:  # rounds, and nothing else, make a candidate better or worse here
-            np.testing.assert_allclose(mended.candidate_cost, plain.candidate_cost, rtol=1e-6)
+            np.testing.assert_allclose(mended.candidate_cost, plain.candidate_cost, rtol=1e-10)
         assert 0 <= mended.repairs <= 3
     assert better >= 1
     assert trusted >= 5
@@ -342,7 +342,7 @@ def test_a_round_mends_a_shortened_candidate_and_makes_none_worse():
         assert shortened <= full.repairs <= 3 + shortened * (1 + ROUNDS_OF_LATER_CANDIDATES)
         assert full.step_fraction >= bare.step_fraction  # what a round brings in need not be shortened further
         if full.step_fraction == bare.step_fraction:
-            assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-6)  # two programs, as above
+            assert not full.candidate_cost > bare.candidate_cost * (1 + 1e-10)  # two programs, as above
         lower = full.candidate_cost < 0.999 * bare.candidate_cost
         better += bool(full.step_fraction < 1 and (full.step_fraction > bare.step_fraction or lower))
     assert better >= 1
