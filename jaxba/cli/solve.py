@@ -310,7 +310,7 @@ def _solve(args: Arguments) -> int:
         path, problem = together(lambda: _checked(args))
     else:
         path, problem = _checked(args)
-    common.prepare_process(untraced=not _is_divided(args))
+    common.prepare_process()
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))
