@@ -7,9 +7,9 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -24,9 +24,10 @@ from jaxba.io.frames import poses_of, read_sidecar, truth_of, write_sidecar
 from jaxba.io.notes import note, note_center
 from jaxba.io.poses import read_poses
 from jaxba.kitti import evaluate
-from jaxba.kitti.assemble import Assembled, sidecar_contents, windows
-from jaxba.kitti.options import BuildOptions, Features
-from jaxba.kitti.sequence import files_of, read_sequence
+from jaxba.kitti.assemble import Assembled, windows
+from jaxba.kitti.calibration import calibration_files
+from jaxba.kitti.options import Build
+from jaxba.kitti.sequence import read_sequence
 from jaxba.kitti.trajectory import path_length
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
@@ -35,13 +36,12 @@ from jaxba.runtime.atomic import write_text
 EVALUATE = "evaluate"
 """First argument of the subcommand; a folder of this name can be given as ./evaluate."""
 
-DEFAULTS = BuildOptions()
-"""Defaults of the options of the same names."""
+options(Build)
 
 
 @options
-class Arguments:
-    """Options of `jaxba-kitti`."""
+class Files:
+    """What is read and written."""
 
     sequence: Annotated[str, "SEQUENCE", tyro.conf.Positional]
     """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
@@ -53,49 +53,9 @@ class Arguments:
     frames: Annotated[str, "A:B:STEP"] = ":"
     """Range of frame numbers, without the end, such as 0:200."""
 
-    features: Features = DEFAULTS.features
-    """sift, orb: match key-points. klt: track corners from frame to frame."""
-
-    keypoints: int = DEFAULTS.keypoints
-    """Key-points per frame at most."""
-
-    reach: int = DEFAULTS.reach
-    """Previous frames with which each frame is matched."""
-
-    min_matches: int = DEFAULTS.min_matches
-    """Verified matches between two frames at least."""
-
-    keyframes: Annotated[str, "RULE"] = "auto"
-    """auto: by parallax and the fraction of tracks left. all: every frame. N: every N-th frame."""
-
-    start: Literal["vo", "poses", "noisy-poses"] = "vo"
-    """vo: start from monocular visual odometry. poses: from --poses. noisy-poses: from --poses with accumulating
-    errors."""
-
     poses: Annotated[str | None, "FILE"] = None
     """True poses, 12 numbers per line for every frame from 0, or 13, the first of them the frame. With --start vo only
     the error of the start is computed from them."""
-
-    rotation_sigma: float = DEFAULTS.rotation_sigma
-    """Error of noisy-poses: standard deviation per axis and key-frame, degrees."""
-
-    translation_sigma: float = DEFAULTS.translation_sigma
-    """The same per axis and key-frame, relative to the distance from the previous key-frame."""
-
-    min_angle: float = DEFAULTS.min_angle
-    """Smallest triangulation angle of a point, degrees."""
-
-    max_error: float = DEFAULTS.max_error
-    """Largest reprojection error of an observation before the noise of noisy-poses, pixels."""
-
-    min_views: int = DEFAULTS.min_views
-    """Key-frames that observe a point at least."""
-
-    window: int | None = None
-    """Write several problems of this many key-frames, named NAME-FIRST-LAST by their frames."""
-
-    stride: int | None = None
-    """Key-frames from the start of one window to the next. Default: half a window."""
 
     camera: int = 0
     """Number of the camera, from 0 (image_0 and P0) to 3."""
@@ -104,11 +64,16 @@ class Arguments:
     """Camera matrix: lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers. Default: that of
     the sequence."""
 
-    work: Annotated[str | None, "FOLDER"] = None
-    """Intermediate results, with which an interrupted run continues. Default: NAME.work."""
+    window: int | None = None
+    """Write several problems of this many key-frames, named NAME-FIRST-LAST by their frames."""
 
-    seed: int = DEFAULTS.seed
-    """Seed of all random numbers."""
+    stride: int | None = None
+    """Key-frames from the start of one window to the next. Default: half a window."""
+
+
+@options
+class Arguments(Build, Files):
+    """Options of `jaxba-kitti`."""
 
 
 @options
@@ -137,7 +102,7 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 for success, 2 for bad input, 130 after Ctrl-C (a new run continues)."""
+    """Runs the command. Exit status: 0 for success, 2 for bad input, 130 after Ctrl-C."""
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv[:1] == [EVALUATE]:
         text = "Computes trajectory errors and draws the scene from above."
@@ -168,31 +133,19 @@ def _check(args: Arguments) -> None:
 
 def _build(args: Arguments) -> int:
     _check(args)
-    from jaxba.kitti.build import build
+    from jaxba.kitti.frontend import build
 
-    with common.notes_printed():
-        sequence, poses = _inputs(args)
-    _check_apart([args.out], sequence, args)
-    options = BuildOptions(**{field.name: getattr(args, field.name) for field in fields(BuildOptions)})
     console = common.console()
-    work = Path(args.work or Path(strip_compression(args.out)).with_suffix(".work"))
-    try:
-        with _progress(console) as report:
-            built = build(sequence, options, work, poses, report)
-        parts = _parts(built, args)
-        _check_apart([path for _, path in parts], sequence, args)
-        for part, path in parts:
-            _write(part, path, sequence, args)
-    except KeyboardInterrupt:
-        console.print("interrupted; what is done is kept, run the same command again to continue")
-        return common.INTERRUPTED
-    console.print(_build_table([part for part, _ in parts], built, poses))
-    for words, numbers in (
-        ("left out, too few matches", built.dropped),
-        ("placed relative to the key-frame beside, without enough known points", built.restarts),
-    ):
-        if numbers:
-            console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")
+    with common.notes_printed(), _progress(console) as report:
+        sequence, poses = _inputs(args)
+        _check_apart([args.out], sequence, args)
+        whole, tracks = build(sequence, args, poses, report)
+    parts = _parts(whole, args)
+    _check_apart([path for _, path in parts], sequence, args)
+    for part, path in parts:
+        _write(part, path, sequence, args)
+    title = f"{len(sequence)} frames, {len(whole.frames)} key-frames, {tracks} tracks"
+    console.print(_build_table(title, [part for part, _ in parts], poses))
     console.print(f"wrote {', '.join(path for _, path in parts)}")
     return 0
 
@@ -200,7 +153,8 @@ def _build(args: Arguments) -> int:
 def _check_apart(problems: Sequence[str], sequence: Any, args: Arguments) -> None:
     """Refuses a problem, or the frames beside one, in the place of a file of the sequence."""
     written = {"--out": [*problems, *map(sidecar_path, problems)]}
-    own = [*sequence.images, *files_of(args.sequence, sequence.folder)]
+    folder = Path(args.sequence)
+    own = [*sequence.images, *calibration_files(folder), folder / "times.txt"]
     read = {"the file of --poses": [args.poses], "the file of --calibration": [args.calibration]}
     check_apart(written, {"a file of the sequence": own, **read})
 
@@ -224,14 +178,14 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
     return sequence, poses
 
 
-def _parts(built: Any, args: Arguments) -> list[tuple[Assembled, str]]:
+def _parts(whole: Assembled, args: Arguments) -> list[tuple[Assembled, str]]:
     """The problems to write, and their files."""
     if args.window is None:
-        return [(built.whole, args.out)]
+        return [(whole, args.out)]
     stride = max(args.window // 2, 1) if args.stride is None else args.stride
     plain = strip_compression(args.out)
     stem, ending = Path(plain).with_suffix(""), Path(plain).suffix + args.out[len(plain) :]
-    parts = windows(built.whole, args.window, stride, args.min_views)
+    parts = windows(whole, args.window, stride, args.min_views)
     return [(part, f"{stem}-{part.frames[0]:06d}-{part.frames[-1]:06d}{ending}") for part in parts]
 
 
@@ -240,20 +194,18 @@ def _write(part: Assembled, path: str, sequence: Any, args: Arguments) -> None:
     from jaxba import __version__
     from jaxba.kitti.opencv import cv2
 
-    times = None if sequence.times is None else dict(zip(sequence.numbers, sequence.times.tolist(), strict=True))
-    metadata = sidecar_contents(
-        part,
-        sequence.calibration,
-        times=times and [times[number] for number in part.frames],
-        options=asdict(args),
-        versions={"jaxba": __version__, "opencv": cv2.__version__},
-    )
+    metadata = {
+        "format": 1,
+        "frames": list(part.frames),
+        "calibration": asdict(sequence.calibration),
+        "options": asdict(args),
+        "versions": {"jaxba": __version__, "opencv": cv2.__version__},
+    }
     write_sidecar(path, metadata)
     write_problem(part.problem, path)
 
 
-def _build_table(parts: list[Assembled], built: Any, poses: Any) -> Any:
-    title = f"{built.frames} frames, {len(built.whole.frames)} key-frames, {built.tracks} tracks"
+def _build_table(title: str, parts: list[Assembled], poses: Any) -> Any:
     table = _table(title, "frames", "key-frames", "points", "observations", "mean error (px)", "ATE of the start (m)")
     for part in parts:
         problem = part.problem

@@ -1,14 +1,15 @@
-"""Views and tracks as a bundle adjustment problem in BAL's convention, and back."""
+"""Views and tracks as a bundle adjustment problem in BAL's convention."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jaxba.io.frames import Calibration
+from jaxba.kitti.options import Build
 from jaxba.kitti.tracks import Tracks
-from jaxba.kitti.triangulate import Filters, Observations, Views, triangulate_robustly
+from jaxba.kitti.triangulate import Observations, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 
@@ -33,8 +34,7 @@ def assemble(
     views: Views,
     calibration: Calibration,
     frames: tuple[int, ...],
-    filters: Filters,
-    min_views: int,
+    options: Build,
     start: Views | None = None,
 ) -> Assembled:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
@@ -47,8 +47,7 @@ def assemble(
         views: world to camera, looking down +z.
         calibration: of all views.
         frames: frame number of each view.
-        filters: for points.
-        min_views: observations that a point needs.
+        options: limits for points.
         start: initial poses of the cameras of the problem, if not `views`, from which the points are then still
             triangulated and filtered. Every point moves with the first camera that sees it, as in odometry.
 
@@ -57,7 +56,8 @@ def assemble(
     """
     rays = calibration.rays(tracks.pixels)
     observations = Observations(tracks.image, tracks.track, rays)
-    points, keep = triangulate_robustly(views, observations, filters, calibration.fx, min_views)
+    error = options.max_error / calibration.fx
+    points, keep = triangulate_robustly(views, observations, options.min_angle, error, options.min_views)
     seen = np.bincount(tracks.image[keep], minlength=len(frames))
     if seen.min() < MIN_OBSERVATIONS:
         bad = int(seen.argmin())
@@ -113,8 +113,3 @@ def _window(whole: Assembled, first: int, end: int, min_views: int) -> Assembled
         renumbered,
     )
     return replace(whole, problem=part, frames=whole.frames[first:end])
-
-
-def sidecar_contents(part: Assembled, calibration: Calibration, **extra: object) -> dict[str, object]:
-    """Contents of the sidecar file of a problem."""
-    return {"format": 1, "frames": list(part.frames), "calibration": asdict(calibration), **extra}

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.frames import Calibration
 from jaxba.kitti.opencv import cv2
 from jaxba.kitti.options import Features
 
@@ -37,14 +36,7 @@ class KeyPoints(NamedTuple):
     """Key-points of an image, the strongest first."""
 
     pixels: Float[np.ndarray, "n 2"]  # relative to the centre of the first pixel, x to the right, y down
-    descriptors: np.ndarray  # uint8, [n, 128] (SIFT) or [n, 32] (ORB, bits)
-
-
-class Verified(NamedTuple):
-    """Matches of two images that are consistent with one motion of the camera."""
-
-    first: Int[np.ndarray, " m"]  # key-points of the first image
-    second: Int[np.ndarray, " m"]
+    descriptors: np.ndarray  # float32 [n, 128] (SIFT) or uint8 [n, 32] (ORB, bits)
 
 
 def detect(image: np.ndarray, features: Features, count: int) -> KeyPoints:
@@ -55,59 +47,42 @@ def detect(image: np.ndarray, features: Features, count: int) -> KeyPoints:
         features: `sift` or `orb`.
         count: the strongest ones are kept.
     """
-    none = KeyPoints(np.empty((0, 2)), np.empty((0, 128 if features == "sift" else 32), np.uint8))
+    found, descriptors = (), None
     if features == "sift":
         detector = cv2.SIFT.create(nfeatures=count, contrastThreshold=SIFT_CONTRAST)
-    elif min(image.shape) <= 2 * ORB_BORDER:
-        return none
-    else:
+        found, descriptors = detector.detectAndCompute(image, None)
+    elif min(image.shape) > 2 * ORB_BORDER:
         detector = cv2.ORB.create(nfeatures=count, fastThreshold=ORB_FAST, edgeThreshold=ORB_BORDER)
-    found, descriptors = detector.detectAndCompute(image, None)
-    if descriptors is None or not found:
-        return none
+        found, descriptors = detector.detectAndCompute(image, None)
+    if not found:
+        return KeyPoints(np.empty((0, 2)), np.empty((0, 32), np.uint8))
     pixels = np.array([key.pt for key in found], np.float64)
     response = np.array([key.response for key in found])
     order = np.lexsort((pixels[:, 1], pixels[:, 0], -response))  # the order of detectors may depend on threads
     _, unique = np.unique(pixels[order], axis=0, return_index=True)  # SIFT repeats a key-point for every orientation
     keep = order[np.sort(unique)][:count]
-    return KeyPoints(pixels[keep], np.asarray(descriptors)[keep].astype(np.uint8))
+    return KeyPoints(pixels[keep], np.asarray(descriptors)[keep])
 
 
 def match(first: KeyPoints, second: KeyPoints) -> Int[np.ndarray, "m 2"]:
-    """Mutual nearest neighbours that pass the ratio test in both directions.
+    """Mutual nearest neighbours that pass the ratio test in both directions, sorted.
 
-    Distances are Euclidean (SIFT, 128 numbers) or Hamming (ORB, 256 bits). All numbers are integers below 2^24, so
-    float32 is exact and the order of summation does not matter.
+    Distances are Euclidean (SIFT, 128 integers) or Hamming (ORB, 256 bits): exact in float32.
     """
-    if len(first.pixels) < 2 or len(second.pixels) < 2:
+    if min(len(first.pixels), len(second.pixels)) < 2:
         return np.empty((0, 2), np.int64)
-    a, b = _vectors(first.descriptors), _vectors(second.descriptors)
+    binary = first.descriptors.shape[1] == 32  # the squared distance of bits is the Hamming distance
+    a, b = ((np.unpackbits(x, axis=1) if binary else x).astype(np.float32) for x in (first[1], second[1]))
     squared = np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T), 0)
-    binary = first.descriptors.shape[1] == 32  # squared distance of bits is already the Hamming distance
-    limit = RATIO if binary else RATIO**2
-    forward, backward = squared.argmin(axis=1), squared.argmin(axis=0)
-    rows = np.flatnonzero(backward[forward] == np.arange(len(a)))
-    columns = forward[rows]
-    best = squared[rows, columns]
-    clear = np.ones(len(rows), bool)
-    for table, own in ((squared[rows], columns), (squared.T[columns], rows)):
-        others = table.copy()
-        others[np.arange(len(rows)), own] = np.inf
-        clear &= best < limit * others.min(axis=1)
-    return np.stack([rows[clear], columns[clear]], axis=1)
+    there, back = (_nearest(table, RATIO if binary else RATIO**2) for table in (squared, squared.T))
+    rows = np.flatnonzero((there >= 0) & (back[there] == np.arange(len(a))))
+    return np.stack([rows, there[rows]], axis=1)
 
 
-def epipolar_inliers(
-    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], calibration: Calibration, seed: int
-) -> np.ndarray:
-    """Which matched pixels are consistent with one essential matrix, shape (m,), by RANSAC.
-
-    Distances are measured in rays, in which both axes have the same scale.
-    """
-    if len(first) < MIN_ESSENTIAL:
-        return np.zeros(len(first), bool)
-    _, inliers = essential(calibration.rays(first), calibration.rays(second), EPIPOLAR_PIXELS / calibration.fx, seed)
-    return inliers
+def _nearest(distances: np.ndarray, ratio: float) -> np.ndarray:
+    """The column of the least entry of each row; -1 if the second least is about as small."""
+    two = np.partition(distances, 1, axis=1)
+    return np.where(two[:, 0] < ratio * two[:, 1], distances.argmin(axis=1), -1)
 
 
 def essential(
@@ -123,16 +98,12 @@ def essential(
 
     Source: Nister 2004, "An efficient solution to the five-point relative pose problem"; OpenCV's findEssentialMat.
     """
+    if len(first) < MIN_ESSENTIAL:
+        return None, np.zeros(len(first), bool)
     cv2.setRNGSeed(seed)
     matrix, mask = cv2.findEssentialMat(
-        np.ascontiguousarray(first), np.ascontiguousarray(second), np.eye(3), cv2.RANSAC, CONFIDENCE, threshold
+        np.ascontiguousarray(first), np.ascontiguousarray(second), np.eye(3), cv2.USAC_ACCURATE, CONFIDENCE, threshold
     )
     if matrix is None or mask is None or matrix.shape[0] < 3:
         return None, np.zeros(len(first), bool)
     return np.asarray(matrix)[:3], np.asarray(mask).ravel() > 0
-
-
-def _vectors(descriptors: np.ndarray) -> np.ndarray:
-    if descriptors.shape[1] == 32:
-        return np.unpackbits(descriptors, axis=1).astype(np.float32)
-    return descriptors.astype(np.float32)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-import os
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from jaxba.io.files import StrPath, display_name, reason
+from jaxba.io.files import display_name, reason
 from jaxba.kitti.sequence import Sequence
 from jaxba.problem.bundle_problem import ProblemError
 
@@ -100,9 +99,3 @@ def _is_complete_png(data: bytes) -> bool:
             return True
         at = end
     return False
-
-
-def stamp(path: StrPath) -> str:
-    """Key of an image file that changes with it: absolute path, size and modification time."""
-    status = os.stat(path)
-    return f"{os.path.abspath(path)} {status.st_size} {status.st_mtime_ns}"

@@ -16,8 +16,6 @@ from jaxba import BundleProblem, read_bal
 from jaxba.cli.kitti import run
 from jaxba.cli.solve import run as solve
 from jaxba.io import write_problem
-from jaxba.io.frames import Calibration
-from jaxba.kitti import frontend, klt
 from jaxba.kitti.features import KeyPoints, detect, essential, match
 from jaxba.kitti.images import image_reader
 from jaxba.kitti.sequence import read_sequence
@@ -129,44 +127,12 @@ def test_a_blank_image_has_no_key_points(features):
     assert len(match(found, found)) == 0
 
 
-def test_tracked_points_are_where_the_geometry_says(rendered):
-    """Corners of the first frame move as their plane demands."""
-    poses = kitti_scene.path(2)
-    first, second = (cv2.imread(str(image(rendered[SMALL], i)), 0) for i in (0, 1))
-    calibration = Calibration(SMALL.fx, SMALL.fy, SMALL.cx, SMALL.cy)
-    points = klt.detect_corners(first, 600)
-    after = klt.track(first, second, points, 600, calibration, 0)
-    old = int(after.old)
-    assert old > 100
-    assert (np.diff(after.tracks) > 0).all()
-    _, a, b = np.intersect1d(points.tracks, after.tracks, return_indices=True)
-    assert len(a) == old
-    rays = np.column_stack([calibration.rays(points.pixels[a]), np.ones(old)]) @ poses[0, :, :3].T
-    distance = np.full(old, np.inf)
-    for axis, position, _ in kitti_scene.PLANES:
-        with np.errstate(divide="ignore"):
-            along = (position - poses[0, axis, 3]) / rays[:, axis]
-        distance = np.where((along > 0) & (along < distance), along, distance)
-    local = (poses[0, :, 3] + rays * distance[:, None] - poses[1, :, 3]) @ poses[1, :, :3]
-    expected = (local[:, :2] / local[:, 2:]) * [SMALL.fx, SMALL.fy] + [SMALL.cx, SMALL.cy]
-    error = np.linalg.norm(after.pixels[b] - expected, axis=1)
-    assert np.median(error) < 0.15
-    assert np.mean(error < 1) > 0.95
-
-
-def test_new_corners_keep_their_distance(rendered):
-    first = cv2.imread(str(image(rendered[SMALL], 0)), 0)
-    pixels = klt.detect_corners(first, 600).pixels
-    gaps = np.linalg.norm(pixels[:, None] - pixels, axis=2) + 1e9 * np.eye(len(pixels))
-    assert gaps.min() >= klt.DISTANCE
-
-
 # The whole command
 
 
 @pytest.mark.parametrize(
     ("camera", "features", "limit"),
-    [(SMALL, "sift", 0.05), (OTHER, "sift", 0.05), (SMALL, "orb", 0.2), (OTHER, "klt", 0.05)],
+    [(SMALL, "sift", 0.05), (OTHER, "sift", 0.05), (SMALL, "orb", 0.2)],
 )
 def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera, features, limit):
     out = tmp_path / "problem.txt.bz2"
@@ -181,7 +147,7 @@ def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera,
     assert (geometry.depths(problem) > 0).all()
     assert np.abs(geometry.residuals(problem)).max() <= 3.0 + 1e-6
     assert np.bincount(problem.point_index).min() >= 2
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["problem.frames.json", "problem.txt.bz2", "problem.work"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["problem.frames.json", "problem.txt.bz2"]
 
 
 @pytest.mark.slow
@@ -238,64 +204,20 @@ def test_windows_are_problems_of_their_own(rendered, tmp_path):
         assert len(json.loads((tmp_path / name.replace("txt.gz", "frames.json")).read_text())["frames"]) == 6
 
 
-# Same command, same numbers
-
-
-@pytest.mark.parametrize("features", ["sift", "klt"])
-def test_a_killed_run_goes_on_and_gives_the_same_bytes(sequence, tmp_path, monkeypatch, capsys, features):
-    whole, broken = tmp_path / "a.txt", tmp_path / "b.txt"
-    options = ("--features", features, "--keypoints", "700")
-    assert build(sequence, whole, *options) == 0
-    calls, name = [], "_verify" if features == "sift" else "track"
-    original = getattr(frontend, name)
-
-    def killed(*arguments):
-        calls.append(1)
-        if len(calls) == 6:
-            raise KeyboardInterrupt
-        return original(*arguments)
-
-    monkeypatch.setattr(frontend, name, killed)
-    assert build(sequence, broken, *options) == 130
-    assert "run the same command again" in capsys.readouterr().out
-    assert not broken.exists()
-    stored = sorted((tmp_path / "b.work").iterdir())
-    stored[1].write_bytes(stored[1].read_bytes()[:100])  # cut short: made anew
-    assert not [path for path in stored if path.suffix != ".npz"]
-    monkeypatch.setattr(frontend, name, original)
-    before = len(calls)
-    assert build(sequence, broken, *options) == 0
-    assert len(calls) == before
-    assert broken.read_bytes() == whole.read_bytes()
-    assert sorted(p.name for p in (tmp_path / "a.work").iterdir()) == sorted(
-        p.name for p in (tmp_path / "b.work").iterdir()
-    )
-
-
-def test_a_changed_image_is_not_taken_from_the_cache(sequence, tmp_path):
-    out = tmp_path / "p.txt"
-    assert build(sequence, out) == 0
-    first = out.read_bytes()
-    shutil.copy(image(sequence, 6), image(sequence, 5))
-    assert build(sequence, out) == 0
-    assert out.read_bytes() != first
-
-
 # Sequences with trouble
 
 
 def test_a_black_frame_is_left_out(sequence, tmp_path, capsys):
-    for features in ("sift", "klt"):
-        cv2.imwrite(str(image(sequence, 5)), np.zeros((SMALL.height, SMALL.width), np.uint8))
-        out = tmp_path / f"{features}.txt"
-        assert build(sequence, out, "--features", features, "--keyframes", "all") == 0
-        printed = capsys.readouterr()
-        assert "note: left out, too few matches: frame 5\n" in printed.out
-        assert json.loads(out.with_suffix(".frames.json").read_text())["frames"] == [*range(5), *range(6, FRAMES)]
-        assert start_error(printed.out) < 0.1
+    cv2.imwrite(str(image(sequence, 5)), np.zeros((SMALL.height, SMALL.width), np.uint8))
+    out = tmp_path / "p.txt"
+    assert build(sequence, out, "--keyframes", "all") == 0
+    printed = capsys.readouterr()
+    assert "note: left out, too few matches: frame 5\n" in printed.out
+    assert json.loads(out.with_suffix(".frames.json").read_text())["frames"] == [*range(5), *range(6, FRAMES)]
+    assert start_error(printed.out) < 0.1
 
 
-@pytest.mark.parametrize("features", ["sift", "orb", "klt"])
+@pytest.mark.parametrize("features", ["sift", "orb"])
 def test_a_long_gap_is_an_error_that_names_the_frames(sequence, tmp_path, capsys, features):
     for number in (6, 7, 8):
         cv2.imwrite(str(image(sequence, number)), np.zeros((SMALL.height, SMALL.width), np.uint8))
@@ -337,15 +259,14 @@ def test_a_camera_that_only_turns_is_refused(sequence, tmp_path, capsys, choice)
     assert message.count("\n") == 1
 
 
-@pytest.mark.parametrize("features", ["sift", "klt"])
-def test_frames_left_out_at_the_end_are_named(sequence, tmp_path, capsys, features):
+def test_frames_left_out_at_the_end_are_named(sequence, tmp_path, capsys):
     for number in (FRAMES - 2, FRAMES - 1):
         cv2.imwrite(str(image(sequence, number)), np.zeros((SMALL.height, SMALL.width), np.uint8))
-    assert build(sequence, tmp_path / "p.txt", "--features", features) == 0
+    assert build(sequence, tmp_path / "p.txt") == 0
     assert "note: left out, too few matches: frames 12, 13\n" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("features", ["sift", "orb", "klt"])
+@pytest.mark.parametrize("features", ["sift", "orb"])
 def test_images_of_one_pixel_are_an_error_in_one_line(sequence, tmp_path, capsys, features):
     for number in range(FRAMES):
         cv2.imwrite(str(image(sequence, number)), np.full((1, 1), 100, np.uint8))
@@ -422,7 +343,7 @@ def test_what_makes_no_sense_is_said_in_one_line(rendered, tmp_path, monkeypatch
     assert words in message
     assert message.startswith("error: ")
     assert message.count("\n") == 1
-    assert not [p for p in tmp_path.iterdir() if p.suffix != ".work"]
+    assert not list(tmp_path.iterdir())
 
 
 def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, capsys):
@@ -471,13 +392,12 @@ def test_an_error_that_is_not_finite_is_said_in_one_line(rendered, tmp_path, cap
 
 
 @needs_data
-@pytest.mark.parametrize("features", ["sift", "klt"])
-def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys, features):
+def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys):
     """Frames 0 to 19 of sequence 00: 16 m of nearly straight road."""
     assert DATA is not None
     root = Path(DATA) / "kitti"
     out, poses = tmp_path / "kitti00.txt.bz2", str(root / "poses" / "00.txt")
-    options = ["--frames", "0:20", "--features", features, "--poses", poses, "--out", str(out)]
+    options = ["--frames", "0:20", "--poses", poses, "--out", str(out)]
     assert run([str(root / "seq00"), *options]) == 0
     assert start_error(capsys.readouterr().out) < 0.5
 
@@ -515,7 +435,7 @@ def test_the_orientation_that_a_photograph_asks_for_is_not_made(sequence):
 
 def test_hidden_files_change_nothing(rendered, sequence, tmp_path):
     (image(sequence, 0).parent / "._000000.png").write_bytes(b"\0\5\x16\7Mac OS X")
-    assert build(rendered[SMALL], tmp_path / "a.txt", "--work", str(tmp_path / "work")) == 0
+    assert build(rendered[SMALL], tmp_path / "a.txt") == 0
     assert build(sequence, tmp_path / "b.txt") == 0
     assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
 

@@ -11,14 +11,16 @@ from jaxba.io.frames import Calibration
 from jaxba.kitti import keyframes
 from jaxba.kitti.assemble import assemble, windows
 from jaxba.kitti.initial_poses import drift
-from jaxba.kitti.odometry import Odometry, visual_odometry
+from jaxba.kitti.odometry import visual_odometry
+from jaxba.kitti.options import Build
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
-from jaxba.kitti.triangulate import Filters, Observations, Views, triangulate, triangulate_robustly
+from jaxba.kitti.triangulate import Observations, Views, triangulate, triangulate_robustly
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 
 CALIBRATION = Calibration(700.0, 650.0, 600.0, 180.0)
-NEARLY_ALL = Filters(angle=1e-3)
+NEARLY_ALL = Build(min_angle=1e-3)
+PIXELS = 3 / CALIBRATION.fx
 
 
 def street(views: int = 6, points: int = 40, seed: int = 0) -> tuple[np.ndarray, Views, np.ndarray]:
@@ -86,7 +88,7 @@ def test_no_track_is_ever_twice_in_an_image():
     matches = {pair: np.stack([random.permutation(30)[:12], random.permutation(30)[:12]], axis=1) for pair in pairs}
     tracks = join_matches(places(*[30] * 8), matches)
     assert len(np.unique(tracks.track * 8 + tracks.image)) == len(tracks.track) > 0
-    assert tracks.lengths().min() >= 2
+    assert np.bincount(tracks.track).min() >= 2
     assert (np.diff(tracks.track * 8 + tracks.image) > 0).all()
 
 
@@ -171,9 +173,9 @@ def drive(steps: list[float], links: list[list[int]], direction: tuple[float, ..
     return make_tracks(*map(np.concatenate, (image, track, pixels)))
 
 
-def steps_of(found: Odometry) -> np.ndarray:
+def steps_of(views: Views) -> np.ndarray:
     """Lengths of the steps between views, the first one 1."""
-    lengths = np.linalg.norm(np.diff(found.views.centers(), axis=0), axis=1)
+    lengths = np.linalg.norm(np.diff(views.centers(), axis=0), axis=1)
     return lengths / lengths[0]
 
 
@@ -181,24 +183,24 @@ def test_the_few_known_points_that_two_views_share_give_the_length_of_the_step()
     """View 4 is 2.5 steps away from view 3 and knows 8 points of it, too few to be placed by them."""
     tracks = drive([1.0, 1.0, 1.0, 2.5], [[0, 1, 2, 3], [3, 4], [0, 1, 2, 3, 4]])
     tracks = tracks.keep((tracks.track < 160 + 8), 2)
-    found = visual_odometry(tracks, 5, CALIBRATION, Filters(), 0, tuple(range(5)))
-    assert found.restarts == (4,)
+    found, restarts = visual_odometry(tracks, 5, CALIBRATION, Build(), tuple(range(5)))
+    assert restarts == (4,)
     np.testing.assert_allclose(steps_of(found), [1, 1, 1, 2.5], rtol=0.03)
 
 
 def test_without_known_points_a_step_has_the_speed_of_the_steps_before():
     """View 4 is three frames after view 3 and shares no known point with it."""
     tracks = drive([1.0, 1.0, 1.0, 3.0], [[0, 1, 2, 3], [3, 4]])
-    found = visual_odometry(tracks, 5, CALIBRATION, Filters(), 0, (0, 1, 2, 3, 6))
-    assert found.restarts == (4,)
+    found, restarts = visual_odometry(tracks, 5, CALIBRATION, Build(), (0, 1, 2, 3, 6))
+    assert restarts == (4,)
     np.testing.assert_allclose(steps_of(found), [1, 1, 1, 3], rtol=0.03)
 
 
 def test_a_stop_without_known_points_leaves_the_scale():
     """Views 3 to 5 stand in one place and share new points only, as behind a lorry that passes."""
     tracks = drive([1.0, 1.0, 1.0, 0.0, 0.0, 1.0, 1.0], [[0, 1, 2, 3], [3, 4], [4, 5], [5, 6, 7]])
-    found = visual_odometry(tracks, 8, CALIBRATION, Filters(), 0, tuple(range(8)))
-    assert found.restarts[:3] == (4, 5, 6)
+    found, restarts = visual_odometry(tracks, 8, CALIBRATION, Build(), tuple(range(8)))
+    assert restarts[:3] == (4, 5, 6)
     np.testing.assert_allclose(steps_of(found), [1, 1, 1, 0, 0, 1, 1], rtol=0.05, atol=1e-9)
 
 
@@ -206,8 +208,8 @@ def test_a_stop_without_known_points_leaves_the_scale():
 def test_two_views_far_from_all_points_have_a_start(seed):
     """The median depth is 67 baselines: OpenCV takes points beyond 50 to be nowhere."""
     tracks = drive([0.3], [[0, 1], [0, 1], [0, 1]], (1.0, 0.0, 0.0), seed)
-    found = visual_odometry(tracks, 2, CALIBRATION, Filters(), 0, (0, 1))
-    np.testing.assert_allclose(found.views.centers()[1], [1, 0, 0], atol=0.2)
+    found, _ = visual_odometry(tracks, 2, CALIBRATION, Build(), (0, 1))
+    np.testing.assert_allclose(found.centers()[1], [1, 0, 0], atol=0.2)
 
 
 def test_wrong_matches_of_the_first_views_do_not_make_the_start():
@@ -219,7 +221,7 @@ def test_wrong_matches_of_the_first_views_do_not_make_the_start():
         np.concatenate([good.track, good.count + np.tile(np.arange(40), 2)]),
         np.concatenate([good.pixels, wrong]),
     )
-    found = visual_odometry(tracks, 6, CALIBRATION, Filters(), 0, tuple(range(6)))
+    found, _ = visual_odometry(tracks, 6, CALIBRATION, Build(), tuple(range(6)))
     np.testing.assert_allclose(steps_of(found), np.ones(5), rtol=0.05)
 
 
@@ -274,7 +276,7 @@ def test_filters_refuse_points_behind_far_and_wrong():
     wrong = np.flatnonzero((observations.track == 2) & (observations.camera == 3))
     rays[wrong] += 0.1
     spoiled = Observations(observations.camera, observations.track, rays)
-    good = triangulate(views, spoiled).good(spoiled.track, Filters(), focal)
+    good = triangulate(views, spoiled).good(spoiled.track, 1.0, 3.0 / focal)
     assert good.tolist() == [False, False, False, True]
 
 
@@ -284,9 +286,8 @@ def test_one_wrong_observation_costs_a_long_track_only_itself():
     rays = observations.rays.copy()
     wrong = np.flatnonzero((observations.track == 1) & (observations.camera == 7))
     rays[wrong] += 6 / 700
-    found, keep = triangulate_robustly(
-        views, Observations(observations.camera, observations.track, rays), Filters(), 700.0
-    )
+    spoiled = Observations(observations.camera, observations.track, rays)
+    found, keep = triangulate_robustly(views, spoiled, 1.0, PIXELS)
     assert np.flatnonzero(~keep).tolist() == wrong.tolist()
     np.testing.assert_allclose(found, points, rtol=1e-6)
 
@@ -294,7 +295,7 @@ def test_one_wrong_observation_costs_a_long_track_only_itself():
 def test_no_tracks_are_no_error():
     _, views, _ = street()
     empty = Observations(np.empty(0, int), np.empty(0, int), np.empty((0, 2)))
-    points, keep = triangulate_robustly(views, empty, Filters(), 700.0)
+    points, keep = triangulate_robustly(views, empty, 1.0, PIXELS)
     assert points.shape == (0, 3)
     assert keep.shape == (0,)
 
@@ -335,7 +336,7 @@ def test_the_problem_reprojects_exactly_through_bals_camera():
     """The camera of BAL looks down -z with y up; fy differs from fx."""
     _, views, points = street()
     observations = sight(views, points)
-    made = assemble(as_tracks(observations), views, CALIBRATION, (3, 4, 5, 6, 7, 9), NEARLY_ALL, 2)
+    made = assemble(as_tracks(observations), views, CALIBRATION, (3, 4, 5, 6, 7, 9), NEARLY_ALL)
     problem = made.problem
     assert made.frames == (3, 4, 5, 6, 7, 9)
     assert (problem.num_points, problem.num_observations) == (len(points), len(observations.track))
@@ -347,7 +348,7 @@ def test_the_problem_reprojects_exactly_through_bals_camera():
 
 def test_cameras_and_poses_are_the_same_thing():
     poses, views, points = street()
-    made = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(6)), NEARLY_ALL, 2)
+    made = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(6)), NEARLY_ALL)
     np.testing.assert_allclose(geometry.camera_poses(np.asarray(made.problem.cameras)), poses, atol=1e-9)
 
 
@@ -359,7 +360,7 @@ def test_points_drift_with_the_first_camera_that_sees_them():
     noisy = drift(poses, 0.3, 0.1, 5)
     inverse = noisy[:, :, :3].transpose(0, 2, 1)
     start = Views(inverse, -np.einsum("nij,nj->ni", inverse, noisy[:, :, 3]))
-    made = assemble(tracks, views, CALIBRATION, tuple(range(6)), NEARLY_ALL, 2, start).problem
+    made = assemble(tracks, views, CALIBRATION, tuple(range(6)), NEARLY_ALL, start).problem
     np.testing.assert_allclose(geometry.camera_poses(np.asarray(made.cameras)), noisy, atol=1e-9)
     error = np.linalg.norm(geometry.residuals(made), axis=1)
     first = np.where(np.asarray(made.point_index) % 2, 2, 0) == made.camera_index
@@ -372,12 +373,12 @@ def test_a_frame_without_points_is_named():
     tracks = as_tracks(sight(views, points))
     lonely = tracks.keep((tracks.image != 4) | (tracks.track < 9), 2)
     with pytest.raises(ProblemError, match="frame 40 sees 9 good ones, at least 10"):
-        assemble(lonely, views, CALIBRATION, (0, 10, 20, 30, 40, 50), NEARLY_ALL, 2)
+        assemble(lonely, views, CALIBRATION, (0, 10, 20, 30, 40, 50), NEARLY_ALL)
 
 
 def test_windows_cover_all_cameras_and_keep_residuals():
     _, views, points = street(views=9)
-    whole = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(0, 18, 2)), Filters(), 2)
+    whole = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(0, 18, 2)), Build())
     parts = windows(whole, 4, 3, 2)
     assert [part.frames for part in parts] == [(0, 2, 4, 6), (6, 8, 10, 12), (10, 12, 14, 16)]
     for part in parts:
