@@ -1,11 +1,11 @@
-"""How well XLA optimises programs on a CPU: fully, or less and in a third to half of the time.
+"""How well XLA optimises programs on a CPU: fully, or hardly and in a third to two thirds of the time.
 
 Compiling takes longer than most solves. A program compiled without LLVM's optimisation, and without XLA's newer kernel
-emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly; with
-LLVM's first level alone, in half of the time, it is nearly as fast as with all (`python -m benchmarks.compilation`). So
-a single solve starts with one of these, and compiles a better program only after as many iterations as would have paid
-for it from the start: as with skis that may be rented or bought, that costs at most about twice the better choice. The
-parts of a step are programs of their own, since they gain differently, and are compiled in parallel.
+emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly
+(`python -m benchmarks.compilation`). So a single solve starts with such programs, and compiles better ones only after
+as many iterations as would have paid for them from the start: as with skis that may be rented or bought, that costs at
+most about twice the better choice. The parts of a step are programs of their own, since they gain differently, and are
+compiled in parallel.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
+from typing import Any, Literal, TypeVar, cast, get_args
 
 import jax
 import jax.numpy as jnp
@@ -28,21 +28,16 @@ from jaxba.runtime.jit import Options, jit, known_options, right_options
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 Compilation = Literal["full", "quick", "auto"]
-"""`full`: all optimisation. `quick`: hardly any. `auto`: at first hardly any or medium, by the number of observations,
-and full after as many iterations as pay for it."""
+"""`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, and full after as many iterations as pay
+for it, by the number of observations."""
 
 COMPILATIONS: tuple[str, ...] = get_args(Compilation)
 
-Level = Literal["full", "medium", "quick"]
+Level = Literal["full", "quick"]
 """How much one program is optimised."""
 
-COMPILER_OPTIONS: dict[Level, Options] = {
-    "medium": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
-    "quick": {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
-}
-"""XLA's options of the levels below full, as far as a jaxlib knows them. With the newer emitters a lower level saves
-only half as much: on jaxlib 0.12, which has no others, quick takes two thirds of the time of full and medium all, so
-that medium is left out there."""
+QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+"""XLA's options of level quick, as far as a jaxlib knows them; from 0.12 on there are no older emitters."""
 
 OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
 """The option that switches XLA's newer kernel emitters off."""
@@ -55,56 +50,30 @@ COMPILE_EVENTS = "/jax/core/compile/"
 """Prefix of the durations that JAX reports while it traces, lowers and compiles."""
 
 
-class Stage(NamedTuple):
-    """A level, and how often a program is run at it before the next better one is compiled."""
-
-    level: Level
-    runs: int
-
-
-class BreakEven(NamedTuple):
-    """When a better program pays for its compilation, as `python -m benchmarks.compilation` measures it."""
-
-    typical: int
-    """Runs that a solve may well take: a level that would not last so long is left out. Of fifteen real problems nine
-    converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one to three repairs each."""
-
-    quick: int
-    """Observations times runs at level quick after which compiling at level medium has paid."""
-
-    medium: int
-    """The same from medium to full."""
-
-
-BREAK_EVEN: dict[Part, BreakEven] = {
-    "factorization": BreakEven(typical=5, quick=1_200_000, medium=5_000_000),
-    "iterative": BreakEven(typical=8, quick=1_000_000, medium=15_000_000),
-    "acceptance": BreakEven(typical=20, quick=3_000_000, medium=8_000_000),
-    "cameras": BreakEven(typical=20, quick=3_000_000, medium=8_000_000),
+BREAK_EVEN: dict[Part, int] = {
+    "factorization": 1_200_000,
+    "iterative": 1_000_000,
+    "acceptance": 3_000_000,
+    "cameras": 3_000_000,
 }
+"""Observations times runs after which a better program has paid for its compilation, as `benchmarks.compilation`
+measures it."""
+
+TYPICAL: dict[Part, int] = {"factorization": 5, "iterative": 8, "acceptance": 20, "cameras": 20}
+"""Runs that a solve may well take: quick programs that would not last so long are left out. Of fifteen real problems
+nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one to three repairs each."""
 
 
-def stages(part: Part, observations: int) -> tuple[Stage, ...]:
-    """Levels at which a part of a step is compiled, one after the other, before it is compiled fully."""
-    typical, *break_even = BREAK_EVEN[part]
-    levels: tuple[Level, ...] = ("quick", "medium") if uses_older_emitters("medium") else ("quick",)
-    found = [Stage(level, count // max(1, observations)) for level, count in zip(levels, break_even, strict=False)]
-    return tuple(stage for stage in found if stage.runs >= typical)
-
-
-def level_after(runs: int, before: tuple[Stage, ...]) -> Level:
-    """The level of a program that was run so often; `full` when all stages before are over."""
-    for level, count in before:
-        if runs < count:
-            return level
-        runs -= count
-    return "full"
+def quick_runs(part: Part, observations: int) -> int:
+    """How often a part of a step is run before it is compiled fully."""
+    runs = BREAK_EVEN[part] // max(1, observations)
+    return runs if runs >= TYPICAL[part] else 0
 
 
 @functools.cache
 def compiler_options(level: Level) -> Options:
     """Options of a level that this jaxlib knows; none for `full`, and on a GPU."""
-    return known_options(COMPILER_OPTIONS.get(level, {})) if jax.default_backend() == "cpu" else {}
+    return known_options(QUICK) if level == "quick" and jax.default_backend() == "cpu" else {}
 
 
 def uses_older_emitters(level: Level) -> bool:
