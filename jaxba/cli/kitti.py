@@ -214,7 +214,7 @@ def _build_table(title: str, parts: list[Assembled], poses: Any) -> Any:
         if poses is not None:
             try:
                 found = evaluate.score(geometry.camera_poses(problem.cameras), poses(part.frames))
-                ate = f"{found.absolute.rmse:.3f}"
+                ate = f"{found['ate_m']['rmse']:.3f}"
             except ProblemError:  # a straight line, or two cameras
                 ate = "undefined"
         numbers = (problem.num_cameras, problem.num_points, problem.num_observations, f"{error:.3f}", ate)
@@ -232,14 +232,15 @@ def _evaluate(args: EvaluateArguments) -> int:
     truth = None if args.poses is None else truth_of(side, args.poses)
     with common.notes_printed():
         results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
-    views = [plots.View(_caption(r), r.points, r.poses[:, :, 3]) for r in results]
+    views = [(_caption(r.numbers), r.points, r.poses[:, :, 3]) for r in results]
+    contents = {"frames": list(side.frames), "results": [r.numbers for r in results]}
     figure = plots.plot_top_view(views, None if truth is None else truth[:, :, 3])
     folder = Path(args.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / "evaluation.json", json.dumps(evaluate.as_json(results, side), allow_nan=False) + "\n")
+        write_text(folder / "evaluation.json", json.dumps(contents, allow_nan=False) + "\n")
         for number, result in enumerate(results):
-            evaluate.write_poses(folder / f"poses-{number}-{result.name}.txt", result.poses)
+            evaluate.write_poses(folder / f"poses-{number}-{result.numbers['name']}.txt", result.poses)
         if truth is not None:
             evaluate.write_poses(folder / "poses-truth.txt", truth)
         files = save_figure(figure, folder / "top-view")
@@ -260,9 +261,8 @@ def _check_results_apart(args: EvaluateArguments) -> None:
     check_apart({"--out": [folder / name for name in names]}, read)
 
 
-def _caption(result: evaluate.Evaluated) -> str:
-    ate = "" if result.scores is None else f", ATE {result.scores.absolute.rmse:.2f} m"
-    return f"{result.name}{ate}"
+def _caption(numbers: dict[str, Any]) -> str:
+    return numbers["name"] + (f", ATE {numbers['ate_m']['rmse']:.2f} m" if "ate_m" in numbers else "")
 
 
 def _evaluate_table(results: list[evaluate.Evaluated], truth: Any) -> Any:
@@ -273,16 +273,15 @@ def _evaluate_table(results: list[evaluate.Evaluated], truth: Any) -> Any:
         names = ("ATE (m)", "largest (m)", "RPE (m)", "RPE (deg)", "segments (%)", "(deg/m)", "number")
     table = _table(title, "file", "rms (px)", *names)
     for r in results:
-        row = [r.name, f"{r.rms:.4f}"]
-        if r.scores is not None:
-            s, segments = r.scores, r.scores.segments
-            row += [f"{s.absolute.rmse:.3f}", f"{s.absolute.largest:.3f}"]
-            row += [f"{s.relative.translation.rmse:.4f}", f"{s.relative.rotation.rmse:.4f}"]
-            row += (
-                ["-"] * 3
-                if segments is None
-                else [f"{segments.translation:.3f}", f"{segments.rotation:.5f}", str(segments.segments)]
-            )
+        found = r.numbers
+        row = [found["name"], f"{found['rms_px']:.4f}"]
+        if truth is not None:
+            row += [f"{found['ate_m'][name]:.3f}" for name in ("rmse", "largest")]
+            row += [f"{found[name]['rmse']:.4f}" for name in ("rpe_translation_m", "rpe_rotation_deg")]
+            if (segments := found["segments"]) is None:
+                row += ["-"] * 3
+            else:
+                row += [f"{segments['translation']:.3f}", f"{segments['rotation']:.5f}", str(segments["segments"])]
         table.add_row(*row)
     return table
 

@@ -253,14 +253,6 @@ def test_the_command_says_what_is_missing(tmp_path, capsys):
     assert "cannot read" in capsys.readouterr().err
 
 
-def test_an_episode_of_the_game_is_written_as_a_page(tmp_path):
-    page = tmp_path / "episode.html"
-    from jaxba.cli.episode import run
-
-    assert run(["--policy", "guarded", "--scene", "1", "--html", str(page)]) == 0
-    assert page.stat().st_size > 500_000
-
-
 def test_names_are_characters_and_nothing_else():
     from jaxba.viewer.panel import plain
 
