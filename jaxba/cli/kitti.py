@@ -116,13 +116,11 @@ def _check(args: Arguments) -> None:
     common.check_positive(
         keypoints=args.keypoints, reach=args.reach, max_error=args.max_error, min_matches=args.min_matches
     )
-    for name in ("max_error", "rotation_sigma", "translation_sigma"):
-        value = getattr(args, name)
-        common.require(math.isfinite(value), f"--{name.replace('_', '-')} must be finite, is {value:g}")
+    common.require(math.isfinite(args.max_error), f"--max-error must be finite, is {args.max_error:g}")
     common.require(args.min_views >= 2, f"--min-views must be at least 2, is {args.min_views}")
     common.require(0 <= args.min_angle < 180, f"--min-angle must lie between 0 and 180, is {args.min_angle:g}")
     common.require(0 <= args.seed < 2**31, f"--seed must lie between 0 and 2147483647, is {args.seed}")
-    common.require(args.start == "vo" or args.poses is not None, f"--start {args.start} needs --poses")
+    common.require(args.start == "vo" or args.poses is not None, "--start poses needs --poses")
     common.require(args.stride is None or args.window is not None, "--stride needs --window")
     common.check_writable("--out", args.out)
     check_output(args.out)

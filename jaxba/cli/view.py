@@ -36,10 +36,6 @@ class Arguments:
     images: Annotated[str | None, "FOLDER"] = None
     """Images, for files that name them (COLMAP, jaxba-kitti)."""
 
-    poses: Annotated[str | None, "FILE"] = None
-    """KITTI's true poses of the whole sequence. Default: those with which jaxba-kitti made the problem, if the file
-    exists."""
-
     html: Annotated[str | None, "FILE"] = None
     """Write one page that opens without a server and plays the iterations. Nothing is served."""
 
@@ -71,7 +67,7 @@ def _run(args: Arguments) -> int:
     from jaxba.viewer import sources
 
     with common.notes_printed():
-        shown = sources.open_all(args.files, args.images, args.poses)
+        shown = sources.open_all(args.files, args.images)
     if args.html:
         from jaxba.viewer.page import write_page
 
@@ -112,7 +108,7 @@ def _check_apart(args: Arguments) -> None:
 
     files = [file for name in args.files for file in problem_files(resolve(name))]
     images = [] if args.images is None else [one for one in Path(args.images).rglob("*") if one.suffix != ".html"]
-    check_apart({"--html": [args.html]}, {PROBLEM: files, "the file of --poses": [args.poses], "an image": images})
+    check_apart({"--html": [args.html]}, {PROBLEM: files, "an image": images})
 
 
 def announce(viewer: Viewer) -> None:

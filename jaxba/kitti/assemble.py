@@ -35,7 +35,6 @@ def assemble(
     calibration: Calibration,
     frames: tuple[int, ...],
     options: Build,
-    start: Views | None = None,
 ) -> Assembled:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
 
@@ -48,8 +47,6 @@ def assemble(
         calibration: of all views.
         frames: frame number of each view.
         options: limits for points.
-        start: initial poses of the cameras of the problem, if not `views`, from which the points are then still
-            triangulated and filtered. Every point moves with the first camera that sees it, as in odometry.
 
     Raises:
         ProblemError: a camera would see fewer than 10 points.
@@ -63,14 +60,10 @@ def assemble(
         bad = int(seen.argmin())
         raise ProblemError(
             f"too few points: frame {frames[bad]} sees {seen[bad]} good ones, at least {MIN_OBSERVATIONS} are needed; "
-            "choose other --frames, --features or --start, or a smaller --min-angle"
+            "choose other --frames or --start, or a smaller --min-angle"
         )
     names, point_index = np.unique(tracks.track[keep], return_inverse=True)
     points = points[names]
-    if start is not None:
-        first = tracks.image[keep][np.searchsorted(point_index, np.arange(len(names)))]
-        local = views.local(first, points) - start.translation[first]
-        points, views = np.einsum("nji,nj->ni", start.rotation[first], local), start
     cameras = np.zeros((len(frames), 9))
     cameras[:, :3] = angle_axis(FLIP @ views.rotation)
     cameras[:, 3:6] = views.translation @ FLIP

@@ -1,4 +1,4 @@
-"""Key-points of an image and their matches between two: SIFT or ORB, ratio test, mutual check, epipolar geometry."""
+"""Key-points of an image and their matches between two: SIFT, ratio test, mutual check, epipolar geometry."""
 
 from __future__ import annotations
 
@@ -8,13 +8,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.kitti.opencv import cv2
-from jaxba.kitti.options import Features
 
 SIFT_CONTRAST = 0.02
 """Contrast threshold, half of OpenCV's: asphalt and shadow have little contrast."""
-
-ORB_FAST = 10
-"""FAST threshold in grey levels, half of OpenCV's, for the same reason."""
 
 RATIO = 0.8
 """Largest ratio of the best to the second-best distance. Source: Lowe 2004, section 7.1."""
@@ -25,9 +21,6 @@ EPIPOLAR_PIXELS = 1.0
 CONFIDENCE = 0.9999
 """Of the RANSAC for the essential matrix."""
 
-ORB_BORDER = 31
-"""OpenCV finds nothing nearer to the border, and fails on images too small for its pyramid (`edgeThreshold`)."""
-
 MIN_ESSENTIAL = 8
 """Fewer matches cannot verify a geometry that five determine."""
 
@@ -36,26 +29,20 @@ class KeyPoints(NamedTuple):
     """Key-points of an image, the strongest first."""
 
     pixels: Float[np.ndarray, "n 2"]  # relative to the centre of the first pixel, x to the right, y down
-    descriptors: np.ndarray  # float32 [n, 128] (SIFT) or uint8 [n, 32] (ORB, bits)
+    descriptors: Float[np.ndarray, "n 128"]  # integers, as float32
 
 
-def detect(image: np.ndarray, features: Features, count: int) -> KeyPoints:
+def detect(image: np.ndarray, count: int) -> KeyPoints:
     """At most `count` key-points of a grey image, no two at the same place.
 
     Args:
         image: shape (height, width), uint8.
-        features: `sift` or `orb`.
         count: the strongest ones are kept.
     """
-    found, descriptors = (), None
-    if features == "sift":
-        detector = cv2.SIFT.create(nfeatures=count, contrastThreshold=SIFT_CONTRAST)
-        found, descriptors = detector.detectAndCompute(image, None)
-    elif min(image.shape) > 2 * ORB_BORDER:
-        detector = cv2.ORB.create(nfeatures=count, fastThreshold=ORB_FAST, edgeThreshold=ORB_BORDER)
-        found, descriptors = detector.detectAndCompute(image, None)
+    detector = cv2.SIFT.create(nfeatures=count, contrastThreshold=SIFT_CONTRAST)
+    found, descriptors = detector.detectAndCompute(image, None)
     if not found:
-        return KeyPoints(np.empty((0, 2)), np.empty((0, 32), np.uint8))
+        return KeyPoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
     pixels = np.array([key.pt for key in found], np.float64)
     response = np.array([key.response for key in found])
     order = np.lexsort((pixels[:, 1], pixels[:, 0], -response))  # the order of detectors may depend on threads
@@ -67,22 +54,21 @@ def detect(image: np.ndarray, features: Features, count: int) -> KeyPoints:
 def match(first: KeyPoints, second: KeyPoints) -> Int[np.ndarray, "m 2"]:
     """Mutual nearest neighbours that pass the ratio test in both directions, sorted.
 
-    Distances are Euclidean (SIFT, 128 integers) or Hamming (ORB, 256 bits): exact in float32.
+    Distances between integers below 2^24 are exact in float32.
     """
-    if min(len(first.pixels), len(second.pixels)) < 2:
+    a, b = first.descriptors, second.descriptors
+    if min(len(a), len(b)) < 2:
         return np.empty((0, 2), np.int64)
-    binary = first.descriptors.shape[1] == 32  # the squared distance of bits is the Hamming distance
-    a, b = ((np.unpackbits(x, axis=1) if binary else x).astype(np.float32) for x in (first[1], second[1]))
     squared = np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T), 0)
-    there, back = (_nearest(table, RATIO if binary else RATIO**2) for table in (squared, squared.T))
+    there, back = _nearest(squared), _nearest(squared.T)
     rows = np.flatnonzero((there >= 0) & (back[there] == np.arange(len(a))))
     return np.stack([rows, there[rows]], axis=1)
 
 
-def _nearest(distances: np.ndarray, ratio: float) -> np.ndarray:
+def _nearest(squared: np.ndarray) -> np.ndarray:
     """The column of the least entry of each row; -1 if the second least is about as small."""
-    two = np.partition(distances, 1, axis=1)
-    return np.where(two[:, 0] < ratio * two[:, 1], distances.argmin(axis=1), -1)
+    two = np.partition(squared, 1, axis=1)
+    return np.where(two[:, 0] < RATIO**2 * two[:, 1], squared.argmin(axis=1), -1)
 
 
 def essential(

@@ -12,7 +12,6 @@ from jaxba.io.notes import report as report_notes
 from jaxba.kitti.assemble import Assembled, assemble
 from jaxba.kitti.features import EPIPOLAR_PIXELS, KeyPoints, detect, essential, match
 from jaxba.kitti.images import image_reader
-from jaxba.kitti.initial_poses import drift
 from jaxba.kitti.keyframes import choose
 from jaxba.kitti.odometry import visual_odometry
 from jaxba.kitti.options import Build
@@ -48,18 +47,15 @@ def build(
     numbers = tuple(sequence.numbers[i] for i in linked)
     chosen = choose(every, len(numbers), options.keyframes, sequence.calibration, numbers)
     frames = tuple(numbers[i] for i in chosen)
-    tracks, restarts, moved = every.restrict(chosen), (), None
+    tracks, restarts = every.restrict(chosen), ()
     if options.start == "vo":
         show = lambda done: report("visual odometry", done, len(frames))
         views, restarts = visual_odometry(tracks, len(frames), sequence.calibration, options, frames, show)
     else:
         assert poses_of_frames is not None
-        poses = poses_of_frames(frames)
-        views = views_of_poses(poses)
-        if options.start == "noisy-poses":
-            moved = views_of_poses(drift(poses, options.rotation_sigma, options.translation_sigma, options.seed))
+        views = views_of_poses(poses_of_frames(frames))
     report("triangulation", 0, 1)
-    whole = assemble(tracks, views, sequence.calibration, frames, options, moved)
+    whole = assemble(tracks, views, sequence.calibration, frames, options)
     for words, left in (
         ("left out, too few matches", sorted(set(sequence.numbers) - set(numbers))),
         ("placed relative to the key-frame beside, without enough known points", [frames[i] for i in restarts]),
@@ -84,7 +80,7 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
     matches: dict[tuple[int, int], np.ndarray] = {}
     for j in range(len(sequence)):
         report("key-points and matches", j, len(sequence))
-        recent.append(detect(read(j), options.features, options.keypoints))
+        recent.append(detect(read(j), options.keypoints))
         pixels.append(recent[-1].pixels)
         for i in range(max(j - options.reach, 0), j):
             pairs = match(recent[i - j - 1], recent[-1])
@@ -113,5 +109,5 @@ def _fail(sequence: Sequence, options: Build, frame: int, counts: dict[int, int]
     shares = ", ".join(f"{count} with frame {number[j]}" for j, count in sorted(counts.items()))
     raise ProblemError(
         f"too few matches: frame {number[frame]} shares {shares}, at least {options.min_matches} are needed; "
-        f"choose other --frames or --features, more --keypoints or fewer --min-matches"
+        f"choose other --frames, more --keypoints or fewer --min-matches"
     )

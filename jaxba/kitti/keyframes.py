@@ -82,6 +82,6 @@ def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, n
         if shared < MIN_SHARED:
             raise ProblemError(
                 f"too few matches: key-frames {numbers[i]} and {numbers[j]} share {shared} tracks, "
-                f"at least {MIN_SHARED} are needed; choose --keyframes all, or other --frames or --features"
+                f"at least {MIN_SHARED} are needed; choose --keyframes all, or other --frames"
             )
     return chosen

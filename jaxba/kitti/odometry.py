@@ -250,7 +250,7 @@ def _pose_from_neighbour(scene: _Scene, view: int, names: tuple[int, ...]) -> tu
     if found is None:
         raise ProblemError(
             f"too few matches: key-frames {names[near]} and {names[view]} share {len(tracks)} tracks that fit one "
-            f"motion badly, {MIN_POINTS} good ones are needed; choose other --frames or --features"
+            f"motion badly, {MIN_POINTS} good ones are needed; choose other --frames"
         )
     known = np.flatnonzero(np.isfinite(scene.points[tracks, 0]))
     views = Views(np.stack([np.eye(3), found.rotation]), np.stack([np.zeros(3), found.translation]))

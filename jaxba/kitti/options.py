@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-Features = Literal["sift", "orb"]
-
 MIN_MATCHES = 40
 """Verified matches that link two frames: random matches of textured images reach some 15 inliers."""
 
@@ -14,9 +12,6 @@ MIN_MATCHES = 40
 @dataclass(frozen=True)
 class Build:
     """How the problem is made."""
-
-    features: Features = "sift"
-    """Kind of key-points."""
 
     keypoints: int = 2000
     """Key-points per frame at most."""
@@ -30,21 +25,14 @@ class Build:
     keyframes: Annotated[str, "RULE"] = "auto"
     """auto: by parallax and the fraction of tracks left. all: every frame. N: every N-th frame."""
 
-    start: Literal["vo", "poses", "noisy-poses"] = "vo"
-    """vo: start from monocular visual odometry. poses: from --poses. noisy-poses: from --poses with accumulating
-    errors."""
-
-    rotation_sigma: float = 0.1
-    """Error of noisy-poses: standard deviation per axis and key-frame, degrees."""
-
-    translation_sigma: float = 0.05
-    """The same per axis and key-frame, relative to the distance from the previous key-frame."""
+    start: Literal["vo", "poses"] = "vo"
+    """vo: start from monocular visual odometry. poses: from --poses."""
 
     min_angle: float = 1.0
     """Smallest angle of a point's rays, degrees."""
 
     max_error: float = 3.0
-    """Largest reprojection error of an observation before the noise of noisy-poses, pixels."""
+    """Largest reprojection error of an observation, pixels."""
 
     min_views: int = 2
     """Key-frames that observe a point at least."""

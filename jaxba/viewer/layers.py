@@ -25,10 +25,6 @@ class Layers:
     def __contains__(self, name: str) -> bool:
         return name in self._nodes
 
-    def names(self) -> set[str]:
-        """The layers that there are."""
-        return {name.split()[0] for name in self._nodes}
-
     def show(self, layer: str, visible: bool) -> None:
         """Shows or hides a layer."""
         for name, node in self._nodes.items():
@@ -65,10 +61,6 @@ class Layers:
         self._nodes[name] = self._scene.add_line_segments(
             f"{self._root}/{name}", segments, colour, thickness=width, thickness_units="screen"
         )
-
-    def path(self, name: str, places: Float[np.ndarray, "n 3"], colour: Colour, width: float) -> None:
-        """Draws a line from each place to the next."""
-        self.lines(name, np.stack([places[:-1], places[1:]], axis=1), colour, width)
 
     def label(self, text: str, position: tuple[float, float, float]) -> None:
         """Writes a text; its first position stays."""

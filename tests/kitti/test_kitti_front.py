@@ -103,26 +103,13 @@ def test_matches_are_those_of_a_search_by_loops():
     a = random.integers(0, 60, (30, 128)).astype(np.uint8)
     b = np.concatenate([a[random.permutation(30)[:20]], random.integers(0, 60, (15, 128)).astype(np.uint8)])
     b = np.clip(b.astype(int) + random.integers(-14, 15, b.shape), 0, 255).astype(np.uint8)
-    found = match(KeyPoints(np.zeros((30, 2)), a), KeyPoints(np.zeros((35, 2)), b))
+    found = match(*(KeyPoints(np.zeros((len(x), 2)), x.astype(np.float32)) for x in (a, b)))
     assert {tuple(pair) for pair in found.tolist()} == brute_force(a, b, 0.8)
     assert 10 < len(found) <= 20
 
 
-def test_bits_are_compared_by_hamming_distance():
-    random = np.random.default_rng(4)
-    a = random.integers(0, 256, (25, 32)).astype(np.uint8)
-    b = a[::-1] ^ (random.integers(0, 256, a.shape) & random.integers(0, 256, a.shape) & 17).astype(np.uint8)
-    found = match(KeyPoints(np.zeros((25, 2)), a), KeyPoints(np.zeros((25, 2)), b))
-    counts = np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2)
-    for i, j in found.tolist():
-        assert counts[i].argmin() == j
-        assert counts[i, j] < 0.8 * np.sort(counts[i])[1]
-    assert len(found) == 25
-
-
-@pytest.mark.parametrize("features", ["sift", "orb"])
-def test_a_blank_image_has_no_key_points(features):
-    found = detect(np.full((100, 200), 90, np.uint8), features, 500)
+def test_a_blank_image_has_no_key_points():
+    found = detect(np.full((100, 200), 90, np.uint8), 500)
     assert len(found.pixels) == 0
     assert len(match(found, found)) == 0
 
@@ -130,20 +117,17 @@ def test_a_blank_image_has_no_key_points(features):
 # The whole command
 
 
-@pytest.mark.parametrize(
-    ("camera", "features", "limit"),
-    [(SMALL, "sift", 0.05), (OTHER, "sift", 0.05), (SMALL, "orb", 0.2)],
-)
-def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera, features, limit):
+@pytest.mark.parametrize("camera", [SMALL, OTHER])
+def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera):
     out = tmp_path / "problem.txt.bz2"
-    assert build(rendered[camera], out, "--features", features) == 0
+    assert build(rendered[camera], out) == 0
     printed = capsys.readouterr()
     assert printed.err == ""
-    assert start_error(printed.out) < limit
+    assert start_error(printed.out) < 0.05
     problem, side = read_bal(out), json.loads((tmp_path / "problem.frames.json").read_text())
     assert problem.num_cameras == len(side["frames"])
     assert side["calibration"]["fx"] == camera.fx
-    assert side["options"]["features"] == features
+    assert side["options"]["keyframes"] == "auto"
     assert (geometry.depths(problem) > 0).all()
     assert np.abs(geometry.residuals(problem)).max() <= 3.0 + 1e-6
     assert np.bincount(problem.point_index).min() >= 2
@@ -155,9 +139,11 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     """jaxba-kitti, jaxba-solve and jaxba-kitti evaluate, one after the other."""
     out, solved, folder = tmp_path / "p.txt", tmp_path / "solved.txt.gz", tmp_path / "eval"
     poses = rendered[OTHER] / "poses.txt"
-    start = ["--start", "noisy-poses", "--rotation-sigma", "0.3", "--translation-sigma", "0.1"]
-    assert build(rendered[OTHER], out, *start, "--keyframes", "all") == 0
-    ate = start_error(capsys.readouterr().out)
+    assert build(rendered[OTHER], out, "--start", "poses", "--keyframes", "all") == 0
+    exact, noise = read_bal(out), np.random.default_rng(0).normal(size=(FRAMES, 3))
+    cameras = np.array(exact.cameras)
+    cameras[:, 3:6] += 0.1 * np.cumsum(noise, axis=0)
+    write_problem(exact.replace(cameras=cameras), out)
     assert solve([str(out), "--policy", "ceres", "--output", str(solved)]) == 0
     capsys.readouterr()
     assert run(["evaluate", str(out), str(solved), "--poses", str(poses), "--out", str(folder), "--lengths", "2"]) == 0
@@ -165,7 +151,6 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     assert printed.err == ""
     found = json.loads((folder / "evaluation.json").read_text())
     before, after = found["results"]
-    assert before["ate_m"]["rmse"] == pytest.approx(ate, abs=6e-4)
     assert after["ate_m"]["rmse"] < 0.5 * before["ate_m"]["rmse"]
     assert after["rms_px"] < before["rms_px"]
     assert after["segments"]["segments"] == before["segments"]["segments"] > 0
@@ -217,18 +202,17 @@ def test_a_black_frame_is_left_out(sequence, tmp_path, capsys):
     assert start_error(printed.out) < 0.1
 
 
-@pytest.mark.parametrize("features", ["sift", "orb"])
-def test_a_long_gap_is_an_error_that_names_the_frames(sequence, tmp_path, capsys, features):
+def test_a_long_gap_is_an_error_that_names_the_frames(sequence, tmp_path, capsys):
     for number in (6, 7, 8):
         cv2.imwrite(str(image(sequence, number)), np.zeros((SMALL.height, SMALL.width), np.uint8))
-    assert build(sequence, tmp_path / "p.txt", "--features", features) == 2
+    assert build(sequence, tmp_path / "p.txt") == 2
     printed = capsys.readouterr()
     assert printed.err.startswith(
         "error: too few matches: frame 5 shares 0 with frame 6, 0 with frame 7, 0 with frame 8"
     )
     assert printed.err.count("\n") == 1
     assert not (tmp_path / "p.txt").exists()
-    assert build(sequence, tmp_path / "p.txt", "--features", features, "--frames", "0:6") == 0
+    assert build(sequence, tmp_path / "p.txt", "--frames", "0:6") == 0
 
 
 @pytest.mark.parametrize("choice", ["auto", "all"])
@@ -266,11 +250,10 @@ def test_frames_left_out_at_the_end_are_named(sequence, tmp_path, capsys):
     assert "note: left out, too few matches: frames 12, 13\n" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("features", ["sift", "orb"])
-def test_images_of_one_pixel_are_an_error_in_one_line(sequence, tmp_path, capsys, features):
+def test_images_of_one_pixel_are_an_error_in_one_line(sequence, tmp_path, capsys):
     for number in range(FRAMES):
         cv2.imwrite(str(image(sequence, number)), np.full((1, 1), 100, np.uint8))
-    assert build(sequence, tmp_path / "p.txt", "--features", features) == 2
+    assert build(sequence, tmp_path / "p.txt") == 2
     message = capsys.readouterr().err
     assert message.startswith("error: too few matches: frame 0 shares 0")
     assert message.count("\n") == 1
@@ -324,7 +307,6 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
         (["--out", "nowhere/p.txt"], "does not exist"),
         (["--seed", "-1"], "--seed must lie"),
         (["--max-error", "inf"], "--max-error must be finite"),
-        (["--rotation-sigma", "nan"], "--rotation-sigma must be finite"),
         (["--keyframes", "99", "--frames", "0:5"], "--keyframes 99 leaves one key-frame of 5"),
         (["--frames", "0:99"], "ends after the last frame, 13"),
         (["--poses", "nowhere.txt"], "cannot be read"),

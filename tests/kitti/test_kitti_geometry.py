@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from jaxba.io.frames import Calibration
 from jaxba.kitti import keyframes
 from jaxba.kitti.assemble import assemble, windows
-from jaxba.kitti.initial_poses import drift
 from jaxba.kitti.odometry import visual_odometry
 from jaxba.kitti.options import Build
 from jaxba.kitti.tracks import Tracks, join_matches, make_tracks
@@ -300,35 +299,6 @@ def test_no_tracks_are_no_error():
     assert keep.shape == (0,)
 
 
-# Starts
-
-
-def test_no_drift_leaves_the_poses():
-    poses, _, _ = street(views=20)
-    np.testing.assert_allclose(drift(poses, 0.0, 0.0, 0), poses, atol=1e-9)
-
-
-def test_drift_accumulates_and_is_repeatable():
-    poses, _, _ = street(views=101)
-    assert np.array_equal(drift(poses, 0.1, 0.05, 3), drift(poses, 0.1, 0.05, 3))
-    assert not np.array_equal(drift(poses, 0.1, 0.05, 3), drift(poses, 0.1, 0.05, 4))
-    runs = np.array([drift(poses, 0.0, 0.05, seed)[:, :, 3] - poses[:, :, 3] for seed in range(400)])
-    spread = (runs**2).sum(axis=2).mean(axis=0)
-    step = np.linalg.norm(poses[1, :, 3] - poses[0, :, 3])
-    for count in (25, 100):  # a random walk: its variance is that of one step times their number
-        assert spread[count] == pytest.approx(3 * count * (0.05 * step) ** 2, rel=0.15)
-    assert spread[0] == 0
-    turns = np.array([(drift(poses, 0.1, 0.0, s)[-1, :, :3] @ poses[-1, :, :3].T) for s in range(400)])
-    angles = np.rad2deg(np.linalg.norm(Rotation.from_matrix(turns).as_rotvec(), axis=1))
-    assert np.sqrt((angles**2).mean()) == pytest.approx(0.1 * np.sqrt(300), rel=0.1)
-
-
-@pytest.mark.parametrize("sigmas", [(-1.0, 0.0), (0.0, float("nan"))])
-def test_a_sigma_that_makes_no_sense_is_refused(sigmas):
-    with pytest.raises(ProblemError, match="must not be negative"):
-        drift(street()[0], *sigmas, 0)
-
-
 # The problem
 
 
@@ -350,22 +320,6 @@ def test_cameras_and_poses_are_the_same_thing():
     poses, views, points = street()
     made = assemble(as_tracks(sight(views, points)), views, CALIBRATION, tuple(range(6)), NEARLY_ALL)
     np.testing.assert_allclose(geometry.camera_poses(np.asarray(made.problem.cameras)), poses, atol=1e-9)
-
-
-def test_points_drift_with_the_first_camera_that_sees_them():
-    poses, views, points = street()
-    observations = sight(views, points)
-    late = observations.camera >= np.where(observations.track % 2, 2, 0)  # odd points are first seen by camera 2
-    tracks = as_tracks(Observations(*(part[late] for part in observations)))
-    noisy = drift(poses, 0.3, 0.1, 5)
-    inverse = noisy[:, :, :3].transpose(0, 2, 1)
-    start = Views(inverse, -np.einsum("nij,nj->ni", inverse, noisy[:, :, 3]))
-    made = assemble(tracks, views, CALIBRATION, tuple(range(6)), NEARLY_ALL, start).problem
-    np.testing.assert_allclose(geometry.camera_poses(np.asarray(made.cameras)), noisy, atol=1e-9)
-    error = np.linalg.norm(geometry.residuals(made), axis=1)
-    first = np.where(np.asarray(made.point_index) % 2, 2, 0) == made.camera_index
-    assert error[first].max() < 1e-6
-    assert np.median(error[~first]) > 0.5
 
 
 def test_a_frame_without_points_is_named():

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from jaxba.kitti import trajectory
-from jaxba.kitti.trajectory import absolute_errors, align, relative_errors, segment_errors
+from jaxba.kitti.trajectory import absolute_errors, relative_errors, segment_errors
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.similarity import umeyama
 
@@ -32,6 +32,10 @@ def moved(poses: np.ndarray, scale: float, turn: np.ndarray, shift: np.ndarray) 
     """Poses in another world: scaled, turned and shifted."""
     centers = scale * poses[:, :, 3] @ turn.T + shift
     return np.concatenate([turn @ poses[:, :, :3], centers[:, :, None]], axis=2)
+
+
+def align(estimate: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return umeyama(estimate[:, :, 3], truth[:, :, 3]).poses(estimate)
 
 
 TURN = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
