@@ -24,13 +24,13 @@ from jaxba.io.frames import poses_of, read_sidecar, truth_of, write_sidecar
 from jaxba.io.notes import note, note_center
 from jaxba.io.poses import read_poses
 from jaxba.kitti import evaluate
-from jaxba.kitti.assemble import Assembled, windows
+from jaxba.kitti.assemble import Frames, windows
 from jaxba.kitti.calibration import calibration_files
 from jaxba.kitti.options import Build
 from jaxba.kitti.sequence import read_sequence
 from jaxba.kitti.trajectory import path_length
 from jaxba.problem import geometry
-from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text
 
 EVALUATE = "evaluate"
@@ -119,7 +119,6 @@ def _check(args: Arguments) -> None:
     common.require(math.isfinite(args.max_error), f"--max-error must be finite, is {args.max_error:g}")
     common.require(args.min_views >= 2, f"--min-views must be at least 2, is {args.min_views}")
     common.require(0 <= args.min_angle < 180, f"--min-angle must lie between 0 and 180, is {args.min_angle:g}")
-    common.require(0 <= args.seed < 2**31, f"--seed must lie between 0 and 2147483647, is {args.seed}")
     common.require(args.start == "vo" or args.poses is not None, "--start poses needs --poses")
     common.require(args.stride is None or args.window is not None, "--stride needs --window")
     common.check_writable("--out", args.out)
@@ -137,14 +136,14 @@ def _build(args: Arguments) -> int:
     with common.notes_printed(), _progress(console) as report:
         sequence, poses = _inputs(args)
         _check_apart([args.out], sequence, args)
-        whole, tracks = build(sequence, args, poses, report)
-    parts = _parts(whole, args)
-    _check_apart([path for _, path in parts], sequence, args)
-    for part, path in parts:
-        _write(part, path, sequence, args)
-    title = f"{len(sequence)} frames, {len(whole.frames)} key-frames, {tracks} tracks"
-    console.print(_build_table(title, [part for part, _ in parts], poses))
-    console.print(f"wrote {', '.join(path for _, path in parts)}")
+        whole, frames, tracks = build(sequence, args, poses, report)
+    parts = _parts(whole, frames, args)
+    _check_apart([path for _, _, path in parts], sequence, args)
+    for part in parts:
+        _write(*part, sequence, args)
+    title = f"{len(sequence)} frames, {len(frames)} key-frames, {tracks} tracks"
+    console.print(_build_table(title, parts, poses))
+    console.print(f"wrote {', '.join(path for _, _, path in parts)}")
     return 0
 
 
@@ -176,47 +175,46 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
     return sequence, poses
 
 
-def _parts(whole: Assembled, args: Arguments) -> list[tuple[Assembled, str]]:
-    """The problems to write, and their files."""
+def _parts(whole: BundleProblem, frames: Frames, args: Arguments) -> list[tuple[BundleProblem, Frames, str]]:
+    """The problems to write, the frames of their cameras, and their files."""
     if args.window is None:
-        return [(whole, args.out)]
+        return [(whole, frames, args.out)]
     stride = max(args.window // 2, 1) if args.stride is None else args.stride
     plain = strip_compression(args.out)
     stem, ending = Path(plain).with_suffix(""), Path(plain).suffix + args.out[len(plain) :]
-    parts = windows(whole, args.window, stride, args.min_views)
-    return [(part, f"{stem}-{part.frames[0]:06d}-{part.frames[-1]:06d}{ending}") for part in parts]
+    parts = windows(whole, frames, args.window, stride, args.min_views)
+    return [(part, own, f"{stem}-{own[0]:06d}-{own[-1]:06d}{ending}") for part, own in parts]
 
 
-def _write(part: Assembled, path: str, sequence: Any, args: Arguments) -> None:
+def _write(problem: BundleProblem, frames: Frames, path: str, sequence: Any, args: Arguments) -> None:
     """Writes the file of frames first, then the problem, so that there is never a problem without its frames."""
     from jaxba import __version__
     from jaxba.kitti.opencv import cv2
 
     metadata = {
         "format": 1,
-        "frames": list(part.frames),
+        "frames": frames,
         "calibration": asdict(sequence.calibration),
         "options": asdict(args),
         "versions": {"jaxba": __version__, "opencv": cv2.__version__},
     }
     write_sidecar(path, metadata)
-    write_problem(part.problem, path)
+    write_problem(problem, path)
 
 
-def _build_table(title: str, parts: list[Assembled], poses: Any) -> Any:
+def _build_table(title: str, parts: list[tuple[BundleProblem, Frames, str]], poses: Any) -> Any:
     table = _table(title, "frames", "key-frames", "points", "observations", "mean error (px)", "ATE of the start (m)")
-    for part in parts:
-        problem = part.problem
+    for problem, frames, _ in parts:
         error = np.linalg.norm(geometry.residuals(problem), axis=1).mean()
         ate = "-"
         if poses is not None:
             try:
-                found = evaluate.score(geometry.camera_poses(problem.cameras), poses(part.frames))
+                found = evaluate.score(geometry.camera_poses(problem.cameras), poses(frames))
                 ate = f"{found['ate_m']['rmse']:.3f}"
             except ProblemError:  # a straight line, or two cameras
                 ate = "undefined"
         numbers = (problem.num_cameras, problem.num_points, problem.num_observations, f"{error:.3f}", ate)
-        table.add_row(f"{part.frames[0]} to {part.frames[-1]}", *map(str, numbers))
+        table.add_row(f"{frames[0]} to {frames[-1]}", *map(str, numbers))
     return table
 
 
@@ -230,22 +228,23 @@ def _evaluate(args: EvaluateArguments) -> int:
     truth = None if args.poses is None else truth_of(side, args.poses)
     with common.notes_printed():
         results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
-    views = [(_caption(r.numbers), r.points, r.poses[:, :, 3]) for r in results]
-    contents = {"frames": list(side.frames), "results": [r.numbers for r in results]}
+    views = [(_caption(numbers), points, poses[:, :, 3]) for numbers, poses, points in results]
+    rows = [numbers for numbers, _, _ in results]
+    contents = json.dumps({"frames": side.frames, "results": rows}, allow_nan=False)
     figure = plots.plot_top_view(views, None if truth is None else truth[:, :, 3])
     folder = Path(args.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / "evaluation.json", json.dumps(contents, allow_nan=False) + "\n")
-        for number, result in enumerate(results):
-            evaluate.write_poses(folder / f"poses-{number}-{result.numbers['name']}.txt", result.poses)
+        write_text(folder / "evaluation.json", contents + "\n")
+        for at, (numbers, poses, _) in enumerate(results):
+            evaluate.write_poses(folder / f"poses-{at}-{numbers['name']}.txt", poses)
         if truth is not None:
             evaluate.write_poses(folder / "poses-truth.txt", truth)
         files = save_figure(figure, folder / "top-view")
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     console = common.console()
-    console.print(_evaluate_table(results, truth))
+    console.print(_evaluate_table(rows, truth))
     console.print(f"wrote {files[0]} and {len(results) + (truth is not None) + 2} files beside it")
     return 0
 
@@ -263,15 +262,14 @@ def _caption(numbers: dict[str, Any]) -> str:
     return numbers["name"] + (f", ATE {numbers['ate_m']['rmse']:.2f} m" if "ate_m" in numbers else "")
 
 
-def _evaluate_table(results: list[evaluate.Evaluated], truth: Any) -> Any:
-    title = f"{len(results[0].poses)} key-frames"
+def _evaluate_table(results: list[dict[str, Any]], truth: Any) -> Any:
+    title = f"{results[0]['cameras']} key-frames"
     names: tuple[str, ...] = ()
     if truth is not None:
         title += f", {path_length(truth):.1f} m of path; after similarity alignment"
         names = ("ATE (m)", "largest (m)", "RPE (m)", "RPE (deg)", "segments (%)", "(deg/m)", "number")
     table = _table(title, "file", "rms (px)", *names)
-    for r in results:
-        found = r.numbers
+    for found in results:
         row = [found["name"], f"{found['rms_px']:.4f}"]
         if truth is not None:
             row += [f"{found['ate_m'][name]:.3f}" for name in ("rmse", "largest")]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 
 from jaxba.io.frames import Calibration
@@ -20,22 +18,17 @@ MIN_OBSERVATIONS = 10
 """Observations that a camera needs: 20 residuals for its 9 parameters."""
 
 
-@dataclass(frozen=True)
-class Assembled:
-    """A problem and the frames of its cameras."""
-
-    problem: BundleProblem
-    frames: tuple[int, ...]
-    """Frame number of every camera."""
+Frames = tuple[int, ...]
+"""Frame number of every camera."""
 
 
 def assemble(
     tracks: Tracks,
     views: Views,
     calibration: Calibration,
-    frames: tuple[int, ...],
+    frames: Frames,
     options: Build,
-) -> Assembled:
+) -> BundleProblem:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
 
     Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical
@@ -69,12 +62,13 @@ def assemble(
     cameras[:, 3:6] = views.translation @ FLIP
     cameras[:, 6] = calibration.fx
     pixels = calibration.fx * rays[keep] * [1, -1]
-    problem = BundleProblem.create(cameras, points, pixels, tracks.image[keep], point_index)
-    return Assembled(problem, frames)
+    return BundleProblem.create(cameras, points, pixels, tracks.image[keep], point_index)
 
 
-def windows(whole: Assembled, size: int, stride: int, min_views: int) -> list[Assembled]:
-    """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before.
+def windows(
+    problem: BundleProblem, frames: Frames, size: int, stride: int, min_views: int
+) -> list[tuple[BundleProblem, Frames]]:
+    """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before, and their frames.
 
     The last one ends with the last camera, so it may start less than `stride` after the one before. A window keeps the
     points that its cameras see `min_views` times.
@@ -82,27 +76,23 @@ def windows(whole: Assembled, size: int, stride: int, min_views: int) -> list[As
     Raises:
         ProblemError: the size or stride is out of range.
     """
-    cameras = whole.problem.num_cameras
+    cameras = problem.num_cameras
     if not 2 <= size <= cameras:
         raise ProblemError(f"--window must lie between 2 and the {cameras} key-frames, is {size}")
     if stride < 1:
         raise ProblemError(f"--stride must be positive, is {stride}")
-    starts = list(range(0, cameras - size, stride))
-    starts.append(cameras - size)
-    return [_window(whole, first, first + size, min_views) for first in starts]
-
-
-def _window(whole: Assembled, first: int, end: int, min_views: int) -> Assembled:
-    problem = whole.problem
     camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
-    keep = (camera_index >= first) & (camera_index < end)
-    keep &= np.bincount(point_index[keep], minlength=problem.num_points)[point_index] >= min_views
-    names, renumbered = np.unique(point_index[keep], return_inverse=True)
-    part = BundleProblem.create(
-        np.asarray(problem.cameras)[first:end],
-        np.asarray(problem.points)[names],
-        np.asarray(problem.observations)[keep],
-        camera_index[keep] - first,
-        renumbered,
-    )
-    return replace(whole, problem=part, frames=whole.frames[first:end])
+    found = []
+    for first in (*range(0, cameras - size, stride), cameras - size):
+        keep = (camera_index >= first) & (camera_index < first + size)
+        keep &= np.bincount(point_index[keep], minlength=problem.num_points)[point_index] >= min_views
+        names, renumbered = np.unique(point_index[keep], return_inverse=True)
+        part = BundleProblem.create(
+            np.asarray(problem.cameras)[first : first + size],
+            np.asarray(problem.points)[names],
+            np.asarray(problem.observations)[keep],
+            camera_index[keep] - first,
+            renumbered,
+        )
+        found.append((part, frames[first : first + size]))
+    return found

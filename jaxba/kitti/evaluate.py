@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -17,14 +17,6 @@ from jaxba.kitti import trajectory
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.similarity import Similarity, umeyama
-
-
-class Evaluated(NamedTuple):
-    """A problem or solution and its errors."""
-
-    poses: Float[np.ndarray, "cameras 3 4"]  # aligned with the truth, or with the first camera
-    points: Float[np.ndarray, "points 3"]  # the same
-    numbers: dict[str, Any]  # name, sizes, reprojection error and, with a truth, `score`; for a JSON file
 
 
 def score(
@@ -39,12 +31,13 @@ def score(
     """
     similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
     aligned = similarity.poses(poses)
-    relative, segments = trajectory.relative_errors(aligned, truth), trajectory.segment_errors(aligned, truth, lengths)
+    translation, rotation = trajectory.relative_errors(aligned, truth)
+    segments = trajectory.segment_errors(aligned, truth, lengths)
     return {
         "scale": similarity.scale,  # metres per unit of the trajectory
         "ate_m": trajectory.absolute_errors(aligned, truth)._asdict(),
-        "rpe_translation_m": relative.translation._asdict(),
-        "rpe_rotation_deg": relative.rotation._asdict(),
+        "rpe_translation_m": translation._asdict(),
+        "rpe_rotation_deg": rotation._asdict(),
         "segments": segments and segments._asdict(),
     }
 
@@ -54,8 +47,11 @@ def evaluate(
     side: Sidecar,
     truth: Float[np.ndarray, "cameras 3 4"] | None,
     lengths: tuple[float, ...] = trajectory.DEVKIT_LENGTHS,
-) -> list[Evaluated]:
+) -> list[tuple[dict[str, Any], Float[np.ndarray, "cameras 3 4"], Float[np.ndarray, "points 3"]]]:
     """A problem and its solutions, each aligned with the truth on its own; without a truth, with the first camera.
+
+    Returns:
+        Of each: name, sizes, reprojection error and, with a truth, `score`; its aligned poses and points.
 
     Raises:
         ProblemError: a file cannot be read, has other cameras than the sidecar file, or cannot be aligned.
@@ -85,7 +81,7 @@ def evaluate(
             similarity = Similarity(1.0, poses[0, :, :3].T, -poses[0, :, :3].T @ poses[0, :, 3])
         else:
             similarity = umeyama(poses[:, :, 3], truth[:, :, 3])
-        results.append(Evaluated(similarity.poses(poses), similarity.points(points), numbers))
+        results.append((numbers, similarity.poses(poses), similarity.points(points)))
     return results
 
 

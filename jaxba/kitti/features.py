@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -25,43 +23,34 @@ MIN_ESSENTIAL = 8
 """Fewer matches cannot verify a geometry that five determine."""
 
 
-class KeyPoints(NamedTuple):
-    """Key-points of an image, the strongest first."""
+def detect(image: np.ndarray, count: int) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 128"]]:
+    """At most `count` key-points of a grey image, the strongest first, no two at the same place.
 
-    pixels: Float[np.ndarray, "n 2"]  # relative to the centre of the first pixel, x to the right, y down
-    descriptors: Float[np.ndarray, "n 128"]  # integers, as float32
-
-
-def detect(image: np.ndarray, count: int) -> KeyPoints:
-    """At most `count` key-points of a grey image, no two at the same place.
-
-    Args:
-        image: shape (height, width), uint8.
-        count: the strongest ones are kept.
+    Returns:
+        Pixels relative to the centre of the first one, x to the right, y down; descriptors, integers as float32.
     """
     detector = cv2.SIFT.create(nfeatures=count, contrastThreshold=SIFT_CONTRAST)
     found, descriptors = detector.detectAndCompute(image, None)
     if not found:
-        return KeyPoints(np.empty((0, 2)), np.empty((0, 128), np.float32))
+        return np.empty((0, 2)), np.empty((0, 128), np.float32)
     pixels = np.array([key.pt for key in found], np.float64)
     response = np.array([key.response for key in found])
     order = np.lexsort((pixels[:, 1], pixels[:, 0], -response))  # the order of detectors may depend on threads
     _, unique = np.unique(pixels[order], axis=0, return_index=True)  # SIFT repeats a key-point for every orientation
     keep = order[np.sort(unique)][:count]
-    return KeyPoints(pixels[keep], np.asarray(descriptors)[keep])
+    return pixels[keep], np.asarray(descriptors)[keep]
 
 
-def match(first: KeyPoints, second: KeyPoints) -> Int[np.ndarray, "m 2"]:
-    """Mutual nearest neighbours that pass the ratio test in both directions, sorted.
+def match(first: Float[np.ndarray, "n 128"], second: Float[np.ndarray, "k 128"]) -> Int[np.ndarray, "m 2"]:
+    """Descriptors of two images that are mutual nearest neighbours and pass the ratio test in both directions.
 
     Distances between integers below 2^24 are exact in float32.
     """
-    a, b = first.descriptors, second.descriptors
-    if min(len(a), len(b)) < 2:
+    if min(len(first), len(second)) < 2:
         return np.empty((0, 2), np.int64)
-    squared = np.maximum((a * a).sum(1)[:, None] + (b * b).sum(1) - 2 * (a @ b.T), 0)
+    squared = np.maximum((first**2).sum(1)[:, None] + (second**2).sum(1) - 2 * (first @ second.T), 0)
     there, back = _nearest(squared), _nearest(squared.T)
-    rows = np.flatnonzero((there >= 0) & (back[there] == np.arange(len(a))))
+    rows = np.flatnonzero((there >= 0) & (back[there] == np.arange(len(first))))
     return np.stack([rows, there[rows]], axis=1)
 
 
@@ -72,21 +61,15 @@ def _nearest(squared: np.ndarray) -> np.ndarray:
 
 
 def essential(
-    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], threshold: float, seed: int
+    first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], threshold: float
 ) -> tuple[np.ndarray | None, np.ndarray]:
-    """Essential matrix of two views by the five-point method and RANSAC, and which rays are consistent with it.
-
-    Args:
-        first: rays `(X / Z, Y / Z)` in the first view.
-        second: the same in the second view.
-        threshold: distance from the epipolar line, in units of the focal length.
-        seed: of the samples.
+    """Essential matrix of two views by the five-point method and OpenCV's most accurate RANSAC, and which of the rays
+    `(X / Z, Y / Z)` are consistent with it: within this distance of the epipolar line, in units of the focal length.
 
     Source: Nister 2004, "An efficient solution to the five-point relative pose problem"; OpenCV's findEssentialMat.
     """
     if len(first) < MIN_ESSENTIAL:
         return None, np.zeros(len(first), bool)
-    cv2.setRNGSeed(seed)
     matrix, mask = cv2.findEssentialMat(
         np.ascontiguousarray(first), np.ascontiguousarray(second), np.eye(3), cv2.USAC_ACCURATE, CONFIDENCE, threshold
     )

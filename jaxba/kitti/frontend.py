@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxba.io.notes import report as report_notes
-from jaxba.kitti.assemble import Assembled, assemble
-from jaxba.kitti.features import EPIPOLAR_PIXELS, KeyPoints, detect, essential, match
+from jaxba.kitti.assemble import Frames, assemble
+from jaxba.kitti.features import EPIPOLAR_PIXELS, detect, essential, match
 from jaxba.kitti.images import image_reader
 from jaxba.kitti.keyframes import choose
 from jaxba.kitti.odometry import visual_odometry
@@ -18,7 +18,7 @@ from jaxba.kitti.options import Build
 from jaxba.kitti.sequence import Sequence
 from jaxba.kitti.tracks import Tracks, join_matches
 from jaxba.kitti.triangulate import views_of_poses
-from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 Report = Callable[[str, int, int], None]
 """Called with the name of a stage, how much of it is done, and how much there is."""
@@ -29,8 +29,8 @@ def build(
     options: Build,
     poses_of_frames: Callable[[tuple[int, ...]], Float[np.ndarray, "frames 3 4"]] | None,
     report: Report,
-) -> tuple[Assembled, int]:
-    """Makes the problem of a sequence, and counts its tracks. Equal arguments give equal numbers.
+) -> tuple[BundleProblem, Frames, int]:
+    """Makes the problem of a sequence: it, its key-frames, and how many tracks they had. Repeatable.
 
     Notes say which frames could not be matched with the others, or placed by known points.
 
@@ -62,7 +62,7 @@ def build(
     ):
         if left:
             report_notes([f"{words}: frame{'s'[: len(left) > 1]} {', '.join(map(str, left))}"])
-    return whole, tracks.count
+    return whole, frames, tracks.count
 
 
 def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tuple[int, ...]]:
@@ -75,17 +75,18 @@ def link(sequence: Sequence, options: Build, report: Report) -> tuple[Tracks, tu
         ProblemError: an image cannot be read, or frames cannot be linked: the message names them.
     """
     read, calibration = image_reader(sequence), sequence.calibration
-    recent: deque[KeyPoints] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
+    recent: deque[np.ndarray] = deque(maxlen=options.reach + 1)  # descriptors of a whole sequence would fill gigabytes
     pixels: list[np.ndarray] = []
     matches: dict[tuple[int, int], np.ndarray] = {}
     for j in range(len(sequence)):
         report("key-points and matches", j, len(sequence))
-        recent.append(detect(read(j), options.keypoints))
-        pixels.append(recent[-1].pixels)
+        found, descriptors = detect(read(j), options.keypoints)
+        pixels.append(found)
+        recent.append(descriptors)
         for i in range(max(j - options.reach, 0), j):
             pairs = match(recent[i - j - 1], recent[-1])
             first, second = (calibration.rays(pixels[k][own]) for k, own in ((i, pairs[:, 0]), (j, pairs[:, 1])))
-            matches[i, j] = pairs[essential(first, second, EPIPOLAR_PIXELS / calibration.fx, options.seed)[1]]
+            matches[i, j] = pairs[essential(first, second, EPIPOLAR_PIXELS / calibration.fx)[1]]
     linked, before = [0], [0]
     for j in range(1, len(sequence)):
         before = [i for i in linked if j - i <= options.reach]

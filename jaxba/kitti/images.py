@@ -23,21 +23,23 @@ Reader = Callable[[int], np.ndarray]
 def image_reader(sequence: Sequence) -> Reader:
     """A reader of grey images, which must all have the size of the first one.
 
-    Images of 16 bits are shifted to the right by `spare_bits`.
+    Images of 16 bits are shifted to the right until the first one fits into 8 bits: cameras of 10 or 12 bits leave the
+    highest bits empty.
 
     Raises:
         ProblemError: (when called) an image cannot be read or has another size.
     """
-    size, spare = functools.cache(lambda: image_size(sequence)), functools.cache(lambda: spare_bits(sequence))
+    first = functools.cache(lambda: _decode(sequence.images[0]))
 
     def read(index: int) -> np.ndarray:
         image = _decode(sequence.images[index])
-        if image.shape != size()[::-1]:
-            sizes = [f"{width:g} x {height:g}" for width, height in (image.shape[::-1], size())]
+        if image.shape != first().shape:
+            sizes = [f"{width} x {height}" for height, width in (image.shape, first().shape)]
             raise ProblemError(f"{display_name(sequence.images[index])}: is {sizes[0]} pixels, the first is {sizes[1]}")
-        if image.dtype != np.uint8:
-            image = np.minimum(image >> spare(), 2**GREY_BITS - 1).astype(np.uint8)
-        return image
+        if image.dtype == np.uint8:
+            return image
+        bits = 16 if first().dtype == np.uint8 else int(first().max()).bit_length()
+        return np.minimum(image >> max(bits - GREY_BITS, 0), 2**GREY_BITS - 1).astype(np.uint8)
 
     return read
 
@@ -46,18 +48,6 @@ def image_size(sequence: Sequence) -> tuple[float, float]:
     """Width and height of the first image, pixels. Raises ProblemError where it cannot be read."""
     height, width = _decode(sequence.images[0]).shape
     return float(width), float(height)
-
-
-def spare_bits(sequence: Sequence) -> int:
-    """Number of low bits to drop from every image, so that the first one fits into 8 bits.
-
-    Cameras of 10 or 12 bits leave the highest bits of their 16-bit images empty.
-
-    Raises:
-        ProblemError: the first image cannot be read.
-    """
-    first = _decode(sequence.images[0])
-    return GREY_BITS if first.dtype == np.uint8 else max(int(first.max()).bit_length() - GREY_BITS, 0)
 
 
 def _decode(path: Path) -> np.ndarray:

@@ -122,7 +122,7 @@ class _Scene:
     def motion(self, i: int, j: int) -> _Motion | None:
         """Motion from view i to view j; None if they share too few tracks."""
         tracks, a, b = self.shared(i, j)
-        matrix, inliers = essential(a, b, EPIPOLAR_PIXELS / self.focal, self.options.seed)
+        matrix, inliers = essential(a, b, EPIPOLAR_PIXELS / self.focal)
         if matrix is None or inliers.sum() < MIN_POINTS:
             return None
         a, b = np.ascontiguousarray(a[inliers]), np.ascontiguousarray(b[inliers])
@@ -153,7 +153,7 @@ def visual_odometry(
         tracks: their images are the views, 0 to `views` - 1.
         views: how many.
         calibration: of all views.
-        options: limits for points, and the seed of random samples.
+        options: limits for points.
         names: frame numbers of the views, for messages.
         report: called with the number of views whose pose is known.
 
@@ -222,7 +222,6 @@ def _resect(scene: _Scene, view: int) -> tuple[np.ndarray, np.ndarray] | None:
     # in the frame of the neighbour, where coordinates are small and rounding errors too
     points = scene.views.local(np.full(len(rows), near), scene.points[scene.tracks.track[rows]])
     rays, pinhole = np.ascontiguousarray(scene.observations.rays[rows]), (np.eye(3), np.zeros(4))
-    cv2.setRNGSeed(scene.options.seed)
     ok, turn, shift, inliers = cv2.solvePnPRansac(
         points,
         rays,

@@ -36,6 +36,3 @@ class Build:
 
     min_views: int = 2
     """Key-frames that observe a point at least."""
-
-    seed: int = 0
-    """Seed of all random numbers."""

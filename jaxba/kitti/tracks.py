@@ -53,27 +53,27 @@ class Tracks:
         _, at_a, at_b = np.intersect1d(self.track[rows_a], self.track[rows_b], return_indices=True)
         return rows_a[at_a], rows_b[at_b]
 
-    def keep(self, rows: np.ndarray, min_views: int) -> Tracks:
-        """The observations that a mask selects, of tracks that then still have `min_views`; tracks are renumbered."""
+    def keep(self, rows: np.ndarray) -> Tracks:
+        """The observations that a mask selects, of tracks that then still have two; tracks are renumbered."""
         image, track, pixels = self.image[rows], self.track[rows], self.pixels[rows]
-        long = np.bincount(track, minlength=self.count)[track] >= min_views
+        long = np.bincount(track, minlength=self.count)[track] >= 2
         return Tracks(image[long], np.unique(track[long], return_inverse=True)[1], pixels[long])
 
-    def restrict(self, images: Sequence[int], min_views: int = 2) -> Tracks:
-        """The observations of some images, renumbered 0, 1, ...; tracks with fewer than `min_views` are dropped."""
+    def restrict(self, images: Sequence[int]) -> Tracks:
+        """The observations of some images, renumbered 0, 1, ...; tracks with fewer than two are dropped."""
         new = np.full(int(self.image.max(initial=-1)) + 1, -1)
         wanted = np.asarray(images, int)
         new[wanted[wanted < len(new)]] = np.flatnonzero(wanted < len(new))
-        kept = self.keep(new[self.image] >= 0, min_views)
+        kept = self.keep(new[self.image] >= 0)
         return Tracks(new[kept.image], kept.track, kept.pixels)
 
 
-def make_tracks(image: np.ndarray, track: np.ndarray, pixels: np.ndarray, min_views: int = 2) -> Tracks:
-    """Tracks from observations in any order, with any numbers of tracks."""
+def make_tracks(image: np.ndarray, track: np.ndarray, pixels: np.ndarray) -> Tracks:
+    """Tracks of two observations or more, from those in any order, with any numbers of tracks."""
     order = np.lexsort((image, track))
     track = np.unique(track[order], return_inverse=True)[1]
     table = Tracks(np.asarray(image)[order], track, np.asarray(pixels, np.float64)[order])
-    return table.keep(np.ones(len(track), bool), min_views)
+    return table.keep(np.ones(len(track), bool))
 
 
 def join_matches(

@@ -30,13 +30,6 @@ class Errors(NamedTuple):
     largest: float
 
 
-class RelativeErrors(NamedTuple):
-    """From one pose to the next."""
-
-    translation: Errors  # units of the truth
-    rotation: Errors  # degrees
-
-
 class SegmentErrors(NamedTuple):
     """The development kit's averages over all segments."""
 
@@ -53,13 +46,16 @@ def absolute_errors(aligned: Poses, truth: Poses) -> Errors:
     return _statistics(np.linalg.norm(aligned[:, :, 3] - truth[:, :, 3], axis=1))
 
 
-def relative_errors(aligned: Poses, truth: Poses) -> RelativeErrors:
+def relative_errors(aligned: Poses, truth: Poses) -> tuple[Errors, Errors]:
     """Errors of the motion from each pose to the next, `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; evo's RPE with a delta of one.
 
     The estimate must have the truth's scale; its rotation and position do not matter.
+
+    Returns:
+        Of translations, in units of the truth, and of rotations, degrees.
     """
     error = _motion(_motion(truth[:-1], truth[1:]), _motion(aligned[:-1], aligned[1:]))
-    return RelativeErrors(_statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error)))
+    return _statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error))
 
 
 def segment_errors(

@@ -118,12 +118,8 @@ def triangulate_robustly(
 
     Points are triangulated once more without the observations whose errors are too large.
 
-    Args:
-        views: of all cameras.
-        observations: of all tracks.
-        angle: least angle between two rays of a point, degrees.
-        error: largest error of an observation, in units of the focal length.
-        min_views: observations that a point needs.
+    A point needs `min_views` observations with errors of at most `error`, in units of the focal length, and two rays
+    with an angle of `angle` degrees between them.
     """
     first = triangulate(views, observations)
     points, keep = first.points, (first.error <= error) & (first.depth > 0)

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, Literal, TypeVar, cast, get_args
+from typing import Any, Literal, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -30,8 +30,6 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 Compilation = Literal["full", "quick", "auto"]
 """`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, and full after as many iterations as pay
 for it, by the number of observations."""
-
-COMPILATIONS: tuple[str, ...] = get_args(Compilation)
 
 Level = Literal["full", "quick"]
 """How much one program is optimised."""

@@ -53,13 +53,7 @@ class Viewer:
     """A page that is served until it is closed."""
 
     def __init__(self, all_shown: Sequence[Shown], port: int = PORT, host: str = HOST) -> None:
-        """Serves a page.
-
-        Args:
-            all_shown: what stands side by side on it.
-            port: first one that is tried.
-            host: address of this machine at which it is reached; `0.0.0.0`: all of them.
-        """
+        """Serves a page at this port or the next free one of an address of this machine; `0.0.0.0`: of all of them."""
         self.host, self.server = host, start_server(port, host)
         self._lock = threading.RLock()
         self.stages = stages(self.server, all_shown, self.choose, caption="name" if len(all_shown) > 1 else "")
@@ -170,15 +164,8 @@ def stages(
     points: int = SHOWN_POINTS,
     caption: str = "",
 ) -> list[Stage]:
-    """Draws problems and solves side by side, and turns the camera to them.
-
-    Args:
-        server: owner of the scene.
-        all_shown: what to draw.
-        on_click: called with the stage and the number of an image that was clicked.
-        points: most points, of all together.
-        caption: as of a `Stage`.
-    """
+    """Draws problems and solves side by side, with at most so many points together, and turns the camera to them. A
+    click on an image calls `on_click` with its stage and its number; `caption` is that of a `Stage`."""
     share = max(points // len(all_shown), 1)
     found: list[Stage] = []
     for place, one in enumerate(all_shown):
