@@ -3,7 +3,7 @@
     python -m benchmarks.compilation PROBLEM ... [--solver learned] [--linear-solver auto] [--repeats 15]
     python -m benchmarks.compilation PROBLEM ... --whole
 
-PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The last columns show after
+PROBLEM is a file or a random scene (`scene:random-150`), the solver one of `jaxba-bench`. The last column shows after
 how many runs, times the observations of the problem and in millions, the faster programs of a better level have repaid
 its longer compilation; the constants of `jaxba/runtime/compilation.py` come from them. The levels are timed alternately
 in one process, without a compilation cache, at the start of the problem with lambda 1e-4. `--whole` times calls of
@@ -44,11 +44,11 @@ from jaxba.structure.layout import layout_for
 LONGEST = 10.0
 """Limit in seconds of all repeats of one program."""
 
-LEVELS: tuple[Level, ...] = ("quick", "medium", "full")
+LEVELS: tuple[Level, ...] = ("quick", "full")
 """Levels of optimisation, by increasing time of compilation and decreasing time of a run."""
 
-REPAID = (("quick", "medium"), ("quick", "full"), ("medium", "full"))
-"""Pairs of levels in the last columns, the better one second."""
+REPAID = (("quick", "full"),)
+"""Levels in the last column, the better one second."""
 
 HEADING = (
     f"{'problem':28s} {'linear solver':13s} {'part':9s}"

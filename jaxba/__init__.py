@@ -1,10 +1,5 @@
 """Bundle adjustment in JAX whose Levenberg-Marquardt damping is chosen by a policy, learned or written."""
 
-from jaxba.runtime import interrupt as _interrupt
-
-_interrupt.end_at_once()  # before the imports that take long
-
-# ruff: noqa: E402
 from jaxba.damping import (
     POLICIES,
     Ceres,

@@ -90,7 +90,6 @@ def write_sequence(folder: Path, camera: Camera, poses: np.ndarray) -> Path:
         cv2.imwrite(str(folder / "image_0" / f"{number:06d}.png"), render(camera, pose, layers))
     matrix = [camera.fx, 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
     (folder / "calib.txt").write_text("P0: " + " ".join(f"{number:.12e}" for number in matrix) + "\n")
-    (folder / "times.txt").write_text("".join(f"{0.1 * i:e}\n" for i in range(len(poses))))
     rows = [" ".join(f"{number:.9e}" for number in pose.ravel()) for pose in poses]
     (folder / "poses.txt").write_text("\n".join(rows) + "\n")
     return folder

@@ -156,46 +156,31 @@ def exit_with(status: int) -> NoReturn:
     sys.exit(status)
 
 
-def prepare_process(*, untraced: bool = False) -> None:
-    """Makes the process keep freed memory, loads LAPACK, and enables the cache of compiled programs.
-
-    Args:
-        untraced: which cache; see `use_compilation_cache`.
-    """
+def prepare_process() -> None:
+    """Makes the process keep freed memory, enables the cache of compiled programs, and loads LAPACK."""
     from jaxba.runtime import process
 
     process.keep_memory()
+    use_compilation_cache()
     process.load_lapack()
-    use_compilation_cache(untraced)
 
 
-def use_compilation_cache(untraced: bool = False) -> None:
-    """Keeps compiled programs in the user's cache folder, so that the next run starts faster.
-
-    Args:
-        untraced: whether to use the cache of `jaxba/runtime/executable_cache.py`, which finds programs without tracing
-            them, but only those that jaxba compiles itself. Otherwise JAX's own cache is used. Both cannot be used
-            together, since a program that JAX has read from its cache cannot be serialised again.
-    """
+def use_compilation_cache() -> None:
+    """Keeps compiled programs in the user's cache folder by JAX's own cache, so that the next run starts faster."""
     import jax
 
-    from jaxba.runtime import compilation, distrust
+    from jaxba.runtime.distrust import programs_folder
     from jaxba.runtime.user_cache import user_cache
 
     choice = os.environ.get(CACHE_VARIABLE, "")
     if choice.lower() == "off" or jax.config.values.get("jax_compilation_cache_dir"):
         return
-    folder = Path(choice) if choice else user_cache("xla")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder = programs_folder(Path(choice) if choice else user_cache("xla"))
     except OSError:
         return  # without a writable cache folder the command only takes longer
-    distrust.limit_instructions(folder)
-    if untraced:
-        compilation.use_cache(folder)
-        return
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def check_extra(module: str) -> None:

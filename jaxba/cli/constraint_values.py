@@ -81,17 +81,17 @@ def _written(value: Any) -> str:
 
 def _stddev(value: Any, images: list[str]) -> Float[np.ndarray, "n 3"]:
     """Standard deviations of each image."""
-    if isinstance(value, dict):
-        missing = [image for image in images if image not in value]
-        if missing:
-            raise ValueError(f"stddev: missing for {names_of(missing)}")
-        return np.stack([_deviations(f"stddev: {image}", value[image]) for image in images])
     if isinstance(value, list) and (len(value) != 3 or any(isinstance(one, list) for one in value)):
         if len(value) != len(images):
             what = f"must be one number, three, or one or three for each of {len(images)} images"
             raise ValueError(f"stddev: {what}, not {len(value)} values")
-        return np.stack([_deviations(f"stddev: {image}", one) for image, one in zip(images, value, strict=True)])
-    return np.tile(_deviations("stddev", value), (len(images), 1))
+        value = dict(zip(images, value, strict=True))
+    if not isinstance(value, dict):
+        return np.tile(_deviations("stddev", value), (len(images), 1))
+    missing = [image for image in images if image not in value]
+    if missing:
+        raise ValueError(f"stddev: missing for {names_of(missing)}")
+    return np.stack([_deviations(f"stddev: {image}", value[image]) for image in images])
 
 
 def _deviations(where: str, value: Any) -> Float[np.ndarray, "3"]:

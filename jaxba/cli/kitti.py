@@ -7,9 +7,9 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -24,24 +24,24 @@ from jaxba.io.frames import poses_of, read_sidecar, truth_of, write_sidecar
 from jaxba.io.notes import note, note_center
 from jaxba.io.poses import read_poses
 from jaxba.kitti import evaluate
-from jaxba.kitti.assemble import Assembled, sidecar_contents, windows
-from jaxba.kitti.options import BuildOptions, Features
-from jaxba.kitti.sequence import files_of, read_sequence
+from jaxba.kitti.assemble import Frames, windows
+from jaxba.kitti.calibration import calibration_files
+from jaxba.kitti.options import Build
+from jaxba.kitti.sequence import read_sequence
 from jaxba.kitti.trajectory import path_length
 from jaxba.problem import geometry
-from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.runtime.atomic import write_text
 
 EVALUATE = "evaluate"
 """First argument of the subcommand; a folder of this name can be given as ./evaluate."""
 
-DEFAULTS = BuildOptions()
-"""Defaults of the options of the same names."""
+options(Build)
 
 
 @options
-class Arguments:
-    """Options of `jaxba-kitti`."""
+class Files:
+    """What is read and written."""
 
     sequence: Annotated[str, "SEQUENCE", tyro.conf.Positional]
     """Folder of a KITTI sequence: image_0/000000.png ... and calib.txt, or image_00/data of the raw data."""
@@ -53,49 +53,9 @@ class Arguments:
     frames: Annotated[str, "A:B:STEP"] = ":"
     """Range of frame numbers, without the end, such as 0:200."""
 
-    features: Features = DEFAULTS.features
-    """sift, orb: match key-points. klt: track corners from frame to frame."""
-
-    keypoints: int = DEFAULTS.keypoints
-    """Key-points per frame at most."""
-
-    reach: int = DEFAULTS.reach
-    """Previous frames with which each frame is matched."""
-
-    min_matches: int = DEFAULTS.min_matches
-    """Verified matches between two frames at least."""
-
-    keyframes: Annotated[str, "RULE"] = "auto"
-    """auto: by parallax and the fraction of tracks left. all: every frame. N: every N-th frame."""
-
-    start: Literal["vo", "poses", "noisy-poses"] = "vo"
-    """vo: start from monocular visual odometry. poses: from --poses. noisy-poses: from --poses with accumulating
-    errors."""
-
     poses: Annotated[str | None, "FILE"] = None
     """True poses, 12 numbers per line for every frame from 0, or 13, the first of them the frame. With --start vo only
     the error of the start is computed from them."""
-
-    rotation_sigma: float = DEFAULTS.rotation_sigma
-    """Error of noisy-poses: standard deviation per axis and key-frame, degrees."""
-
-    translation_sigma: float = DEFAULTS.translation_sigma
-    """The same per axis and key-frame, relative to the distance from the previous key-frame."""
-
-    min_angle: float = DEFAULTS.min_angle
-    """Smallest triangulation angle of a point, degrees."""
-
-    max_error: float = DEFAULTS.max_error
-    """Largest reprojection error of an observation before the noise of noisy-poses, pixels."""
-
-    min_views: int = DEFAULTS.min_views
-    """Key-frames that observe a point at least."""
-
-    window: int | None = None
-    """Write several problems of this many key-frames, named NAME-FIRST-LAST by their frames."""
-
-    stride: int | None = None
-    """Key-frames from the start of one window to the next. Default: half a window."""
 
     camera: int = 0
     """Number of the camera, from 0 (image_0 and P0) to 3."""
@@ -104,11 +64,16 @@ class Arguments:
     """Camera matrix: lines as in calib.txt, calib_cam_to_cam.txt or perspective.txt, or 3 x 3 numbers. Default: that of
     the sequence."""
 
-    work: Annotated[str | None, "FOLDER"] = None
-    """Intermediate results, with which an interrupted run continues. Default: NAME.work."""
+    window: int | None = None
+    """Write several problems of this many key-frames, named NAME-FIRST-LAST by their frames."""
 
-    seed: int = DEFAULTS.seed
-    """Seed of all random numbers."""
+    stride: int | None = None
+    """Key-frames from the start of one window to the next. Default: half a window."""
+
+
+@options
+class Arguments(Build, Files):
+    """Options of `jaxba-kitti`."""
 
 
 @options
@@ -137,7 +102,7 @@ def main() -> None:
 
 
 def run(argv: Sequence[str] | None = None) -> int:
-    """Runs the command. Exit status: 0 for success, 2 for bad input, 130 after Ctrl-C (a new run continues)."""
+    """Runs the command. Exit status: 0 for success, 2 for bad input, 130 after Ctrl-C."""
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv[:1] == [EVALUATE]:
         text = "Computes trajectory errors and draws the scene from above."
@@ -151,13 +116,10 @@ def _check(args: Arguments) -> None:
     common.check_positive(
         keypoints=args.keypoints, reach=args.reach, max_error=args.max_error, min_matches=args.min_matches
     )
-    for name in ("max_error", "rotation_sigma", "translation_sigma"):
-        value = getattr(args, name)
-        common.require(math.isfinite(value), f"--{name.replace('_', '-')} must be finite, is {value:g}")
+    common.require(math.isfinite(args.max_error), f"--max-error must be finite, is {args.max_error:g}")
     common.require(args.min_views >= 2, f"--min-views must be at least 2, is {args.min_views}")
     common.require(0 <= args.min_angle < 180, f"--min-angle must lie between 0 and 180, is {args.min_angle:g}")
-    common.require(0 <= args.seed < 2**31, f"--seed must lie between 0 and 2147483647, is {args.seed}")
-    common.require(args.start == "vo" or args.poses is not None, f"--start {args.start} needs --poses")
+    common.require(args.start == "vo" or args.poses is not None, "--start poses needs --poses")
     common.require(args.stride is None or args.window is not None, "--stride needs --window")
     common.check_writable("--out", args.out)
     check_output(args.out)
@@ -168,39 +130,28 @@ def _check(args: Arguments) -> None:
 
 def _build(args: Arguments) -> int:
     _check(args)
-    from jaxba.kitti.build import build
+    from jaxba.kitti.frontend import build
 
-    with common.notes_printed():
-        sequence, poses = _inputs(args)
-    _check_apart([args.out], sequence, args)
-    options = BuildOptions(**{field.name: getattr(args, field.name) for field in fields(BuildOptions)})
     console = common.console()
-    work = Path(args.work or Path(strip_compression(args.out)).with_suffix(".work"))
-    try:
-        with _progress(console) as report:
-            built = build(sequence, options, work, poses, report)
-        parts = _parts(built, args)
-        _check_apart([path for _, path in parts], sequence, args)
-        for part, path in parts:
-            _write(part, path, sequence, args)
-    except KeyboardInterrupt:
-        console.print("interrupted; what is done is kept, run the same command again to continue")
-        return common.INTERRUPTED
-    console.print(_build_table([part for part, _ in parts], built, poses))
-    for words, numbers in (
-        ("left out, too few matches", built.dropped),
-        ("placed relative to the key-frame beside, without enough known points", built.restarts),
-    ):
-        if numbers:
-            console.print(f"note: {words}: frame{'s'[: len(numbers) > 1]} {', '.join(map(str, numbers))}")
-    console.print(f"wrote {', '.join(path for _, path in parts)}")
+    with common.notes_printed(), _progress(console) as report:
+        sequence, poses = _inputs(args)
+        _check_apart([args.out], sequence, args)
+        whole, frames, tracks = build(sequence, args, poses, report)
+    parts = _parts(whole, frames, args)
+    _check_apart([path for _, _, path in parts], sequence, args)
+    for part in parts:
+        _write(*part, sequence, args)
+    title = f"{len(sequence)} frames, {len(frames)} key-frames, {tracks} tracks"
+    console.print(_build_table(title, parts, poses))
+    console.print(f"wrote {', '.join(path for _, _, path in parts)}")
     return 0
 
 
 def _check_apart(problems: Sequence[str], sequence: Any, args: Arguments) -> None:
     """Refuses a problem, or the frames beside one, in the place of a file of the sequence."""
     written = {"--out": [*problems, *map(sidecar_path, problems)]}
-    own = [*sequence.images, *files_of(args.sequence, sequence.folder)]
+    folder = Path(args.sequence)
+    own = [*sequence.images, *calibration_files(folder), folder / "times.txt"]
     read = {"the file of --poses": [args.poses], "the file of --calibration": [args.calibration]}
     check_apart(written, {"a file of the sequence": own, **read})
 
@@ -224,49 +175,46 @@ def _inputs(args: Arguments) -> tuple[Any, Any]:
     return sequence, poses
 
 
-def _parts(built: Any, args: Arguments) -> list[tuple[Assembled, str]]:
-    """The problems to write, and their files."""
+def _parts(whole: BundleProblem, frames: Frames, args: Arguments) -> list[tuple[BundleProblem, Frames, str]]:
+    """The problems to write, the frames of their cameras, and their files."""
     if args.window is None:
-        return [(built.whole, args.out)]
+        return [(whole, frames, args.out)]
     stride = max(args.window // 2, 1) if args.stride is None else args.stride
     plain = strip_compression(args.out)
     stem, ending = Path(plain).with_suffix(""), Path(plain).suffix + args.out[len(plain) :]
-    parts = windows(built.whole, args.window, stride, args.min_views)
-    return [(part, f"{stem}-{part.frames[0]:06d}-{part.frames[-1]:06d}{ending}") for part in parts]
+    parts = windows(whole, frames, args.window, stride, args.min_views)
+    return [(part, own, f"{stem}-{own[0]:06d}-{own[-1]:06d}{ending}") for part, own in parts]
 
 
-def _write(part: Assembled, path: str, sequence: Any, args: Arguments) -> None:
+def _write(problem: BundleProblem, frames: Frames, path: str, sequence: Any, args: Arguments) -> None:
     """Writes the file of frames first, then the problem, so that there is never a problem without its frames."""
     from jaxba import __version__
     from jaxba.kitti.opencv import cv2
 
-    times = None if sequence.times is None else dict(zip(sequence.numbers, sequence.times.tolist(), strict=True))
-    metadata = sidecar_contents(
-        part,
-        sequence.calibration,
-        times=times and [times[number] for number in part.frames],
-        options=asdict(args),
-        versions={"jaxba": __version__, "opencv": cv2.__version__},
-    )
+    metadata = {
+        "format": 1,
+        "frames": frames,
+        "calibration": asdict(sequence.calibration),
+        "options": asdict(args),
+        "versions": {"jaxba": __version__, "opencv": cv2.__version__},
+    }
     write_sidecar(path, metadata)
-    write_problem(part.problem, path)
+    write_problem(problem, path)
 
 
-def _build_table(parts: list[Assembled], built: Any, poses: Any) -> Any:
-    title = f"{built.frames} frames, {len(built.whole.frames)} key-frames, {built.tracks} tracks"
+def _build_table(title: str, parts: list[tuple[BundleProblem, Frames, str]], poses: Any) -> Any:
     table = _table(title, "frames", "key-frames", "points", "observations", "mean error (px)", "ATE of the start (m)")
-    for part in parts:
-        problem = part.problem
+    for problem, frames, _ in parts:
         error = np.linalg.norm(geometry.residuals(problem), axis=1).mean()
         ate = "-"
         if poses is not None:
             try:
-                found = evaluate.score(geometry.camera_poses(problem.cameras), poses(part.frames))
-                ate = f"{found.absolute.rmse:.3f}"
+                found = evaluate.score(geometry.camera_poses(problem.cameras), poses(frames))
+                ate = f"{found['ate_m']['rmse']:.3f}"
             except ProblemError:  # a straight line, or two cameras
                 ate = "undefined"
         numbers = (problem.num_cameras, problem.num_points, problem.num_observations, f"{error:.3f}", ate)
-        table.add_row(f"{part.frames[0]} to {part.frames[-1]}", *map(str, numbers))
+        table.add_row(f"{frames[0]} to {frames[-1]}", *map(str, numbers))
     return table
 
 
@@ -280,21 +228,23 @@ def _evaluate(args: EvaluateArguments) -> int:
     truth = None if args.poses is None else truth_of(side, args.poses)
     with common.notes_printed():
         results = evaluate.evaluate([args.problem, *args.solutions], side, truth, args.lengths)
-    views = [plots.View(_caption(r), r.points, r.poses[:, :, 3]) for r in results]
+    views = [(_caption(numbers), points, poses[:, :, 3]) for numbers, poses, points in results]
+    rows = [numbers for numbers, _, _ in results]
+    contents = json.dumps({"frames": side.frames, "results": rows}, allow_nan=False)
     figure = plots.plot_top_view(views, None if truth is None else truth[:, :, 3])
     folder = Path(args.out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / "evaluation.json", json.dumps(evaluate.as_json(results, side), allow_nan=False) + "\n")
-        for number, result in enumerate(results):
-            evaluate.write_poses(folder / f"poses-{number}-{result.name}.txt", result.poses)
+        write_text(folder / "evaluation.json", contents + "\n")
+        for at, (numbers, poses, _) in enumerate(results):
+            evaluate.write_poses(folder / f"poses-{at}-{numbers['name']}.txt", poses)
         if truth is not None:
             evaluate.write_poses(folder / "poses-truth.txt", truth)
         files = save_figure(figure, folder / "top-view")
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     console = common.console()
-    console.print(_evaluate_table(results, truth))
+    console.print(_evaluate_table(rows, truth))
     console.print(f"wrote {files[0]} and {len(results) + (truth is not None) + 2} files beside it")
     return 0
 
@@ -308,29 +258,26 @@ def _check_results_apart(args: EvaluateArguments) -> None:
     check_apart({"--out": [folder / name for name in names]}, read)
 
 
-def _caption(result: evaluate.Evaluated) -> str:
-    ate = "" if result.scores is None else f", ATE {result.scores.absolute.rmse:.2f} m"
-    return f"{result.name}{ate}"
+def _caption(numbers: dict[str, Any]) -> str:
+    return numbers["name"] + (f", ATE {numbers['ate_m']['rmse']:.2f} m" if "ate_m" in numbers else "")
 
 
-def _evaluate_table(results: list[evaluate.Evaluated], truth: Any) -> Any:
-    title = f"{len(results[0].poses)} key-frames"
+def _evaluate_table(results: list[dict[str, Any]], truth: Any) -> Any:
+    title = f"{results[0]['cameras']} key-frames"
     names: tuple[str, ...] = ()
     if truth is not None:
         title += f", {path_length(truth):.1f} m of path; after similarity alignment"
         names = ("ATE (m)", "largest (m)", "RPE (m)", "RPE (deg)", "segments (%)", "(deg/m)", "number")
     table = _table(title, "file", "rms (px)", *names)
-    for r in results:
-        row = [r.name, f"{r.rms:.4f}"]
-        if r.scores is not None:
-            s, segments = r.scores, r.scores.segments
-            row += [f"{s.absolute.rmse:.3f}", f"{s.absolute.largest:.3f}"]
-            row += [f"{s.relative.translation.rmse:.4f}", f"{s.relative.rotation.rmse:.4f}"]
-            row += (
-                ["-"] * 3
-                if segments is None
-                else [f"{segments.translation:.3f}", f"{segments.rotation:.5f}", str(segments.segments)]
-            )
+    for found in results:
+        row = [found["name"], f"{found['rms_px']:.4f}"]
+        if truth is not None:
+            row += [f"{found['ate_m'][name]:.3f}" for name in ("rmse", "largest")]
+            row += [f"{found[name]['rmse']:.4f}" for name in ("rpe_translation_m", "rpe_rotation_deg")]
+            if (segments := found["segments"]) is None:
+                row += ["-"] * 3
+            else:
+                row += [f"{segments['translation']:.3f}", f"{segments['rotation']:.5f}", str(segments["segments"])]
         table.add_row(*row)
     return table
 

@@ -27,7 +27,7 @@ _COLORS = re.compile(r"\x1b\[[\d;]*m")
 
 @dataclass_transform(frozen_default=True)
 def options(cls: type[Arguments]) -> type[Arguments]:
-    """Makes a frozen dataclass of options.
+    """Makes a frozen dataclass of options, or gives one its help.
 
     The text below a field is its help, whatever the lengths of its lines. A text in the annotation,
     `Annotated[str, "FILE"]`, stands for the value in the help. A class that inherits from several such classes has
@@ -45,7 +45,7 @@ def options(cls: type[Arguments]) -> type[Arguments]:
         )
         own = [extra for extra in extras if not isinstance(extra, str)]
         cls.__annotations__[name] = Annotated[(kind, shown, *own)]  # pyright: ignore[reportInvalidTypeForm]
-    return dataclass(frozen=True)(cls)
+    return cls if "__dataclass_fields__" in vars(cls) else dataclass(frozen=True)(cls)
 
 
 def _texts(cls: type) -> dict[str, str]:

@@ -49,7 +49,9 @@ def check_outputs(
     Raises:
         UsageError, ProblemError: they cannot be, or one is; the message is one line.
     """
+    solution: list[StrPath | None] = [output]
     if output and is_model(output, source):
+        solution = [*formats.model_files(output)]
         common.check_folder("--output", output)
         if not _is_like_source(output, source):
             check_output(output)
@@ -58,9 +60,6 @@ def check_outputs(
         check_output(output or "")
     for option, path in others.items():
         common.check_writable(option, path)
-    solution: list[StrPath | None] = [output]
-    if output and is_model(output, source):
-        solution = [*formats.model_files(output)]
     written = {option: [path] for option, path in others.items()}
     check_apart({"--output": solution, **written}, {what: [path] for what, path in read.items()})
     replaced = output and source and os.path.exists(output) and os.path.samefile(output, source)

@@ -304,13 +304,10 @@ def _run_main(args: Arguments) -> int:
 def _solve(args: Arguments) -> int:
     common.require(args.problem != "", "the name of the problem is empty")
     policy, options = solve_options(args)
-    if _is_divided(args):
-        from jaxba.runtime.distributed import together
+    from jaxba.runtime.distributed import together
 
-        path, problem = together(lambda: _checked(args))
-    else:
-        path, problem = _checked(args)
-    common.prepare_process(untraced=not _is_divided(args))
+    path, problem = together(lambda: _checked(args))
+    common.prepare_process()
     name = f"random scene {DEFAULT_SCENE}" if args.problem is None else path if args.problem == STREAM else args.problem
     assert name is not None
     common.print_line(table.heading(name, problem, args, options.step_options(policy)))

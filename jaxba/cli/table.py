@@ -18,7 +18,7 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK
 from jaxba.results.retriangulate import Retriangulation
-from jaxba.runtime.compilation import Part, compiler_options, stages
+from jaxba.runtime.compilation import Part, compiler_options, quick_runs
 from jaxba.solver.loop import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import split_refinement
@@ -81,7 +81,7 @@ def compiled(compilation: str, problem: BundleProblem) -> str:
     if compilation == "quick":
         return "compiled quickly"
     parts: tuple[Part, ...] = ("factorization", "acceptance")
-    later = any(stages(part, problem.num_observations) for part in parts)
+    later = any(quick_runs(part, problem.num_observations) for part in parts)
     return "compiled quickly at first" if later else "compiled fully"
 
 

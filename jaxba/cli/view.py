@@ -1,14 +1,13 @@
-"""`jaxba-view`: problems and recorded solves in the browser; `jaxba.cli.episode` adds episodes of the game."""
+"""`jaxba-view`: problems and recorded solves in the browser."""
 
 from __future__ import annotations
 
-import functools
 import os
 import socket
 import sys
 import threading
 import webbrowser
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,9 +18,6 @@ from jaxba.cli.options import options
 
 if TYPE_CHECKING:
     from jaxba.viewer.panel import Viewer
-    from jaxba.viewer.recording import Recording
-
-    Play = Callable[[str, int], Recording]
 
 VIEWER = "jaxba.viewer.extra"
 """Module that needs viser."""
@@ -34,21 +30,11 @@ NAMED = 5
 class Arguments:
     """Options of `jaxba-view`."""
 
-    files: Annotated[tuple[str, ...], "[FILE ...]", tyro.conf.Positional]
+    files: Annotated[tuple[str, ...], "FILE ...", tyro.conf.Positional]
     """Problems in any format of jaxba-solve, and recordings of jaxba-solve --record, side by side."""
 
     images: Annotated[str | None, "FOLDER"] = None
     """Images, for files that name them (COLMAP, jaxba-kitti)."""
-
-    poses: Annotated[str | None, "FILE"] = None
-    """KITTI's true poses of the whole sequence. Default: those with which jaxba-kitti made the problem, if the file
-    exists."""
-
-    policy: Annotated[str | None, "NAME"] = None
-    """Instead of files: an episode of the game, played by this policy or file of jaxba-train."""
-
-    scene: int = 0
-    """Number of the random scene of --policy."""
 
     html: Annotated[str | None, "FILE"] = None
     """Write one page that opens without a server and plays the iterations. Nothing is served."""
@@ -61,25 +47,17 @@ class Arguments:
 
 
 def main() -> None:
-    """Entry point without episodes of the game."""
+    """Entry point of `jaxba-view`."""
     common.exit_with(run())
 
 
-def run(argv: Sequence[str] | None = None, play: Play | None = None) -> int:
-    """Runs the command. Exit status: 0, or 2 for bad input.
-
-    Args:
-        argv: the command line; `sys.argv[1:]` if None.
-        play: makes the recording of `--policy` and `--scene`.
-    """
-    show = functools.partial(_run, play=play)
-    return common.run_command(Arguments, show, "Look at problems and recorded solves in the browser.", argv)
+def run(argv: Sequence[str] | None = None) -> int:
+    """Runs the command. Exit status: 0, or 2 for bad input."""
+    return common.run_command(Arguments, _run, "Look at problems and recorded solves in the browser.", argv)
 
 
-def _run(args: Arguments, play: Play | None) -> int:
-    common.require(bool(args.files or args.policy), "name a problem or a recording, or a policy by --policy")
-    common.require(not (args.files and args.policy), "--policy plays a random scene, not a file")
-    common.require(args.scene >= 0, f"--scene must not be negative, is {args.scene}")
+def _run(args: Arguments) -> int:
+    common.require(bool(args.files), "name a problem or a recording")
     common.require(0 < args.port < 65536, f"--port must lie between 1 and 65535, is {args.port}")
     common.require(args.images is None or os.path.isdir(args.images), f"--images {args.images}: is no folder")
     _check_host(args.host)
@@ -89,12 +67,7 @@ def _run(args: Arguments, play: Play | None) -> int:
     from jaxba.viewer import sources
 
     with common.notes_printed():
-        if args.policy is None:
-            shown = sources.open_all(args.files, args.images, args.poses)
-        else:
-            if play is None:
-                raise common.UsageError("--policy needs the game: use jaxba-view")
-            shown = [sources.shown(play(args.policy, args.scene), f"scene {args.scene}, {args.policy}")]
+        shown = sources.open_all(args.files, args.images)
     if args.html:
         from jaxba.viewer.page import write_page
 
@@ -130,13 +103,12 @@ def _check_apart(args: Arguments) -> None:
     """Refuses a page in the place of a file that is shown."""
     if args.html is None:
         return
-    from jaxba.cli.overwriting import PROBLEM, check_apart, policy_file, problem_files
+    from jaxba.cli.overwriting import PROBLEM, check_apart, problem_files
     from jaxba.datasets.bal.paths import resolve
 
     files = [file for name in args.files for file in problem_files(resolve(name))]
     images = [] if args.images is None else [one for one in Path(args.images).rglob("*") if one.suffix != ".html"]
-    read = {PROBLEM: files, "the file of --poses": [args.poses], "an image": images}
-    check_apart({"--html": [args.html]}, {**read, "the file of --policy": [policy_file(args.policy or "")]})
+    check_apart({"--html": [args.html]}, {PROBLEM: files, "an image": images})
 
 
 def announce(viewer: Viewer) -> None:

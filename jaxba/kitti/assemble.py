@@ -1,14 +1,13 @@
-"""Views and tracks as a bundle adjustment problem in BAL's convention, and back."""
+"""Views and tracks as a bundle adjustment problem in BAL's convention."""
 
 from __future__ import annotations
-
-from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from jaxba.io.frames import Calibration
+from jaxba.kitti.options import Build
 from jaxba.kitti.tracks import Tracks
-from jaxba.kitti.triangulate import Filters, Observations, Views, triangulate_robustly
+from jaxba.kitti.triangulate import Observations, Views, triangulate_robustly
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
 
@@ -19,24 +18,17 @@ MIN_OBSERVATIONS = 10
 """Observations that a camera needs: 20 residuals for its 9 parameters."""
 
 
-@dataclass(frozen=True)
-class Assembled:
-    """A problem and the frames of its cameras."""
-
-    problem: BundleProblem
-    frames: tuple[int, ...]
-    """Frame number of every camera."""
+Frames = tuple[int, ...]
+"""Frame number of every camera."""
 
 
 def assemble(
     tracks: Tracks,
     views: Views,
     calibration: Calibration,
-    frames: tuple[int, ...],
-    filters: Filters,
-    min_views: int,
-    start: Views | None = None,
-) -> Assembled:
+    frames: Frames,
+    options: Build,
+) -> BundleProblem:
     """The problem whose cameras are `views` and whose points are the tracks that triangulate well.
 
     Every camera starts with the focal length fx and without distortion. Where fy differs from fx, vertical
@@ -47,41 +39,36 @@ def assemble(
         views: world to camera, looking down +z.
         calibration: of all views.
         frames: frame number of each view.
-        filters: for points.
-        min_views: observations that a point needs.
-        start: initial poses of the cameras of the problem, if not `views`, from which the points are then still
-            triangulated and filtered. Every point moves with the first camera that sees it, as in odometry.
+        options: limits for points.
 
     Raises:
         ProblemError: a camera would see fewer than 10 points.
     """
     rays = calibration.rays(tracks.pixels)
     observations = Observations(tracks.image, tracks.track, rays)
-    points, keep = triangulate_robustly(views, observations, filters, calibration.fx, min_views)
+    error = options.max_error / calibration.fx
+    points, keep = triangulate_robustly(views, observations, options.min_angle, error, options.min_views)
     seen = np.bincount(tracks.image[keep], minlength=len(frames))
     if seen.min() < MIN_OBSERVATIONS:
         bad = int(seen.argmin())
         raise ProblemError(
             f"too few points: frame {frames[bad]} sees {seen[bad]} good ones, at least {MIN_OBSERVATIONS} are needed; "
-            "choose other --frames, --features or --start, or a smaller --min-angle"
+            "choose other --frames or --start, or a smaller --min-angle"
         )
     names, point_index = np.unique(tracks.track[keep], return_inverse=True)
     points = points[names]
-    if start is not None:
-        first = tracks.image[keep][np.searchsorted(point_index, np.arange(len(names)))]
-        local = views.local(first, points) - start.translation[first]
-        points, views = np.einsum("nji,nj->ni", start.rotation[first], local), start
     cameras = np.zeros((len(frames), 9))
     cameras[:, :3] = angle_axis(FLIP @ views.rotation)
     cameras[:, 3:6] = views.translation @ FLIP
     cameras[:, 6] = calibration.fx
     pixels = calibration.fx * rays[keep] * [1, -1]
-    problem = BundleProblem.create(cameras, points, pixels, tracks.image[keep], point_index)
-    return Assembled(problem, frames)
+    return BundleProblem.create(cameras, points, pixels, tracks.image[keep], point_index)
 
 
-def windows(whole: Assembled, size: int, stride: int, min_views: int) -> list[Assembled]:
-    """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before.
+def windows(
+    problem: BundleProblem, frames: Frames, size: int, stride: int, min_views: int
+) -> list[tuple[BundleProblem, Frames]]:
+    """Problems of `size` consecutive cameras, each starting `stride` cameras after the one before, and their frames.
 
     The last one ends with the last camera, so it may start less than `stride` after the one before. A window keeps the
     points that its cameras see `min_views` times.
@@ -89,32 +76,23 @@ def windows(whole: Assembled, size: int, stride: int, min_views: int) -> list[As
     Raises:
         ProblemError: the size or stride is out of range.
     """
-    cameras = whole.problem.num_cameras
+    cameras = problem.num_cameras
     if not 2 <= size <= cameras:
         raise ProblemError(f"--window must lie between 2 and the {cameras} key-frames, is {size}")
     if stride < 1:
         raise ProblemError(f"--stride must be positive, is {stride}")
-    starts = list(range(0, cameras - size, stride))
-    starts.append(cameras - size)
-    return [_window(whole, first, first + size, min_views) for first in starts]
-
-
-def _window(whole: Assembled, first: int, end: int, min_views: int) -> Assembled:
-    problem = whole.problem
     camera_index, point_index = np.asarray(problem.camera_index), np.asarray(problem.point_index)
-    keep = (camera_index >= first) & (camera_index < end)
-    keep &= np.bincount(point_index[keep], minlength=problem.num_points)[point_index] >= min_views
-    names, renumbered = np.unique(point_index[keep], return_inverse=True)
-    part = BundleProblem.create(
-        np.asarray(problem.cameras)[first:end],
-        np.asarray(problem.points)[names],
-        np.asarray(problem.observations)[keep],
-        camera_index[keep] - first,
-        renumbered,
-    )
-    return replace(whole, problem=part, frames=whole.frames[first:end])
-
-
-def sidecar_contents(part: Assembled, calibration: Calibration, **extra: object) -> dict[str, object]:
-    """Contents of the sidecar file of a problem."""
-    return {"format": 1, "frames": list(part.frames), "calibration": asdict(calibration), **extra}
+    found = []
+    for first in (*range(0, cameras - size, stride), cameras - size):
+        keep = (camera_index >= first) & (camera_index < first + size)
+        keep &= np.bincount(point_index[keep], minlength=problem.num_points)[point_index] >= min_views
+        names, renumbered = np.unique(point_index[keep], return_inverse=True)
+        part = BundleProblem.create(
+            np.asarray(problem.cameras)[first : first + size],
+            np.asarray(problem.points)[names],
+            np.asarray(problem.observations)[keep],
+            camera_index[keep] - first,
+            renumbered,
+        )
+        found.append((part, frames[first : first + size]))
+    return found

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import functools
-import os
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
-from jaxba.io.files import StrPath, display_name, reason
+from jaxba.io.files import display_name, reason
 from jaxba.kitti.sequence import Sequence
 from jaxba.problem.bundle_problem import ProblemError
-
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-"""First bytes of a PNG file."""
 
 GREY_BITS = 8
 """Bits per pixel of the images in which key-points are detected."""
@@ -27,22 +23,23 @@ Reader = Callable[[int], np.ndarray]
 def image_reader(sequence: Sequence) -> Reader:
     """A reader of grey images, which must all have the size of the first one.
 
-    Images of 16 bits are shifted to the right by `spare_bits`.
+    Images of 16 bits are shifted to the right until the first one fits into 8 bits: cameras of 10 or 12 bits leave the
+    highest bits empty.
 
     Raises:
-        ImportError: OpenCV is missing.
         ProblemError: (when called) an image cannot be read or has another size.
     """
-    size, spare = functools.cache(lambda: image_size(sequence)), functools.cache(lambda: spare_bits(sequence))
+    first = functools.cache(lambda: _decode(sequence.images[0]))
 
     def read(index: int) -> np.ndarray:
         image = _decode(sequence.images[index])
-        if image.shape != size()[::-1]:
-            sizes = [f"{width:g} x {height:g}" for width, height in (image.shape[::-1], size())]
+        if image.shape != first().shape:
+            sizes = [f"{width} x {height}" for height, width in (image.shape, first().shape)]
             raise ProblemError(f"{display_name(sequence.images[index])}: is {sizes[0]} pixels, the first is {sizes[1]}")
-        if image.dtype != np.uint8:
-            image = np.minimum(image >> spare(), 2**GREY_BITS - 1).astype(np.uint8)
-        return image
+        if image.dtype == np.uint8:
+            return image
+        bits = 16 if first().dtype == np.uint8 else int(first().max()).bit_length()
+        return np.minimum(image >> max(bits - GREY_BITS, 0), 2**GREY_BITS - 1).astype(np.uint8)
 
     return read
 
@@ -53,56 +50,13 @@ def image_size(sequence: Sequence) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def spare_bits(sequence: Sequence) -> int:
-    """Number of low bits to drop from every image, so that the first one fits into 8 bits.
-
-    Cameras of 10 or 12 bits leave the highest bits of their 16-bit images empty.
-
-    Raises:
-        ProblemError: the first image cannot be read.
-    """
-    first = _decode(sequence.images[0])
-    return GREY_BITS if first.dtype == np.uint8 else max(int(first.max()).bit_length() - GREY_BITS, 0)
-
-
 def _decode(path: Path) -> np.ndarray:
     """Grey image of a file, shape (height, width), uint8 or uint16."""
-    from jaxba.kitti.opencv import cv2
-
     try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
-    complete = (
-        _is_complete_png(data) if path.suffix.lower() == ".png" else bool(data)
-    )  # for a damaged one libpng prints warnings
-    # calibration is that of the stored pixels, whatever EXIF says of how to show them
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if complete else None
-    if image is None:
-        raise ProblemError(f"{display_name(path)}: is no image that can be decoded")
-    return np.asarray(image)
-
-
-def _is_complete_png(data: bytes) -> bool:
-    """Whether the bytes are a complete PNG file, and all its chunks have the right checksums.
-
-    Source: the PNG specification (ISO/IEC 15948), section 5.3: length, name, content, CRC-32 of name and content.
-    """
-    at = len(PNG_SIGNATURE)
-    if data[:at] != PNG_SIGNATURE:
-        return False
-    while len(data) >= at + 12:
-        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
-        if zlib.crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], "big"):
-            return False
-        if data[at + 4 : at + 8] == b"IEND":
-            return True
-        at = end
-    return False
-
-
-def stamp(path: StrPath) -> str:
-    """Key of an image file that changes with it: absolute path, size and modification time."""
-    status = os.stat(path)
-    return f"{os.path.abspath(path)} {status.st_size} {status.st_mtime_ns}"
+        with Image.open(path) as image:
+            deep = image.mode.startswith("I")
+            return np.asarray(image).astype(np.uint16) if deep else np.asarray(image.convert("L"))
+    except (OSError, SyntaxError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno:
+            raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
+        raise ProblemError(f"{display_name(path)}: is no image that can be decoded") from None

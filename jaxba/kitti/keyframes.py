@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from jaxba.io.frames import Calibration
 from jaxba.kitti.tracks import Tracks
@@ -29,24 +30,17 @@ def parallax(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"], 
 
     The rotation is the least-squares fit to the rays, which absorbs a little of a translation where the scene is far.
 
-    Args:
-        first: rays `(X / Z, Y / Z)` in one view.
-        second: the same in the other view.
-        focal: pixels.
+    Rays are `(X / Z, Y / Z)`, the focal length is in pixels.
     """
     rotated = np.column_stack([first, np.ones(len(first))]) @ relative_rotation(first, second).T
     return float(focal * np.median(np.linalg.norm(perspective(rotated) - second, axis=1)))
 
 
 def relative_rotation(first: Float[np.ndarray, "m 2"], second: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "3 3"]:
-    """The least-squares rotation from the rays of one view to those of another.
-
-    Source: Kabsch 1976.
-    """
+    """The least-squares rotation from the rays of one view to those of another."""
     a, b = (np.column_stack([rays, np.ones(len(rays))]) for rays in (first, second))
     a, b = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (a, b))
-    u, _, vt = np.linalg.svd(b.T @ a)
-    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return Rotation.align_vectors(b, a)[0].as_matrix()
 
 
 def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, numbers: tuple[int, ...]) -> list[int]:
@@ -85,6 +79,6 @@ def choose(tracks: Tracks, images: int, choice: str, calibration: Calibration, n
         if shared < MIN_SHARED:
             raise ProblemError(
                 f"too few matches: key-frames {numbers[i]} and {numbers[j]} share {shared} tracks, "
-                f"at least {MIN_SHARED} are needed; choose --keyframes all, or other --frames or --features"
+                f"at least {MIN_SHARED} are needed; choose --keyframes all, or other --frames"
             )
     return chosen

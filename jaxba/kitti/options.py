@@ -1,54 +1,38 @@
-"""Options of the problem that is made of a sequence."""
+"""Options of the problem that is made of a sequence, which are those of `jaxba-kitti`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
-
-from jaxba.kitti.triangulate import Filters
-
-Features = Literal["sift", "orb", "klt"]
+from typing import Annotated, Literal
 
 MIN_MATCHES = 40
 """Verified matches that link two frames: random matches of textured images reach some 15 inliers."""
 
 
 @dataclass(frozen=True)
-class BuildOptions:
-    """Options of `build`; those of `jaxba-kitti` of the same name say more."""
-
-    features: Features = "sift"
-    """Kind of key-points, or `klt` for points tracked by Lucas-Kanade."""
+class Build:
+    """How the problem is made."""
 
     keypoints: int = 2000
-    """Largest number of key-points of a frame."""
+    """Key-points per frame at most."""
 
     reach: int = 3
-    """Number of earlier frames that a frame is matched with; for KLT, of bad frames in a row after which it fails."""
+    """Previous frames that a frame is matched with."""
 
     min_matches: int = MIN_MATCHES
-    """Verified matches that link two frames."""
+    """Verified matches between two frames at least."""
 
-    seed: int = 0
-    """Seed of every random sample."""
+    keyframes: Annotated[str, "RULE"] = "auto"
+    """auto: by parallax and the fraction of tracks left. all: every frame. N: every N-th frame."""
 
-    keyframes: str = "auto"
-    """`auto`, `all` or N for every N-th frame."""
+    start: Literal["vo", "poses"] = "vo"
+    """vo: start from monocular visual odometry. poses: from --poses."""
 
-    start: Literal["vo", "poses", "noisy-poses"] = "vo"
-    """Source of the initial poses."""
+    min_angle: float = 1.0
+    """Smallest angle of a point's rays, degrees."""
 
-    rotation_sigma: float = 0.1
-    """Of `noisy-poses`: degrees per key-frame."""
-
-    translation_sigma: float = 0.05
-    """Of `noisy-poses`: relative to the length of the motion."""
-
-    min_angle: float = Filters.angle
-    """Least angle in degrees between two rays of a point."""
-
-    max_error: float = Filters.pixels
+    max_error: float = 3.0
     """Largest reprojection error of an observation, pixels."""
 
     min_views: int = 2
-    """Observations that a point needs."""
+    """Key-frames that observe a point at least."""

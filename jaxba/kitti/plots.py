@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -17,24 +16,20 @@ MARGIN = 30.0
 """Margin around the true path, metres."""
 
 
-class View(NamedTuple):
-    """Contents of a panel, in the frame of the truth or of the first camera: x to the right, z forward."""
-
-    title: str
-    points: Float[np.ndarray, "points 3"]
-    path: Float[np.ndarray, "poses 3"]
-
-
-def plot_top_view(views: Sequence[View], truth: Float[np.ndarray, "poses 3"] | None) -> Figure:
+def plot_top_view(
+    views: Sequence[tuple[str, Float[np.ndarray, "points 3"], Float[np.ndarray, "poses 3"]]],
+    truth: Float[np.ndarray, "poses 3"] | None,
+) -> Figure:
     """A panel for each view, all with the same axes, equal along x and z.
 
     Points far outside the paths are not shown: a few distant ones would shrink the road to a line.
 
     Args:
-        views: of the same cameras, for example before and after bundle adjustment.
+        views: titles, points and paths of the same cameras, for example before and after bundle adjustment, in the
+            frame of the truth or of the first camera: x to the right, z forward.
         truth: true positions, metres; None if unknown.
     """
-    paths = np.concatenate([*(view.path for view in views), *([] if truth is None else [truth])])[:, [0, 2]]
+    paths = np.concatenate([*(path for _, _, path in views), *([] if truth is None else [truth])])[:, [0, 2]]
     low, high = paths.min(axis=0), paths.max(axis=0)
     margin = MARGIN if truth is not None else 0.3 * float((high - low).max())
     low, high = low - margin, high + margin
@@ -42,17 +37,17 @@ def plot_top_view(views: Sequence[View], truth: Float[np.ndarray, "poses 3"] | N
     width = min(max(4.2 * wide / tall, 2.8), 9.0)
     figure = Figure(figsize=(width * len(views) + 0.8, 5.6), layout="constrained")
     axes = figure.subplots(1, len(views), squeeze=False, sharex=True, sharey=True)[0]
-    for one, view in zip(axes, views, strict=True):
-        x, z = view.points[:, 0], view.points[:, 2]
+    for one, (title, points, path) in zip(axes, views, strict=True):
+        x, z = points[:, 0], points[:, 2]
         inside = (x > low[0]) & (x < high[0]) & (z > low[1]) & (z < high[1])
         one.scatter(x[inside], z[inside], s=1.0, c=POINT, alpha=0.5, linewidths=0, rasterized=True, label="points")
         if truth is not None:
             one.plot(truth[:, 0], truth[:, 2], color=TRUTH, linewidth=3.0, label="ground truth", zorder=2)
-        one.plot(view.path[:, 0], view.path[:, 2], color=PATH, linewidth=1.2, label="path", zorder=3)
+        one.plot(path[:, 0], path[:, 2], color=PATH, linewidth=1.2, label="path", zorder=3)
         one.set_xlim(low[0], high[0])
         one.set_ylim(low[1], high[1])
         one.set_aspect("equal")
-        one.set_title(view.title, fontsize="medium", parse_math=False)
+        one.set_title(title, fontsize="medium", parse_math=False)
         one.set_xlabel("x (m)" if truth is not None else "x")
     axes[0].set_ylabel("z (m)" if truth is not None else "z")
     handles, labels = axes[0].get_legend_handles_labels()

@@ -1,34 +1,27 @@
-"""A KITTI sequence on disk: images, calibration, times.
+"""A KITTI sequence on disk: images and their calibration.
 
-Images are searched in `image_0` (odometry benchmark), `image_00/data` (raw data) and `image_00/data_rect` (KITTI-360),
-times in `times.txt` and in `timestamps.txt` beside the images' folder. Source: Geiger et al. 2012, "Are we ready for
-autonomous driving?", 2013, "Vision meets robotics"; Liao et al. 2022, "KITTI-360".
+Images are searched in `image_0` (odometry benchmark), `image_00/data` (raw data) and `image_00/data_rect` (KITTI-360).
+Source: Geiger et al. 2012, "Are we ready for autonomous driving?", 2013, "Vision meets robotics"; Liao et al. 2022,
+"KITTI-360".
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
 from jaxba.io.files import StrPath, display_name, visible
 from jaxba.io.frames import Calibration
-from jaxba.io.poses import lines_of, numbers_of
-from jaxba.kitti.calibration import calibration_files, read_calibration
+from jaxba.kitti.calibration import read_calibration
 from jaxba.problem.bundle_problem import ProblemError
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 
 CAMERAS = range(4)
 """KITTI's cameras: 0 and 1 are grey, 2 and 3 coloured."""
-
-
-_STAMP = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(\.\d+)?")
-"""A time of the raw data, such as 2011-09-26 13:02:25.964389445."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +40,6 @@ class Sequence:
     calibration: Calibration
     """Of all frames."""
 
-    times: Float[np.ndarray, " frames"] | None = None
-    """Seconds, where the folder has them."""
-
     def __len__(self) -> int:
         return len(self.numbers)
 
@@ -66,7 +56,6 @@ class Sequence:
             self,
             numbers=tuple(self.numbers[at] for at in kept),
             images=tuple(self.images[at] for at in kept),
-            times=None if self.times is None else self.times[kept],
         )
 
 
@@ -99,28 +88,12 @@ def read_sequence(folder: StrPath, frames: str = ":", camera: int = 0, calibrati
     if len(chosen) < 2:
         last = max(numbered)
         raise ProblemError(f"{name}: --frames {frames} leaves {len(chosen)} of frames {min(numbered)} to {last}, not 2")
-    times = next((path for path in _times_files(root, images) if path.is_file()), None)
     return Sequence(
         images,
         tuple(chosen),
         tuple(numbered[number] for number in chosen),
         read_calibration(root if calibration is None else calibration, camera),
-        None if times is None else read_times(times, chosen),
     )
-
-
-def files_of(folder: StrPath, images: Path) -> list[Path]:
-    """Where calibration and times of a sequence may be.
-
-    Args:
-        folder: of the sequence.
-        images: the folder of its images.
-    """
-    return [*calibration_files(Path(folder)), *_times_files(Path(folder), images)]
-
-
-def _times_files(root: Path, images: Path) -> list[Path]:
-    return [root / "times.txt", images.parent / "timestamps.txt"]
 
 
 def _images_folder(root: Path, camera: int) -> Path | None:
@@ -152,33 +125,3 @@ def _range(frames: str, name: str, count: int) -> range:
     if end is not None and end > count:
         raise ProblemError(f"{name}: --frames {frames} ends after the last frame, {count - 1}")
     return range(*slice(first, end, step).indices(count))
-
-
-def read_times(path: Path, numbers: list[int]) -> Float[np.ndarray, " frames"]:
-    """Times of frames, seconds: line N of a file is that of frame N, seconds or a date with a time.
-
-    Dates are counted from the first line, so that no digits are lost.
-
-    Raises:
-        ProblemError: the file cannot be read, has too few lines, or one of them is no time.
-    """
-    lines = lines_of(path)
-    if max(numbers) >= len(lines):
-        raise ProblemError(f"{display_name(path)}: has no time for frame {max(numbers)}")
-    where = lambda at: f"{display_name(path)} line {lines[at][0]}"
-    if not _STAMP.fullmatch(lines[0][1]):
-        return np.array([numbers_of(lines[at][1], 1, where(at))[0] for at in numbers])
-    start, fraction = _stamp(lines[0][1], where(0))
-    stamps = [_stamp(lines[at][1], where(at)) for at in numbers]
-    return np.array([(time - start).total_seconds() + (part - fraction) for time, part in stamps])
-
-
-def _stamp(text: str, where: str) -> tuple[datetime, float]:
-    """Whole seconds of a date with a time, and the fraction of the last one."""
-    match = _STAMP.fullmatch(text)
-    try:
-        if match is not None:
-            return datetime.fromisoformat(match[1]), float(match[2] or 0)
-    except ValueError:  # a thirteenth month
-        pass
-    raise ProblemError(f"{where}: is no date and time")

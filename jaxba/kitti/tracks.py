@@ -30,10 +30,6 @@ class Tracks:
         """Number of tracks."""
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
-    def lengths(self) -> Int[np.ndarray, " tracks"]:
-        """Observations of each track."""
-        return np.bincount(self.track, minlength=self.count)
-
     @cached_property
     def _by_image(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows sorted by image, and the first one of each image (one more entry than images)."""
@@ -57,27 +53,27 @@ class Tracks:
         _, at_a, at_b = np.intersect1d(self.track[rows_a], self.track[rows_b], return_indices=True)
         return rows_a[at_a], rows_b[at_b]
 
-    def keep(self, rows: np.ndarray, min_views: int) -> Tracks:
-        """The observations that a mask selects, of tracks that then still have `min_views`; tracks are renumbered."""
+    def keep(self, rows: np.ndarray) -> Tracks:
+        """The observations that a mask selects, of tracks that then still have two; tracks are renumbered."""
         image, track, pixels = self.image[rows], self.track[rows], self.pixels[rows]
-        long = np.bincount(track, minlength=self.count)[track] >= min_views
+        long = np.bincount(track, minlength=self.count)[track] >= 2
         return Tracks(image[long], np.unique(track[long], return_inverse=True)[1], pixels[long])
 
-    def restrict(self, images: Sequence[int], min_views: int = 2) -> Tracks:
-        """The observations of some images, renumbered 0, 1, ...; tracks with fewer than `min_views` are dropped."""
+    def restrict(self, images: Sequence[int]) -> Tracks:
+        """The observations of some images, renumbered 0, 1, ...; tracks with fewer than two are dropped."""
         new = np.full(int(self.image.max(initial=-1)) + 1, -1)
         wanted = np.asarray(images, int)
         new[wanted[wanted < len(new)]] = np.flatnonzero(wanted < len(new))
-        kept = self.keep(new[self.image] >= 0, min_views)
+        kept = self.keep(new[self.image] >= 0)
         return Tracks(new[kept.image], kept.track, kept.pixels)
 
 
-def make_tracks(image: np.ndarray, track: np.ndarray, pixels: np.ndarray, min_views: int = 2) -> Tracks:
-    """Tracks from observations in any order, with any numbers of tracks."""
+def make_tracks(image: np.ndarray, track: np.ndarray, pixels: np.ndarray) -> Tracks:
+    """Tracks of two observations or more, from those in any order, with any numbers of tracks."""
     order = np.lexsort((image, track))
     track = np.unique(track[order], return_inverse=True)[1]
     table = Tracks(np.asarray(image)[order], track, np.asarray(pixels, np.float64)[order])
-    return table.keep(np.ones(len(track), bool), min_views)
+    return table.keep(np.ones(len(track), bool))
 
 
 def join_matches(
@@ -86,8 +82,7 @@ def join_matches(
     """Tracks from matches of pairs of images: the connected components of matched key-points.
 
     A component with two key-points of one image cannot be one point. It is split into the chains of matches between
-    neighbouring images (the nearest ones that were matched): these are one to one, so a chain has no two key-points of
-    one image.
+    images next to each other: these are one to one, so a chain has no two key-points of one image.
 
     Args:
         pixels: key-points of every image.
@@ -97,20 +92,12 @@ def join_matches(
     first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
     image = np.repeat(np.arange(len(pixels)), sizes)
     edges = {pair: first[list(pair)] + np.asarray(found, np.int64).reshape(-1, 2) for pair, found in matches.items()}
-    label = _components(int(first[-1]), list(edges.values()))
+    label = _components(len(image), list(edges.values()))
     order = np.lexsort((image, label))
     twice = (np.diff(label[order]) == 0) & (np.diff(image[order]) == 0)
     bad = np.isin(label, label[order][1:][twice])
-    if bad.any():
-        nearest: dict[int, int] = {}
-        for i, j in sorted(edges):
-            nearest.setdefault(i, j)
-        back: dict[int, int] = {}
-        for i, j in sorted(edges, reverse=True):
-            back.setdefault(j, i)
-        chain = [edges[i, j] for i, j in nearest.items() if back[j] == i]
-        part = _components(int(first[-1]), chain)
-        label = np.where(bad, label.max() + 1 + part, label)
+    chain = _components(len(image), [edge for (i, j), edge in edges.items() if j == i + 1])
+    label = np.where(bad, len(image) + chain, label)
     return make_tracks(image, label, np.concatenate([np.empty((0, 2)), *pixels]))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from jaxba.problem.similarity import Poses, umeyama
+from jaxba.problem.similarity import Poses
 
 DEVKIT_LENGTHS = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 """Metres. Source: `lengths` in the development kit's evaluate_odometry.cpp."""
@@ -30,24 +30,12 @@ class Errors(NamedTuple):
     largest: float
 
 
-class RelativeErrors(NamedTuple):
-    """From one pose to the next."""
-
-    translation: Errors  # units of the truth
-    rotation: Errors  # degrees
-
-
 class SegmentErrors(NamedTuple):
     """The development kit's averages over all segments."""
 
     translation: float  # percent of the segment's length
     rotation: float  # degrees per metre
     segments: int
-
-
-def align(estimate: Poses, truth: Poses) -> Poses:
-    """The estimate after the least-squares similarity from its centres to the true ones. Raises as `umeyama`."""
-    return umeyama(estimate[:, :, 3], truth[:, :, 3]).poses(estimate)
 
 
 def absolute_errors(aligned: Poses, truth: Poses) -> Errors:
@@ -58,13 +46,16 @@ def absolute_errors(aligned: Poses, truth: Poses) -> Errors:
     return _statistics(np.linalg.norm(aligned[:, :, 3] - truth[:, :, 3], axis=1))
 
 
-def relative_errors(aligned: Poses, truth: Poses) -> RelativeErrors:
+def relative_errors(aligned: Poses, truth: Poses) -> tuple[Errors, Errors]:
     """Errors of the motion from each pose to the next, `(Q_i^-1 Q_j)^-1 (P_i^-1 P_j)`; evo's RPE with a delta of one.
 
-    The estimate must have the truth's scale (`align`); its rotation and position do not matter.
+    The estimate must have the truth's scale; its rotation and position do not matter.
+
+    Returns:
+        Of translations, in units of the truth, and of rotations, degrees.
     """
     error = _motion(_motion(truth[:-1], truth[1:]), _motion(aligned[:-1], aligned[1:]))
-    return RelativeErrors(_statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error)))
+    return _statistics(np.linalg.norm(error[:, :, 3], axis=1)), _statistics(_angles(error))
 
 
 def segment_errors(

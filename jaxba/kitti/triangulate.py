@@ -5,30 +5,18 @@ Cameras here look down +z: a point `X` of the world is at `R X + t`, and its ray
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxba.problem.geometry import perspective
+from jaxba.problem.geometry import perspective, translations
 
 GAUSS_NEWTON_STEPS = 6
 """Gauss-Newton steps of a point after the linear solution; three are enough on most tracks."""
 
-
-@dataclass(frozen=True)
-class Filters:
-    """Criteria that a triangulated point must meet."""
-
-    angle: float = 1.0
-    """Least angle in degrees between two rays of a point."""
-
-    pixels: float = 3.0
-    """Largest reprojection error of an observation."""
-
-    depth: float = 0.0
-    """Depth in front of every camera that it must exceed, scene units."""
+SMALLEST = 1e-12
+"""Damping of the linear systems of a point, relative, for rays that are parallel."""
 
 
 class Views(NamedTuple):
@@ -46,6 +34,12 @@ class Views(NamedTuple):
         return np.einsum("nij,nj->ni", self.rotation[camera], points) + self.translation[camera]
 
 
+def views_of_poses(poses: Float[np.ndarray, "views 3 4"]) -> Views:
+    """World-to-camera views of camera-to-world poses."""
+    rotation = poses[:, :, :3].transpose(0, 2, 1)
+    return Views(rotation, translations(rotation, poses[:, :, 3]))
+
+
 class Observations(NamedTuple):
     """Rays of tracks, sorted by track; every track from 0 to the last one has at least one."""
 
@@ -53,121 +47,86 @@ class Observations(NamedTuple):
     track: Int[np.ndarray, " n"]
     rays: Float[np.ndarray, "n 2"]
 
+    def numbered(self, rows: np.ndarray) -> tuple[Int[np.ndarray, " tracks"], Observations]:
+        """Numbers of the tracks of some rows, and these rows, whose tracks have positions among them as numbers."""
+        names, track = np.unique(self.track[rows], return_inverse=True)
+        return names, Observations(self.camera[rows], track, self.rays[rows])
+
 
 class Triangulated(NamedTuple):
     """Points and their errors."""
 
     points: Float[np.ndarray, "tracks 3"]
-    angle: Float[np.ndarray, " tracks"]  # largest between the first or last ray and any other, degrees
+    angle: Float[np.ndarray, " tracks"]  # largest between the first ray and any other, degrees
     depth: Float[np.ndarray, " n"]  # of each observation
     error: Float[np.ndarray, " n"]  # distance of each ray from the point's, in units of the focal length
 
-    def good(self, track: np.ndarray, filters: Filters, focal: float) -> Bool[np.ndarray, " tracks"]:
-        """Tracks whose point passes all filters, in all observations."""
-        bad = (self.depth <= filters.depth) | ~(self.error * focal <= filters.pixels)
-        good = (self.angle >= filters.angle) & np.isfinite(self.points).all(axis=1)
-        good[track[bad]] = False
+    def good(self, track: np.ndarray, angle: float, error: float) -> Bool[np.ndarray, " tracks"]:
+        """Tracks whose point lies in front of all its cameras, with an angle and errors within these limits."""
+        good = self.angle >= angle
+        good[track[(self.depth <= 0) | ~(self.error <= error)]] = False
         return good
 
 
 def triangulate(views: Views, observations: Observations) -> Triangulated:
-    """Points that minimise the squared reprojection errors: a linear solution, refined by Gauss-Newton.
-
-    Source of the linear solution: Hartley and Zisserman, "Multiple View Geometry", section 12.2, with the world moved
-    to the first camera of each track and scaled by its longest baseline.
-    """
+    """Points that minimise the squared reprojection errors: the points nearest to the rays, refined by Gauss-Newton."""
     camera, track, rays = observations
-    count = int(track[-1]) + 1 if len(track) else 0
-    starts = np.searchsorted(track, np.arange(count))
-    centers = views.centers()
-    origin = centers[camera[starts]]
-    baseline = centers[camera] - origin[track]
-    scale = np.maximum.reduceat(np.linalg.norm(baseline, axis=1), starts) if count else np.empty(0)
-    scale = np.where(scale > 0, scale, 1.0)
-    rotation = views.rotation[camera]
-    shift = -np.einsum("nij,nj->ni", rotation, baseline / scale[track, None])
-    rows = np.concatenate([rotation, shift[:, :, None]], axis=2)  # [n, 3, 4]
-    lines = rays[:, :, None] * rows[:, 2:] - rows[:, :2]  # [n, 2, 4]
-    normal = _sum(np.einsum("nki,nkj->nij", lines, lines), starts)
-    homogeneous = np.linalg.eigh(normal)[1][:, :, 0] if count else np.empty((0, 4))
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        points = homogeneous[:, :3] / homogeneous[:, 3:]
-    points = np.where(np.isfinite(points).all(axis=1, keepdims=True), points, 1e9)
-    for _ in range(GAUSS_NEWTON_STEPS):
-        points = _refine(points, rotation, shift, track, rays, starts)
-    points = points * scale[:, None] + origin
-    local = views.local(camera, points[track])
-    with np.errstate(invalid="ignore", over="ignore"):
-        error = np.linalg.norm(perspective(local) - rays, axis=1)
-    return Triangulated(points, _angles(points, centers[camera], track, starts), local[:, 2], error)
+    starts = np.flatnonzero(np.diff(track, prepend=-1))
+    total = lambda values: np.add.reduceat(values, starts, axis=0)
+    rotation, centers = views.rotation[camera], views.centers()[camera]
+    origin = centers[starts]  # of the points in the following, so that few digits are lost
+    baseline = centers - origin[track]
+    shift = -np.einsum("nij,nj->ni", rotation, baseline)
+    directions = np.einsum("nji,nj->ni", rotation, np.column_stack([rays, np.ones(len(rays))]))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    across = np.eye(3) - directions[:, :, None] * directions[:, None]
+    points = _solve(total(across), total(np.einsum("nij,nj->ni", across, baseline)))
 
-
-def _refine(points, rotation, shift, track, rays, starts):
-    """One Gauss-Newton step of every point, accepted where its own cost falls."""
-
-    def residual(at):
+    def residual(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         local = np.einsum("nij,nj->ni", rotation, at[track]) + shift
-        difference = perspective(local) - rays
-        cost = np.add.reduceat((difference**2).sum(axis=1), starts) if len(starts) else np.empty(0)
-        return local, difference, cost
+        with np.errstate(invalid="ignore", over="ignore"):
+            difference = perspective(local) - rays
+            return local, difference, total((difference**2).sum(axis=1))
 
-    local, difference, cost = residual(points)
-    inverse = 1 / np.where(local[:, 2] == 0, np.inf, local[:, 2])
-    plane = local[:, :2] * inverse[:, None]
-    slope = inverse[:, None, None] * (rotation[:, :2] - plane[:, :, None] * rotation[:, 2:])  # [n, 2, 3]
-    hessian = _sum(np.einsum("nki,nkj->nij", slope, slope), starts)
-    gradient = _sum(np.einsum("nki,nk->ni", slope, np.nan_to_num(difference)), starts)
-    hessian += 1e-12 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
-    new = points - np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
-    with np.errstate(invalid="ignore"):
-        better = residual(new)[2] < cost
-    return np.where(better[:, None], new, points)
-
-
-def _angles(points, centers, track, starts):
-    """Largest angle between the first or the last ray of a track and any other, degrees."""
-    if not len(starts):
-        return np.empty(0)
-    directions = points[track] - centers
+    for _ in range(GAUSS_NEWTON_STEPS):
+        local, difference, cost = residual(points)
+        inverse = 1 / np.where(local[:, 2] == 0, np.inf, local[:, 2])
+        plane = local[:, :2] * inverse[:, None]
+        slope = inverse[:, None, None] * (rotation[:, :2] - plane[:, :, None] * rotation[:, 2:])  # [n, 2, 3]
+        gradient = np.einsum("nki,nk->ni", slope, np.nan_to_num(difference))
+        new = points - _solve(total(np.einsum("nki,nkj->nij", slope, slope)), total(gradient))
+        points = np.where((residual(new)[2] < cost)[:, None], new, points)
+    local, difference, _ = residual(points)
     with np.errstate(divide="ignore", invalid="ignore"):
-        directions = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    ends = np.append(starts[1:], len(track)) - 1
-    largest = np.zeros(len(starts))
-    for reference in (starts, ends):
-        chord = np.linalg.norm(directions - directions[reference][track], axis=1)
-        angle = 2 * np.arcsin(np.minimum(chord / 2, 1))
-        largest = np.maximum(largest, np.maximum.reduceat(np.nan_to_num(angle), starts))
-    return np.rad2deg(largest)
+        directions = points[track] - baseline
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    chord = np.nan_to_num(np.linalg.norm(directions - directions[starts][track], axis=1))
+    angle = np.rad2deg(2 * np.arcsin(np.minimum(np.maximum.reduceat(chord, starts) / 2, 1)))
+    return Triangulated(points + origin, angle, local[:, 2], np.linalg.norm(difference, axis=1))
 
 
-def _sum(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    return np.add.reduceat(values, starts, axis=0) if len(starts) else np.empty((0, *values.shape[1:]))
+def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solutions of many 3 x 3 systems, a little damped."""
+    damping = SMALLEST * np.trace(matrix, axis1=1, axis2=2) + 1e-300
+    return np.linalg.solve(matrix + damping[:, None, None] * np.eye(3), right[:, :, None])[:, :, 0]
 
 
 def triangulate_robustly(
-    views: Views, observations: Observations, filters: Filters, focal: float, min_views: int = 2
+    views: Views, observations: Observations, angle: float, error: float, min_views: int = 2
 ) -> tuple[Float[np.ndarray, "tracks 3"], Bool[np.ndarray, " n"]]:
     """Points of all tracks, and which observations are good; the point of a track without any is meaningless.
 
-    A track that fails is triangulated once more without the observations whose errors are too large.
+    Points are triangulated once more without the observations whose errors are too large.
 
-    Args:
-        views: of all cameras.
-        observations: of all tracks.
-        filters: for points.
-        focal: pixels.
-        min_views: observations that a point needs.
+    A point needs `min_views` observations with errors of at most `error`, in units of the focal length, and two rays
+    with an angle of `angle` degrees between them.
     """
     first = triangulate(views, observations)
-    good = first.good(observations.track, filters, focal)
-    points, keep = first.points.copy(), good[observations.track]
-    again = ~keep & (first.error * focal <= filters.pixels) & (first.depth > filters.depth)
-    again &= np.bincount(observations.track[again], minlength=len(points))[observations.track] >= min_views
-    if again.any():
-        names, track = np.unique(observations.track[again], return_inverse=True)
-        second = triangulate(views, Observations(observations.camera[again], track, observations.rays[again]))
-        fine = second.good(track, filters, focal)
-        points[names[fine]] = second.points[fine]
-        keep[np.flatnonzero(again)[fine[track]]] = True
+    points, keep = first.points, (first.error <= error) & (first.depth > 0)
     keep &= np.bincount(observations.track[keep], minlength=len(points))[observations.track] >= min_views
+    names, rest = observations.numbered(keep)
+    second = triangulate(views, rest)
+    good = second.good(rest.track, angle, error)
+    points[names] = second.points
+    keep[keep] = good[rest.track]
     return points, keep

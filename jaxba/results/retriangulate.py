@@ -31,7 +31,7 @@ from jaxba.problem.options import StepOptions
 from jaxba.refinement.midpoints import midpoints
 from jaxba.refinement.points import refine_points
 from jaxba.runtime import process
-from jaxba.runtime.compilation import compile_and_run, level_after, program, stages
+from jaxba.runtime.compilation import program, quick_runs
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.diagnosis import explain_start
 from jaxba.solver.place import check_problem, placed
@@ -121,10 +121,10 @@ def retriangulate_without(
         origin = np.zeros((3, len(order)))
         centers = geometry.camera_centers(counted.cameras) - offset
         origin[:, real] = components_first(centers[first[order[real]]])
-        level = level_after(EQUIVALENT_STEPS, stages("acceptance", here.num_observations))
+        level = "quick" if quick_runs("acceptance", here.num_observations) > EQUIVALENT_STEPS else "full"
         search = program(_search, "loss", level=level)
         arguments = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
-        found = jax.device_get(compile_and_run(search, *arguments))
+        found = jax.device_get(search(*arguments))
         process.release_programs()  # see `release_programs`: too many programs end a process
     if not np.isfinite(found.cost_before):
         raise ProblemError(explain_start(problem, loss))

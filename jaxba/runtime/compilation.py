@@ -1,52 +1,41 @@
-"""How well XLA optimises programs on a CPU: fully, or less and in a third to half of the time.
+"""How well XLA optimises programs on a CPU: fully, or hardly and in a third to two thirds of the time.
 
 Compiling takes longer than most solves. A program compiled without LLVM's optimisation, and without XLA's newer kernel
-emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly; with
-LLVM's first level alone, in half of the time, it is nearly as fast as with all (`python -m benchmarks.compilation`). So
-a single solve starts with one of these, and compiles a better program only after as many iterations as would have paid
-for it from the start: as with skis that may be rented or bought, that costs at most about twice the better choice. The
-parts of a step are programs of their own, since they gain differently, and are compiled in parallel.
+emitters, whose kernels LLVM takes longest for, computes the same to rounding, but two to six times as slowly
+(`python -m benchmarks.compilation`). So a single solve starts with such programs, and compiles better ones only after
+as many iterations as would have paid for them from the start: as with skis that may be rented or bought, that costs at
+most about twice the better choice. The parts of a step are programs of their own, since they gain differently, and are
+compiled in parallel.
 """
 
 from __future__ import annotations
 
 import functools
-import inspect
 import os
 import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args
+from typing import Any, Literal, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
 from jax import monitoring
 
-from jaxba.runtime import distrust
-from jaxba.runtime.executable_cache import CachedExecutable, ExecutableCache, watch_compilation
 from jaxba.runtime.fusion import fast_compilation
 from jaxba.runtime.jit import Options, jit, known_options, right_options
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 Compilation = Literal["full", "quick", "auto"]
-"""`full`: all optimisation. `quick`: hardly any. `auto`: at first hardly any or medium, by the number of observations,
-and full after as many iterations as pay for it."""
+"""`full`: all optimisation. `quick`: hardly any. `auto`: hardly any at first, and full after as many iterations as pay
+for it, by the number of observations."""
 
-COMPILATIONS: tuple[str, ...] = get_args(Compilation)
-
-Level = Literal["full", "medium", "quick"]
+Level = Literal["full", "quick"]
 """How much one program is optimised."""
 
-COMPILER_OPTIONS: dict[Level, Options] = {
-    "medium": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
-    "quick": {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False},
-}
-"""XLA's options of the levels below full, as far as a jaxlib knows them. With the newer emitters a lower level saves
-only half as much: on jaxlib 0.12, which has no others, quick takes two thirds of the time of full and medium all, so
-that medium is left out there."""
+QUICK: Options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+"""XLA's options of level quick, as far as a jaxlib knows them; from 0.12 on there are no older emitters."""
 
 OLDER_EMITTERS = "xla_cpu_use_fusion_emitters"
 """The option that switches XLA's newer kernel emitters off."""
@@ -59,56 +48,30 @@ COMPILE_EVENTS = "/jax/core/compile/"
 """Prefix of the durations that JAX reports while it traces, lowers and compiles."""
 
 
-class Stage(NamedTuple):
-    """A level, and how often a program is run at it before the next better one is compiled."""
-
-    level: Level
-    runs: int
-
-
-class BreakEven(NamedTuple):
-    """When a better program pays for its compilation, as `python -m benchmarks.compilation` measures it."""
-
-    typical: int
-    """Runs that a solve may well take: a level that would not last so long is left out. Of fifteen real problems nine
-    converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one to three repairs each."""
-
-    quick: int
-    """Observations times runs at level quick after which compiling at level medium has paid."""
-
-    medium: int
-    """The same from medium to full."""
-
-
-BREAK_EVEN: dict[Part, BreakEven] = {
-    "factorization": BreakEven(typical=5, quick=1_200_000, medium=5_000_000),
-    "iterative": BreakEven(typical=8, quick=1_000_000, medium=15_000_000),
-    "acceptance": BreakEven(typical=20, quick=3_000_000, medium=8_000_000),
-    "cameras": BreakEven(typical=20, quick=3_000_000, medium=8_000_000),
+BREAK_EVEN: dict[Part, int] = {
+    "factorization": 1_200_000,
+    "iterative": 1_000_000,
+    "acceptance": 3_000_000,
+    "cameras": 3_000_000,
 }
+"""Observations times runs after which a better program has paid for its compilation, as `benchmarks.compilation`
+measures it."""
+
+TYPICAL: dict[Part, int] = {"factorization": 5, "iterative": 8, "acceptance": 20, "cameras": 20}
+"""Runs that a solve may well take: quick programs that would not last so long are left out. Of fifteen real problems
+nine converge in 3 to 9 iterations with 0 to 2 repairs, the others take 15 to 98 with one to three repairs each."""
 
 
-def stages(part: Part, observations: int) -> tuple[Stage, ...]:
-    """Levels at which a part of a step is compiled, one after the other, before it is compiled fully."""
-    typical, *break_even = BREAK_EVEN[part]
-    levels: tuple[Level, ...] = ("quick", "medium") if uses_older_emitters("medium") else ("quick",)
-    found = [Stage(level, count // max(1, observations)) for level, count in zip(levels, break_even, strict=False)]
-    return tuple(stage for stage in found if stage.runs >= typical)
-
-
-def level_after(runs: int, before: tuple[Stage, ...]) -> Level:
-    """The level of a program that was run so often; `full` when all stages before are over."""
-    for level, count in before:
-        if runs < count:
-            return level
-        runs -= count
-    return "full"
+def quick_runs(part: Part, observations: int) -> int:
+    """How often a part of a step is run before it is compiled fully."""
+    runs = BREAK_EVEN[part] // max(1, observations)
+    return runs if runs >= TYPICAL[part] else 0
 
 
 @functools.cache
 def compiler_options(level: Level) -> Options:
     """Options of a level that this jaxlib knows; none for `full`, and on a GPU."""
-    return known_options(COMPILER_OPTIONS.get(level, {})) if jax.default_backend() == "cpu" else {}
+    return known_options(QUICK) if level == "quick" and jax.default_backend() == "cpu" else {}
 
 
 def uses_older_emitters(level: Level) -> bool:
@@ -121,31 +84,23 @@ class Program:
 
     def __init__(self, function: Callable[..., Any], static: tuple[str, ...], level: Level) -> None:
         self.function = function
-        self.options = right_options() | compiler_options(level)
-        self.fast = uses_older_emitters(level)
-        self.jitted = jax.jit(
-            _strongly_typed(function), static_argnames=static, compiler_options=self.options, keep_unused=True
-        )
-        self._static = [name if name in static else None for name in inspect.signature(function).parameters]
+        self._fast = uses_older_emitters(level)
+        options = right_options() | compiler_options(level)
+        self._jitted = jax.jit(_strongly_typed(function), static_argnames=static, compiler_options=options)
 
     def __call__(self, *arguments: Any) -> Any:
-        with fast_compilation(self.fast):
-            return self.jitted(*arguments)
+        with fast_compilation(self._fast):
+            return self._jitted(*arguments)
 
     def lower(self, *arguments: Any) -> tuple[Any, Any]:
         """The lowered program, not yet compiled, and shapes and types of its results."""
-        with fast_compilation(self.fast):
-            traced = self.jitted.trace(*arguments)
+        with fast_compilation(self._fast):
+            traced = self._jitted.trace(*arguments)
             return traced.lower(), traced.out_info
-
-    def split(self, arguments: tuple[Any, ...]) -> tuple[dict[str, Any], tuple[Any, ...]]:
-        """Static arguments by name, and the others."""
-        named = list(zip(self._static, arguments, strict=False))
-        return {name: x for name, x in named if name}, tuple(x for name, x in named if not name)
 
 
 def _strongly_typed(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function without weakly typed results, which a program on disk does not have."""
+    """The function without weakly typed results, for which a program that takes them would be compiled once more."""
 
     @functools.wraps(function)
     def strong(*arguments: Any, **named: Any) -> Any:
@@ -167,22 +122,6 @@ def program(function: Callable[..., Any], *static: str, level: Level = "full") -
     return Program(function, static, level)
 
 
-_cache: ExecutableCache | None = None
-
-
-def use_cache(folder: Path | None) -> None:
-    """Makes `ParallelCompilation` read compiled programs from a folder, and store new ones there for later processes.
-
-    For solves with a callback or with `solve(compilation="auto")` or `"quick"`: the loop as one program has JAX's own
-    compilation cache. Where that is switched on it is the only one.
-
-    Args:
-        folder: must exist and be writable by nobody else; None switches the cache off.
-    """
-    global _cache
-    _cache = None if folder is None else ExecutableCache(folder)
-
-
 class ParallelCompilation:
     """A context in which programs are compiled in parallel, and not run; `run` then runs them without compiling.
 
@@ -193,19 +132,13 @@ class ParallelCompilation:
     """
 
     def __init__(self) -> None:
-        self.loaded: dict[Program, CachedExecutable] = {}
-        """Programs that were read from disk."""
-        self._verified: set[Program] = set()  # of these, the ones that have run once
-        # called as compiled, not by `jit`: that would compile once more for results of programs that were read from
-        # disk, which are bound to a device
-        self._compiled: dict[Program, jax.stages.Compiled] = {}
         self._results: dict[Program, Any] = {}  # shapes and types of results
         self.late_s = 0.0
         """Seconds in which `run` has compiled programs that nobody had asked for before."""
 
     def __enter__(self) -> ParallelCompilation:
         self._pool = ThreadPoolExecutor(max_workers=max(1, (os.cpu_count() or 1) - 1))
-        self._waiting: deque[Callable[[], None]] = deque()
+        self._waiting: deque[Callable[[], Any]] = deque()
         self._jobs: list[Future[None]] = []
         return self
 
@@ -220,57 +153,19 @@ class ParallelCompilation:
             Shapes and types of its results, to be arguments of the next.
         """
         if function not in self._results:
-            self._results[function] = self._begin(function, *arguments)
+            lowered, self._results[function] = function.lower(*arguments)
+            self._waiting.append(lowered.compile)
+            self._jobs.append(self._pool.submit(self._compile_next))
         return self._results[function]
 
-    def _begin(self, function: Program, *arguments: Any) -> Any:
-        cache, path = None if jax.config.values.get("jax_compilation_cache_dir") else _cache, None
-        if cache is not None:
-            static, given = function.split(arguments)
-            path = cache.path_for(function.function, static, given, function.options)
-            if (stored := cache.load(path)) is not None:
-                self.loaded[function] = stored
-                return stored.out
-        lowered, out = function.lower(*arguments)
-
-        def compile_and_store() -> None:
-            if cache is None:
-                lowered.compile()
-                return
-            with watch_compilation() as was_compiled:
-                self._compiled[function] = compiled = lowered.compile()
-            if was_compiled():
-                cache.save(path, compiled, out)
-
-        self._waiting.append(compile_and_store)
-        self._jobs.append(self._pool.submit(self._compile_next))
-        return out
-
     def run(self, function: Program, *arguments: Any) -> Any:
-        """What the program computes. It is compiled now, or read from disk, if the context has not had it."""
+        """What the program computes. It is compiled now if the context has not had it."""
         if function not in self._results:
             started = time.perf_counter()
             with self:
                 self(function, *arguments)
             self.late_s += time.perf_counter() - started
-        given = function.split(arguments)[1]
-        if function in self._compiled:
-            return self._compiled[function](*given)
-        stored = self.loaded.get(function)
-        if stored is None:
-            return function(*arguments)
-        if function in self._verified:
-            return stored.run(*given)
-        try:
-            with distrust.first_run(stored.path.parent):
-                result = jax.block_until_ready(stored.run(*given))
-        except Exception:  # XLA finds some damage only when it runs a program
-            del self.loaded[function]
-            if _cache is not None:
-                _cache.remove(stored)
-            return function(*arguments)
-        self._verified.add(function)
-        return result
+        return function(*arguments)
 
     def _compile_next(self) -> None:
         try:
@@ -289,13 +184,6 @@ class ParallelCompilation:
         if kind is None:
             for job in self._jobs:
                 job.result()
-
-
-def compile_and_run(function: Program, *arguments: Any) -> Any:
-    """What a program computes, for one that runs once; it is read from the cache of `use_cache` if it is there."""
-    with ParallelCompilation() as compile_programs:
-        compile_programs(function, *arguments)
-    return compile_programs.run(function, *arguments)
 
 
 def traced_once(*static: str) -> Callable[[Function], Function]:

@@ -13,7 +13,6 @@ import pickle
 import socket
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
@@ -64,7 +63,7 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
         process: number of this one, from 0. Without all three JAX finds them under Slurm, Open MPI and Kubernetes.
 
     Raises:
-        InputError: bad arguments, none were found, or the first process cannot be reached or use its port.
+        InputError: bad arguments, none were found, or the first process cannot use its port.
         RuntimeError: JAX has computed already.
     """
     given = [x is not None for x in (coordinator, processes, process)]
@@ -113,25 +112,13 @@ def _check(coordinator: str, processes: int, process: int) -> None:
     host, _, number = coordinator.rpartition(":")
     if not host or not number.isdecimal() or not 0 < int(number) < 2**16:
         raise InputError(f"coordinator must be HOST:PORT, not {coordinator!r}")
-    port = int(number)
     if process == 0:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                probe.bind(("", port))
+                probe.bind(("", int(number)))
             except OSError as error:
                 raise InputError(f"coordinator {coordinator}: {error.strerror or error}") from None
-        return
-    deadline = time.monotonic() + START_S
-    while True:
-        try:
-            socket.create_connection((host.strip("[]"), port), timeout=START_S).close()
-            return
-        except OSError as error:
-            if time.monotonic() > deadline:
-                reason = f"no answer for {START_S} s ({error.strerror or error})"
-                raise InputError(f"coordinator {coordinator}: {reason}") from None
-            time.sleep(0.2)
 
 
 def is_main() -> bool:

@@ -1,109 +1,76 @@
-"""What a command does where XLA distrusts the programs of the cache that were compiled on the same machine.
+"""Where compiled programs are kept, and what is done where XLA distrusts programs that it compiled on the same machine.
 
 On some Intel processors XLA notes preferences of its compiler (`+prefer-no-gather`) as instructions that a program
 needs, then misses them in the machine, says so for every program that it reads, and may compile them all anew
-(jax-ml/jax#38445); and where instructions really are missing, the process dies by SIGILL. With
-`--xla_cpu_max_isa=AVX2` programs need neither. As an option of a single program that changes nothing (jaxlib 0.10.2),
-so it is a flag of the process, which a command may set for itself and a library may not.
+(jax-ml/jax#38445). With `--xla_cpu_max_isa=AVX2` it does not. As an option of a single program that changes nothing
+(jaxlib 0.10.2), so it is a flag of the process, which a command may set for itself and a library may not.
 """
 
 from __future__ import annotations
 
-import contextlib
-import functools
 import hashlib
 import os
 import platform
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from jaxba.runtime.atomic import atomic_write
+import jax
+import jaxlib
+from jax.experimental.serialize_executable import deserialize_and_load, serialize
+
+from jaxba.runtime.atomic import write_text
 
 FLAG = "--xla_cpu_max_isa"
 
 COMPLAINT = b"doesn't match the machine type for execution"
 """What XLA writes to standard error, and no function returns."""
 
-MARK, RUNNING = ".avx2", ".running"
-"""Endings of files beside the programs: the decision for a machine; and a process that runs a program from the cache
-for the first time, which is left behind only by one that has died of it."""
+DECISION = "instructions"
+"""Name of the file that says what programs of a folder are compiled for."""
 
 
-def limit_instructions(folder: Path) -> None:
-    """Sets XLA's flag if programs of this folder were refused before on this machine. Before JAX's backend starts."""
-    for file in folder.glob(f"{_machine()}-*{RUNNING}"):
-        if not _is_alive(int(file.stem.rpartition("-")[2])):
-            _decide(folder, "a process died of a compiled program in")
-            file.unlink(missing_ok=True)
-    flags = os.environ.get("XLA_FLAGS", "")
-    if FLAG not in flags and (folder / f"{_machine()}{MARK}").exists():
+def programs_folder(parent: Path) -> Path:
+    """The folder of the programs of these processors and this jaxlib; foreign ones could end the process.
+
+    The first command on a machine tries whether XLA distrusts its own programs, says so, and notes it in a file there.
+    Then this and all later commands set XLA's flag, for which JAX's backend must not have started; for the first one it
+    comes too late.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    cpus = Path("/proc/cpuinfo")
+    lines = cpus.read_text().splitlines() if cpus.is_file() else []
+    features = sorted({line for line in lines if line.startswith(("flags", "Features"))}) or [platform.node()]
+    name = hashlib.sha256("\n".join([jaxlib.__version__, *features]).encode()).hexdigest()[:16]
+    folder, flags = parent / name, os.environ.get("XLA_FLAGS", "")
+    folder.mkdir(parents=True, exist_ok=True)
+    if FLAG in flags:
+        return folder
+    decision = folder / DECISION
+    if not decision.exists():
+        distrusted = are_distrusted(serialize(jax.jit(lambda x: x + 1).lower(1.0).compile()))
+        write_text(decision, "AVX2" if distrusted else "all")
+        if distrusted:
+            print(f"note: XLA refuses its compiled programs here: {FLAG}=AVX2 from now on", file=sys.stderr)
+    if decision.read_text() == "AVX2":
         os.environ["XLA_FLAGS"] = f"{flags} {FLAG}=AVX2".strip()
+    return folder
 
 
-@contextlib.contextmanager
-def reading(folder: Path) -> Iterator[None]:
-    """While a program is read: hears what XLA says of it on standard error, and passes that on only if it is else."""
-    if FLAG in os.environ.get("XLA_FLAGS", "") or sys.__stderr__ is None:
-        yield
-        return
+def are_distrusted(stored: tuple[Any, ...]) -> bool:
+    """Whether XLA complains on standard error when it reads a program, given as JAX's `serialize` returns it."""
+    if sys.__stderr__ is None:
+        return False
     with tempfile.TemporaryFile() as heard:
         kept = os.dup(2)
         os.dup2(heard.fileno(), 2)
         try:
-            yield
+            deserialize_and_load(*stored, execution_devices=jax.local_devices()[:1])
         finally:
             os.dup2(kept, 2)
             os.close(kept)
-            heard.seek(0)
-            lines = heard.read().splitlines(keepends=True)
-            others = [line for line in lines if COMPLAINT not in line]
-            os.write(2, b"".join(others))
-            if len(others) < len(lines):
-                _decide(folder, "XLA refuses the compiled programs in")
-
-
-@contextlib.contextmanager
-def first_run(folder: Path) -> Iterator[None]:
-    """While a program from the cache runs for the first time: what is left of it tells the next process of a crash."""
-    file = folder / f"{_machine()}-{os.getpid()}{RUNNING}"
-    with contextlib.suppress(OSError):
-        file.touch()
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            file.unlink()
-
-
-def _decide(folder: Path, reason: str) -> None:
-    mark = folder / f"{_machine()}{MARK}"
-    if mark.exists():
-        return
-    with contextlib.suppress(OSError), atomic_write(mark) as file:
-        file.write(b"")
-    print(f"note: {reason} {folder}: from now on programs are compiled with {FLAG}=AVX2", file=sys.stderr)
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # another user's
-        return True
-    return True
-
-
-@functools.cache
-def _machine() -> str:
-    """A name for this machine and its instructions, found without JAX."""
-    return hashlib.sha256("\n".join([platform.node(), *processor_features()]).encode()).hexdigest()[:16]
-
-
-def processor_features() -> list[str]:
-    """Lines of instructions that the processors have, if the system tells them."""
-    cpus = Path("/proc/cpuinfo")
-    lines = cpus.read_text().splitlines() if cpus.is_file() else []
-    return sorted({line for line in lines if line.startswith(("flags", "Features"))})
+        heard.seek(0)
+        return COMPLAINT in heard.read()

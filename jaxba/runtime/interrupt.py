@@ -9,7 +9,6 @@ import socket
 import sys
 import threading
 import time
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -34,24 +33,6 @@ RAISE_AGAIN_S = 0.01
 
 _HANDLED = 0
 """Byte that the signal handler sends to the thread when it raises KeyboardInterrupt; no signal has this number."""
-
-
-def end_at_once() -> None:
-    """If this process is one of the commands: until its `Interrupt` begins, Ctrl-C ends it with one line.
-
-    Importing the package takes a second, and nothing has been begun by then. Processes that import it for themselves
-    are left alone.
-    """
-    name = os.path.basename(sys.argv[0] if sys.argv else "").removesuffix(".exe")
-    command = Path(__file__).parents[1] / "cli" / f"{name.removeprefix('jaxba-')}.py"
-    unhandled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if unhandled and name.startswith("jaxba-") and command.is_file():
-        signal.signal(signal.SIGINT, _end)
-
-
-def _end(*_: object) -> None:
-    os.write(2, b"interrupted\n")
-    os._exit(INTERRUPTED)
 
 
 class Interrupt:
@@ -108,7 +89,7 @@ class Interrupt:
             self._receiver.close()
 
     def _replaces(self, handler: Any) -> bool:
-        unhandled = handler in (signal.default_int_handler, _end, signal.SIG_DFL)
+        unhandled = handler in (signal.default_int_handler, signal.SIG_DFL)
         return unhandled or (self.unit != "" and handler is not signal.SIG_IGN)
 
     def _listen(self) -> None:
@@ -141,7 +122,7 @@ class Interrupt:
             if self._sender is not None:
                 self._sender.send(bytes([_HANDLED]))
             before = self._previous[signal.Signals(number)]
-            if callable(before) and before is not _end:
+            if callable(before):
                 before(number, frame)
             raise KeyboardInterrupt
         self._request(number)

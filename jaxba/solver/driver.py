@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.runtime.compilation import CompileClock, compile_and_run
+from jaxba.runtime.compilation import CompileClock, Program
 from jaxba.solver.compiled import solve_loop
 from jaxba.solver.iteration import Carry
 from jaxba.solver.prepare import Setup
@@ -55,7 +55,7 @@ class Compiled(Driver):
 
     def begin(self) -> LMState:
         """The state at the start."""
-        self._start = jax.block_until_ready(self.setup.initial(compile_and_run))
+        self._start = jax.block_until_ready(self.setup.initial(Program.__call__))
         return self._start
 
     def finish(self) -> tuple[StepInfo, Termination]:

@@ -14,7 +14,7 @@ from jaxba.runtime.compilation import CompileClock
 from jaxba.solver.driver import Compiled, OnDevices
 from jaxba.solver.options import SolveOptions
 from jaxba.solver.prepare import Setup
-from jaxba.solver.stepwise import Stepwise, stages_of
+from jaxba.solver.stepwise import Stepwise, quick_runs_of
 
 
 class IterationRecord(NamedTuple):
@@ -106,9 +106,9 @@ def _driver(setup: Setup, options: SolveOptions, clock: CompileClock, alone: boo
     arguments = setup, options.tolerances, options.max_iterations, clock
     if setup.shards is not None:
         return OnDevices(setup.shards, *arguments)
-    stages = stages_of(options.compilation, setup.placed.here.num_observations, setup.options)
-    if options.max_iterations and (any(stages.values()) or not alone):
-        return Stepwise(stages, *arguments)
+    first = quick_runs_of(options.compilation, setup.placed.here.num_observations, setup.options)
+    if options.max_iterations and (any(first.values()) or not alone):
+        return Stepwise(first, *arguments)
     return Compiled(*arguments)
 
 

@@ -35,11 +35,9 @@ from jaxba.runtime.compilation import (
     ParallelCompilation,
     Part,
     Program,
-    Stage,
     compiler_options,
-    level_after,
     program,
-    stages,
+    quick_runs,
 )
 from jaxba.solver.driver import Driver
 from jaxba.solver.iteration import Carry, advance, begin, problem_info
@@ -52,19 +50,19 @@ Call = Callable[..., Any]
 class Stepwise(Driver):
     """Iterations one at a time on one device, of programs at their own levels."""
 
-    def __init__(self, stages: Mapping[str, tuple[Stage, ...]], *arguments: Any) -> None:
+    def __init__(self, first: Mapping[str, int], *arguments: Any) -> None:
         """
         Args:
-            stages: of compilation of each part of a step, by the name of its function (`stages_of`).
+            first: runs of each part of a step before it is fully optimised (`quick_runs_of`).
             arguments: as for `Driver`.
         """
         super().__init__(*arguments)
-        self._stages, self._runs = stages, Counter[str]()
+        self._first, self._runs = first, Counter[str]()
         self._levels = self._levels_now()
         self._programs, self._compile_s = ParallelCompilation(), 0.0
 
     def _levels_now(self) -> dict[str, Level]:
-        return {name: level_after(self._runs[name], stages) for name, stages in self._stages.items()}
+        return {name: "quick" if self._runs[name] < runs else "full" for name, runs in self._first.items()}
 
     def _run(self, function: Program, *arguments: Any) -> Any:
         self._runs[function.function.__name__] += 1
@@ -85,7 +83,7 @@ class Stepwise(Driver):
             self._iterate(compile_programs, self._begin(compile_programs, setup.initial(compile_programs)))
         state = jax.block_until_ready(setup.initial(self._run))
         self.carry = jax.block_until_ready(self._begin(self._run, state))
-        if self.clock.seconds > 0 or self._programs.loaded:
+        if self.clock.seconds > 0:
             # warm-up, so that the first iteration is timed like later ones: a first run also allocates memory
             if self._optimised:
                 jax.block_until_ready(self._iterate(self._run, self.carry)[2])
@@ -141,14 +139,14 @@ def parts_of(options: StepOptions) -> dict[str, Part]:
     return found
 
 
-def stages_of(compilation: Compilation, observations: int, options: StepOptions) -> dict[str, tuple[Stage, ...]]:
-    """The stages of compilation of each part of a step, before it is fully optimised."""
+def quick_runs_of(compilation: Compilation, observations: int, options: StepOptions) -> dict[str, int]:
+    """How often each part of a step is run before it is fully optimised."""
     parts = parts_of(options)
     if compilation == "full" or not compiler_options("quick"):
-        return dict.fromkeys(parts, ())
+        return dict.fromkeys(parts, 0)
     if compilation == "quick":
-        return dict.fromkeys(parts, (Stage("quick", sys.maxsize),))
-    return {name: stages(part, observations) for name, part in parts.items()}
+        return dict.fromkeys(parts, sys.maxsize)
+    return {name: quick_runs(part, observations) for name, part in parts.items()}
 
 
 class Next(IntEnum):

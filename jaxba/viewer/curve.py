@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -25,41 +26,31 @@ def colour_of(stage: int) -> str:
     return COLOURS[(stage + 1) % len(COLOURS)]
 
 
-class CostCurve:
-    """A chart in the panel; there is none where nothing was recorded."""
+def add_curve(server: viser.ViserServer, stages: Sequence[Stage]) -> Any:
+    """A chart in the panel, without data."""
+    series: list[dict] = [{"label": "iteration"}]
+    for k, stage in enumerate(stages):
+        colour = colour_of(k)
+        label = f"cost, {stage.shown.name}" if len(stages) > 1 else "cost (px²)"
+        dot = {"show": True, "size": DOT, "fill": colour}
+        series.append({"label": label, "stroke": colour, "width": 2, "points": {"show": False}})
+        series.append({"label": "shown", "stroke": colour, "width": 0, "points": dot})
+    return server.gui.add_uplot(
+        curve_of(stages),
+        tuple(series),  # pyright: ignore[reportArgumentType] (dictionaries of uPlot)
+        scales={"x": {"time": False}, "y": {"distr": 3}},
+        axes=({"font": FONT}, {"font": FONT, "size": LABELS}),
+        padding=(14, 14, 0, 0),
+        legend={"show": False},
+        aspect=ASPECT,
+    )
 
-    def __init__(self, server: viser.ViserServer, stages: Sequence[Stage]) -> None:
-        self._stages = stages
-        several = len(stages) > 1
-        series: list[dict] = [{"label": "iteration"}]
-        for k, stage in enumerate(stages):
-            colour = colour_of(k)
-            label = f"cost, {stage.shown.name}" if several else "cost (px²)"
-            dot = {"show": True, "size": DOT, "fill": colour}
-            series.append({"label": label, "stroke": colour, "width": 2, "points": {"show": False}})
-            series.append({"label": "shown", "stroke": colour, "width": 0, "points": dot})
-        self._chart = server.gui.add_uplot(
-            self._data(),
-            tuple(series),  # pyright: ignore[reportArgumentType] (dictionaries of uPlot)
-            scales={"x": {"time": False}, "y": {"distr": 3}},
-            axes=({"font": FONT}, {"font": FONT, "size": LABELS}),
-            padding=(14, 14, 0, 0),
-            legend={"show": False},
-            aspect=ASPECT,
-        )
-        self.update()
 
-    def update(self) -> None:
-        """Draws the curves of recordings that have grown, and the dots where the stages are."""
-        data = self._data()
-        self._chart.data, self._chart.visible = data, len(data[0]) > 1
-
-    def _data(self) -> tuple[np.ndarray, ...]:
-        """Rows: iteration; per stage its cost (last value repeated); the shown iteration's cost, NaN elsewhere."""
-        iterations = np.arange(max(stage.shown.recording.last for stage in self._stages) + 1.0)
-        found = [iterations]
-        for stage in self._stages:
-            recorded = stage.shown.recording.cost
-            cost = np.pad(recorded, (0, len(iterations) - len(recorded)), mode="edge")
-            found += [cost, np.where(iterations == stage.iteration, cost, np.nan)]
-        return tuple(found)
+def curve_of(stages: Sequence[Stage]) -> tuple[np.ndarray, ...]:
+    """Rows: iteration; per stage its cost (last value repeated); the shown iteration's cost, NaN elsewhere."""
+    found = [np.arange(max(stage.shown.recording.last for stage in stages) + 1.0)]
+    for stage in stages:
+        recorded = stage.shown.recording.cost
+        cost = np.pad(recorded, (0, len(found[0]) - len(recorded)), mode="edge")
+        found += [cost, np.where(found[0] == stage.iteration, cost, np.nan)]
+    return tuple(found)

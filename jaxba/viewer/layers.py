@@ -25,10 +25,6 @@ class Layers:
     def __contains__(self, name: str) -> bool:
         return name in self._nodes
 
-    def names(self) -> set[str]:
-        """The layers that there are."""
-        return {name.split()[0] for name in self._nodes}
-
     def show(self, layer: str, visible: bool) -> None:
         """Shows or hides a layer."""
         for name, node in self._nodes.items():
@@ -58,17 +54,9 @@ class Layers:
 
     def lines(self, name: str, segments: Float[np.ndarray, "n 2 3"], colour: Colour, width: float) -> None:
         """Draws segments, `width` pixels wide."""
-        node = self._nodes.get(name)
-        if node is not None and len(node.points) == len(segments):
-            node.points = segments.astype(np.float32)
-            return
         self._nodes[name] = self._scene.add_line_segments(
             f"{self._root}/{name}", segments, colour, thickness=width, thickness_units="screen"
         )
-
-    def path(self, name: str, places: Float[np.ndarray, "n 3"], colour: Colour, width: float) -> None:
-        """Draws a line from each place to the next."""
-        self.lines(name, np.stack([places[:-1], places[1:]], axis=1), colour, width)
 
     def label(self, text: str, position: tuple[float, float, float]) -> None:
         """Writes a text; its first position stays."""
@@ -88,16 +76,8 @@ class Layers:
         colour: Colour,
         on_click: Callable[[int], None] | None,
     ) -> None:
-        """Draws a camera.
-
-        Args:
-            camera: its number.
-            pose: camera to world, looking along +z with y downwards.
-            half: half of width and height of its image at distance 1; the first ones stay.
-            scale: as of viser's frusta; the first one stays.
-            colour: of its lines.
-            on_click: called with the number when it is clicked.
-        """
+        """Draws a camera, whose camera-to-world pose looks along +z with y downwards. Half of its image's width and
+        height at distance 1 and viser's scale stay those of the first call. A click calls `on_click` with it."""
         from scipy.spatial.transform import Rotation
 
         quaternion = Rotation.from_matrix(pose[:, :3]).as_quat()[[3, 0, 1, 2]]

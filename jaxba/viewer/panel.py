@@ -14,7 +14,7 @@ from io import StringIO
 import numpy as np
 
 from jaxba.viewer import geometry
-from jaxba.viewer.curve import CostCurve, colour_of
+from jaxba.viewer.curve import add_curve, colour_of, curve_of
 from jaxba.viewer.extra import viser
 from jaxba.viewer.recording import Recording
 from jaxba.viewer.sources import Shown
@@ -53,13 +53,7 @@ class Viewer:
     """A page that is served until it is closed."""
 
     def __init__(self, all_shown: Sequence[Shown], port: int = PORT, host: str = HOST) -> None:
-        """Serves a page.
-
-        Args:
-            all_shown: what stands side by side on it.
-            port: first one that is tried.
-            host: address of this machine at which it is reached; `0.0.0.0`: all of them.
-        """
+        """Serves a page at this port or the next free one of an address of this machine; `0.0.0.0`: of all of them."""
         self.host, self.server = host, start_server(port, host)
         self._lock = threading.RLock()
         self.stages = stages(self.server, all_shown, self.choose, caption="name" if len(all_shown) > 1 else "")
@@ -120,22 +114,21 @@ class Viewer:
         gui.add_markdown("\n\n".join(lines))
         self._slider = gui.add_slider("iteration", 0, max(last, 1), 1, last, visible=last > 0)
         self._numbers = gui.add_markdown("")
-        self._curve = CostCurve(self.server, self.stages)
+        self._curve = add_curve(self.server, self.stages)
         choices = list(dict.fromkeys(name for stage in self.stages for name in stage.colour_choices()))
         colour = gui.add_dropdown("colour", choices, initial_value=self.stages[0].colour)
         size = gui.add_slider("size of points", 0.001, 0.03, 0.001, POINT_SIZE)
         worst = {name: (stage, camera) for stage in self.stages for name, camera in worst_images(stage)}
         picked = gui.add_dropdown("worst images", (NOTHING, *worst))
-        layers = [(name, what) for name, what in LAYERS if any(what in stage.layers.names() for stage in self.stages)]
         self._about = gui.add_markdown("Click on an image, or choose one of the worst.")
         self._picture = gui.add_image(np.full((1, 1, 3), 255, np.uint8), visible=False)
         self._slider.on_update(lambda _: self._show(iteration=int(self._slider.value)))
         colour.on_update(lambda _: self._show(colour=colour.value))
         picked.on_update(lambda _: self.choose(*worst.get(picked.value, (self.stages[0], None))))
         size.on_update(lambda _: self._each(lambda stage: stage.layers.size("points", size.value)))
-        for name, what in layers:
-            box = gui.add_checkbox(name, True)
-            box.on_update(lambda _, box=box, what=what: self._each(lambda stage: stage.layers.show(what, box.value)))
+        if any("start points" in stage.layers for stage in self.stages):
+            start = gui.add_checkbox("start, grey", True)
+            start.on_update(lambda _: self._each(lambda stage: stage.layers.show("start", start.value)))
         self._tell()
 
     def _each(self, change: Callable[[Stage], None]) -> None:
@@ -160,11 +153,8 @@ class Viewer:
             meaning = stage.limits_text()
             lines.append(f"{name}{stage.numbers()}" + (f"  \n*{meaning}*" if meaning else ""))
         self._numbers.content = "\n\n".join(lines)
-        self._curve.update()
-
-
-LAYERS = (("start, grey", "start"), ("true path, blue", "truth"), ("path, red", "path"))
-"""Check boxes, and the layers of stages that they show."""
+        self._curve.data = data = curve_of(self.stages)
+        self._curve.visible = len(data[0]) > 1
 
 
 def stages(
@@ -174,15 +164,8 @@ def stages(
     points: int = SHOWN_POINTS,
     caption: str = "",
 ) -> list[Stage]:
-    """Draws problems and solves side by side, and turns the camera to them.
-
-    Args:
-        server: owner of the scene.
-        all_shown: what to draw.
-        on_click: called with the stage and the number of an image that was clicked.
-        points: most points, of all together.
-        caption: as of a `Stage`.
-    """
+    """Draws problems and solves side by side, with at most so many points together, and turns the camera to them. A
+    click on an image calls `on_click` with its stage and its number; `caption` is that of a `Stage`."""
     share = max(points // len(all_shown), 1)
     found: list[Stage] = []
     for place, one in enumerate(all_shown):

@@ -119,12 +119,7 @@ class Recorder:
         self._rows = [(0, np.nan, np.nan, np.nan, 0.0)]
 
     def __call__(self, record: IterationRecord, now: Callable[[], BundleProblem]) -> None:
-        """Records an iteration.
-
-        Args:
-            record: of the iteration.
-            now: gives the problem with the parameters after it.
-        """
+        """Records an iteration; `now` gives the problem with the parameters after it."""
         step = record.step
         if len(self._rows) == 1:
             self._rows[0] = (0, float(step.previous_cost), np.nan, np.nan, 0.0)

@@ -1,25 +1,21 @@
-"""What the viewer shows, from files: problems, recordings, COLMAP's colours, images, KITTI's true paths."""
+"""What the viewer shows, from files: problems, recordings, COLMAP's colours, images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from jaxba.datasets.bal.paths import resolve
 from jaxba.io import is_colmap, read_problem
 from jaxba.io.colmap.problem import Looks, read_colmap_with_looks
 from jaxba.io.files import StrPath, display_name, sidecar_path
-from jaxba.io.frames import Sidecar, read_sidecar, truth_of
-from jaxba.io.poses import read_poses
+from jaxba.io.frames import Sidecar, read_sidecar
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import camera_centers
-from jaxba.problem.similarity import umeyama
 from jaxba.viewer.recording import ENDING, Recording, read_recording, still
 
 LARGEST_SIDE = 480
@@ -34,9 +30,6 @@ class Shown:
     recording: Recording
     looks: Looks | None = None
     """Colours of points, sizes of images and their principal points; None if they are not known."""
-
-    truth: Float[np.ndarray, "cameras 3"] | None = None
-    """True positions of cameras, in the scene of the last iteration."""
 
     names: tuple[str, ...] | None = None
     """Names of images."""
@@ -89,21 +82,19 @@ def shown(what: BundleProblem | Recording, name: str) -> Shown:
     return Shown(name, recording, names=labels and labels.names)
 
 
-def open_all(paths: Sequence[str], images: str | None = None, poses: str | None = None) -> list[Shown]:
+def open_all(paths: Sequence[str], images: str | None = None) -> list[Shown]:
     """Opens files.
 
     Args:
         paths: of problems in any format that is read, names of downloaded BAL problems, or recordings.
         images: folder of the images.
-        poses: KITTI's file of the true poses of the whole sequence; None: that with which `jaxba-kitti` made the
-            problem, if it is there.
 
     Raises:
         ProblemError: a file cannot be read; one line.
     """
     found = [_open(path) for path in paths]
     sides = [_sidecar(path, one) for path, one in zip(paths, found, strict=True)]
-    return [_with_frames(one, sides, poses, images) for one in found]
+    return [_with_frames(one, sides, images) for one in found]
 
 
 def _open(path: str) -> Shown:
@@ -125,8 +116,8 @@ def _sidecar(path: str, one: Shown) -> Sidecar | None:
     return None
 
 
-def _with_frames(one: Shown, sides: Sequence[Sidecar | None], poses: str | None, images: StrPath | None) -> Shown:
-    """With names, images and the true path of a problem of `jaxba-kitti`; the files of one sequence share a sidecar."""
+def _with_frames(one: Shown, sides: Sequence[Sidecar | None], images: StrPath | None) -> Shown:
+    """With names and images of a problem of `jaxba-kitti`; the files of one sequence share a sidecar."""
     count = one.problem.num_cameras
     side = next((side for side in sides if side is not None and len(side.frames) == count), None)
     if side is not None and one.names is None:
@@ -138,28 +129,4 @@ def _with_frames(one: Shown, sides: Sequence[Sidecar | None], poses: str | None,
     if side is not None and one.looks is None:
         principal = np.tile([side.calibration.cx, side.calibration.cy], (count, 1))
         one = replace(one, looks=Looks(None, np.array([one.size(camera) for camera in range(count)]), principal))
-    if poses is not None:
-        return replace(one, truth=_truth(one, side, poses))
-    known = None if side is None else side.contents.get("options", {}).get("poses")
-    if known and Path(known).is_file():
-        with suppress(ProblemError):  # nobody asked for it
-            return replace(one, truth=_truth(one, side, known))
     return one
-
-
-def _truth(one: Shown, side: Sidecar | None, poses: StrPath) -> Float[np.ndarray, "cameras 3"]:
-    """The true path in the scene of the last iteration, by the similarity that takes it to the path found.
-
-    Raises:
-        ProblemError: it cannot be read, or is not one of these cameras.
-    """
-    count, table = one.problem.num_cameras, read_poses(poses)
-    if side is not None:
-        path = truth_of(side, poses)[:, :, 3]
-    elif len(table.numbers) == count:
-        path = table.matrices[:, :, 3]
-    else:
-        has = f"{len(table.numbers)} poses for {count} cameras"
-        raise ProblemError(f"{display_name(poses)}: has {has}, and no .frames.json says which are meant")
-    centers = camera_centers(one.recording.at(one.recording.last).cameras)
-    return umeyama(path, centers).points(path)

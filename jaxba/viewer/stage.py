@@ -1,4 +1,4 @@
-"""One problem or recorded solve drawn into a scene of viser: points, frusta, the start, the true path, an image chosen.
+"""One problem or recorded solve drawn into a scene of viser: points, frusta, the start, an image chosen.
 
 Every stage has its own similarity to the page, so that solves from other starts stand side by side.
 """
@@ -36,7 +36,7 @@ ASIDE = 3.0
 FILE, ERROR, TRACK = "colour of the file", "reprojection error", "track length"
 """What colours of points may mean."""
 
-START, TRUTH, PATH, CHOSEN, RESIDUAL = (150, 150, 150), (31, 94, 234), (208, 0, 0), (255, 120, 0), (208, 0, 0)
+START, CHOSEN, RESIDUAL = (150, 150, 150), (255, 120, 0), (208, 0, 0)
 """Colours."""
 
 _CORNERS = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
@@ -164,9 +164,6 @@ class Stage:
             self._mark(problem, measures, poses)
             if "start points" not in layers and self.shown.recording.last > 0:
                 self._draw_start()
-            if self.shown.truth is not None:
-                layers.path("truth", similarity.points(self.shown.truth), TRUTH, 3.0)
-                layers.path("path", poses[:, :, 3], PATH, 2.0)
             self._label(points)
 
     def _colours(self, measures: Measures) -> np.ndarray:

@@ -69,21 +69,6 @@ def test_a_solve_whose_output_nobody_reads_writes_its_file(tmp_path):
     assert (tmp_path / "out.txt").stat().st_size > 1000
 
 
-PAUSE = "import os, importlib.abc; sys.meta_path.insert(0, type('P', (importlib.abc.MetaPathFinder,), dict(find_spec=\
-lambda *a: (os.write(1, b'x'), sys.stdin.read(1), None)[-1] if a[1] == 'jax' else None))()); "
-"""Waits for a byte when `jax` is imported."""
-
-
-@linux
-def test_ctrl_c_while_a_command_imports_is_one_line():
-    child = begin("solve", before=PAUSE, stdin=subprocess.PIPE)
-    assert child.stdout is not None
-    assert child.stdout.read(1) == "x"
-    child.send_signal(signal.SIGINT)
-    assert child.communicate(timeout=100)[1] == "interrupted\n"
-    assert child.returncode == 130
-
-
 @linux
 @pytest.mark.parametrize("command", ["paper", "data", "kitti"])
 def test_sigterm_is_handled_as_ctrl_c_with_its_own_status(command, monkeypatch, capsys):

@@ -66,7 +66,6 @@ CASES = [
     (view, "model --html model/cameras.bin", "--html model/cameras.bin: is a file of the problem"),
     (view, "p.txt --html p.frames.json", "is a file of the problem"),
     (view, "model --images kitti/image_0 --html kitti/image_0/000001.png", "000001.png: is an image"),
-    (view, "model --poses kitti/poses.txt --html kitti/poses.txt", "is the file of --poses"),
     (kitti, "kitti --poses kitti/poses.txt --out kitti/poses.txt", "--out kitti/poses.txt: is the file of --poses"),
     (kitti, "kitti --out kitti/calib.txt", "kitti/calib.txt: is a file of the sequence"),
     (kitti, "kitti --out kitti/times.txt", "kitti/times.txt: is a file of the sequence"),

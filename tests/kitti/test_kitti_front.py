@@ -16,9 +16,7 @@ from jaxba import BundleProblem, read_bal
 from jaxba.cli.kitti import run
 from jaxba.cli.solve import run as solve
 from jaxba.io import write_problem
-from jaxba.io.frames import Calibration
-from jaxba.kitti import frontend, klt
-from jaxba.kitti.features import KeyPoints, detect, essential, match
+from jaxba.kitti.features import detect, essential, match
 from jaxba.kitti.images import image_reader
 from jaxba.kitti.sequence import read_sequence
 from jaxba.problem import geometry
@@ -73,7 +71,7 @@ def test_the_epipolar_geometry_separates_wrong_matches_from_right_ones():
     first, second, turn = known_motion()
     second = second + 1e-4 * np.random.default_rng(1).standard_normal(second.shape)
     second[:60] = np.random.default_rng(2).uniform(-0.5, 0.5, (60, 2))
-    matrix, inliers = essential(first, second, 1 / 700, seed=0)
+    matrix, inliers = essential(first, second, 1 / 700)
     assert matrix is not None
     assert inliers[60:].mean() > 0.98
     assert inliers[:60].mean() < 0.1
@@ -82,7 +80,7 @@ def test_the_epipolar_geometry_separates_wrong_matches_from_right_ones():
     truth = cross @ turn
     cosine = abs((matrix * truth).sum()) / np.linalg.norm(matrix) / np.linalg.norm(truth)
     assert cosine > 0.9999
-    again = essential(first, second, 1 / 700, seed=0)
+    again = essential(first, second, 1 / 700)
     assert np.array_equal(again[0], matrix)
 
 
@@ -105,83 +103,35 @@ def test_matches_are_those_of_a_search_by_loops():
     a = random.integers(0, 60, (30, 128)).astype(np.uint8)
     b = np.concatenate([a[random.permutation(30)[:20]], random.integers(0, 60, (15, 128)).astype(np.uint8)])
     b = np.clip(b.astype(int) + random.integers(-14, 15, b.shape), 0, 255).astype(np.uint8)
-    found = match(KeyPoints(np.zeros((30, 2)), a), KeyPoints(np.zeros((35, 2)), b))
+    found = match(a.astype(np.float32), b.astype(np.float32))
     assert {tuple(pair) for pair in found.tolist()} == brute_force(a, b, 0.8)
     assert 10 < len(found) <= 20
 
 
-def test_bits_are_compared_by_hamming_distance():
-    random = np.random.default_rng(4)
-    a = random.integers(0, 256, (25, 32)).astype(np.uint8)
-    b = a[::-1] ^ (random.integers(0, 256, a.shape) & random.integers(0, 256, a.shape) & 17).astype(np.uint8)
-    found = match(KeyPoints(np.zeros((25, 2)), a), KeyPoints(np.zeros((25, 2)), b))
-    counts = np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2)
-    for i, j in found.tolist():
-        assert counts[i].argmin() == j
-        assert counts[i, j] < 0.8 * np.sort(counts[i])[1]
-    assert len(found) == 25
-
-
-@pytest.mark.parametrize("features", ["sift", "orb"])
-def test_a_blank_image_has_no_key_points(features):
-    found = detect(np.full((100, 200), 90, np.uint8), features, 500)
-    assert len(found.pixels) == 0
-    assert len(match(found, found)) == 0
-
-
-def test_tracked_points_are_where_the_geometry_says(rendered):
-    """Corners of the first frame move as their plane demands."""
-    poses = kitti_scene.path(2)
-    first, second = (cv2.imread(str(image(rendered[SMALL], i)), 0) for i in (0, 1))
-    calibration = Calibration(SMALL.fx, SMALL.fy, SMALL.cx, SMALL.cy)
-    points = klt.detect_corners(first, 600)
-    after = klt.track(first, second, points, 600, calibration, 0)
-    old = int(after.old)
-    assert old > 100
-    assert (np.diff(after.tracks) > 0).all()
-    _, a, b = np.intersect1d(points.tracks, after.tracks, return_indices=True)
-    assert len(a) == old
-    rays = np.column_stack([calibration.rays(points.pixels[a]), np.ones(old)]) @ poses[0, :, :3].T
-    distance = np.full(old, np.inf)
-    for axis, position, _ in kitti_scene.PLANES:
-        with np.errstate(divide="ignore"):
-            along = (position - poses[0, axis, 3]) / rays[:, axis]
-        distance = np.where((along > 0) & (along < distance), along, distance)
-    local = (poses[0, :, 3] + rays * distance[:, None] - poses[1, :, 3]) @ poses[1, :, :3]
-    expected = (local[:, :2] / local[:, 2:]) * [SMALL.fx, SMALL.fy] + [SMALL.cx, SMALL.cy]
-    error = np.linalg.norm(after.pixels[b] - expected, axis=1)
-    assert np.median(error) < 0.15
-    assert np.mean(error < 1) > 0.95
-
-
-def test_new_corners_keep_their_distance(rendered):
-    first = cv2.imread(str(image(rendered[SMALL], 0)), 0)
-    pixels = klt.detect_corners(first, 600).pixels
-    gaps = np.linalg.norm(pixels[:, None] - pixels, axis=2) + 1e9 * np.eye(len(pixels))
-    assert gaps.min() >= klt.DISTANCE
+def test_a_blank_image_has_no_key_points():
+    pixels, descriptors = detect(np.full((100, 200), 90, np.uint8), 500)
+    assert len(pixels) == 0
+    assert len(match(descriptors, descriptors)) == 0
 
 
 # The whole command
 
 
-@pytest.mark.parametrize(
-    ("camera", "features", "limit"),
-    [(SMALL, "sift", 0.05), (OTHER, "sift", 0.05), (SMALL, "orb", 0.2), (OTHER, "klt", 0.05)],
-)
-def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera, features, limit):
+@pytest.mark.parametrize("camera", [SMALL, OTHER])
+def test_the_path_is_found_from_images_alone(rendered, tmp_path, capsys, camera):
     out = tmp_path / "problem.txt.bz2"
-    assert build(rendered[camera], out, "--features", features) == 0
+    assert build(rendered[camera], out) == 0
     printed = capsys.readouterr()
     assert printed.err == ""
-    assert start_error(printed.out) < limit
+    assert start_error(printed.out) < 0.05
     problem, side = read_bal(out), json.loads((tmp_path / "problem.frames.json").read_text())
     assert problem.num_cameras == len(side["frames"])
     assert side["calibration"]["fx"] == camera.fx
-    assert side["options"]["features"] == features
+    assert side["options"]["keyframes"] == "auto"
     assert (geometry.depths(problem) > 0).all()
     assert np.abs(geometry.residuals(problem)).max() <= 3.0 + 1e-6
     assert np.bincount(problem.point_index).min() >= 2
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["problem.frames.json", "problem.txt.bz2", "problem.work"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["problem.frames.json", "problem.txt.bz2"]
 
 
 @pytest.mark.slow
@@ -189,9 +139,11 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     """jaxba-kitti, jaxba-solve and jaxba-kitti evaluate, one after the other."""
     out, solved, folder = tmp_path / "p.txt", tmp_path / "solved.txt.gz", tmp_path / "eval"
     poses = rendered[OTHER] / "poses.txt"
-    start = ["--start", "noisy-poses", "--rotation-sigma", "0.3", "--translation-sigma", "0.1"]
-    assert build(rendered[OTHER], out, *start, "--keyframes", "all") == 0
-    ate = start_error(capsys.readouterr().out)
+    assert build(rendered[OTHER], out, "--start", "poses", "--keyframes", "all") == 0
+    exact, noise = read_bal(out), np.random.default_rng(0).normal(size=(FRAMES, 3))
+    cameras = np.array(exact.cameras)
+    cameras[:, 3:6] += 0.1 * np.cumsum(noise, axis=0)
+    write_problem(exact.replace(cameras=cameras), out)
     assert solve([str(out), "--policy", "ceres", "--output", str(solved)]) == 0
     capsys.readouterr()
     assert run(["evaluate", str(out), str(solved), "--poses", str(poses), "--out", str(folder), "--lengths", "2"]) == 0
@@ -199,7 +151,6 @@ def test_start_solution_and_truth_are_compared(rendered, tmp_path, capsys):
     assert printed.err == ""
     found = json.loads((folder / "evaluation.json").read_text())
     before, after = found["results"]
-    assert before["ate_m"]["rmse"] == pytest.approx(ate, abs=6e-4)
     assert after["ate_m"]["rmse"] < 0.5 * before["ate_m"]["rmse"]
     assert after["rms_px"] < before["rms_px"]
     assert after["segments"]["segments"] == before["segments"]["segments"] > 0
@@ -238,75 +189,30 @@ def test_windows_are_problems_of_their_own(rendered, tmp_path):
         assert len(json.loads((tmp_path / name.replace("txt.gz", "frames.json")).read_text())["frames"]) == 6
 
 
-# Same command, same numbers
-
-
-@pytest.mark.parametrize("features", ["sift", "klt"])
-def test_a_killed_run_goes_on_and_gives_the_same_bytes(sequence, tmp_path, monkeypatch, capsys, features):
-    whole, broken = tmp_path / "a.txt", tmp_path / "b.txt"
-    options = ("--features", features, "--keypoints", "700")
-    assert build(sequence, whole, *options) == 0
-    calls, name = [], "_verify" if features == "sift" else "track"
-    original = getattr(frontend, name)
-
-    def killed(*arguments):
-        calls.append(1)
-        if len(calls) == 6:
-            raise KeyboardInterrupt
-        return original(*arguments)
-
-    monkeypatch.setattr(frontend, name, killed)
-    assert build(sequence, broken, *options) == 130
-    assert "run the same command again" in capsys.readouterr().out
-    assert not broken.exists()
-    stored = sorted((tmp_path / "b.work").iterdir())
-    stored[1].write_bytes(stored[1].read_bytes()[:100])  # cut short: made anew
-    assert not [path for path in stored if path.suffix != ".npz"]
-    monkeypatch.setattr(frontend, name, original)
-    before = len(calls)
-    assert build(sequence, broken, *options) == 0
-    assert len(calls) == before
-    assert broken.read_bytes() == whole.read_bytes()
-    assert sorted(p.name for p in (tmp_path / "a.work").iterdir()) == sorted(
-        p.name for p in (tmp_path / "b.work").iterdir()
-    )
-
-
-def test_a_changed_image_is_not_taken_from_the_cache(sequence, tmp_path):
-    out = tmp_path / "p.txt"
-    assert build(sequence, out) == 0
-    first = out.read_bytes()
-    shutil.copy(image(sequence, 6), image(sequence, 5))
-    assert build(sequence, out) == 0
-    assert out.read_bytes() != first
-
-
 # Sequences with trouble
 
 
 def test_a_black_frame_is_left_out(sequence, tmp_path, capsys):
-    for features in ("sift", "klt"):
-        cv2.imwrite(str(image(sequence, 5)), np.zeros((SMALL.height, SMALL.width), np.uint8))
-        out = tmp_path / f"{features}.txt"
-        assert build(sequence, out, "--features", features, "--keyframes", "all") == 0
-        printed = capsys.readouterr()
-        assert "note: left out, too few matches: frame 5\n" in printed.out
-        assert json.loads(out.with_suffix(".frames.json").read_text())["frames"] == [*range(5), *range(6, FRAMES)]
-        assert start_error(printed.out) < 0.1
+    cv2.imwrite(str(image(sequence, 5)), np.zeros((SMALL.height, SMALL.width), np.uint8))
+    out = tmp_path / "p.txt"
+    assert build(sequence, out, "--keyframes", "all") == 0
+    printed = capsys.readouterr()
+    assert "note: left out, too few matches: frame 5\n" in printed.out
+    assert json.loads(out.with_suffix(".frames.json").read_text())["frames"] == [*range(5), *range(6, FRAMES)]
+    assert start_error(printed.out) < 0.1
 
 
-@pytest.mark.parametrize("features", ["sift", "orb", "klt"])
-def test_a_long_gap_is_an_error_that_names_the_frames(sequence, tmp_path, capsys, features):
+def test_a_long_gap_is_an_error_that_names_the_frames(sequence, tmp_path, capsys):
     for number in (6, 7, 8):
         cv2.imwrite(str(image(sequence, number)), np.zeros((SMALL.height, SMALL.width), np.uint8))
-    assert build(sequence, tmp_path / "p.txt", "--features", features) == 2
+    assert build(sequence, tmp_path / "p.txt") == 2
     printed = capsys.readouterr()
     assert printed.err.startswith(
         "error: too few matches: frame 5 shares 0 with frame 6, 0 with frame 7, 0 with frame 8"
     )
     assert printed.err.count("\n") == 1
     assert not (tmp_path / "p.txt").exists()
-    assert build(sequence, tmp_path / "p.txt", "--features", features, "--frames", "0:6") == 0
+    assert build(sequence, tmp_path / "p.txt", "--frames", "0:6") == 0
 
 
 @pytest.mark.parametrize("choice", ["auto", "all"])
@@ -337,19 +243,17 @@ def test_a_camera_that_only_turns_is_refused(sequence, tmp_path, capsys, choice)
     assert message.count("\n") == 1
 
 
-@pytest.mark.parametrize("features", ["sift", "klt"])
-def test_frames_left_out_at_the_end_are_named(sequence, tmp_path, capsys, features):
+def test_frames_left_out_at_the_end_are_named(sequence, tmp_path, capsys):
     for number in (FRAMES - 2, FRAMES - 1):
         cv2.imwrite(str(image(sequence, number)), np.zeros((SMALL.height, SMALL.width), np.uint8))
-    assert build(sequence, tmp_path / "p.txt", "--features", features) == 0
+    assert build(sequence, tmp_path / "p.txt") == 0
     assert "note: left out, too few matches: frames 12, 13\n" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("features", ["sift", "orb", "klt"])
-def test_images_of_one_pixel_are_an_error_in_one_line(sequence, tmp_path, capsys, features):
+def test_images_of_one_pixel_are_an_error_in_one_line(sequence, tmp_path, capsys):
     for number in range(FRAMES):
         cv2.imwrite(str(image(sequence, number)), np.full((1, 1), 100, np.uint8))
-    assert build(sequence, tmp_path / "p.txt", "--features", features) == 2
+    assert build(sequence, tmp_path / "p.txt") == 2
     message = capsys.readouterr().err
     assert message.startswith("error: too few matches: frame 0 shares 0")
     assert message.count("\n") == 1
@@ -401,9 +305,7 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
         (["--min-views", "1"], "--min-views must be at least 2"),
         (["--out", "p.ply"], "the problem is a BAL file"),
         (["--out", "nowhere/p.txt"], "does not exist"),
-        (["--seed", "-1"], "--seed must lie"),
         (["--max-error", "inf"], "--max-error must be finite"),
-        (["--rotation-sigma", "nan"], "--rotation-sigma must be finite"),
         (["--keyframes", "99", "--frames", "0:5"], "--keyframes 99 leaves one key-frame of 5"),
         (["--frames", "0:99"], "ends after the last frame, 13"),
         (["--poses", "nowhere.txt"], "cannot be read"),
@@ -422,7 +324,7 @@ def test_what_makes_no_sense_is_said_in_one_line(rendered, tmp_path, monkeypatch
     assert words in message
     assert message.startswith("error: ")
     assert message.count("\n") == 1
-    assert not [p for p in tmp_path.iterdir() if p.suffix != ".work"]
+    assert not list(tmp_path.iterdir())
 
 
 def test_evaluate_refuses_what_does_not_belong_together(rendered, tmp_path, capsys):
@@ -471,13 +373,12 @@ def test_an_error_that_is_not_finite_is_said_in_one_line(rendered, tmp_path, cap
 
 
 @needs_data
-@pytest.mark.parametrize("features", ["sift", "klt"])
-def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys, features):
+def test_real_frames_give_a_path_near_the_truth(tmp_path, capsys):
     """Frames 0 to 19 of sequence 00: 16 m of nearly straight road."""
     assert DATA is not None
     root = Path(DATA) / "kitti"
     out, poses = tmp_path / "kitti00.txt.bz2", str(root / "poses" / "00.txt")
-    options = ["--frames", "0:20", "--features", features, "--poses", poses, "--out", str(out)]
+    options = ["--frames", "0:20", "--poses", poses, "--out", str(out)]
     assert run([str(root / "seq00"), *options]) == 0
     assert start_error(capsys.readouterr().out) < 0.5
 
@@ -515,7 +416,7 @@ def test_the_orientation_that_a_photograph_asks_for_is_not_made(sequence):
 
 def test_hidden_files_change_nothing(rendered, sequence, tmp_path):
     (image(sequence, 0).parent / "._000000.png").write_bytes(b"\0\5\x16\7Mac OS X")
-    assert build(rendered[SMALL], tmp_path / "a.txt", "--work", str(tmp_path / "work")) == 0
+    assert build(rendered[SMALL], tmp_path / "a.txt") == 0
     assert build(sequence, tmp_path / "b.txt") == 0
     assert (tmp_path / "a.txt").read_bytes() == (tmp_path / "b.txt").read_bytes()
 

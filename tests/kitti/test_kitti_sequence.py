@@ -30,7 +30,6 @@ def folder(tmp_path) -> Path:
     for number in range(5, 15):
         (tmp_path / "image_0" / f"{number:06d}.png").touch()
     (tmp_path / "calib.txt").write_text(CALIBRATION)
-    (tmp_path / "times.txt").write_text("".join(f"{i / 10}\n" for i in range(15)))
     return tmp_path
 
 
@@ -38,7 +37,6 @@ def test_frames_carry_the_numbers_of_their_files(folder):
     sequence = read_sequence(folder, "6:12:2")
     assert sequence.numbers == (6, 8, 10)
     assert [path.name for path in sequence.images] == ["000006.png", "000008.png", "000010.png"]
-    np.testing.assert_array_equal(sequence.times, [0.6, 0.8, 1.0])
     assert sequence.calibration == Calibration(700.0, 700.0, 600.5, 180.25)
     assert read_sequence(folder).numbers == tuple(range(5, 15))
 
@@ -130,12 +128,6 @@ def test_an_image_without_a_number_is_refused(folder):
         read_sequence(folder)
 
 
-def test_times_that_end_early_are_refused(folder):
-    (folder / "times.txt").write_text("0.0\n0.1\n")
-    with pytest.raises(ProblemError, match="no time for frame 14"):
-        read_sequence(folder)
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -205,13 +197,11 @@ def test_a_matrix_of_three_rows_of_four_is_a_calibration(folder):
 
 
 def raw(root: Path) -> Path:
-    """A drive of the raw data: images and time stamps by camera, calibration of the day above."""
+    """A drive of the raw data: images by camera, calibration of the day above."""
     drive = root / "2011_09_26" / "2011_09_26_drive_0001_sync"
     (drive / "image_00" / "data").mkdir(parents=True)
     for number in range(4):
         (drive / "image_00" / "data" / f"{number:010d}.png").touch()
-    stamps = [f"2011-09-26 13:0{at + 1}:5{at}.{at}64389445" for at in range(4)]
-    (drive / "image_00" / "timestamps.txt").write_text("\r\n".join(stamps))
     lines = ["calib_time: 09-Jan-2012 13:57:47", "corner_dist: 9.950000e-02", "K_00: 9 0 1 0 9 1 0 0 1"]
     lines += ["P_rect_00: 700 0 600.5 0 0 700 180.25 0 0 0 1 0", "P_rect_01: 700 0 600.5 -350 0 700 180.25 0 0 0 1 0"]
     (root / "2011_09_26" / "calib_cam_to_cam.txt").write_text("\n".join(lines))
@@ -224,12 +214,8 @@ def test_the_folders_of_the_raw_data_are_read(tmp_path, monkeypatch):
     assert sequence.numbers == (1, 2, 3)
     assert sequence.images[0].name == "0000000001.png"
     assert sequence.calibration == Calibration(700.0, 700.0, 600.5, 180.25)
-    np.testing.assert_allclose(sequence.times, [61.1, 122.2, 183.3], atol=1e-12)
     monkeypatch.chdir(drive)
     assert read_sequence(".").calibration == sequence.calibration
-    (drive / "image_00" / "timestamps.txt").write_text("2011-09-26 13:02:25.9\n" * 3 + "2011-13-26 13:02:25.9\n")
-    with pytest.raises(ProblemError, match=r"timestamps\.txt line 4: is no date and time"):
-        read_sequence(drive)
 
 
 def test_the_folders_of_kitti_360_are_read(tmp_path):
@@ -277,10 +263,8 @@ def test_malformed_poses_are_refused_by_the_line_of_the_file(tmp_path, text, wor
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_byte_order_marks_are_no_trouble_in_poses_and_times(folder, encoding):
-    (folder / "times.txt").write_text((folder / "times.txt").read_text(), encoding=encoding)
+def test_byte_order_marks_are_no_trouble_in_poses(folder, encoding):
     (folder / "poses.txt").write_text(f"{IDENTITY}\r{IDENTITY}\r", encoding=encoding, newline="")
-    np.testing.assert_array_equal(read_sequence(folder, "6:9").times, [0.6, 0.7, 0.8])
     assert len(read_poses(folder / "poses.txt").numbers) == 2
 
 

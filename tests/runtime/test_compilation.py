@@ -21,15 +21,14 @@ from jaxba.problem.options import Refinement, StepOptions
 from jaxba.runtime import compilation
 from jaxba.runtime.compilation import (
     BREAK_EVEN,
+    TYPICAL,
     Level,
     ParallelCompilation,
     Part,
     Program,
-    Stage,
     compiler_options,
-    level_after,
     program,
-    stages,
+    quick_runs,
 )
 from jaxba.solver.stepwise import try_step_by_parts
 
@@ -39,35 +38,16 @@ on_a_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="only a CPU
 
 
 @pytest.mark.parametrize("part", get_args(Part))
-def test_more_observations_mean_better_levels_and_shorter_stages(part, monkeypatch):
-    monkeypatch.setattr(compilation, "uses_older_emitters", lambda _: True)
-    typical, quick, medium = BREAK_EVEN[part]
-    assert stages(part, 1) == (("quick", quick), ("medium", medium))
-    assert stages(part, 100) == (("quick", quick // 100), ("medium", medium // 100))
-    assert stages(part, quick // typical) == (("quick", typical), ("medium", medium // (quick // typical)))
-    assert [level for level, _ in stages(part, quick // (typical - 1))] == ["medium"]
-    assert stages(part, medium // typical) == (("medium", typical),)
-    assert stages(part, medium // (typical - 1)) == stages(part, 10**9) == ()
-    assert sum(runs for _, runs in stages(part, 31_843)) > 100, "Ladybug-49 converges before that"
-
-
-@pytest.mark.parametrize("part", BREAK_EVEN)
-def test_without_the_older_emitters_there_is_no_medium_level(part, monkeypatch):
-    monkeypatch.setattr(compilation, "uses_older_emitters", lambda _: False)
-    assert stages(part, 1) == (("quick", BREAK_EVEN[part].quick),)
-    assert stages(part, BREAK_EVEN[part].quick) == ()
-
-
-def test_a_program_is_replaced_by_a_better_one_after_its_runs():
-    both = (Stage("quick", 2), Stage("medium", 3))
-    assert [level_after(runs, both) for runs in range(7)] == ["quick"] * 2 + ["medium"] * 3 + ["full"] * 2
-    assert level_after(0, ()) == "full"
+def test_more_observations_mean_fewer_quick_runs(part):
+    even, typical = BREAK_EVEN[part], TYPICAL[part]
+    assert [quick_runs(part, count) for count in (1, 100, even // typical)] == [even, even // 100, typical]
+    assert quick_runs(part, even // (typical - 1)) == quick_runs(part, 10**9) == 0
+    assert quick_runs(part, 31_843) > 12, "Ladybug-49 converges before that"
 
 
 @on_a_cpu
-def test_this_jaxlib_compiles_at_both_lower_levels():
-    for level, optimization in {"quick": 0, "medium": 1}.items():
-        assert compiler_options(level)["xla_backend_optimization_level"] == optimization
+def test_this_jaxlib_compiles_at_the_lower_level():
+    assert compiler_options("quick")["xla_backend_optimization_level"] == 0
     assert compiler_options("full") == {}
 
 
@@ -95,22 +75,6 @@ def test_a_solve_compiled_at_level_quick_is_the_same_solve(how):
     np.testing.assert_allclose(quick.history.cost, full.history.cost, rtol=1e-8)
     # a network of, among others, the last digits of a decrease
     np.testing.assert_allclose(quick.history.damping, full.history.damping, rtol=1e-4)
-
-
-@pytest.mark.fully_compiled
-@on_a_cpu
-@pytest.mark.parametrize("how", [{}, {"linear_solver": "implicit"}, {"method": "stba"}], ids=str)
-def test_a_solve_compiled_at_level_medium_is_the_same_solve(how, monkeypatch):
-    full = solve(support.tiny(), "learned", **how, max_iterations=8, callback=lambda record: None)
-    monkeypatch.setattr("jaxba.solver.stepwise.stages", lambda part, _: (Stage("medium", 100),))
-    medium = solve(support.tiny(), "learned", **how, max_iterations=8, compilation="auto")
-    assert (full.quick_iterations, medium.quick_iterations) == (0, medium.iterations)
-    assert (medium.iterations, medium.accepted, medium.termination) == (
-        full.iterations,
-        full.accepted,
-        full.termination,
-    )
-    np.testing.assert_allclose(medium.history.cost, full.history.cost, rtol=1e-8)
 
 
 @pytest.mark.xla
@@ -224,8 +188,8 @@ def test_nothing_more_is_compiled_after_an_error():
 def test_the_optimised_program_takes_over_and_the_records_go_on(watched, monkeypatch):
     full = solve(support.tiny(), "ceres")
     assert full.iterations > 2
-    before = {"factorization": (Stage("quick", 1),), "acceptance": (Stage("quick", 1), Stage("medium", 1))}
-    monkeypatch.setattr("jaxba.solver.stepwise.stages", lambda part, _: before[part])
+    before = {"factorization": 1, "acceptance": 2}
+    monkeypatch.setattr("jaxba.solver.stepwise.quick_runs", lambda part, _: before[part])
     records = []
     callback = records.append if watched else None
     mixed = solve(support.tiny(), "ceres", compilation="auto", callback=callback)
@@ -242,7 +206,7 @@ def test_the_optimised_program_takes_over_and_the_records_go_on(watched, monkeyp
 @pytest.mark.xla
 @on_a_cpu
 def test_a_second_quick_solve_compiles_nothing_and_each_level_has_its_program():
-    assert len({program(propose, "options", level=level) for level in get_args(Level)}) == 3
+    assert len({program(propose, "options", level=level) for level in get_args(Level)}) == 2
     solve(support.paper(0), "ceres", max_iterations=3, compilation="quick")
     with Compilations() as seen:
         again = solve(support.paper(1), "ceres", max_iterations=3, compilation="quick")
@@ -263,7 +227,7 @@ def test_iterations_of_alternating_solves_are_added():
 
 
 def test_where_the_options_are_unknown_programs_are_optimised(monkeypatch):
-    monkeypatch.setitem(compilation.COMPILER_OPTIONS, "quick", {"xla_no_such_option": True})
+    monkeypatch.setattr(compilation, "QUICK", {"xla_no_such_option": True})
     assert compiler_options.__wrapped__("quick") == {}
 
 
@@ -272,7 +236,7 @@ def test_where_the_options_are_unknown_programs_are_optimised(monkeypatch):
 def test_an_unknown_option_leaves_those_that_are_known(unknown_first, monkeypatch):
     known = {"xla_backend_optimization_level": 0}
     options = {"xla_no_such_option": True, **known} if unknown_first else {**known, "xla_no_such_option": True}
-    monkeypatch.setitem(compilation.COMPILER_OPTIONS, "quick", options)
+    monkeypatch.setattr(compilation, "QUICK", options)
     assert compiler_options.__wrapped__("quick") == known
 
 
@@ -290,6 +254,6 @@ def test_the_command_reports_iterations_of_lower_levels(tmp_path, capsys, monkey
     assert " (all with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out
     assert run([*fast, "--compilation", "full"]) == 0
     assert "quickly" not in capsys.readouterr().out
-    monkeypatch.setattr("jaxba.solver.stepwise.stages", lambda part, _: (Stage("quick", 1),))
+    monkeypatch.setattr("jaxba.solver.stepwise.quick_runs", lambda part, _: 1)
     assert run(fast) == 0
     assert " (1 of them with quickly compiled programs, see --compilation)\n" in capsys.readouterr().out

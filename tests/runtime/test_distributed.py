@@ -27,14 +27,11 @@ def test_what_does_not_name_a_process_is_one_line(arguments, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_port_that_is_taken_or_that_nobody_listens_at_is_named(monkeypatch):
-    monkeypatch.setattr(distributed, "START_S", 0.1)
+def test_a_port_that_is_taken_is_named():
     with socket.socket() as taken:
         taken.bind(("", 0))
-        address = f"localhost:{taken.getsockname()[1]}"
-        with pytest.raises(InputError, match=rf"{address}: no answer for 0.1 s \(Connection refused\)"):
-            distributed.initialize(address, 2, 1)
         taken.listen()
+        address = f"localhost:{taken.getsockname()[1]}"
         with pytest.raises(InputError, match=f"{address}: Address already in use"):
             distributed.initialize(address, 2, 0)
 

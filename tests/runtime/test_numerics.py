@@ -6,7 +6,6 @@ import multiprocessing
 import signal
 import sys
 import threading
-import tomllib
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,7 +18,7 @@ from support import DAMPINGS, paper, solve_options
 from threadpoolctl import threadpool_info
 
 import jaxba
-from jaxba.runtime import interrupt, process
+from jaxba.runtime import process
 from jaxba.runtime.numerics import numerics
 
 PYPROJECT = Path(jaxba.__file__).parents[1] / "pyproject.toml"
@@ -180,17 +179,3 @@ def test_contexts_that_overlap_give_blas_its_threads_back():
         leave.set()
         running.result(60)
     assert blas_threads() == before
-
-
-@pytest.mark.skipif(not PYPROJECT.is_file(), reason="the package stands alone")
-def test_only_the_commands_themselves_handle_ctrl_c_from_the_start(monkeypatch):
-    set_by_import = []
-    monkeypatch.setattr(signal, "signal", lambda *given: set_by_import.append(given))
-    monkeypatch.setattr(signal, "getsignal", lambda _: signal.default_int_handler)
-    commands = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]["scripts"]
-    assert "jaxba-solve" in commands
-    for name in (*commands, "jaxba-tool-of-a-user", "python", "solve"):
-        set_by_import.clear()
-        monkeypatch.setattr(sys, "argv", [f"/usr/bin/{name}"])
-        interrupt.end_at_once()
-        assert len(set_by_import) == (name in commands), name

@@ -166,7 +166,7 @@ def test_the_page_shows_points_and_frusta_and_the_slider_changes_them(browser, v
     wait_for(lambda: "start, cost" in browser.find_element(By.TAG_NAME, "body").text, browser)
     wait_for(lambda: (np.abs(scene(browser) - last).max(axis=2) > 60).sum() > 200, browser)
     recorded = viewer.stages[0].shown.recording.cost
-    iterations, cost, shown = viewer._curve._chart.data
+    iterations, cost, shown = viewer._curve.data
     np.testing.assert_array_equal(iterations, np.arange(len(recorded)))
     np.testing.assert_array_equal(cost, recorded)
     np.testing.assert_array_equal(shown, [recorded[0], *[np.nan] * (len(recorded) - 1)])
@@ -237,10 +237,10 @@ def test_slider_and_curve_come_with_the_first_iteration(recording):
     viewer = Viewer([shown(start, "run")])
     try:
         assert not viewer._slider.visible
-        assert not viewer._curve._chart.visible
+        assert not viewer._curve.visible
         viewer.grow(recording)
         assert viewer._slider.visible
-        assert viewer._curve._chart.visible
+        assert viewer._curve.visible
         assert viewer._slider.value == recording.last
     finally:
         viewer.close()
@@ -251,14 +251,6 @@ def test_the_command_says_what_is_missing(tmp_path, capsys):
 
     assert run([str(Path(tmp_path) / "no.npz")]) == 2
     assert "cannot read" in capsys.readouterr().err
-
-
-def test_an_episode_of_the_game_is_written_as_a_page(tmp_path):
-    page = tmp_path / "episode.html"
-    from jaxba.cli.episode import run
-
-    assert run(["--policy", "guarded", "--scene", "1", "--html", str(page)]) == 0
-    assert page.stat().st_size > 500_000
 
 
 def test_names_are_characters_and_nothing_else():

@@ -1,4 +1,4 @@
-"""What files hold for looking at: COLMAP's colours and sizes, true paths, names; and one line where that fails."""
+"""What files hold for looking at: COLMAP's colours and sizes, names; and one line where that fails."""
 
 from __future__ import annotations
 
@@ -8,9 +8,6 @@ import pytest
 import jaxba
 from jaxba.cli import solve, view
 from jaxba.io.colmap.problem import read_colmap_with_looks
-from jaxba.kitti.evaluate import write_poses
-from jaxba.problem.geometry import camera_poses
-from jaxba.problem.similarity import Similarity
 from jaxba.viewer.sources import open_all
 
 
@@ -51,16 +48,6 @@ def test_colours_and_sizes_are_those_that_pycolmap_reads(model, tmp_path):
         camera = reconstruction.images[number].camera
         np.testing.assert_array_equal(looks.sizes[at], [camera.width, camera.height])
         np.testing.assert_allclose(looks.principal[at], [camera.principal_point_x, camera.principal_point_y])
-
-
-def test_a_true_path_in_another_frame_lies_on_the_cameras(model, tmp_path):
-    (shown,) = open_all([model])
-    poses = camera_poses(np.asarray(shown.problem.cameras))
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    moved = Similarity(3.0, turn, np.array([1.0, 2, 3])).poses(poses)
-    write_poses(tmp_path / "poses.txt", moved)
-    (shown,) = open_all([model], poses=str(tmp_path / "poses.txt"))
-    np.testing.assert_allclose(shown.truth, poses[:, :, 3], atol=1e-9)
 
 
 @pytest.mark.parametrize(
