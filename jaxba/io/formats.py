@@ -11,8 +11,8 @@ from jaxba.io.bal import read_bal, write_bal
 from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap
 from jaxba.io.colmap.model import PARTS, RIG_PARTS
-from jaxba.io.encoding import open_text
-from jaxba.io.files import READ_ERRORS, StrPath, display_name, strip_compression
+from jaxba.io.encoding import plain_text
+from jaxba.io.files import StrPath, beginning, display_name, strip_compression
 from jaxba.io.foreign import RECONSTRUCTION, TRACKS
 from jaxba.io.ply import write_ply
 from jaxba.io.recognise import nerfstudio, recognised
@@ -72,16 +72,8 @@ FORMATS = (
 )
 """Formats of files. The first is that of names whose ending says nothing. Folders are COLMAP models, or OpenSfM's."""
 
-OTHER_ENDINGS = (
-    *(".abc", ".b3dm", ".bin", ".blend", ".csv", ".dae", ".db", ".dot", ".e57", ".fbx", ".g2o", ".glb", ".gltf"),
-    *(".graph", ".h5", ".hdf5", ".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mg"),
-    *(".mvs", ".npy", ".npz", ".nvm2", ".obj", ".off", ".p4p", ".pcd", ".pdf", ".pickle", ".pkl", ".png", ".pose"),
-    *(".psx", ".psz", ".pt", ".pts", ".ptx", ".py", ".rcalign", ".safetensors", ".sql", ".sqlite", ".stl", ".svg"),
-    *(".tif", ".tiff", ".toml", ".toro", ".tsv", ".usd", ".usda", ".usdc", ".usdz", ".vrml", ".vtk", ".wrl", ".xml"),
-    *(".xyz", ".yaml", ".yml"),
-    *(".7z", ".lz4", ".lzma", ".rar", ".tar", ".tbz", ".tbz2", ".tgz", ".txz", ".z", ".zip", ".zst", ".zstd"),
-)
-"""Endings of what is neither read nor written, so that a name with one of them is a mistake."""
+_OTHER = re.compile(r"\.([a-z]+|7z|b3dm|e57|g2o|h5|hdf5|p4p)")
+"""Endings that say what a file is. A name with one of them that is no format's is a mistake; one as .5 says nothing."""
 
 _SNIFFED = 1024
 """Bytes at the beginning of a file that tell its format."""
@@ -98,9 +90,8 @@ def by_ending(path: StrPath) -> Format | None:
 
 
 def is_file_name(path: StrPath) -> bool:
-    """Whether a name has an ending of compression, of a format or of another program's file: it is no folder's."""
-    known = by_ending(path) is not None or ending(path) in OTHER_ENDINGS
-    return known or strip_compression(path) != str(path)
+    """Whether a name has an ending that says what a file is, or how it is compressed: it is no folder's."""
+    return bool(_OTHER.fullmatch(ending(path))) or strip_compression(path) != str(path)
 
 
 def formats_read() -> str:
@@ -127,26 +118,20 @@ def read(path: StrPath) -> BundleProblem:
     known = by_ending(path)
     if known is not None and known.read is None:
         raise ProblemError(f"cannot read {display_name(path)}: {known.name} is only written; {formats_read()}")
+    begin = _beginning(path)
+    found = next((one for one in FORMATS if one.begins and begin.lstrip().startswith(one.begins)), None)
+    if found is not None and known in (None, FORMATS[0]):
+        known = found
+    elif begin and (what := recognised(path, begin)):
+        raise ProblemError(f"{display_name(path)}: is {what}{'' if ': ' in what else f'; {formats_read()}'}")
     try:
-        return read_bal(path) if known is None or known.read is None else known.read(path)
+        return known.read(path) if known is not None and known.read is not None else read_bal(path)
     except ProblemError as error:
-        begin = _beginning(path)
-        found = next((one for one in FORMATS if begin.lstrip().startswith(one.begins)), None) if begin else None
-        if found is not None and found.read is not None and known in (None, FORMATS[0]):
-            return found.read(path)
-        raise _explained(path, begin, error) from error
-
-
-def _explained(path: StrPath, begin: bytes, error: ProblemError) -> ProblemError:
-    """The error of a reader, or what the file is instead, if that is known."""
-    what = recognised(path, begin) if begin else None
-    if what is not None:
-        return ProblemError(f"{display_name(path)}: is {what}{'' if ': ' in what else f'; {formats_read()}'}")
-    if ending(path) in OTHER_ENDINGS and begin:
-        return ProblemError(f"{error}; files with {ending(path)} are not read; {formats_read()}")
-    if by_ending(path) in (None, FORMATS[0]) and re.match(rb"\s*[^\s\d+.-]", begin):  # no number, as BAL begins
-        return ProblemError(f"{error}; {formats_read()}")
-    return error
+        if known is None and _OTHER.fullmatch(ending(path)):
+            raise ProblemError(f"{error}; files with {ending(path)} are not read; {formats_read()}") from error
+        if known in (None, FORMATS[0]) and re.match(rb"\s*[^\s\d+.-]", begin):  # no number, as BAL begins
+            raise ProblemError(f"{error}; {formats_read()}") from error
+        raise
 
 
 def writer(path: StrPath) -> Writer:
@@ -156,7 +141,7 @@ def writer(path: StrPath) -> Writer:
         ProblemError: the ending is that of a format that is not written; one line with the endings that are.
     """
     known = by_ending(path)
-    write = FORMATS[0].write if known is None and ending(path) not in OTHER_ENDINGS else known and known.write
+    write = FORMATS[0].write if known is None and not _OTHER.fullmatch(ending(path)) else known and known.write
     if write is None:
         of = f" of {known.name}" if known else ""
         name = display_name(path)
@@ -193,14 +178,8 @@ def model_files(folder: StrPath) -> list[Path]:
 
 
 def _beginning(path: StrPath) -> bytes:
-    """First bytes of a regular file, decompressed; empty if they cannot be read (again)."""
-    if not Path(path).is_file():
-        return b""
-    text = b""
+    """First bytes of the text of a regular file; empty if they cannot be read."""
     try:
-        with open_text(path) as blocks:
-            while len(text) < _SNIFFED and (block := next(blocks, None)) is not None:
-                text += block
-            return text[:_SNIFFED]
-    except (ProblemError, *READ_ERRORS):
+        return plain_text(beginning(path, _SNIFFED))
+    except UnicodeError:
         return b""

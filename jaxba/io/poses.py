@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.encoding import decode
-from jaxba.io.files import StrPath, display_name, reason
+from jaxba.io.encoding import read_characters
+from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
@@ -78,12 +78,7 @@ def lines_of(path: Path) -> list[tuple[int, str]]:
     Raises:
         ProblemError: the file cannot be read, or is no text.
     """
-    try:
-        text = decode(path.read_bytes())
-    except (OSError, ValueError) as error:
-        if isinstance(error, UnicodeDecodeError):
-            raise ProblemError(f"{display_name(path)}: is no text") from None
-        raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
+    text = read_characters(path)
     return [(at, line.strip()) for at, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 

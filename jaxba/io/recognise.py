@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import zipfile
 from pathlib import Path
 
 from jaxba.io.colmap.model import PARTS, RIG_PARTS
@@ -13,26 +12,15 @@ _ARCHIVE = "an archive: unpack it and give the problem in it"
 _IMAGE = "an image: give the problem that was made from the images"
 _DATABASE = "a COLMAP data base (SQLite), which holds no poses: give the folder of the model that the mapper writes"
 _PAGE = "an HTML page: perhaps a link was saved in the place of the file behind it"
-_CLOUD = "a point cloud, which has no observations of its points"
-_GRAPH = "a pose graph (g2o or TORO), which has no observations of points in images"
 _POSES = "a file of poses, as KITTI has them, without points: give the problem, and these to jaxba-kitti by --poses"
+_ARRAYS = "a file of NumPy arrays, perhaps a recording of a solve, which jaxba-view shows: give the problem"
 _LFS = "a pointer of Git LFS, not the file that it stands for: fetch that with git lfs pull"
 
 MAGIC = {
     b"SQLite format 3\0": _DATABASE,
     **dict.fromkeys((b"7z\xbc\xaf\x27\x1c", b"Rar!", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"), _ARCHIVE),
     **dict.fromkeys((b"\x89PNG", b"\xff\xd8\xff", b"GIF8", b"II*\0", b"MM\0*", b"RIFF", b"P5\n", b"P6\n"), _IMAGE),
-    b"ply\n": _CLOUD,
-    b"LASF": _CLOUD,
-    b"ASTM-E57": _CLOUD,
-    b"# .PCD": _CLOUD,
-    b"\x89HDF": "an HDF5 file",
-    b"\x93NUMPY": "a single array of NumPy",
-    b"%PDF": "a PDF document",
-    b"glTF": "a glTF mesh",
-    b"MATLAB 5.0": "a MATLAB file",
-    b"<?xml": "an XML file",
-    **dict.fromkeys((b"VERTEX_", b"EDGE_", b"VERTEX2 "), _GRAPH),
+    b"ply\n": "a point cloud, which has no observations of its points",
     b"version https://git-lfs": _LFS,
 }
 """First bytes of files of other programs, and what they are."""
@@ -61,7 +49,7 @@ def recognised(path: StrPath, begin: bytes) -> str | None:
     if model is not None:
         return f"a file of a COLMAP model: give {model}"
     if begin.startswith(b"PK\x03\x04"):
-        return _zip(Path(path))
+        return _ARRAYS if str(path).lower().endswith(".npz") else _ARCHIVE
     known = next((what for magic, what in MAGIC.items() if begin.startswith(magic)), None)
     if known is not None:
         return known
@@ -90,19 +78,6 @@ def _of_model(path: Path, begin: bytes) -> str | None:
     if named:
         return f"the folder that holds it, {display_name(path.parent)}"
     return "the folder of the model" if _COLMAP_COMMENTS.match(begin) else None
-
-
-def _zip(path: Path) -> str:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except (OSError, ValueError, zipfile.BadZipFile):
-        return _ARCHIVE
-    if not names or not all(name.endswith(".npy") for name in names):
-        return _ARCHIVE
-    if "state.npy" in names:
-        return "a recording of a solve, which jaxba-view shows: give the problem"
-    return "a file of NumPy arrays"
 
 
 def _are_poses(begin: bytes) -> bool:

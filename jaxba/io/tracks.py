@@ -6,13 +6,12 @@ A point is its position, its colour, the number of its views, and for each view 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.text import NumberReader
+from jaxba.io.text import Text
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.typing import LARGEST_COUNT
 
@@ -31,48 +30,41 @@ class Tracks(NamedTuple):
     """Position after the last number of the last view."""
 
 
-def read_tracks(
-    reader: NumberReader, position: int, count: int, num_cameras: int, other_field: Callable[[int], str]
-) -> Tracks:
-    """Reads points from a position among the numbers of a reader that were not taken yet.
-
-    Counts allocate nothing; memory is proportional to what the file really holds.
+def read_tracks(text: Text, start: int, count: int, num_cameras: int) -> Tracks:
+    """Reads points from a position among the numbers of a text.
 
     Args:
-        reader: of the file; nothing is taken from it, and its field describes points from now on.
-        position: of the first point's x.
+        text: of the file, whose numbers are read; its `field` describes those before the points.
+        start: position of the first point's x.
         count: how many points there are.
         num_cameras: cameras have the indices below it.
-        other_field: description of the numbers before the points.
 
     Raises:
         ProblemError: the file ends early, or something is no number or out of range; or there are no views.
     """
-    values = reader.peek_all()
-    starts: list[int] = []
+    values, before, starts, end = text.values, text.field, [], start
 
     def field(ordinal: int) -> str:
         point = bisect_right(starts, ordinal) - 1
-        return other_field(ordinal) if point < 0 else _point_field(point, ordinal - starts[point])
+        return before(ordinal) if point < 0 else _point_field(point, ordinal - starts[point])
 
-    reader.field = field
+    text.field = field
     for _ in range(count):
-        starts.append(position)
-        reader.need(position + len(POINT_FIELDS))
-        views = float(values[position + 6])
+        starts.append(end)
+        text.need(end + len(POINT_FIELDS))
+        views = float(values[end + 6])
         if not 0 <= views <= LARGEST_COUNT or not views.is_integer():
-            reader.integers([position + 6], values[position + 6 : position + 7], 0, LARGEST_COUNT)
-        position += len(POINT_FIELDS) + len(VIEW_FIELDS) * int(views)
-        reader.need(position)
+            text.integers([end + 6], 0, LARGEST_COUNT)
+        end += len(POINT_FIELDS) + len(VIEW_FIELDS) * int(views)
+        text.need(end)
     first_view = np.array(starts, dtype=np.int64) + len(POINT_FIELDS)
     views = values[first_view - 1].astype(np.int64)
-    before = np.cumsum(views) - views
-    at = np.repeat(first_view - 4 * before, views) + 4 * np.arange(views.sum())
-    camera_index = reader.integers(at, values[at], 0, num_cameras - 1)
+    at = np.repeat(first_view - 4 * (np.cumsum(views) - views), views) + 4 * np.arange(views.sum())
+    camera_index = text.integers(at, 0, num_cameras - 1)
     if not camera_index.size:
-        raise ProblemError(f"{reader.name}: no camera sees a point")
+        raise ProblemError(f"{text.name}: no camera sees a point")
     points = values[first_view[:, None] - len(POINT_FIELDS) + np.arange(3)]
-    return Tracks(points, camera_index, np.repeat(np.arange(count), views), values[at[:, None] + [2, 3]], position)
+    return Tracks(points, camera_index, np.repeat(np.arange(count), views), values[at[:, None] + [2, 3]], end)
 
 
 def _point_field(point: int, at: int) -> str:

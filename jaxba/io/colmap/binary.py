@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
 from jaxba.io.colmap.model import KEY, POINT, TRACK, Image, Model, Points
 from jaxba.io.colmap.poses import pose_of
+from jaxba.io.files import read_bytes
 from jaxba.problem.bundle_problem import ProblemError
 
 _COUNT = struct.Struct("<Q")
@@ -93,19 +95,19 @@ class _Bytes:
             self.fail(f"is too long, by {self.left} byte{plural} after {count} {self.record}s")
 
 
-def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
+def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
     """The records of a file by id, in its order; of `points3D` all points and tracks.
 
     Args:
         part: `cameras`, `images`, `points3D`, `rigs` or `frames`.
-        data: content of the file.
+        path: of the file.
         name: its name for messages.
 
     Raises:
         ProblemError: the file is cut short or too long, or a record cannot be understood; one line that names the file
             and the record.
     """
-    file, found = _Bytes(data, name, part.removesuffix("3D")[:-1]), {}
+    file, found = _Bytes(read_bytes(path), name, part.removesuffix("3D")[:-1]), {}
     if part == "points3D":
         return _read_points(file)
     first, read_one = fields.READERS.get(part, (fields.IMAGE, _read_image))

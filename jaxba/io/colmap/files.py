@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxba.io.colmap import binary, text
 from jaxba.io.colmap.model import PARTS, RIG_PARTS, Model, check_model, file_name
-from jaxba.io.files import READ_ERRORS, StrPath, display_name, reason
+from jaxba.io.files import StrPath, display_name, reason
 from jaxba.problem.bundle_problem import ProblemError
 
 _FORMS: dict[str, Any] = {".bin": binary, ".txt": text}
@@ -56,11 +56,7 @@ def _read(folder: StrPath, part: str, suffix: str) -> Any:
     name = file_name(os.fspath(folder), path.name)
     if path.exists() and not path.is_file():  # reading a pipe could wait for ever
         raise ProblemError(f"{name} is no file")
-    try:
-        data = path.read_bytes()
-    except (*READ_ERRORS, ValueError) as error:
-        raise ProblemError(f"cannot read {name}: {reason(error)}") from error
-    return _FORMS[suffix].read(part, data, name)
+    return _FORMS[suffix].read(part, path, name)
 
 
 def write_model(model: Model, folder: StrPath, suffix: str) -> None:

@@ -6,10 +6,10 @@ follows the ninth field of its line. Numbers are written with as many digits as 
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
@@ -18,7 +18,7 @@ from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
 from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model, Points
 from jaxba.io.colmap.poses import pose_of
-from jaxba.io.encoding import utf8
+from jaxba.io.encoding import read_text
 from jaxba.io.text import number, shown_word
 from jaxba.problem.bundle_problem import ProblemError
 
@@ -115,22 +115,22 @@ class _Line:
         return int(value)
 
 
-def _lines(data: bytes, name: str, record: str, *, empty: bool = False) -> Iterator[_Line]:
+def _lines(path: Path, name: str, record: str, *, empty: bool = False) -> Iterator[_Line]:
     """Lines of a file that are no comments, without blanks at their ends; also `empty` ones if asked for."""
-    for at, line in enumerate(io.BytesIO(b"".join(utf8(iter([data]), name))), 1):
+    for at, line in enumerate(read_text(path).split(b"\n"), 1):
         text = line.strip()
         if (text or empty) and not text.startswith(b"#"):
             yield _Line(f"{name} line {at}", text, record)
 
 
-def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
+def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
     """The records of a file by id, in its order; of `points3D` all points and tracks. The line of an image's key-points
     may be empty or missing. Arguments as for `binary.read`.
 
     Raises:
         ProblemError: a line cannot be understood; one line that names the file, the line and the field.
     """
-    lines = _lines(data, name, part.removesuffix("3D")[:-1], empty=part == "images")
+    lines = _lines(path, name, part.removesuffix("3D")[:-1], empty=part == "images")
     if part == "points3D":
         return _read_points(lines)
     found = {}

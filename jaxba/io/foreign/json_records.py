@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io.encoding import parse_json, read_text
+from jaxba.io.encoding import parse_json, read_characters
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import ProblemError
@@ -139,7 +139,7 @@ def read_json(path: StrPath) -> Record:
         ProblemError: the file cannot be read, is no JSON, is nested too deeply, or an object has a key twice.
     """
     name = display_name(path)
-    text = read_text(path)
+    text = read_characters(path)
     try:
         return Record(parse_json(text), name)
     except ProblemError as error:

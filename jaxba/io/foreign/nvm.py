@@ -15,11 +15,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.encoding import open_text
+from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign.cameras import FIXED, ForeignLens, assemble
 from jaxba.io.notes import note, note_origin
-from jaxba.io.text import LineReader, NumberReader, finite_numbers
+from jaxba.io.text import Text, finite_numbers
 from jaxba.io.tracks import read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, are_rotations, translations
@@ -50,20 +50,17 @@ def read_nvm(path: StrPath) -> BundleProblem:
         ProblemError: the file cannot be read or is no valid model; one line that names the file and, where there is
             one, the line and the field.
     """
-    name = display_name(path)
-    with open_text(path) as blocks:
-        lines = LineReader(blocks, name)
-        matrices, calibration = _header(lines)
-        images = _images(lines, matrices)
-        reader = NumberReader(lines.rest(), name, lambda _: "number of points", line=lines.line + 1)
-        values = reader.peek_all()
-        reader.need(1)
-        count = int(reader.integers([0], values[:1], 0, LARGEST_COUNT)[0])
-        if not count:
-            raise ProblemError(f"{name}: its first model has no points")
-        tracks = read_tracks(reader, 1, count, len(images), reader.field)
-        if tracks.end < values.size and values[tracks.end] > 0:  # the number of images of the next model, or 0
-            note(path, "only the first model of the file is read")
+    text = Text(read_text(path), display_name(path))
+    matrices, calibration = _header(text)
+    images = _images(text, matrices)
+    values = text.read_numbers(lambda _: "number of points")
+    text.need(1)
+    count = int(text.integers([0], 0, LARGEST_COUNT)[0])
+    if not count:
+        raise ProblemError(f"{text.name}: its first model has no points")
+    tracks = read_tracks(text, 1, count, len(images))
+    if tracks.end < values.size and values[tracks.end] > 0:  # the number of images of the next model, or 0
+        note(path, "only the first model of the file is read")
     note_origin(path, tracks.pixels)
     lenses, lens_of, coefficients = _lenses(images, calibration)
     focal = np.array([lens.focal for lens in lenses])
@@ -117,10 +114,9 @@ def _poses(
     return rotations, translations(rotations, images[:, 5:8])
 
 
-def _header(lines: LineReader) -> tuple[bool, list[float] | None]:
+def _header(text: Text) -> tuple[bool, list[float] | None]:
     """Whether poses are rotation matrices and translations, and fx cx fy cy r of all images."""
-    words = lines.next().split()
-    where = f"{lines.name} line {max(lines.line, 1)}"
+    words, where = text.next_line().split(), text.where
     if not words or words[0] not in HEADERS:
         shown = ascii(b" ".join(words)[:40].decode("latin-1"))
         raise ProblemError(f"{where}: {shown} is not the header 'NVM_V3' of a VisualSFM file")
@@ -131,10 +127,9 @@ def _header(lines: LineReader) -> tuple[bool, list[float] | None]:
     return words[0] == HEADERS[1], finite_numbers(words[2:], ("fx", "cx", "fy", "cy", "r"), where)
 
 
-def _images(lines: LineReader, matrices: bool) -> Float[np.ndarray, "images numbers"]:
+def _images(text: Text, matrices: bool) -> Float[np.ndarray, "images numbers"]:
     """The numbers of the images' lines."""
-    line = lines.next()
-    where = f"{lines.name} line {max(lines.line, 1)}"
+    line, where = text.next_line(), text.where
     if not line:
         raise ProblemError(f"{where}: the file ends before the number of images")
     count = finite_numbers([line], ("number of images",), where)[0]
@@ -143,8 +138,7 @@ def _images(lines: LineReader, matrices: bool) -> Float[np.ndarray, "images numb
     fields = _FIELDS_R9T if matrices else _FIELDS
     rows = []
     for image in range(int(count)):
-        words = lines.next().rsplit(maxsplit=len(fields))  # names may have blanks
-        where = f"{lines.name} line {max(lines.line, 1)}"
+        words, where = text.next_line().rsplit(maxsplit=len(fields)), text.where  # names may have blanks
         if not words:
             raise ProblemError(f"{where}: the file ends before image {image} of {count:g}")
         if len(words) != len(fields) + 1:

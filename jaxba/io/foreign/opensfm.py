@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxba.io.encoding import read_text
+from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import TRACKS
 from jaxba.io.foreign.cameras import ForeignLens, assemble
@@ -175,7 +175,7 @@ def _read_tracks(
 ) -> tuple[dict[tuple[str, str], tuple[float, float]], dict[str, int]]:
     """The pixels of reconstructed images and points by image and track, and what else the file holds."""
     name = display_name(path)
-    lines = read_text(path).split("\n")
+    lines = read_characters(path).split("\n")
     version, first = 0, 0
     if lines[0].startswith(TRACKS_HEADER):
         stated = lines[0].removeprefix(TRACKS_HEADER).strip()
