@@ -13,7 +13,6 @@ import numpy as np
 from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
 from jaxba.io.colmap.model import KEY, POINT, TRACK, Image, Model, Points
-from jaxba.io.colmap.poses import pose_of
 from jaxba.io.files import read_bytes
 from jaxba.problem.bundle_problem import ProblemError
 
@@ -135,7 +134,7 @@ def _read_points(file: _Bytes) -> Points:
 
 def _read_image(file: _Bytes) -> Image:
     identity, *pose, camera = file.take(fields.IMAGE)
-    image = Image(identity, pose_of(pose), camera, file.string(), np.empty(0, KEY))
+    image = Image(identity, tuple(pose), camera, file.string(), np.empty(0, KEY))
     return replace(image, keys=file.array(KEY, f"key-points of {image}"))
 
 

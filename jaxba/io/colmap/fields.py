@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from jaxba.io.colmap.model import MODELS, SENSORS, Camera, Frame, Image, Rig, Sensor
-from jaxba.io.colmap.poses import pose_of
 from jaxba.problem.camera_models import CAMERA_MODELS
 
 
@@ -78,14 +77,14 @@ def _read_rig(file: Any) -> Rig:
     for number in range(file.count("number of sensors", SENSOR)):
         kind, sensor = file.take(SENSOR)
         placed = number and any(file.take(PLACED))
-        sensors.append(Sensor(kind, sensor, pose_of(file.take(POSE)) if placed else None))
+        sensors.append(Sensor(kind, sensor, file.take(POSE) if placed else None))
     return Rig(identity, tuple(sensors))
 
 
 def _read_frame(file: Any) -> Frame:
     identity, rig, *pose = file.take(FRAME)
     return Frame(
-        identity, rig, pose_of(pose), tuple(file.take(DATUM) for _ in range(file.count("number of data", DATUM)))
+        identity, rig, tuple(pose), tuple(file.take(DATUM) for _ in range(file.count("number of data", DATUM)))
     )
 
 
@@ -107,7 +106,7 @@ def values(record: Camera | Image | Rig | Frame) -> Values:
             yield CAMERA, (record.id, _NUMBERS[record.model], record.width, record.height)
             yield PARAMETERS[record.model], record.params
         case Image():
-            yield IMAGE, (record.id, *record.pose.numbers, record.camera)
+            yield IMAGE, (record.id, *record.pose, record.camera)
         case Rig():
             yield RIG, (record.id,)
             yield COUNT, (len(record.sensors),)
@@ -116,9 +115,9 @@ def values(record: Camera | Image | Rig | Frame) -> Values:
                 if number:
                     yield PLACED, (int(one.from_rig is not None),)
                 if number and one.from_rig is not None:
-                    yield POSE, one.from_rig.numbers
+                    yield POSE, one.from_rig
         case Frame():
-            yield FRAME, (record.id, record.rig, *record.pose.numbers)
+            yield FRAME, (record.id, record.rig, *record.pose)
             yield COUNT, (len(record.data),)
             for datum in record.data:
                 yield DATUM, datum

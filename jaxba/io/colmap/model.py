@@ -235,10 +235,10 @@ def _check_frames(model: Model, rigs: dict[int, Rig], frames: dict[int, Frame]) 
 
 
 def _check_pose(model: Model, part: str, record: str, pose: Pose) -> None:
-    for field, values in (("qvec", pose.qvec), ("tvec", pose.tvec)):
+    for field, values in (("qvec", pose[:4]), ("tvec", pose[4:])):
         if not np.isfinite(values).all():
             _fail(model, part, f"{record}: {field} is not finite: {' '.join(f'{value:g}' for value in values)}")
-    if not any(pose.qvec):
+    if not any(pose[:4]):
         _fail(model, part, f"{record}: qvec is zero, which is no rotation")
 
 

@@ -139,7 +139,7 @@ def _with_places(model: Model, assembled: Assembled, problem: BundleProblem) -> 
         if sensor.from_rig is None or sensor.type != CAMERA_SENSOR or (rig.id, sensor.id) not in moved:
             return sensor
         pose, turn = moved[rig.id, sensor.id]
-        return replace(sensor, from_rig=pose if turn else replace(sensor.from_rig, tvec=pose.tvec))
+        return replace(sensor, from_rig=pose if turn else (*sensor.from_rig[:4], *pose[4:]))
 
     rigs = {
         identity: replace(rig, sensors=tuple(placed(rig, sensor) for sensor in rig.sensors))
