@@ -20,7 +20,6 @@ from jaxba.io.text import Text
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
 from jaxba.typing import LARGEST_COUNT
 
-_WRITE_ROWS = 1 << 15  # lines formatted at once
 _COUNTS = ("cameras", "points", "observations")
 _OBSERVATION = ("camera index", "point index", "x", "y")
 _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z", "f", "k1", "k2")
@@ -61,17 +60,12 @@ def write_bal(problem: BundleProblem, path: StrPath) -> None:
     check_bal_lenses(problem, path)
     arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
     valid = BundleProblem.create(*arrays)
-    observations, camera_index, point_index = valid.observations, valid.camera_index, valid.point_index
+    index = (valid.camera_index.tolist(), valid.point_index.tolist(), valid.observations.tolist())
     with open_output(path) as file:
         file.write(f"{valid.num_cameras} {valid.num_points} {valid.num_observations}\n".encode())
-        for start in range(0, valid.num_observations, _WRITE_ROWS):
-            rows = slice(start, start + _WRITE_ROWS)
-            x, y = observations[rows].T.tolist()
-            index = zip(camera_index[rows].tolist(), point_index[rows].tolist(), x, y, strict=True)
-            file.write("".join([f"{c} {p} {x} {y}\n" for c, p, x, y in index]).encode())
-        for numbers in (valid.cameras.ravel(), valid.points.ravel()):
-            for start in range(0, numbers.size, _WRITE_ROWS):
-                file.write("".join([f"{v}\n" for v in numbers[start : start + _WRITE_ROWS].tolist()]).encode())
+        file.writelines(f"{camera} {point} {x} {y}\n".encode() for camera, point, (x, y) in zip(*index, strict=True))
+        for numbers in (valid.cameras, valid.points):
+            file.writelines(f"{number}\n".encode() for number in numbers.ravel().tolist())
 
 
 def check_bal_lenses(problem: BundleProblem, path: StrPath) -> None:

@@ -15,7 +15,6 @@ from jaxba.io.encoding import plain_text
 from jaxba.io.files import StrPath, beginning, display_name, strip_compression
 from jaxba.io.foreign import RECONSTRUCTION, TRACKS
 from jaxba.io.ply import write_ply
-from jaxba.io.recognise import nerfstudio, recognised
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 Reader = Callable[[StrPath], BundleProblem]
@@ -56,7 +55,8 @@ def _read_json(path: StrPath) -> BundleProblem:
     for program in (opensfm, openmvg, alicevision):
         if program.recognises(document):
             return program.from_document(document, path)
-    if nerfstudio(document.value):
+    frames = document.value.get("frames") if isinstance(document.value, dict) else None
+    if isinstance(frames, list) and any(isinstance(one, dict) and "transform_matrix" in one for one in frames):
         document.fail(
             "is nerfstudio's transforms.json, which has poses but no points: give the COLMAP model it was made from"
         )
@@ -77,6 +77,22 @@ _OTHER = re.compile(r"\.([a-z]+|7z|b3dm|e57|g2o|h5|hdf5|p4p)")
 
 _SNIFFED = 1024
 """Bytes at the beginning of a file that tell its format."""
+
+_ARCHIVE = "an archive: unpack it and give the problem in it"
+
+_MAGIC = {
+    **dict.fromkeys(
+        (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"), _ARCHIVE
+    ),
+    b"SQLite format 3\0": "a COLMAP data base (SQLite), which holds no poses: give the folder that the mapper writes",
+}
+"""First bytes of files that are often given for a problem, and what they are."""
+
+_COLMAP_COMMENTS = re.compile(rb"# (Camera|Image|3D point|Rig|Frame) list|# \w+ calib list")
+"""First line of each text file of a COLMAP model."""
+
+_UNPRINTABLE = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]")
+"""Bytes that no text holds."""
 
 
 def ending(path: StrPath) -> str:
@@ -132,6 +148,27 @@ def read(path: StrPath) -> BundleProblem:
         if known in (None, FORMATS[0]) and re.match(rb"\s*[^\s\d+.-]", begin):  # no number, as BAL begins
             raise ProblemError(f"{error}; {formats_read()}") from error
         raise
+
+
+def recognised(path: StrPath, begin: bytes) -> str | None:
+    """What a file is that no reader reads, as part of a message; None if it may be a text of a format here.
+
+    Args:
+        path: of the file.
+        begin: its first bytes, decompressed.
+    """
+    place = Path(path)
+    beside = any(
+        (place.parent / f"{part}{place.suffix}").is_file() for part in (*PARTS, *RIG_PARTS) if part != place.stem
+    )
+    if place.stem in (*PARTS, *RIG_PARTS) and (place.suffix == ".bin" or (place.suffix == ".txt" and beside)):
+        return f"a file of a COLMAP model: give the folder that holds it, {display_name(place.parent)}"
+    if _COLMAP_COMMENTS.match(begin):
+        return "a file of a COLMAP model: give the folder of the model"
+    if begin[257:].startswith(b"ustar"):  # of a tar archive, whose compression is undone by then
+        return _ARCHIVE
+    known = next((what for magic, what in _MAGIC.items() if begin.startswith(magic)), None)
+    return known or ("a binary file of no format that is known here" if _UNPRINTABLE.search(begin) else None)
 
 
 def writer(path: StrPath) -> Writer:
