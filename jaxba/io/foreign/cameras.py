@@ -1,29 +1,43 @@
 """From the cameras of other programs to a problem: lenses in pixels, poses that look down +z with y downwards.
 
-This is the convention of COLMAP, VisualSFM, OpenSfM, OpenMVG and AliceVision. BAL's camera looks down -z with y
+This is the convention of COLMAP, VisualSFM, OpenSfM, OpenMVG and AliceVision; the last three also have views with poses
+and intrinsics, and points with observations, in common (`build`). BAL's camera looks down -z with y
 upwards, has no principal point, one focal length, and two coefficients of distortion. Lenses with more of it become
 those of `jaxba.CAMERA_MODELS`: Brown's FULL_OPENCV, and OPENCV_FISHEYE.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.io.files import StrPath, display_name
+from jaxba.io.foreign.json_records import Record
 from jaxba.io.notes import note, note_center
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CAMERA_MODELS
-from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
+from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, are_rotations
+from jaxba.problem.geometry import translations as translations_of
 from jaxba.problem.intrinsics import Lenses
 
 FIXED = (False, False, False)
 
 BROWN, FISHEYE = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 """Coefficients of the two kinds of distortion, in the order in which OpenMVG and AliceVision write them."""
+
+
+UNDEFINED = 2**32 - 1
+"""Number that stands for no pose or no intrinsic. Source: `UndefinedIndexT` in types.hpp of both programs."""
+
+Pose = tuple[Float[np.ndarray, "3 3"], list[float]]
+"""Rotation and centre of a camera whose frame is `rotation (X - center)`, x to the right, y down, z forward."""
+
+Landmark = tuple[list[float], list[int], list[list[float]]]
+"""A point: its position, the numbers of its views, and their pixels."""
 
 
 @dataclass(frozen=True)
@@ -157,3 +171,87 @@ def _covariance(whitening: np.ndarray) -> np.ndarray | None:
     root = np.linalg.inv(whitening)
     covariance = root @ root.transpose(0, 2, 1)
     return 0.5 * (covariance + covariance.transpose(0, 2, 1))
+
+
+def checked_pose(record: Record, rotation: np.ndarray, center: list[float]) -> Pose:
+    """A pose after a check of its rotation. Raises ProblemError."""
+    if rotation.shape != (3, 3) or not are_rotations(rotation[None])[0]:
+        record.fail("has a rotation that is none")
+    return rotation, center
+
+
+def part(document: Record, key: str, program: str) -> Record:
+    """One of the parts of a file, which must be there and not empty.
+
+    Raises:
+        ProblemError: it is not; the message says what the file has.
+    """
+    if document.has(key) and document.value[key] not in ([], {}, ""):
+        return document.get(key)
+    names = ("views", "intrinsics", "extrinsics", "poses", "structure")
+    there = [name for name in names if document.has(name) and document.value[name] not in ([], {}, "")]
+    document.fail(f"has no {key}, only {', '.join(there) or 'other parts'}: have {program} write its whole result")
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
+def build(
+    path: StrPath,
+    views: Mapping[int, tuple[int, Any]],
+    poses: Mapping[int, Pose],
+    intrinsics: Container[Any],
+    lens: Callable[[Any], ForeignLens],
+    landmarks: Iterable[Landmark],
+) -> BundleProblem:
+    """The problem of a file. Cameras are the views that see a point, by their numbers; points are in the file's order.
+
+    Observations in views that are not reconstructed are left out, with a warning that counts them.
+
+    Args:
+        path: of the file, for messages.
+        views: numbers of pose and intrinsic by the number of a view.
+        poses: by number; views without one are not reconstructed.
+        intrinsics: their numbers, or names; the same.
+        lens: makes the lens of one.
+        landmarks: the points.
+
+    Raises:
+        ProblemError: views share a pose, no observation is left, or something is not finite.
+    """
+    name = display_name(path)
+    points, seen_views, pixels, point_index = [], [], [], []
+    for number, (position, seen_by, at) in enumerate(landmarks):
+        points.append(position)
+        seen_views += seen_by
+        pixels += at
+        point_index += [number] * len(seen_by)
+    there = [key for key, (pose, intrinsic) in views.items() if pose in poses and intrinsic in intrinsics]
+    seen = np.array(seen_views, dtype=np.int64)
+    kept = np.isin(seen, np.array(there, dtype=np.int64))
+    if not kept.all():
+        note(path, f"{np.sum(~kept)} of {len(kept)} observations left out: their views have no pose or no intrinsic")
+    if not kept.any():
+        raise ProblemError(f"{name}: no view that has a pose and an intrinsic sees a point")
+    names, camera_index = np.unique(seen[kept], return_inverse=True)
+    owner: dict[int, int] = {}
+    for key in names.tolist():
+        other = owner.setdefault(views[key][0], key)
+        if other != key:
+            raise ProblemError(
+                f"{name}: views {other} and {key} share pose {views[key][0]}, as in a rig; rigs are not read"
+            )
+    if len(there) > len(names):
+        note(path, f"{len(there) - len(names)} of {len(there)} views with a pose left out: they see no point")
+    of_cameras = [views[key][1] for key in names.tolist()]
+    used = list(dict.fromkeys(sorted(of_cameras)))
+    rotations, centers = (np.array(parts) for parts in zip(*(poses[pose] for pose in owner), strict=True))
+    return assemble(
+        path,
+        [lens(key) for key in used],
+        np.array([used.index(key) for key in of_cameras]),
+        rotations,
+        translations_of(rotations, centers),
+        np.array(points),
+        np.array(pixels)[kept],
+        camera_index,
+        np.array(point_index)[kept],
+    )
