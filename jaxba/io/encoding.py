@@ -20,11 +20,8 @@ MARKS = {
 
 
 def read_text(path: StrPath) -> bytes:
-    """The text of a file, decompressed, as `plain_text` gives it.
-
-    Raises:
-        ProblemError: it cannot be read, or is not in the encoding of its mark; one line.
-    """
+    """The text of a file, decompressed, as `plain_text` gives it. Raises ProblemError: it cannot be read, or is not in
+    the encoding of its mark; one line."""
     try:
         return plain_text(read_bytes(path))
     except UnicodeError as error:
@@ -34,11 +31,7 @@ def read_text(path: StrPath) -> bytes:
 
 
 def read_characters(path: StrPath) -> str:
-    """The same as characters.
-
-    Raises:
-        ProblemError: as `read_text`, or it is no UTF-8.
-    """
+    """The same as characters. Raises ProblemError: as `read_text`, or it is no UTF-8."""
     try:
         return read_text(path).decode()
     except UnicodeDecodeError:
@@ -47,11 +40,8 @@ def read_characters(path: StrPath) -> str:
 
 def plain_text(data: bytes) -> bytes:
     """The text in all bytes of a file, without a byte order mark, and with lines that end in LF. What begins with the
-    mark of UTF-16 or UTF-32 becomes UTF-8, everything else stays as it is.
-
-    Raises:
-        UnicodeDecodeError: the text is not in the encoding of its mark.
-    """
+    mark of UTF-16 or UTF-32 becomes UTF-8, everything else stays as it is. Raises UnicodeDecodeError: the text is
+    not in the encoding of its mark."""
     mark = next((mark for mark in MARKS if data.startswith(mark)), b"")
     text = data[len(mark) :]
     if mark and MARKS[mark] != "utf-8":
@@ -60,21 +50,14 @@ def plain_text(data: bytes) -> bytes:
 
 
 def decode(data: bytes) -> str:
-    """`plain_text` as characters.
-
-    Raises:
-        UnicodeDecodeError: the bytes are neither UTF-8 nor in the encoding of their mark.
-    """
+    """`plain_text` as characters. Raises UnicodeDecodeError: the bytes are neither UTF-8 nor in the encoding of their
+    mark."""
     return plain_text(data).decode()
 
 
 def parse_json(text: str | bytes) -> Any:
-    """The value of a JSON text.
-
-    Raises:
-        ProblemError: a key is there twice in one object, so that one of its values would count for nothing.
-        ValueError, RecursionError: as `json.loads`.
-    """
+    """The value of a JSON text. Raises ProblemError: a key is there twice in one object, so that one of its values
+    would count for nothing. Raises ValueError, RecursionError: as `json.loads`."""
     return json.loads(text, object_pairs_hook=_unique)
 
 

@@ -63,19 +63,13 @@ def reason(error: BaseException) -> str:
 
 def visible(folder: StrPath) -> list[Path]:
     """What lies in a folder, sorted, without names that begin with a dot: systems leave such files beside any other.
-
-    Raises:
-        OSError: it is no folder, or cannot be listed.
-    """
+    Raises OSError: it is no folder, or cannot be listed."""
     return sorted(path for path in Path(folder).iterdir() if not path.name.startswith("."))
 
 
 def read_bytes(path: StrPath) -> bytes:
-    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name.
-
-    Raises:
-        ProblemError: it cannot be read, is not compressed as its name says, or is damaged; one line.
-    """
+    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name. Raises
+    ProblemError: it cannot be read, is not compressed as its name says, or is damaged; one line."""
     name = display_name(path)
     try:
         with open(path, "rb") as file:
@@ -109,11 +103,7 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
     """A stream whose bytes become the file at the end of the block, or not at all (`atomic_write`).
 
     They are compressed if the name ends in `.bz2`, `.gz` or `.xz`. A device or pipe, such as standard output, is
-    written directly, an open stream from its current position.
-
-    Raises:
-        ProblemError: the file cannot be written.
-    """
+    written directly, an open stream from its current position. Raises ProblemError: the file cannot be written."""
     name = display_name(path)
     try:
         target = os.path.realpath(path)

@@ -124,10 +124,7 @@ def formats_written() -> str:
 
 def read(path: StrPath) -> BundleProblem:
     """Reads a file in the format of its ending, or else of its first bytes; a folder as OpenSfM's or a COLMAP model.
-
-    Raises:
-        ProblemError: it cannot be read; one line. Of a file of another program it says what that is.
-    """
+    Raises ProblemError: it cannot be read; one line. Of a file of another program it says what that is."""
     if Path(path).is_dir():
         reconstruction = Path(path) / RECONSTRUCTION
         return _read_json(reconstruction) if reconstruction.is_file() and not is_colmap(path) else read_colmap(path)
@@ -151,12 +148,8 @@ def read(path: StrPath) -> BundleProblem:
 
 
 def recognised(path: StrPath, begin: bytes) -> str | None:
-    """What a file is that no reader reads, as part of a message; None if it may be a text of a format here.
-
-    Args:
-        path: of the file.
-        begin: its first bytes, decompressed.
-    """
+    """What a file is that no reader reads, by its name and its first bytes, decompressed, as part of a message; None if
+    it may be a text of a format here."""
     place = Path(path)
     beside = any(
         (place.parent / f"{part}{place.suffix}").is_file() for part in (*PARTS, *RIG_PARTS) if part != place.stem
@@ -172,11 +165,8 @@ def recognised(path: StrPath, begin: bytes) -> str | None:
 
 
 def writer(path: StrPath) -> Writer:
-    """What writes a file of a name.
-
-    Raises:
-        ProblemError: the ending is that of a format that is not written; one line with the endings that are.
-    """
+    """What writes a file of a name. Raises ProblemError: the ending is that of a format that is not written; one line
+    with the endings that are."""
     known = by_ending(path)
     write = FORMATS[0].write if known is None and not _OTHER.fullmatch(ending(path)) else known and known.write
     if write is None:
@@ -200,8 +190,7 @@ def holds_problem(path: StrPath) -> bool:
 def files_of(path: StrPath) -> list[StrPath]:
     """The files that a problem of this path is read from, or would be if they were there.
 
-    A folder has those of a COLMAP model and of OpenSfM, whose tracks also lie beside a `.json` file.
-    """
+    A folder has those of a COLMAP model and of OpenSfM, whose tracks also lie beside a `.json` file."""
     folder = Path(path)
     if not folder.is_dir():
         beside = [folder.with_name(name) for name in TRACKS] if ending(path) == ".json" else []

@@ -43,11 +43,8 @@ def plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], data: Any, path: str = "") -> T:
-    """The inverse of `plain` for a dataclass. Unknown keys are ignored.
-
-    Raises:
-        ProblemError: a key is missing, or its value has the wrong type.
-    """
+    """The inverse of `plain` for a dataclass. Unknown keys are ignored. Raises ProblemError: a key is missing, or its
+    value has the wrong type."""
     if not isinstance(data, Mapping):
         raise ProblemError(f"{path or 'the record'} is no object")
     hints = typing.get_type_hints(kind)
@@ -78,11 +75,8 @@ def _value(kind: Any, value: Any, path: str) -> Any:
 
 def read(path: str | os.PathLike[str], kind: type[T]) -> list[T]:
     """All lines of a file, in order. Empty lines are skipped; an incomplete last line is ignored with a warning in the
-    log.
-
-    Raises:
-        ProblemError: the file cannot be read, or another line is malformed; the message names the file and the line.
-    """
+    log. Raises ProblemError: the file cannot be read, or another line is malformed; the message names the file and
+    the line."""
     try:
         lines, found = Path(path).read_bytes().split(b"\n"), []
     except OSError as error:
@@ -105,11 +99,7 @@ def append(path: str | os.PathLike[str], value: Any) -> None:
     """Appends a line in a single write, followed by fsync.
 
     If the file ends in an incomplete line, that line is removed first. If only the newline after a complete line is
-    missing, it is added. Only one process may write at a time.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    missing, it is added. Only one process may write at a time. Raises OSError: the file cannot be written."""
     line = json.dumps(plain(value), allow_nan=False, separators=(",", ":")).encode() + b"\n"
     with open(path, "a+b") as file:
         tail_start, tail = _unterminated_tail(file)

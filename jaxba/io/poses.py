@@ -37,11 +37,8 @@ class Poses(NamedTuple):
 
 
 def read_poses(path: StrPath) -> Poses:
-    """Poses of camera 0, camera to world, in metres.
-
-    Raises:
-        ProblemError: the file cannot be read, a line is malformed or holds no rotation, or a frame comes twice.
-    """
+    """Poses of camera 0, camera to world, in metres. Raises ProblemError: the file cannot be read, a line is malformed
+    or holds no rotation, or a frame comes twice."""
     name = display_name(path)
     lines = lines_of(Path(path))
     if not lines:
@@ -73,21 +70,15 @@ def read_poses(path: StrPath) -> Poses:
 
 
 def lines_of(path: Path) -> list[tuple[int, str]]:
-    """Lines of a text file that are not blank, each with its number from 1.
-
-    Raises:
-        ProblemError: the file cannot be read, or is no text.
-    """
+    """Lines of a text file that are not blank, each with its number from 1. Raises ProblemError: the file cannot be
+    read, or is no text."""
     text = read_characters(path)
     return [(at, line.strip()) for at, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 
 def numbers_of(text: str, count: int, where: str) -> np.ndarray:
-    """The finite numbers of a line, shape (count,).
-
-    Raises:
-        ProblemError: there are not so many, or one is none; the message begins with `where`.
-    """
+    """The finite numbers of a line, shape (count,). Raises ProblemError: there are not so many, or one is none; the
+    message begins with `where`."""
     words = text.split()
     try:
         numbers = np.array([number(word) for word in words])

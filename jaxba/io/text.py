@@ -31,11 +31,7 @@ _FORTRAN_TO_C = bytes.maketrans(b"Dd", b"Ee")
 
 def number(word: str) -> float:
     """The number that a word is, also with Fortran's exponents (1.0D+00); NaN if it is one that is not finite in any
-    spelling (inf, -nan(ind), 1.#QNAN).
-
-    Raises:
-        ValueError: it is no number.
-    """
+    spelling (inf, -nan(ind), 1.#QNAN). Raises ValueError: it is no number."""
     text = word.encode("utf-8", "replace")
     if _NUMBER.fullmatch(text):
         return float(text.translate(_FORTRAN_TO_C))
@@ -51,16 +47,8 @@ def shown_word(word: bytes) -> str:
 
 
 def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: str) -> list[float]:
-    """The words as finite numbers.
-
-    Args:
-        words: to read.
-        fields: what each of them is, for messages.
-        where: where they stand; begins the messages.
-
-    Raises:
-        ProblemError: a word is no number, or not finite.
-    """
+    """The words as finite numbers. `fields` say what each of them is, and `where` begins the messages. Raises
+    ProblemError: a word is no number, or not finite."""
     found = []
     for word, field in zip(words, fields, strict=True):
         text = word if isinstance(word, str) else word.decode("latin-1")
@@ -120,11 +108,7 @@ class Text:
         return self.values
 
     def need(self, count: int) -> None:
-        """Refuses a text of fewer numbers.
-
-        Raises:
-            ProblemError: it says why there are no more of them.
-        """
+        """Refuses a text of fewer numbers. Raises ProblemError: it says why there are no more of them."""
         have = len(self.values)
         if count > have and self._complaint is not None:
             self.fail(have, self._complaint)
@@ -138,16 +122,8 @@ class Text:
             self.fail(count, "is left over after the last number", field="")
 
     def integers(self, ordinals: Sequence[int] | np.ndarray, low: int, high: int) -> np.ndarray:
-        """The numbers at some ordinals as int32, after a check that they are integers in `[low, high]`.
-
-        Args:
-            ordinals: shape (n,).
-            low: smallest allowed value.
-            high: largest allowed value, at most 2**31 - 1.
-
-        Raises:
-            ProblemError: one of them is not.
-        """
+        """The numbers at some ordinals as int32, after a check that they are integers in `[low, high]`. Raises
+        ProblemError: one of them is not."""
         values = self.values[ordinals]
         whole = values == np.floor(values)
         bad = np.flatnonzero(~(whole & (values >= low) & (values <= high)))

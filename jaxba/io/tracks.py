@@ -31,17 +31,9 @@ class Tracks(NamedTuple):
 
 
 def read_tracks(text: Text, start: int, count: int, num_cameras: int) -> Tracks:
-    """Reads points from a position among the numbers of a text.
-
-    Args:
-        text: of the file, whose numbers are read; its `field` describes those before the points.
-        start: position of the first point's x.
-        count: how many points there are.
-        num_cameras: cameras have the indices below it.
-
-    Raises:
-        ProblemError: the file ends early, or something is no number or out of range; or there are no views.
-    """
+    """Reads `count` points from the position of the first one's x among the numbers of a text, whose `field` describes
+    those before the points. Raises ProblemError: the file ends early, or something is no number or out of range; or
+    there are no views."""
     values, before, starts, end = text.values, text.field, [], start
 
     def field(ordinal: int) -> str:

@@ -64,16 +64,8 @@ def lens_size(lenses: Lenses | None) -> int:
 
 
 def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
-    """Checks lenses and returns them as int32 and bool NumPy arrays.
-
-    Args:
-        lenses: lenses of a problem.
-        cameras: its cameras, shape (cameras, 6 + numbers).
-
-    Raises:
-        ValueError: shapes differ, an index is out of range, or cameras with the same lens differ in their intrinsics.
-            The message is one line.
-    """
+    """Checks the lenses of cameras and returns them as int32 and bool NumPy arrays. Raises ValueError: shapes differ,
+    an index is out of range, or cameras with the same lens differ in their intrinsics. The message is one line."""
     index, free = plain_array("index of lenses", lenses.index), plain_array("free of lenses", lenses.free)
     if index.shape != (len(cameras),) or index.dtype.kind not in "iu":
         raise ValueError(f"lenses must name a lens for each of {len(cameras)} cameras, not {index.dtype}{index.shape}")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import angle_axis, rotation_matrices
 
 Poses = Float[np.ndarray, "poses 3 4"]
 """Camera-to-world poses `[R | c]`."""
@@ -32,6 +34,27 @@ class Similarity(NamedTuple):
         """Transforms camera-to-world poses: centres as points, orientations by the rotation."""
         centers = self.points(poses[:, :, 3])
         return np.concatenate([self.rotation @ poses[:, :, :3], centers[:, :, None]], axis=2)
+
+
+def transformed(
+    problem: BundleProblem, by: Similarity, seen: Any = slice(None), placed: Any = slice(None)
+) -> BundleProblem:
+    """A problem moved with the cameras and points that are chosen. Residuals stay as they are, but those of priors of
+    rotations where it is turned."""
+    scale, rotation, shift = by
+    cameras, points = (np.array(x, np.float64) for x in (problem.cameras, problem.points))
+    priors, rigs = problem.priors, problem.rigs
+    matrices = rotation_matrices(cameras[seen, :3])
+    if (rotation != np.eye(3)).any():
+        matrices = matrices @ rotation.T
+        cameras[seen, :3] = angle_axis(matrices)
+    cameras[seen, 3:6] = scale * cameras[seen, 3:6] - matrices @ shift
+    points[placed] = by.points(points[placed])
+    if priors is not None:
+        whitening = np.asarray(priors.position_whitening) / scale
+        priors = replace(priors, positions=by.points(np.asarray(priors.positions)), position_whitening=whitening)
+    rigs = rigs if rigs is None or scale == 1.0 else rigs.scaled(scale)
+    return problem.replace(cameras=cameras, points=points, rigs=rigs, priors=priors)
 
 
 def umeyama(
@@ -73,8 +96,7 @@ def along_line(
     """The similarity that takes the line through `source` to that through `target`, without a turn about it.
 
     Its rotation is the smallest one; where the lines are opposite it is about an axis as near to z as can be. Arguments
-    as for `umeyama`; the points of neither may be at one place.
-    """
+    as for `umeyama`; the points of neither may be at one place."""
     shares = weights / weights.sum()
     mean_source, mean_target = shares @ source, shares @ target
     a = source - mean_source

@@ -123,17 +123,9 @@ def _check(partial: Path, entry: Entry) -> None:
 
 
 def download_rest(url: str, file: BinaryIO, report: Report) -> None:
-    """Downloads the missing rest of a file, or all of it if the server does not resume.
-
-    Args:
-        url: http or https.
-        file: open to append, with what has come so far. After a failure it keeps what was received.
-        report: called after every block.
-
-    Raises:
-        UnreachableError: no response.
-        DownloadError: the server has no such file, or the connection broke.
-    """
+    """Downloads the missing rest of a file that is open to append, or all of it if the server does not resume. After a
+    failure the file keeps what was received. `report` is called after every block. Raises UnreachableError: no
+    response. Raises DownloadError: the server has no such file, or the connection broke."""
     have = file.tell()
     with requests.Session() as session:
         response = _request(session, url, have)

@@ -58,11 +58,8 @@ _NAME = re.compile(rf"(?:{'|'.join(FAMILIES)})-\d+", re.IGNORECASE)
 
 
 def select(names: Sequence[str]) -> list[Entry]:
-    """The problems with some names, without duplicates; the name of a family stands for all of its problems.
-
-    Raises:
-        ProblemError: no such name; the message suggests the closest ones.
-    """
+    """The problems with some names, without duplicates; the name of a family stands for all of its problems. Raises
+    ProblemError: no such name; the message suggests the closest ones."""
     found: dict[Entry, None] = {}
     for name in names:
         members = [entry for entry in ENTRIES if name.lower() in (entry.name, entry.family)]
@@ -97,11 +94,8 @@ def downloaded_path(entry: Entry) -> Path | None:
 
 
 def local_path(name: str) -> Path:
-    """Path of the downloaded problem of a name.
-
-    Raises:
-        ProblemError: there is no problem of that name, or it has not been downloaded; one line that says how to.
-    """
+    """Path of the downloaded problem of a name. Raises ProblemError: there is no problem of that name, or it has not
+    been downloaded; one line that says how to."""
     found = next((entry for entry in ENTRIES if entry.name == name.lower()), None)
     if found is None:
         raise ProblemError(_unknown(name))
@@ -112,11 +106,8 @@ def local_path(name: str) -> Path:
 
 
 def resolve(location: str) -> str:
-    """The path of a problem's name, such as ladybug-49, if no file is called so; every other location as it is.
-
-    Raises:
-        ProblemError: as `local_path` does, for a location that has the form of a name.
-    """
+    """The path of a problem's name, such as ladybug-49, if no file is called so; every other location as it is. Raises
+    ProblemError: as `local_path` does, for a location that has the form of a name."""
     if _NAME.fullmatch(location) and not os.path.lexists(location):
         return str(local_path(location))
     return location

@@ -95,17 +95,9 @@ class _Bytes:
 
 
 def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
-    """The records of a file by id, in its order; of `points3D` all points and tracks.
-
-    Args:
-        part: `cameras`, `images`, `points3D`, `rigs` or `frames`.
-        path: of the file.
-        name: its name for messages.
-
-    Raises:
-        ProblemError: the file is cut short or too long, or a record cannot be understood; one line that names the file
-            and the record.
-    """
+    """The records of a file by id, in its order; of `points3D` all points and tracks. `part` is the file's name without
+    its ending; `name` is for messages. Raises ProblemError: the file is cut short or too long, or a record cannot be
+    understood; one line that names the file and the record."""
     file, found = _Bytes(read_bytes(path), name, part.removesuffix("3D")[:-1]), {}
     if part == "points3D":
         return _read_points(file)

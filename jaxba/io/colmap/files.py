@@ -22,12 +22,9 @@ def is_colmap(path: StrPath) -> bool:
 
 
 def read_model(folder: StrPath) -> Model:
-    """Reads the files of a model, the binary ones where there are both, and checks its structure.
-
-    Raises:
-        ProblemError: a file is missing, cannot be read or understood, or `check_model` refuses the model; one line
-            that names the file.
-    """
+    """Reads the files of a model, the binary ones where there are both, and checks its structure. Raises ProblemError:
+    a file is missing, cannot be read or understood, or `check_model` refuses the model; one line that names the
+    file."""
     if not is_colmap(folder):
         raise ProblemError(f"{display_name(folder)}: no directory with a COLMAP model (cameras.bin or cameras.txt)")
     whole = [suffix for suffix in _FORMS if has_parts(folder, suffix)]
@@ -60,16 +57,9 @@ def _read(folder: StrPath, part: str, suffix: str) -> Any:
 
 
 def write_model(model: Model, folder: StrPath, suffix: str) -> None:
-    """Writes the files of a model: all to a hidden folder, then each replaces the old one.
-
-    Args:
-        model: with rigs and frames.
-        folder: made if it does not exist.
-        suffix: `.bin` or `.txt`.
-
-    Raises:
-        ProblemError: the folder cannot be written.
-    """
+    """Writes the files of a model with rigs and frames, `.bin` or `.txt` by the suffix: all to a hidden folder, then
+    each replaces the old one. The folder is made if it does not exist. Raises ProblemError: the folder cannot be
+    written."""
     target = Path(folder)
     beside = target if target.is_dir() else target.absolute().parent  # writable, and on the same file system
     try:

@@ -26,11 +26,8 @@ LARGEST_RATIO = 1e6
 
 
 def check_lens(model: Model, camera: Camera) -> None:
-    """Refuses a lens with parameters that cannot be.
-
-    Raises:
-        ProblemError: it cannot be used; one line that names file and camera.
-    """
+    """Refuses a lens with parameters that cannot be. Raises ProblemError: it cannot be used; one line that names file
+    and camera."""
     focals = camera.focals
     if not camera.possible or (focals and max(focals) / LARGEST_RATIO > min(focals)):
         shown = ", ".join(f"{value:g}" for value in camera.params)
@@ -75,13 +72,8 @@ def lenses_of(
 
 
 def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool) -> Camera:
-    """A camera with new numbers, where its model has them; all else stays as it is, bit by bit.
-
-    Args:
-        camera: the old one.
-        lens: its numbers in the problem.
-        bal: whether these are BAL's.
-    """
+    """A camera with new numbers, which are BAL's if `bal`, where its model has them; all else stays as it is, bit by
+    bit."""
     if not bal:
         return replace(camera, params=tuple(lens[: len(camera.params)].tolist()))
     names = CAMERA_MODELS[camera.model].parameters

@@ -93,15 +93,8 @@ def read_colmap_with_looks(folder: StrPath) -> tuple[BundleProblem, Looks]:
 
 
 def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:
-    """The problem of a model.
-
-    Args:
-        model: the model.
-        refine_principal_point: whether principal points are optimised.
-
-    Raises:
-        ProblemError: it is not known where a camera is in its rig, a lens cannot be used, or nothing is observed.
-    """
+    """The problem of a model, whose principal points are optimised if asked for. Raises ProblemError: it is not known
+    where a camera is in its rig, a lens cannot be used, or nothing is observed."""
     images, notes = _registered(model)
     table = ordered(model, images)
     for camera in sorted({image.camera for image in images}):
@@ -153,11 +146,8 @@ def _posed(model: Model, image: Image) -> Image:
 
 
 def _registered(model: Model) -> tuple[list[Image], list[str]]:
-    """Registered images by id, with the poses of their frames, and notes on the others.
-
-    Raises:
-        ProblemError: it is not known where a camera is in its rig.
-    """
+    """Registered images by id, with the poses of their frames, and notes on the others. Raises ProblemError: it is not
+    known where a camera is in its rig."""
     images, frames = [model.images[identity] for identity in sorted(model.images)], model.frame_of
     if model.frames is None:
         return images, []
@@ -169,11 +159,7 @@ def _registered(model: Model) -> tuple[list[Image], list[str]]:
 
 
 def place_in_rig(model: Model, frame: Frame, camera: int) -> Pose | None:
-    """Where a camera is in the rig of a frame; None for the reference sensor.
-
-    Raises:
-        ProblemError: it is not known.
-    """
+    """Where a camera is in the rig of a frame; None for the reference sensor. Raises ProblemError: it is not known."""
     assert model.rigs is not None
     sensors = model.rigs[frame.rig].sensors
     at = next(at for at, one in enumerate(sensors) if (one.type, one.id) == (CAMERA_SENSOR, camera))

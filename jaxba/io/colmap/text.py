@@ -109,11 +109,8 @@ def _lines(path: Path, name: str, record: str, *, empty: bool = False) -> Iterat
 
 def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
     """The records of a file by id, in its order; of `points3D` all points and tracks. The line of an image's key-points
-    may be empty, and missing in the last. Arguments as for `binary.read`.
-
-    Raises:
-        ProblemError: a line cannot be understood; one line that names the file, the line and the field.
-    """
+    may be empty, and missing in the last. Arguments as for `binary.read`. Raises ProblemError: a line cannot be
+    understood; one line that names the file, the line and the field."""
     lines = _lines(path, name, part.removesuffix("3D")[:-1], empty=part == "images")
     if part == "points3D":
         return _read_points(lines)

@@ -53,13 +53,9 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     """The problem of a scene of AliceVision.
 
     Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. Intrinsics without
-    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Those of
-    the others in `DISTORTIONS` stay as they are.
-
-    Raises:
-        ProblemError: the file lacks a part, names a model that is not in `DISTORTIONS`, or views are of a rig; one line
-            that names the file, the record and the field.
-    """
+    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Those of the
+    others in `DISTORTIONS` stay as they are. Raises ProblemError: the file lacks a part, names a model that is not in
+    `DISTORTIONS`, or views are of a rig; one line that names the file, the record and the field."""
     version = tuple(row.integer() for row in document.get("version").rows())
     views = {}
     for number, value in part(document, "views", _PROGRAM).numbered("viewId", "view"):

@@ -181,11 +181,8 @@ def checked_pose(record: Record, rotation: np.ndarray, center: list[float]) -> P
 
 
 def part(document: Record, key: str, program: str) -> Record:
-    """One of the parts of a file, which must be there and not empty.
-
-    Raises:
-        ProblemError: it is not; the message says what the file has.
-    """
+    """One of the parts of a file, which must be there and not empty. Raises ProblemError: it is not; the message says
+    what the file has."""
     if document.has(key) and document.value[key] not in ([], {}, ""):
         return document.get(key)
     names = ("views", "intrinsics", "extrinsics", "poses", "structure")
@@ -204,19 +201,8 @@ def build(
 ) -> BundleProblem:
     """The problem of a file. Cameras are the views that see a point, by their numbers; points are in the file's order.
 
-    Observations in views that are not reconstructed are left out, with a warning that counts them.
-
-    Args:
-        path: of the file, for messages.
-        views: numbers of pose and intrinsic by the number of a view.
-        poses: by number; views without one are not reconstructed.
-        intrinsics: their numbers, or names; the same.
-        lens: makes the lens of one.
-        landmarks: the points.
-
-    Raises:
-        ProblemError: views share a pose, no observation is left, or something is not finite.
-    """
+    Views have the numbers of a pose and an intrinsic; observations in views whose pose or intrinsic is not there are
+    left out, with a warning that counts them. `lens` makes the lens of an intrinsic."""
     name = display_name(path)
     points, seen_views, pixels, point_index = [], [], [], []
     for number, (position, seen_by, at) in enumerate(landmarks):

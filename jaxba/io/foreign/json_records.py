@@ -134,10 +134,7 @@ class Record:
 
 def read_json(path: StrPath) -> Record:
     """The contents of a JSON file, decompressed; NaN and Infinity, which JSON lacks, are found when they are taken.
-
-    Raises:
-        ProblemError: the file cannot be read, is no JSON, is nested too deeply, or an object has a key twice.
-    """
+    Raises ProblemError: the file cannot be read, is no JSON, is nested too deeply, or an object has a key twice."""
     name = display_name(path)
     text = read_characters(path)
     try:

@@ -41,15 +41,8 @@ def read_nvm(path: StrPath) -> BundleProblem:
 
     An image without distortion is a camera of BAL, whose f, k1 and k2 are optimised. With one, its pixels are
     undistorted once and residuals weighted so that to first order they are those of the measured image; its f is
-    optimised, k1 and k2 stay zero. With `FixedK` all intrinsics stay as they are.
-
-    Args:
-        path: the file, plain or compressed; may be a pipe.
-
-    Raises:
-        ProblemError: the file cannot be read or is no valid model; one line that names the file and, where there is
-            one, the line and the field.
-    """
+    optimised, k1 and k2 stay zero. With `FixedK` all intrinsics stay as they are. Raises ProblemError: the file cannot
+    be read or is no valid model; one line that names the file and, where there is one, the line and the field."""
     text = Text(read_text(path), display_name(path))
     matrices, calibration = _header(text)
     images = _images(text, matrices)

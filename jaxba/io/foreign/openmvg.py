@@ -51,12 +51,8 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
 
     Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. `pinhole`,
     `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. The intrinsics of the others in `MODELS`
-    stay as they are.
-
-    Raises:
-        ProblemError: the file lacks a part, names a camera model that is not in `MODELS`, or views share a pose; one
-            line that names the file, the record and the field.
-    """
+    stay as they are. Raises ProblemError: the file lacks a part, names a camera model that is not in `MODELS`, or views
+    share a pose; one line that names the file, the record and the field."""
     views = {}
     unused = dict.fromkeys(PRIORS.values(), 0)
     for key, value in part(document, "views", _PROGRAM).numbered("key", "view", "value"):

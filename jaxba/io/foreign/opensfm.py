@@ -54,11 +54,8 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     `perspective`, `simple_radial` and `radial` cameras are optimised; intrinsics of `brown`, `fisheye` and
     `fisheye_opencv` stay as they are. Images share the lens of their camera. Images and tracks that are not
     reconstructed are ignored, images that see no point are left out; of repeated observations the last one counts.
-
-    Raises:
-        ProblemError: tracks are missing or malformed, a camera model is not one of `MODELS`, or images are of a rig;
-            one line that names the file, the record and the field.
-    """
+    Raises ProblemError: tracks are missing or malformed, a camera model is not one of `MODELS`, or images are of a rig;
+    one line that names the file, the record and the field."""
     if isinstance(document.value, list):
         if not document.value:
             document.fail("holds no reconstruction")
