@@ -57,15 +57,20 @@ def write_bal(problem: BundleProblem, path: StrPath) -> None:
         ProblemError: the problem is not valid, for example not finite, has lenses that are not BAL's, or the file
             cannot be written.
     """
-    check_bal_lenses(problem, path)
-    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
-    valid = BundleProblem.create(*arrays)
+    valid = bal_only(problem, path)
     index = (valid.camera_index.tolist(), valid.point_index.tolist(), valid.observations.tolist())
     with open_output(path) as file:
         file.write(f"{valid.num_cameras} {valid.num_points} {valid.num_observations}\n".encode())
         file.writelines(f"{camera} {point} {x} {y}\n".encode() for camera, point, (x, y) in zip(*index, strict=True))
         for numbers in (valid.cameras, valid.points):
             file.writelines(f"{number}\n".encode() for number in numbers.ravel().tolist())
+
+
+def bal_only(problem: BundleProblem, path: StrPath) -> BundleProblem:
+    """What a file of BAL's cameras holds of a problem, checked. Raises ProblemError."""
+    check_bal_lenses(problem, path)
+    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
+    return BundleProblem.create(*arrays)
 
 
 def check_bal_lenses(problem: BundleProblem, path: StrPath) -> None:

@@ -10,13 +10,12 @@ from functools import partial
 
 import numpy as np
 
-from jaxba.io.bal import check_bal_lenses
+from jaxba.io.bal import bal_only
 from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name, open_output
 from jaxba.io.notes import note_origin
 from jaxba.io.ply import POINT_COLOUR
-from jaxba.io.text import Text
-from jaxba.io.tracks import numbered, read_tracks
+from jaxba.io.text import Text, numbered, read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import angle_axis, are_rotations, rotation_matrices
 from jaxba.problem.labels import part_name
@@ -65,9 +64,7 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
         ProblemError: the problem is not valid, a camera that sees points has focal length 0, which stands for cameras
             that are not registered, lenses are not BAL's, or the file cannot be written.
     """
-    check_bal_lenses(problem, path)
-    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
-    valid = BundleProblem.create(*arrays)
+    valid = bal_only(problem, path)
     cameras, camera_index = np.asarray(valid.cameras), np.asarray(valid.camera_index)
     lost = np.flatnonzero((cameras[:, 6] == 0) & (np.bincount(camera_index, minlength=len(cameras)) > 0))
     if lost.size:

@@ -72,8 +72,14 @@ FORMATS = (
 )
 """Formats of files. The first is that of names whose ending says nothing. Folders are COLMAP models, or OpenSfM's."""
 
-_OTHER = re.compile(r"\.([a-z]+|7z|b3dm|e57|g2o|h5|hdf5|p4p)")
-"""Endings that say what a file is. A name with one of them that is no format's is a mistake; one as .5 says nothing."""
+OTHER_ENDINGS = (
+    *(".7z", ".abc", ".bin", ".csv", ".dae", ".db", ".fbx", ".g2o", ".glb", ".gltf", ".graph", ".h5", ".hdf5"),
+    *(".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mvs", ".npy", ".npz"),
+    *(".obj", ".pcd", ".pdf", ".pickle", ".pkl", ".png", ".psx", ".pt", ".py", ".rar", ".safetensors", ".sql"),
+    *(".sqlite", ".stl", ".tar", ".tbz2", ".tgz", ".tif", ".toml", ".tsv", ".txz", ".usd", ".vtk", ".xml"),
+    *(".xyz", ".yaml", ".yml", ".z", ".zip", ".zst"),
+)
+"""Endings of what is neither read nor written, so that a name with one of them is a mistake."""
 
 _SNIFFED = 1024
 """Bytes at the beginning of a file that tell its format."""
@@ -107,7 +113,8 @@ def by_ending(path: StrPath) -> Format | None:
 
 def is_file_name(path: StrPath) -> bool:
     """Whether a name has an ending that says what a file is, or how it is compressed: it is no folder's."""
-    return bool(_OTHER.fullmatch(ending(path))) or strip_compression(path) != str(path)
+    known = by_ending(path) is not None or ending(path) in OTHER_ENDINGS
+    return known or strip_compression(path) != str(path)
 
 
 def formats_read() -> str:
@@ -140,7 +147,7 @@ def read(path: StrPath) -> BundleProblem:
     try:
         return known.read(path) if known is not None and known.read is not None else read_bal(path)
     except ProblemError as error:
-        if known is None and _OTHER.fullmatch(ending(path)):
+        if known is None and ending(path) in OTHER_ENDINGS:
             raise ProblemError(f"{error}; files with {ending(path)} are not read; {formats_read()}") from error
         if known in (None, FORMATS[0]) and re.match(rb"\s*[^\s\d+.-]", begin):  # no number, as BAL begins
             raise ProblemError(f"{error}; {formats_read()}") from error
@@ -168,7 +175,7 @@ def writer(path: StrPath) -> Writer:
     """What writes a file of a name. Raises ProblemError: the ending is that of a format that is not written; one line
     with the endings that are."""
     known = by_ending(path)
-    write = FORMATS[0].write if known is None and not _OTHER.fullmatch(ending(path)) else known and known.write
+    write = FORMATS[0].write if known is None and ending(path) not in OTHER_ENDINGS else known and known.write
     if write is None:
         of = f" of {known.name}" if known else ""
         name = display_name(path)

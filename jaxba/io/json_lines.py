@@ -23,6 +23,9 @@ _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+LONGEST_LINE = 1 << 24
+"""Bytes at the end of a file that are looked at before it is appended to."""
+
 _NAMES = {int: "a whole number", str: "a text", bool: "true or false"}
 
 
@@ -102,27 +105,16 @@ def append(path: str | os.PathLike[str], value: Any) -> None:
     missing, it is added. Only one process may write at a time. Raises OSError: the file cannot be written."""
     line = json.dumps(plain(value), allow_nan=False, separators=(",", ":")).encode() + b"\n"
     with open(path, "a+b") as file:
-        tail_start, tail = _unterminated_tail(file)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - LONGEST_LINE))
+        tail = file.read().rpartition(b"\n")[2]
         if tail:
             try:
                 json.loads(tail)
                 line = b"\n" + line
             except ValueError:
-                file.truncate(tail_start)
+                file.truncate(size - len(tail))
                 _log.warning("%s: half-written last line of an interrupted run removed", path)
         file.write(line)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _unterminated_tail(file: Any, block: int = 1 << 16) -> tuple[int, bytes]:
-    """Offset and bytes of what follows the last newline. Reads backwards from the end, so that the size of the file
-    does not matter."""
-    start, tail = file.seek(0, os.SEEK_END), b""
-    while start > 0 and b"\n" not in tail:
-        step = min(block, start)
-        start -= step
-        file.seek(start)
-        tail = file.read(step) + tail
-    cut = tail.rfind(b"\n") + 1
-    return start + cut, tail[cut:]

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.text import number
+from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
 
@@ -79,13 +79,7 @@ def lines_of(path: Path) -> list[tuple[int, str]]:
 def numbers_of(text: str, count: int, where: str) -> np.ndarray:
     """The finite numbers of a line, shape (count,). Raises ProblemError: there are not so many, or one is none; the
     message begins with `where`."""
-    words = text.split()
-    try:
-        numbers = np.array([number(word) for word in words])
-    except ValueError:
-        raise ProblemError(f"{where}: holds something that is no number") from None
+    numbers = finite_numbers(text.split(), [f"number {at}" for at in range(1, len(text.split()) + 1)], where)
     if len(numbers) != count:
         raise ProblemError(f"{where}: has {len(numbers)} numbers instead of {count}")
-    if not np.isfinite(numbers).all():
-        raise ProblemError(f"{where}: holds a number that is not finite")
-    return numbers
+    return np.array(numbers)

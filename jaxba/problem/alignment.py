@@ -25,23 +25,15 @@ DOUBTFUL, MISFIT = 2.0, 5.0
 """Distance of this share, in terms of that of noise alone, from which other axes or units are tried, and from which the
 scene does not fit its positions."""
 
-BETTER = 0.3
-"""Share of the misfit that other axes or units leave before they are taken for the true ones."""
-
-EXPLAINED = 0.1
-"""Largest misfit that they leave, as a share of the extent."""
-
-LEAST_IMAGES = 5
-"""Fewest images by which other axes or units are recognised: four fit too well by chance."""
+BETTER, EXPLAINED, LEAST_IMAGES = 0.3, 0.1, 5
+"""Other axes or units are taken for the true ones if they leave this share of the misfit, and no more than this share
+of the extent, with so many images: four fit too well by chance."""
 
 MEDIAN, UPPER_QUARTER, NEARLY_ALL = 1.538, 2.027, 3.37
 """Norm of three standard normal numbers: its quantiles at 50, 75 and 99 percent."""
 
-LARGEST_AREA = 1.0
-"""Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent."""
-
-EARTH = 6.371e6
-"""Radius, metres."""
+LARGEST_AREA, EARTH = 1.0, 6.371e6
+"""Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent. Radius, metres."""
 
 NOT_DETERMINED = (
     "the positions are at one place within their noise: the alignment only moves the scene",

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.problem.checks import inverse_roots, plain_array, real_numbers
+from jaxba.problem.checks import indices, inverse_roots, real_numbers
 from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
@@ -137,8 +137,8 @@ class BundleProblem(ArrayRecord):
                 cameras=cameras,
                 points=points,
                 observations=_floats("observations", observations, 2),
-                camera_index=_indices("camera_index", camera_index, len(cameras)),
-                point_index=_indices("point_index", point_index, len(points)),
+                camera_index=indices("camera_index", camera_index, len(cameras)),
+                point_index=indices("point_index", point_index, len(points)),
             )
             count = problem.num_observations
             whitening = _whitening(covariance, weight, count)
@@ -229,17 +229,6 @@ def _floats(name: str, values: Any, width: int) -> np.ndarray:
     if bad.size:
         raise ProblemError(f"{name}[{bad[0]}] is not finite: {array[bad[0]].tolist()}")
     return array
-
-
-def _indices(name: str, values: Any, bound: int) -> np.ndarray:
-    """An int32 vector, checked to be in [0, bound)."""
-    array = plain_array(name, values)
-    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
-        raise ProblemError(f"{name} must be a vector of integers, not {array.dtype} of shape {array.shape}")
-    bad = np.flatnonzero((array < 0) | (array >= bound))
-    if bad.size:
-        raise ProblemError(f"{name}[{bad[0]}] is {array[bad[0]]}, outside 0..{bound - 1}")
-    return np.ascontiguousarray(array, dtype=np.int32)
 
 
 def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:

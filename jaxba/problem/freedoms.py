@@ -37,15 +37,9 @@ def fixed_freedoms(problem: BundleProblem) -> int:
 def free_directions(
     problem: BundleProblem,
 ) -> tuple[Float[np.ndarray, "directions cameras parameters"], Float[np.ndarray, "directions points 3"]]:
-    """The directions of a similarity that a problem leaves free.
-
-    Args:
-        problem: any problem near the origin.
-
-    Returns:
-        Up to seven independent directions, scene units: steps of the parameters of cameras as `in_frames` has them,
-        rotations on the manifold, and of points. What does not move, and what nothing observes, has zeros.
-    """
+    """The directions of a similarity that a problem near the origin leaves free, up to seven, scene units: steps of the
+    parameters of cameras as `in_frames` has them, rotations on the manifold, and of points. What does not move, and
+    what nothing observes, has zeros."""
     combinations, steps, points_move, middle, extent = _freedoms(problem)
     of_poses = np.einsum("nij,jk->kni", steps, combinations)
     of_poses *= np.where(np.arange(of_poses.shape[2]) % POSE_SIZE < 3, 1.0, extent)  # rotation and translation
@@ -126,13 +120,8 @@ def _motions(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 7"]:
 
 
 def determined_directions(problem: BundleProblem) -> Float[np.ndarray, "points 3 3"]:
-    """For each point the projection on the directions in which its rays determine it.
-
-    It is the identity for a point with rays that are not parallel, zero for one that is constant or has no rays.
-
-    Args:
-        problem: in the coordinates of its own cameras, not `in_frames`.
-    """
+    """For each point of a problem with cameras, not frames, the projection on the directions in which its rays
+    determine it: the identity where they are not parallel, zero for a point that is constant or has no rays."""
     centers = geometry.camera_centers(problem.cameras)
     rays = np.asarray(problem.points)[problem.point_index] - centers[problem.camera_index]
     rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(float).tiny)

@@ -43,11 +43,13 @@ def rotation_matrices(vectors: Float[Array, "n 3"]) -> Float[np.ndarray, "n 3 3"
     angle = np.linalg.norm(w, axis=1)
     first = np.sinc(angle / np.pi)[:, None, None]
     second = (0.5 * np.sinc(angle / (2 * np.pi)) ** 2)[:, None, None]
-    x, y, z = w.T
-    cross = np.zeros((len(w), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -z, y, -x
-    cross[:, 1, 0], cross[:, 2, 0], cross[:, 2, 1] = z, -y, x
+    cross = cross_matrices(w)
     return np.eye(3) + first * cross + second * (cross @ cross)
+
+
+def cross_matrices(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """Matrices `[v]` with `[v] u = v x u`."""
+    return np.cross(vectors[:, None], np.eye(3)).transpose(0, 2, 1)
 
 
 def angle_axis(rotations: Float[Array, "n 3 3"]) -> Float[np.ndarray, "n 3"]:

@@ -106,7 +106,8 @@ class Covariance(ArrayRecord):
         jacobian = np.zeros((6, 12))
         jacobian[:3, :3], jacobian[:3, 6:9] = -relative, np.eye(3)
         # R <- exp(d_2) R exp(-d_1): t_2 - R t_1 changes by d_2's and d_1's turn of R t_1
-        jacobian[3:, 6:9], jacobian[3:, :3] = _cross(moved), -_cross(moved) @ relative
+        (across,) = geometry.cross_matrices(moved[None])
+        jacobian[3:, 6:9], jacobian[3:, :3] = across, -across @ relative
         jacobian[3:, 3:6], jacobian[3:, 9:] = -relative, np.eye(3)
         return _through(jacobian, self.between(first, second))
 
@@ -185,13 +186,13 @@ def _changes(
         changes[:, :3, :3] = changes[:, 3:6, 3:6] = turn
         moved = np.einsum("nij,nj->ni", turn, np.asarray(problem.cameras)[:, 3:6])
         by_extrinsics = np.tile(np.eye(EXTRINSICS_SIZE), (len(rotations), 1, 1))
-        by_extrinsics[:, 3:, :3] = [-_cross(one) for one in moved]
+        by_extrinsics[:, 3:, :3] = -geometry.cross_matrices(moved)
         start = unknowns.lens_size
         for place, column in enumerate(unknowns.columns):
             if column >= start:
                 changes[:, :, POSE_SIZE + place] = by_extrinsics[:, :, column - start]
     back = np.tile(np.eye(6), (len(rotations), 1, 1))
-    back[:, 3:, :3] = [_cross(moved) for moved in rotations @ offset]  # -(w x R o) = [R o]x w
+    back[:, 3:, :3] = geometry.cross_matrices(rotations @ offset)  # -(w x R o) = [R o]x w
     return back @ changes
 
 
@@ -385,7 +386,3 @@ def _submatrix(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
     found = np.zeros((len(rows), len(rows)))
     found[np.ix_(known, known)] = matrix[np.ix_(rows[known], rows[known])]
     return found
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

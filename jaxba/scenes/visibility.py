@@ -78,15 +78,9 @@ class TrueCameras:
 def place_points(scene: TrueCameras, lengths: Int[np.ndarray, " points"], rng: np.random.Generator) -> Views:
     """Places points so that the total number of views is exactly the wanted one.
 
-    Args:
-        scene: the true cameras.
-        lengths: wanted views of each point, longest first. A point that fewer cameras can see gets as many views as
-            there are; the rest go to points that more cameras can see.
-        rng: source of the randomness.
-
-    Raises:
-        ProblemError: the cameras overlap too little for so many views.
-    """
+    `lengths` are the wanted views of each point, longest first. A point that fewer cameras can see gets as many
+    views as there are; the rest go to points that more cameras can see. Raises ProblemError: the cameras overlap too
+    little."""
     count = len(lengths)
     reference = rng.permutation(np.arange(count, dtype=np.int32) % scene.count)
     points = np.empty((count, 3))

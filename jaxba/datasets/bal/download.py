@@ -48,25 +48,12 @@ class UnreachableError(DownloadError):
 def fetch(
     entry: Entry, folder: Path, report: Report, base_url: str = BASE_URL, use_checksum: bool = True
 ) -> tuple[Path, bool]:
-    """The path of a problem, downloaded if it is missing or has a wrong checksum.
+    """The path of a problem in the folder of the data set, and whether it had to be downloaded since it was missing or
+    had a wrong checksum (that is ignored without `use_checksum`, for a mirror that has compressed the files again).
 
     The file appears under its name complete and checked, or not at all. After a broken connection the part that was
     received stays beside it under a hidden name, and the next call resumes it. A file without a checksum must
-    decompress, and its header must have the counts of its name.
-
-    Args:
-        entry: the problem.
-        folder: of the whole data set; created if it is missing.
-        report: called with the progress.
-        base_url: folder of the families on a server.
-        use_checksum: false to ignore known checksums, for a mirror that has compressed the files again.
-
-    Returns:
-        The path, and whether anything had to be downloaded.
-
-    Raises:
-        DownloadError: the download failed; one line.
-    """
+    decompress, and its header must have the counts of its name. Raises DownloadError: the download failed; one line."""
     url, target, partial = f"{base_url.rstrip('/')}/{entry.file}", folder / entry.file, partial_path(entry, folder)
     checksum = entry.sha256 if use_checksum else None
     try:

@@ -38,14 +38,10 @@ class _Bytes:
     def unpack(self, layout: struct.Struct, where: str) -> tuple[Any, ...]:
         if self.left < layout.size:
             self.fail(f"is cut short in {where}")
-        values = layout.unpack_from(self.data, self.at)
         self.at += layout.size
-        return values
+        return layout.unpack_from(self.data, self.at - layout.size)
 
     def take(self, fields: Fields, what: str = "") -> tuple[Any, ...]:
-        if what and self.left < fields.struct.size:
-            wanted = f"the parameters of {self.about} ({what}) should have {len(fields.names)}"
-            self.fail(f"is cut short: {wanted}, and {self.left} bytes follow")
         values = self.unpack(fields.struct, self.about)
         if not self._named:
             self.about, self._named = f"{self.record} {values[0]}", True
@@ -101,7 +97,7 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
     file, found = _Bytes(read_bytes(path), name, part.removesuffix("3D")[:-1]), {}
     if part == "points3D":
         return _read_points(file)
-    first, read_one = fields.READERS.get(part, (fields.IMAGE, _read_image))
+    first, read_one = fields.FIRST[part], fields.READERS.get(part, _read_image)
     for _ in file.records(first.struct.size + (1 + _COUNT.size if first is fields.IMAGE else 0)):
         record = read_one(file)
         if record.id in found:

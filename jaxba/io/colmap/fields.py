@@ -88,12 +88,11 @@ def _read_frame(file: Any) -> Frame:
     )
 
 
-READERS: dict[str, tuple[Fields, Callable[[Any], Any]]] = {
-    "cameras": (CAMERA, _read_camera),
-    "rigs": (RIG, _read_rig),
-    "frames": (FRAME, _read_frame),
-}
-"""Of each file of records that are read alike in both forms: the fields with which one begins, and what reads it."""
+READERS: dict[str, Callable[[Any], Any]] = {"cameras": _read_camera, "rigs": _read_rig, "frames": _read_frame}
+"""What reads a record of the files that are read alike in both forms."""
+
+FIRST = {"cameras": CAMERA, "images": IMAGE, "points3D": POINT, "rigs": RIG, "frames": FRAME}
+"""The fields with which a record of each file begins."""
 
 Values = Iterator[tuple[Fields, tuple[Any, ...]]]
 """Fields and their values, one group after the other."""

@@ -42,6 +42,9 @@ NO_ID = 2**32 - 1
 NO_POINT = 2**64 - 1
 """COLMAP's id of no point; -1 in a text file."""
 
+LARGEST_RATIO = 1e6
+"""Of the focal lengths of a lens; a larger one is damage."""
+
 CAMERA_SENSOR = 0
 """Number of the sensor type of cameras."""
 
@@ -82,9 +85,12 @@ class Camera:
         return self.params[x], self.params[y]
 
     @property
-    def possible(self) -> bool:
-        """Whether all parameters are finite and focal lengths positive."""
-        return bool(np.isfinite(self.params).all()) and all(f > 0 for f in self.focals)
+    def impossible(self) -> str | None:
+        """Its parameters for a message, if they are not finite, focal lengths not positive or too different."""
+        focals = self.focals
+        if np.isfinite(self.params).all() and (not focals or 0 < max(focals) <= LARGEST_RATIO * min(focals)):
+            return None
+        return f"{', '.join(f'{value:g}' for value in self.params)} ({self.model})"
 
 
 @dataclass(frozen=True)

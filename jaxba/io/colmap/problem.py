@@ -98,7 +98,8 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
     images, notes = _registered(model)
     table = ordered(model, images)
     for camera in sorted({image.camera for image in images}):
-        lenses.check_lens(model, model.cameras[camera])
+        if wrong := model.cameras[camera].impossible:
+            raise ProblemError(f"{model.file('cameras')}: camera {camera} has impossible parameters: {wrong}")
     views, found = find_views(table)
     views, odd = _finite(table, views)
     notes += found + odd

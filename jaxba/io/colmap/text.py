@@ -23,13 +23,6 @@ from jaxba.problem.bundle_problem import ProblemError
 _NAME = len(fields.IMAGE.names)  # fields before the name of an image
 _LONGEST = 30  # characters of an integer that is read exactly
 _LARGEST = {"B": 255, "I": NO_ID, "Q": NO_POINT}
-_HEADERS = {
-    "cameras": "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-    "images": "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; next line: POINTS2D[] as (X, Y, POINT3D_ID)",
-    "points3D": "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-    "rigs": "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, [POSE])",
-    "frames": "FRAME_ID, RIG_ID, QW, QX, QY, QZ, TX, TY, TZ, NUM_DATA, DATA[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)",
-}
 
 
 class _Line:
@@ -115,7 +108,7 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
     if part == "points3D":
         return _read_points(lines)
     found = {}
-    for line, record in _images(lines) if part == "images" else ((one, fields.READERS[part][1](one)) for one in lines):
+    for line, record in _images(lines) if part == "images" else ((one, fields.READERS[part](one)) for one in lines):
         if line.rest:
             line.fail(f"{shown_word(line.rest[0])} is left over")
         if record.id in found:
@@ -165,7 +158,7 @@ def encode(model: Model) -> Iterator[tuple[str, bytes]]:
     """Names and contents of the files of a model with rigs and frames."""
     lines = {part: map(_joined, records.values()) for part, records in model.records.items()}
     for part, found in {**lines, "points3D": _point_lines(model.points)}.items():
-        yield f"{part}.txt", b"\n".join([f"# {_HEADERS[part]}".encode(), *found, b""])
+        yield f"{part}.txt", b"\n".join([f"# {', '.join(fields.FIRST[part].names)}, ...".encode(), *found, b""])
 
 
 def _joined(record: Any) -> bytes:

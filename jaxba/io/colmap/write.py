@@ -14,7 +14,7 @@ from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Image, Model, Po
 from jaxba.io.colmap.poses import colmap_poses, composed, inverse
 from jaxba.io.colmap.problem import Assembled, assemble, place_in_rig
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.tracks import numbered
+from jaxba.io.text import numbered
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.constraints import every_lens
@@ -95,9 +95,8 @@ def _new_cameras(
             raise ProblemError(f"cannot write {target}: images of camera {image.camera} have different intrinsics")
     cameras = {identity: with_lens(model.cameras[identity], lens, bal=bal) for identity, lens in found.items()}
     for camera in cameras.values():
-        if not camera.possible:
-            shown = ", ".join(f"{value:g}" for value in camera.params)
-            raise ProblemError(f"cannot write {target}: camera {camera.id} would have impossible parameters: {shown}")
+        if wrong := camera.impossible:
+            raise ProblemError(f"cannot write {target}: camera {camera.id} would have impossible parameters: {wrong}")
     return cameras
 
 

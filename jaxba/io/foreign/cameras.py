@@ -91,26 +91,11 @@ def assemble(
     point_index: Int[np.ndarray, " observations"],
     whitening: Float[np.ndarray, "observations 2 2"] | None = None,
 ) -> BundleProblem:
-    """The problem of cameras in the convention of this module.
+    """The problem of cameras in the convention of this module, `P = R X + t`, with pixels x to the right, y down.
 
-    Where the distortion of all lenses is BAL's, so are those of the problem; else all are of the other models. Pixels
-    that are not finite are left out, with a warning that counts them.
-
-    Args:
-        path: of the file, for messages.
-        lenses: of the cameras.
-        lens_of: lens of each camera.
-        rotations: from the world to the camera, right-handed.
-        translations: the same, `P = R X + t`.
-        points: in the world.
-        pixels: observations, x to the right, y down.
-        camera_index: camera of each observation.
-        point_index: point of each observation.
-        whitening: matrices that multiply the residuals of lenses of BAL; None: the identity.
-
-    Raises:
-        ProblemError: a lens is impossible, no observation is left, or something is not finite.
-    """
+    Where the distortion of all lenses is BAL's, so are those of the problem, and `whitening` multiplies their
+    residuals; else all are of the other models. Pixels that are not finite are left out, with a warning that counts
+    them. Raises ProblemError: a lens is impossible, no observation is left, or something is not finite."""
     name = display_name(path)
     for lens in lenses:
         _check(lens, name)

@@ -19,8 +19,7 @@ from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign.cameras import FIXED, ForeignLens, assemble
 from jaxba.io.notes import note, note_origin
-from jaxba.io.text import Text, finite_numbers
-from jaxba.io.tracks import read_tracks
+from jaxba.io.text import Text, finite_numbers, read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, are_rotations, translations
 from jaxba.typing import LARGEST_COUNT
