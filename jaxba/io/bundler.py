@@ -93,16 +93,14 @@ def _read(text: Text) -> BundleProblem:
     start = 2 + len(_CAMERA) * num_cameras
     text.need(start)
     cameras = values[2:start].reshape(-1, len(_CAMERA))
-    tracks = read_tracks(text, start, num_points, num_cameras)
-    registered = _check_cameras(text, cameras, tracks.camera_index)
+    points, camera_index, point_index, pixels, end = read_tracks(text, start, num_points, num_cameras)
+    registered = _check_cameras(text, cameras, camera_index)
     rotations = cameras[registered, 3:12].reshape(-1, 3, 3)
     parameters = (angle_axis(rotations), cameras[registered, 12:], cameras[registered, :3])
-    text.finish(tracks.end)
+    text.finish(end)
     new_index = np.cumsum(registered) - 1
     try:
-        return BundleProblem.create(
-            np.hstack(parameters), tracks.points, tracks.pixels, new_index[tracks.camera_index], tracks.point_index
-        )
+        return BundleProblem.create(np.hstack(parameters), points, pixels, new_index[camera_index], point_index)
     except ProblemError as error:
         raise ProblemError(f"{text.name}: {error}") from error
 

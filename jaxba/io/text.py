@@ -6,10 +6,10 @@ import re
 import warnings
 from bisect import bisect_right
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.typing import LARGEST_COUNT
@@ -151,21 +151,18 @@ POINT_FIELDS = ("x", "y", "z", "red", "green", "blue", "number of views")
 VIEW_FIELDS = ("camera index", "key", "x", "y")
 
 
-class Tracks(NamedTuple):
-    """Points and their views as Bundler and VisualSFM write them, in the order of the file."""
+def read_tracks(
+    text: Text, start: int, count: int, num_cameras: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    """Reads points and their views, as Bundler and VisualSFM write them, from the position of the first one's x among
+    the numbers of a text, whose `field` describes those before the points.
 
-    points: Float[np.ndarray, "points 3"]
-    camera_index: Int[np.ndarray, " observations"]
-    point_index: Int[np.ndarray, " observations"]
-    pixels: Float[np.ndarray, "observations 2"]
-    end: int
-    """Position after the last number of the last view."""
+    Returns:
+        Positions (count, 3); of each view camera, point and pixel (views, 2); the position after the last number.
 
-
-def read_tracks(text: Text, start: int, count: int, num_cameras: int) -> Tracks:
-    """Reads `count` points from the position of the first one's x among the numbers of a text, whose `field` describes
-    those before the points. Raises ProblemError: the file ends early, or something is no number or out of range; or
-    there are no views."""
+    Raises:
+        ProblemError: the file ends early, or something is no number or out of range; or there are no views.
+    """
     values, before, starts, end = text.values, text.field, [], start
 
     def field(ordinal: int) -> str:
@@ -188,7 +185,7 @@ def read_tracks(text: Text, start: int, count: int, num_cameras: int) -> Tracks:
     if not camera_index.size:
         raise ProblemError(f"{text.name}: no camera sees a point")
     points = values[first_view[:, None] - len(POINT_FIELDS) + np.arange(3)]
-    return Tracks(points, camera_index, np.repeat(np.arange(count), views), values[at[:, None] + [2, 3]], end)
+    return points, camera_index, np.repeat(np.arange(count), views), values[at[:, None] + [2, 3]], end
 
 
 def _point_field(point: int, at: int) -> str:

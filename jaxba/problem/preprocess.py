@@ -9,17 +9,10 @@ from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import camera_centers, depths, rotation_matrices, translations
 from jaxba.problem.similarity import Similarity, transformed
 
-POBA_SIZE = 100.0
-"""Size of a normalised scene. Source: Ceres `BALProblem::Normalize`, kept by rootba and PoBA."""
-
-POBA_NOISE = 0.01
-"""Standard deviation of translation and point noise in PoBA's experiments, for a scene of size 100."""
-
-POBA_MIN_DEPTH = 0.1
-"""Smallest depth of an observation in PoBA's experiments, for a scene of size 100."""
-
-POBA_SEED = 38401
-"""Default seed of rootba and PoBA. Their random generator is another one, so the same seed gives other numbers here."""
+POBA_SIZE, POBA_NOISE, POBA_MIN_DEPTH, POBA_SEED = 100.0, 0.01, 0.1, 38401
+"""Of PoBA's experiments: size of the normalised scene, as in Ceres' `BALProblem::Normalize`; standard deviation of
+translation and point noise; smallest depth of an observation; default seed (its random generator is another one, so the
+same seed gives other numbers here)."""
 
 FAR = 10.0
 """Distance of a scene from the origin, relative to its extent, from which it is shifted to the origin to be solved.

@@ -21,11 +21,8 @@ WINDOW = 2.5
 """Candidate cameras per wanted view. At an end of the path half of the candidates do not exist, which takes 2; the rest
 is for missed views."""
 
-NEAREST = 0.5
-"""A view nearer than this part of min_depth does not count."""
-
-FARTHEST = 2.0
-"""A view farther than this many times max_depth does not count."""
+NEAREST, FARTHEST = 0.5, 2.0
+"""A view nearer than this part of min_depth, or farther than this many times max_depth, does not count."""
 
 MIN_VIEWS = 4
 """Every camera should see so many points: 8 residuals for its 6 degrees of freedom and focal length."""

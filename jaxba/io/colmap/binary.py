@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
-from jaxba.io.colmap.model import KEY, POINT, TRACK, Image, Model, Points
+from jaxba.io.colmap.model import KEY, POINT, TRACK, Image, Model
 from jaxba.io.files import read_bytes
 from jaxba.problem.bundle_problem import ProblemError
 
@@ -46,9 +46,9 @@ class _Bytes:
         if not self._named:
             self.about, self._named = f"{self.record} {values[0]}", True
         if fields.kinds is not None:
-            number = values[fields.codes.index("i")]
-            if number not in fields.kinds.numbers.values():
-                self.fail(f"{self.about}{fields.kinds.unknown_number.format(number)}")
+            number, (known, _, unknown) = values[fields.codes.index("i")], fields.kinds
+            if number not in known.values():
+                self.fail(f"{self.about}{unknown.format(number)}")
         return values
 
     def count(self, field: str, each: Fields) -> int:
@@ -90,7 +90,7 @@ class _Bytes:
             self.fail(f"is too long, by {self.left} byte{plural} after {count} {self.record}s")
 
 
-def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
+def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray, np.ndarray]:
     """The records of a file by id, in its order; of `points3D` all points and tracks. `part` is the file's name without
     its ending; `name` is for messages. Raises ProblemError: the file is cut short or too long, or a record cannot be
     understood; one line that names the file and the record."""
@@ -106,7 +106,7 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
     return found
 
 
-def _read_points(file: _Bytes) -> Points:
+def _read_points(file: _Bytes) -> tuple[np.ndarray, np.ndarray]:
     heads, tracks, length_of = [], [], _COUNT.unpack_from
     for where in file.records(POINT.itemsize):  # a track's length says where the next point is
         start, end = file.at, file.at + POINT.itemsize
@@ -117,7 +117,7 @@ def _read_points(file: _Bytes) -> Points:
             file.fail(f"is cut short in the track of point {length_of(file.data, start)[0]}")
         heads.append(file.data[start:end])
         tracks.append(file.data[end : file.at])
-    return Points(np.frombuffer(b"".join(heads), POINT), np.frombuffer(b"".join(tracks), TRACK))
+    return np.frombuffer(b"".join(heads), POINT), np.frombuffer(b"".join(tracks), TRACK)
 
 
 def _read_image(file: _Bytes) -> Image:
@@ -130,8 +130,7 @@ def encode(model: Model) -> Iterator[tuple[str, bytes]]:
     """Names and contents of the files of a model with rigs and frames."""
     for part, records in model.records.items():
         yield f"{part}.bin", b"".join([_COUNT.pack(len(records)), *map(_packed, records.values())])
-    points = model.points
-    yield "points3D.bin", b"".join([_COUNT.pack(len(points.heads)), *_packed_points(points)])
+    yield "points3D.bin", b"".join([_COUNT.pack(len(model.points)), *_packed_points(model)])
 
 
 def _packed(record: Any) -> bytes:
@@ -141,9 +140,9 @@ def _packed(record: Any) -> bytes:
     return b"".join(parts)
 
 
-def _packed_points(points: Points) -> Iterator[bytes]:
-    heads, tracks, at = points.heads.tobytes(), points.tracks.tobytes(), 0
-    for number, length in enumerate(points.heads["length"].tolist()):
+def _packed_points(model: Model) -> Iterator[bytes]:
+    heads, tracks, at = model.points.tobytes(), model.tracks.tobytes(), 0
+    for number, length in enumerate(model.points["length"].tolist()):
         end = at + length * TRACK.itemsize
         yield heads[number * POINT.itemsize : (number + 1) * POINT.itemsize] + tracks[at:end]
         at = end

@@ -12,21 +12,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxba.io.colmap.model import MODELS, SENSORS, Camera, Frame, Image, Rig, Sensor
 from jaxba.problem.camera_models import CAMERA_MODELS
 
-
-class Kinds(NamedTuple):
-    """A field that is a word in text and its number in a binary file."""
-
-    numbers: Mapping[str, int]
-    unknown_word: str
-    """What a message says of another word."""
-
-    unknown_number: str
-    """And of another number, after the name of the record."""
+Kinds = tuple[Mapping[str, int], str, str]
+"""Numbers in a binary file by their words in text, and what a message says of another word, and (after the name of the
+record) of another number."""
 
 
 class Fields:
@@ -45,7 +38,7 @@ _NUMBERS = {name: number for number, name in enumerate(MODELS)}
 CAMERA = Fields(
     "CAMERA_ID, model, width, height",
     "IiQQ",
-    Kinds(_NUMBERS, "is an unknown camera model", " has an unknown model, number {}"),
+    (_NUMBERS, "is an unknown camera model", " has an unknown model, number {}"),
 )
 PARAMETERS = {
     name: Fields(", ".join(f"parameter {k + 1}" for k in range(size)), size * "d")
@@ -59,7 +52,7 @@ RIG = Fields("RIG_ID", "I")
 SENSOR = Fields(
     "type of a sensor, id of a sensor",
     "iI",
-    Kinds(SENSORS, "is no type of sensors", ": {} is the number of no type of sensors"),
+    (SENSORS, "is no type of sensors", ": {} is the number of no type of sensors"),
 )
 PLACED = Fields("whether there is a pose", "B", largest=1)
 FRAME = Fields(f"FRAME_ID, RIG_ID, {_POSE_NAMES}", f"II{7 * 'd'}")

@@ -36,7 +36,7 @@ def read_model(folder: StrPath) -> Model:
     try:
         content = {part: _read(folder, part, suffix) for part in here}
         cameras, images, points = (content[part] for part in PARTS)
-        model = Model(os.fspath(folder), suffix, cameras, images, points, *map(content.get, RIG_PARTS))
+        model = Model(os.fspath(folder), suffix, cameras, images, *points, *map(content.get, RIG_PARTS))
         check_model(model)
     except MemoryError:
         raise ProblemError(f"cannot read {display_name(folder)}: not enough memory") from None

@@ -144,17 +144,6 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Points:
-    """All points and their tracks."""
-
-    heads: Shaped[np.ndarray, " points"]
-    """Of type `POINT`."""
-
-    tracks: Shaped[np.ndarray, " elements"]
-    """Of type `TRACK`: those of the first point, then those of the second, and so on."""
-
-
-@dataclass(frozen=True)
 class Model:
     """A COLMAP model. Records are in the order of the files."""
 
@@ -164,7 +153,12 @@ class Model:
 
     cameras: dict[int, Camera]
     images: dict[int, Image]
-    points: Points
+    points: Shaped[np.ndarray, " points"]
+    """Of type `POINT`."""
+
+    tracks: Shaped[np.ndarray, " elements"]
+    """Of type `TRACK`: those of the first point, then those of the second, and so on."""
+
     rigs: dict[int, Rig] | None
     """None in models of COLMAP before 3.12, whose images are all registered."""
 
@@ -199,7 +193,7 @@ def check_model(model: Model) -> None:
     for part, records in model.records.items():
         if NO_ID in records:
             _fail(model, part, f"{NO_ID} is the id of no {part[:-1]}")
-    ids, counts = np.unique(model.points.heads["id"], return_counts=True)
+    ids, counts = np.unique(model.points["id"], return_counts=True)
     if (counts > 1).any():
         _fail(model, "points3D", f"point {ids[counts.argmax()]} is there twice")
     if len(ids) and ids[-1] == NO_POINT:

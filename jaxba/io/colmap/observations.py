@@ -47,9 +47,9 @@ class Ordered(NamedTuple):
 def ordered(model: Model, images: list[Image]) -> Ordered:
     """Sorts the points and joins the key-points of the registered images, which are sorted by id."""
     keys = [image.keys for image in images]
-    order = np.argsort(model.points.heads["id"], kind="stable")
+    order = np.argsort(model.points["id"], kind="stable")
     first = np.cumsum([0, *map(len, keys)])
-    return Ordered(model, images, np.concatenate([np.empty(0, KEY), *keys]), first, model.points.heads[order], order)
+    return Ordered(model, images, np.concatenate([np.empty(0, KEY), *keys]), first, model.points[order], order)
 
 
 def find_views(table: Ordered) -> tuple[Views, list[str]]:
@@ -69,7 +69,7 @@ def find_views(table: Ordered) -> tuple[Views, list[str]]:
 
 def _track_notes(table: Ordered, views: Views) -> list[str]:
     """Lines on points whose tracks are not those of their key-points."""
-    heads, elements = table.model.points.heads, table.model.points.tracks
+    heads, elements = table.model.points, table.model.tracks
     point = np.repeat(np.argsort(table.order), heads["length"].astype(np.int64))
     image, registered = _positions(np.array([image.id for image in table.images], np.uint32), elements["image"])
     first, index = np.append(table.first_key, 0), elements["key"].astype(np.int64)

@@ -35,7 +35,7 @@ class Assembled(NamedTuple):
     """Those of the problem's cameras."""
 
     points: Int[np.ndarray, " points"]
-    """Positions in `model.points.heads`."""
+    """Positions in `model.points`."""
 
     notes: list[str]
     """What was left out or mended, one line each."""
@@ -89,7 +89,7 @@ def read_colmap_with_looks(folder: StrPath) -> tuple[BundleProblem, Looks]:
     sizes = np.array([(one.width, one.height) for one in cameras], np.float64)
     found = [one.principal_point if one.focals else (np.nan, np.nan) for one in cameras]
     principal = np.where(np.isnan(found), sizes / 2, found)  # a panorama has its own in the middle
-    return assembled.problem, Looks(model.points.heads["rgb"][assembled.points], sizes, principal)
+    return assembled.problem, Looks(model.points["rgb"][assembled.points], sizes, principal)
 
 
 def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:
@@ -220,7 +220,7 @@ def _problem(
         with np.errstate(over="ignore"):  # what is not finite is refused below
             pixels = (pixels - centers) * COLMAP_FLIP[:2]
     parameters = np.hstack([bal_poses([image.pose for image in images]), intrinsics[lens]])
-    heads = model.points.heads[points]
+    heads = model.points[points]
     try:
         problem = BundleProblem.create(parameters, heads["xyz"], pixels, image, point, lenses=of_problem)
     except ProblemError as error:

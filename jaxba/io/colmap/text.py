@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
-from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model, Points
+from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model
 from jaxba.io.encoding import read_text
 from jaxba.io.text import number, shown_word
 from jaxba.problem.bundle_problem import ProblemError
@@ -78,10 +78,8 @@ class _Line:
     def _value(self, name: str, code: str, of: Fields) -> Any:
         word = self._word(name)
         if code == "i" and of.kinds is not None:
-            kind = word.decode("latin-1")
-            if kind not in of.kinds.numbers:
-                self.fail(f"{kind!a} {of.kinds.unknown_word}")
-            return of.kinds.numbers[kind]
+            kind, (known, unknown, _) = word.decode("latin-1"), of.kinds
+            return known[kind] if kind in known else self.fail(f"{kind!a} {unknown}")
         (value,) = self.numbers([word], code, name, of.largest)
         self.about = self.about or f"{self.record} {value}"
         return value
@@ -100,7 +98,7 @@ def _lines(path: Path, name: str, record: str, *, empty: bool = False) -> Iterat
             yield _Line(f"{name} line {at}", text, record)
 
 
-def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
+def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray, np.ndarray]:
     """The records of a file by id, in its order; of `points3D` all points and tracks. The line of an image's key-points
     may be empty, and missing in the last. Arguments as for `binary.read`. Raises ProblemError: a line cannot be
     understood; one line that names the file, the line and the field."""
@@ -117,7 +115,7 @@ def read(part: str, path: Path, name: str) -> dict[int, Any] | Points:
     return found
 
 
-def _read_points(lines: Iterator[_Line]) -> Points:
+def _read_points(lines: Iterator[_Line]) -> tuple[np.ndarray, np.ndarray]:
     heads, tracks = [], []
     for line in lines:
         identity, x, y, z, red, green, blue, error = line.take(fields.POINT)
@@ -126,7 +124,7 @@ def _read_points(lines: Iterator[_Line]) -> Points:
         track = line.numbers(line.rest, "I", "IMAGE_ID or POINT2D_IDX of the track")
         heads.append((identity, (x, y, z), (red, green, blue), error, len(track) // 2))
         tracks.extend(zip(track[::2], track[1::2], strict=True))
-    return Points(np.array(heads, POINT), np.array(tracks, TRACK))
+    return np.array(heads, POINT), np.array(tracks, TRACK)
 
 
 def _images(lines: Iterator[_Line]) -> Iterator[tuple[_Line, Image]]:
@@ -157,14 +155,14 @@ def _keys(line: _Line) -> np.ndarray:
 def encode(model: Model) -> Iterator[tuple[str, bytes]]:
     """Names and contents of the files of a model with rigs and frames."""
     lines = {part: map(_joined, records.values()) for part, records in model.records.items()}
-    for part, found in {**lines, "points3D": _point_lines(model.points)}.items():
+    for part, found in {**lines, "points3D": _point_lines(model)}.items():
         yield f"{part}.txt", b"\n".join([f"# {', '.join(fields.FIRST[part].names)}, ...".encode(), *found, b""])
 
 
 def _joined(record: Any) -> bytes:
     words: list[str] = []
     for of, numbers in fields.values(record):
-        kinds = {number: word for word, number in of.kinds.numbers.items()} if of.kinds is not None else {}
+        kinds = {number: word for word, number in of.kinds[0].items()} if of.kinds is not None else {}
         words += [kinds[v] if code == "i" else str(v) for code, v in zip(of.codes, numbers, strict=True)]
     text = " ".join(words).encode()
     if not isinstance(record, Image):
@@ -175,10 +173,10 @@ def _joined(record: Any) -> bytes:
     return b"".join([text, b" ", record.name, b"\n", keys.encode()])
 
 
-def _point_lines(points: Points) -> Iterator[bytes]:
-    elements = [f" {image} {key}" for image, key in points.tracks.tolist()]
+def _point_lines(model: Model) -> Iterator[bytes]:
+    elements = [f" {image} {key}" for image, key in model.tracks.tolist()]
     at = 0
-    columns = (points.heads[field].tolist() for field in ("id", "xyz", "rgb", "error", "length"))
+    columns = (model.points[field].tolist() for field in ("id", "xyz", "rgb", "error", "length"))
     for identity, (x, y, z), (red, green, blue), error, length in zip(*columns, strict=True):
         track = "".join(elements[at : at + length])
         yield f"{identity} {x} {y} {z} {red} {green} {blue} {error}{track}".encode()

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from jaxba.io.colmap import model as records
 from jaxba.io.colmap.files import has_parts, read_model, write_model
 from jaxba.io.colmap.lenses import with_lens
-from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Image, Model, Points, Rig, Sensor
+from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Image, Model, Rig, Sensor
 from jaxba.io.colmap.poses import colmap_poses, composed, inverse
 from jaxba.io.colmap.problem import Assembled, assemble, place_in_rig
 from jaxba.io.files import StrPath, display_name
@@ -69,7 +69,7 @@ def write_colmap(problem: BundleProblem, folder: StrPath, like: StrPath | None =
 def _check_finite(model: Model, assembled: Assembled, problem: BundleProblem, target: str) -> None:
     poses, points = np.asarray(problem.cameras)[:, :6], np.asarray(problem.points)
     pose_name = lambda at: f"the pose of {assembled.images[at]}"
-    point_name = lambda at: f"point {model.points.heads['id'][assembled.points[at]]}"
+    point_name = lambda at: f"point {model.points['id'][assembled.points[at]]}"
     for values, name in ((poses, pose_name), (points, point_name)):
         if not (finite := np.isfinite(values).all(axis=1)).all():
             raise ProblemError(f"cannot write {target}: {name(int(finite.argmin()))} is not finite")
@@ -77,12 +77,12 @@ def _check_finite(model: Model, assembled: Assembled, problem: BundleProblem, ta
 
 def _with_points(model: Model, assembled: Assembled, problem: BundleProblem) -> Model:
     """The model with the points of the problem, and their errors."""
-    heads = model.points.heads.copy()
+    heads = model.points.copy()
     heads["xyz"][assembled.points] = problem.points
     with np.errstate(over="ignore", invalid="ignore"):
         difference = geometry.project(problem) - np.asarray(problem.observations)
     heads["error"][assembled.points] = mean_errors(difference, np.asarray(problem.point_index), problem.num_points)
-    return replace(model, points=Points(heads, model.points.tracks))
+    return replace(model, points=heads)
 
 
 def _new_cameras(
@@ -205,7 +205,7 @@ def create_model(problem: BundleProblem, target: str) -> Model:
         number: _camera(number, lenses, int(lenses.index[at]), cameras[at, 6:], size, target)
         for number, (at, size) in enumerate(zip(first, half, strict=True), 1)
     }
-    return Model(target, ".bin", made, images, Points(heads, tracks), None, None)
+    return Model(target, ".bin", made, images, heads, tracks, None, None)
 
 
 def mean_errors(

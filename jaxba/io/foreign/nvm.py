@@ -50,16 +50,16 @@ def read_nvm(path: StrPath) -> BundleProblem:
     count = int(text.integers([0], 0, LARGEST_COUNT)[0])
     if not count:
         raise ProblemError(f"{text.name}: its first model has no points")
-    tracks = read_tracks(text, 1, count, len(images))
-    if tracks.end < values.size and values[tracks.end] > 0:  # the number of images of the next model, or 0
+    points, camera_index, point_index, measured, end = read_tracks(text, 1, count, len(images))
+    if end < values.size and values[end] > 0:  # the number of images of the next model, or 0
         note(path, "only the first model of the file is read")
-    note_origin(path, tracks.pixels)
+    note_origin(path, measured)
     lenses, lens_of, coefficients = _lenses(images, calibration)
     focal = np.array([lens.focal for lens in lenses])
-    of_views = lens_of[tracks.camera_index]
-    pixels, whitening = _undistorted(tracks.pixels, focal[of_views], coefficients[of_views])
-    seen = tracks.points, pixels, tracks.camera_index, tracks.point_index
-    return assemble(path, lenses, lens_of, *_poses(images, matrices), *seen, whitening)
+    of_views = lens_of[camera_index]
+    pixels, whitening = _undistorted(measured, focal[of_views], coefficients[of_views])
+    poses = _poses(images, matrices)
+    return assemble(path, lenses, lens_of, *poses, points, pixels, camera_index, point_index, whitening)
 
 
 def _lenses(
