@@ -133,20 +133,12 @@ class BundleProblem(ArrayRecord):
         try:
             cameras = _floats("cameras", cameras, POSE_SIZE + lens_size(lenses))
             points = _floats("points", points, POINT_SIZE)
-            problem = cls(
-                cameras=cameras,
-                points=points,
-                observations=_floats("observations", observations, 2),
-                camera_index=indices("camera_index", camera_index, len(cameras)),
-                point_index=indices("point_index", point_index, len(points)),
-            )
-            count = problem.num_observations
-            whitening = _whitening(covariance, weight, count)
-            if count == 0:
+            observations = _floats("observations", observations, 2)
+            whitening = _whitening(covariance, weight, len(observations))
+            if not len(observations):
                 raise ProblemError("the problem has no observations")
-            for name in ("camera_index", "point_index"):
-                if len(getattr(problem, name)) != count:
-                    raise ProblemError(f"{name} has {len(getattr(problem, name))} entries for {count} observations")
+            camera_index = indices("camera_index", camera_index, len(cameras), len(observations))
+            point_index = indices("point_index", point_index, len(points), len(observations))
             if lenses is not None:
                 lenses = checked_lenses(lenses, cameras)
             if constants is not None:
@@ -158,7 +150,8 @@ class BundleProblem(ArrayRecord):
                 priors = checked_priors(priors, len(cameras), of_lenses, lens_size(lenses))
         except ValueError as error:
             raise error if isinstance(error, ProblemError) else ProblemError(str(error)) from None
-        return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
+        arrays = (cameras, points, observations, camera_index, point_index, whitening)
+        return cls(*arrays, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
 
     def __repr__(self) -> str:
         arrays = ("cameras", "points", "observations")

@@ -45,12 +45,11 @@ def real_numbers(name: str, values: Any) -> np.ndarray:
     raise ValueError(f"{name} must be real numbers, not {array.dtype}")
 
 
-def indices(name: str, values: Any, bound: int, count: int | None = None) -> Int[np.ndarray, " n"]:
+def indices(name: str, values: Any, bound: int, count: int) -> Int[np.ndarray, " n"]:
     """The values as an int32 vector of that many entries in [0, bound). Raises ValueError: they are none; one line."""
     array = plain_array(name, values)
-    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu") or len(array) != (count or len(array)):
-        wanted = "a vector of integers" if count is None else f"a vector of {count} integers"
-        raise ValueError(f"{name} must be {wanted}, not {array.dtype} of shape {array.shape}")
+    if array.shape != (count,) or (count and array.dtype.kind not in "iu"):
+        raise ValueError(f"{name} must be a vector of {count} integers, not {array.dtype} of shape {array.shape}")
     bad = np.flatnonzero((array < 0) | (array >= bound))
     if bad.size:
         raise ValueError(f"{name}[{bad[0]}] is {array[bad[0]]}, outside 0..{bound - 1}")

@@ -162,8 +162,7 @@ def test_list_of_some_names(folder, capsys):
 def test_download_without_names_and_without_requests_are_one_line(folder, capsys, monkeypatch):
     assert data.run(["download"]) == 2
     check_one_line(capsys.readouterr().err, "name a problem or a family")
-    for module in ("jaxba.datasets.bal.download", "jaxba.datasets.bal.transfer"):
-        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.delitem(sys.modules, "jaxba.datasets.bal.download", raising=False)
     monkeypatch.delattr(sys.modules["jaxba.datasets.bal"], "download", raising=False)
     monkeypatch.setitem(sys.modules, "requests", None)
     assert data.run(["download", "ladybug-49"]) == 2

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxba.io.files import StrPath
-from jaxba.io.foreign.cameras import BROWN, FISHEYE, FIXED, UNDEFINED, ForeignLens, Landmark, build, checked_pose, part
+from jaxba.io.foreign.cameras import BROWN, FISHEYE, UNDEFINED, ForeignLens, Landmark, build, checked_pose, part
 from jaxba.io.foreign.json_records import Record
 from jaxba.io.notes import note, note_unused
 from jaxba.problem.bundle_problem import BundleProblem
@@ -103,7 +103,7 @@ def _lens(value: Record, version: tuple[int, ...]) -> ForeignLens:
         x, y = x + width / 2, y + height / 2
     fisheye = model == "fisheye4"
     distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
-    free = FIXED if value.get("locked", False).flag() else (True, count > 0, count > 1)
+    free = not value.get("locked", False).flag()
     return ForeignLens(value.where, _focal(value, version, width), (x, y), distortion, fisheye, free, (width, height))
 
 

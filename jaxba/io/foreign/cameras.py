@@ -24,8 +24,6 @@ from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, are_rotations
 from jaxba.problem.geometry import translations as translations_of
 from jaxba.problem.intrinsics import Lenses
 
-FIXED = (False, False, False)
-
 BROWN, FISHEYE = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 """Coefficients of the two kinds of distortion, in the order in which OpenMVG and AliceVision write them."""
 
@@ -59,8 +57,9 @@ class ForeignLens:
     fisheye: bool = False
     """Whether radii are angles."""
 
-    free: tuple[bool, bool, bool] = (True, True, True)
-    """Which of f, k1 and k2 may be optimised, if the distortion is BAL's; other lenses stay as they are."""
+    free: bool = True
+    """Whether f, k1 and k2 may be optimised, the last two where they are among the coefficients, if the distortion is
+    BAL's; other lenses stay as they are."""
 
     size: tuple[float, float] | None = None
     """Width and height of the image, pixels, if the principal point is measured from its corner."""
@@ -107,11 +106,11 @@ def assemble(
     intrinsics = np.zeros((len(lenses), max(map(len, models))))
     free = np.zeros(intrinsics.shape, bool)
     for at, (lens, model) in enumerate(zip(lenses, names, strict=True)):
-        (fx, fy), (cx, cy), (f, k1, k2) = lens.focal, lens.center, lens.free if lens.is_bal else FIXED
+        (fx, fy), (cx, cy) = lens.focal, lens.center
         values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens.distortion}
-        moves = {"f": f, "fx": f, "fy": f, "k1": k1, "k2": k2}
+        moves = {"f", "fx", "fy", *({"k1", "k2"} & set(lens.distortion))} if lens.free and lens.is_bal else set()
         for place, parameter in enumerate(CAMERA_MODELS[model].parameters):
-            intrinsics[at, place], free[at, place] = values.get(parameter, 0.0), moves.get(parameter, False)
+            intrinsics[at, place], free[at, place] = values.get(parameter, 0.0), parameter in moves
     lens_of = np.asarray(lens_of)
     observations = pixels
     if bal:

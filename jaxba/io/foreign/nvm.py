@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 
 from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.foreign.cameras import FIXED, ForeignLens, assemble
+from jaxba.io.foreign.cameras import ForeignLens, assemble
 from jaxba.io.notes import note, note_origin
 from jaxba.io.text import Text, finite_numbers, read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -68,9 +68,9 @@ def _lenses(
     """The lenses without distortion, the lens of each image, and r of each lens."""
     if calibration is not None:
         fx, _, fy, _, r = calibration
-        return [ForeignLens("FixedK", (fx, fy), free=FIXED)], np.zeros(len(images), np.int64), np.array([r])
+        return [ForeignLens("FixedK", (fx, fy), free=False)], np.zeros(len(images), np.int64), np.array([r])
     lenses = [
-        ForeignLens(f"image {image}", (f, f), free=(True, r == 0, r == 0))
+        ForeignLens(f"image {image}", (f, f), distortion={} if r else {"k1": 0.0, "k2": 0.0})
         for image, (f, *_, r, _) in enumerate(images.tolist())
     ]
     return lenses, np.arange(len(lenses)), images[:, -2]

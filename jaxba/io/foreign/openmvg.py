@@ -100,7 +100,7 @@ def _lens(model: str, data: Record) -> ForeignLens:
     x, y = data.get("principal_point").vector(2)
     fisheye = model == "fisheye"
     distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
-    return ForeignLens(data.where, (focal, focal), (x, y), distortion, fisheye, (True, count > 0, count > 1), size)
+    return ForeignLens(data.where, (focal, focal), (x, y), distortion, fisheye, size=size)
 
 
 def _landmarks(structure: Record) -> Iterator[Landmark]:

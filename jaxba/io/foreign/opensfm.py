@@ -138,8 +138,7 @@ def _lens(camera: Record) -> ForeignLens:
         (width / 2 + side * offset[0], height / 2 + side * offset[1]),
         {name: optional(name) for name in names},
         model.startswith("fisheye"),
-        (True, True, count > 1),
-        (width, height),
+        size=(width, height),
     )
 
 
