@@ -78,8 +78,7 @@ def _data(args: Arguments) -> int:
 def _list(args: List) -> int:
     from rich.table import Table
 
-    from jaxba.datasets.bal.catalog import ENTRIES, select
-    from jaxba.datasets.bal.paths import data_folder, downloaded_path
+    from jaxba.datasets.bal.paths import ENTRIES, data_folder, downloaded_path, select
 
     table = Table(box=None, header_style="bold", pad_edge=False)  # 80 columns wide
     for title in ("name", "cameras", "points", "file", "sha256", "here"):
@@ -97,8 +96,7 @@ def _list(args: List) -> int:
 def _download(args: Download) -> int:
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
-    from jaxba.datasets.bal.catalog import select
-    from jaxba.datasets.bal.paths import data_folder
+    from jaxba.datasets.bal.paths import data_folder, select
 
     if not args.names:
         raise common.UsageError("name a problem or a family; jaxba-data list shows them")

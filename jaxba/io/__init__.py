@@ -73,11 +73,8 @@ def is_folder(path: StrPath) -> bool:
 
 
 def check_output(path: StrPath) -> None:
-    """Refuses a name whose ending is that of a format that `write_problem` does not write.
-
-    Raises:
-        ProblemError: it is, or the path is a folder of other things; one line.
-    """
+    """Refuses a name whose ending is that of a format that `write_problem` does not write. Raises ProblemError: it is,
+    or the path is a folder of other things; one line."""
     if not is_folder(path):
         formats.writer(path)
     elif os.path.isdir(path) and visible(path) and not is_colmap(path):

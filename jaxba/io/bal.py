@@ -9,17 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
-from jaxba.io.encoding import open_text
+from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name, open_output
 from jaxba.io.notes import note_origin
-from jaxba.io.text import NumberReader
+from jaxba.io.text import Text
 from jaxba.problem.bundle_problem import CAMERA_SIZE, POINT_SIZE, BundleProblem, ProblemError
 from jaxba.typing import LARGEST_COUNT
 
-_WRITE_ROWS = 1 << 15  # lines formatted at once
 _COUNTS = ("cameras", "points", "observations")
 _OBSERVATION = ("camera index", "point index", "x", "y")
 _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translation y", "translation z", "f", "k1", "k2")
@@ -28,8 +28,7 @@ _CAMERA = ("rotation x", "rotation y", "rotation z", "translation x", "translati
 def read_bal(path: StrPath) -> BundleProblem:
     """Reads a BAL file, plain or compressed by bzip2, gzip or xz (recognised by its first bytes).
 
-    Decimal numbers are rounded correctly, so a problem that is written and read back is the same bit by bit. Counts in
-    the header allocate nothing: memory is proportional to what the file really holds.
+    Decimal numbers are rounded correctly, so a problem that is written and read back is the same bit by bit.
 
     Args:
         path: the file; may be a pipe.
@@ -38,8 +37,7 @@ def read_bal(path: StrPath) -> BundleProblem:
         ProblemError: the file cannot be read or is no valid problem; one line that names the file and, where there is
             one, the line and the field.
     """
-    with open_text(path) as blocks:
-        problem = _read(NumberReader(blocks, display_name(path), partial(_field, ())))
+    problem = _read(Text(read_text(path), display_name(path)))
     note_origin(path, np.asarray(problem.observations))
     return problem
 
@@ -59,20 +57,20 @@ def write_bal(problem: BundleProblem, path: StrPath) -> None:
         ProblemError: the problem is not valid, for example not finite, has lenses that are not BAL's, or the file
             cannot be written.
     """
-    check_bal_lenses(problem, path)
-    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
-    valid = BundleProblem.create(*arrays)
-    observations, camera_index, point_index = valid.observations, valid.camera_index, valid.point_index
+    valid = bal_only(problem, path)
+    index = (valid.camera_index.tolist(), valid.point_index.tolist(), valid.observations.tolist())
     with open_output(path) as file:
         file.write(f"{valid.num_cameras} {valid.num_points} {valid.num_observations}\n".encode())
-        for start in range(0, valid.num_observations, _WRITE_ROWS):
-            rows = slice(start, start + _WRITE_ROWS)
-            x, y = observations[rows].T.tolist()
-            index = zip(camera_index[rows].tolist(), point_index[rows].tolist(), x, y, strict=True)
-            file.write("".join([f"{c} {p} {x} {y}\n" for c, p, x, y in index]).encode())
-        for numbers in (valid.cameras.ravel(), valid.points.ravel()):
-            for start in range(0, numbers.size, _WRITE_ROWS):
-                file.write("".join([f"{v}\n" for v in numbers[start : start + _WRITE_ROWS].tolist()]).encode())
+        file.writelines(f"{camera} {point} {x} {y}\n".encode() for camera, point, (x, y) in zip(*index, strict=True))
+        for numbers in (valid.cameras, valid.points):
+            file.writelines(f"{number}\n".encode() for number in numbers.ravel().tolist())
+
+
+def bal_only(problem: BundleProblem, path: StrPath) -> BundleProblem:
+    """What a file of BAL's cameras holds of a problem, checked. Raises ProblemError."""
+    check_bal_lenses(problem, path)
+    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
+    return BundleProblem.create(*arrays)
 
 
 def check_bal_lenses(problem: BundleProblem, path: StrPath) -> None:
@@ -82,25 +80,28 @@ def check_bal_lenses(problem: BundleProblem, path: StrPath) -> None:
         raise ProblemError(f"cannot write {display_name(path)}: it would hold BAL's lenses only, not {names}")
 
 
-def _read(reader: NumberReader) -> BundleProblem:
-    (ordinal, header), *_ = reader.rows(1, 3)
-    counts = reader.integers(range(ordinal, 3), header[0], 1, LARGEST_COUNT).tolist()
-    num_cameras, num_points, num_observations = counts
-    reader.field = partial(_field, counts)
-    camera_index, point_index, observations = [], [], []
-    for first, rows in reader.rows(num_observations, 4):
-        end = first + rows.size
-        camera_index.append(reader.integers(range(first, end, 4), rows[:, 0], 0, num_cameras - 1))
-        point_index.append(reader.integers(range(first + 1, end, 4), rows[:, 1], 0, num_points - 1))
-        observations.append(rows[:, 2:].copy())  # a view would keep the whole block
-    cameras = [rows for _, rows in reader.rows(num_cameras, CAMERA_SIZE)]
-    points = [rows for _, rows in reader.rows(num_points, POINT_SIZE)]
-    reader.finish()
-    parts = (cameras, points, observations, camera_index, point_index)
+def _read(text: Text) -> BundleProblem:
+    values = text.read_numbers(partial(_field, ()))
+    text.need(3)
+    num_cameras, num_points, num_observations = counts = text.integers(range(3), 1, LARGEST_COUNT).tolist()
+    text.field = partial(_field, counts)
+    first = 3 + 4 * np.arange(min(num_observations, (len(values) - 3) // 4))
+    camera_index = text.integers(first, 0, num_cameras - 1)
+    point_index = text.integers(first + 1, 0, num_points - 1)
+    ends = np.cumsum([3, 4 * num_observations, CAMERA_SIZE * num_cameras, POINT_SIZE * num_points]).tolist()
+    text.need(ends[-1])
+    text.finish(ends[-1])
+    observations, cameras, points = (values[start:end] for start, end in pairwise(ends))
     try:
-        return BundleProblem.create(*(np.concatenate(part) for part in parts))
+        return BundleProblem.create(
+            cameras.reshape(-1, CAMERA_SIZE),
+            points.reshape(-1, POINT_SIZE),
+            observations.reshape(-1, 4)[:, 2:],
+            camera_index,
+            point_index,
+        )
     except ProblemError as error:
-        raise ProblemError(f"{reader.name}: {error}") from error
+        raise ProblemError(f"{text.name}: {error}") from error
 
 
 def _field(counts: Sequence[int], ordinal: int) -> str:

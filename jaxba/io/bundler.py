@@ -10,13 +10,12 @@ from functools import partial
 
 import numpy as np
 
-from jaxba.io.bal import check_bal_lenses
-from jaxba.io.encoding import open_text
+from jaxba.io.bal import bal_only
+from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name, open_output
 from jaxba.io.notes import note_origin
 from jaxba.io.ply import POINT_COLOUR
-from jaxba.io.text import LineReader, NumberReader
-from jaxba.io.tracks import numbered, read_tracks
+from jaxba.io.text import Text, numbered, read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import angle_axis, are_rotations, rotation_matrices
 from jaxba.problem.labels import part_name
@@ -41,15 +40,12 @@ def read_bundler(path: StrPath) -> BundleProblem:
         ProblemError: the file cannot be read or is no valid model, or a point is seen by an unregistered camera; one
             line that names the file and, where there is one, the line and the field.
     """
-    name = display_name(path)
-    with open_text(path) as blocks:
-        lines = LineReader(blocks, name)
-        header = lines.next()
-        if header != HEADER:
-            shown = ascii(header[:40].decode("latin-1"))
-            complaint = f"{shown} is not the header {HEADER.decode()!r} of a Bundler file"
-            raise ProblemError(f"{name} line {max(lines.line, 1)}: {complaint}")
-        problem = _read(NumberReader(lines.rest(), name, partial(_field, 0), line=lines.line + 1))
+    text = Text(read_text(path), display_name(path))
+    header = text.next_line()
+    if header != HEADER:
+        shown = ascii(header[:40].decode("latin-1"))
+        raise ProblemError(f"{text.where}: {shown} is not the header {HEADER.decode()!r} of a Bundler file")
+    problem = _read(text)
     note_origin(path, np.asarray(problem.observations))
     return problem
 
@@ -68,9 +64,7 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
         ProblemError: the problem is not valid, a camera that sees points has focal length 0, which stands for cameras
             that are not registered, lenses are not BAL's, or the file cannot be written.
     """
-    check_bal_lenses(problem, path)
-    arrays = (problem.cameras, problem.points, problem.observations, problem.camera_index, problem.point_index)
-    valid = BundleProblem.create(*arrays)
+    valid = bal_only(problem, path)
     cameras, camera_index = np.asarray(valid.cameras), np.asarray(valid.camera_index)
     lost = np.flatnonzero((cameras[:, 6] == 0) & (np.bincount(camera_index, minlength=len(cameras)) > 0))
     if lost.size:
@@ -91,30 +85,27 @@ def write_bundler(problem: BundleProblem, path: StrPath) -> None:
             file.write(f"{point[0]} {point[1]} {point[2]}\n{colour}\n{count}{seen}\n".encode())
 
 
-def _read(reader: NumberReader) -> BundleProblem:
-    values = reader.peek_all()
-    reader.need(2)
-    num_cameras, num_points = reader.integers(range(2), values[:2], 1, LARGEST_COUNT).tolist()
-    reader.field = partial(_field, num_cameras)
-    position = 2 + len(_CAMERA) * num_cameras
-    reader.need(position)
-    cameras = values[2:position].reshape(-1, len(_CAMERA))
-    tracks = read_tracks(reader, position, num_points, num_cameras, reader.field)
-    registered = _check_cameras(reader, cameras, tracks.camera_index)
+def _read(text: Text) -> BundleProblem:
+    values = text.read_numbers(partial(_field, 0))
+    text.need(2)
+    num_cameras, num_points = text.integers(range(2), 1, LARGEST_COUNT).tolist()
+    text.field = partial(_field, num_cameras)
+    start = 2 + len(_CAMERA) * num_cameras
+    text.need(start)
+    cameras = values[2:start].reshape(-1, len(_CAMERA))
+    points, camera_index, point_index, pixels, end = read_tracks(text, start, num_points, num_cameras)
+    registered = _check_cameras(text, cameras, camera_index)
     rotations = cameras[registered, 3:12].reshape(-1, 3, 3)
     parameters = (angle_axis(rotations), cameras[registered, 12:], cameras[registered, :3])
-    reader.skip(tracks.end)
-    reader.finish()
+    text.finish(end)
     new_index = np.cumsum(registered) - 1
     try:
-        return BundleProblem.create(
-            np.hstack(parameters), tracks.points, tracks.pixels, new_index[tracks.camera_index], tracks.point_index
-        )
+        return BundleProblem.create(np.hstack(parameters), points, pixels, new_index[camera_index], point_index)
     except ProblemError as error:
-        raise ProblemError(f"{reader.name}: {error}") from error
+        raise ProblemError(f"{text.name}: {error}") from error
 
 
-def _check_cameras(reader: NumberReader, cameras: np.ndarray, camera_index: np.ndarray) -> np.ndarray:
+def _check_cameras(text: Text, cameras: np.ndarray, camera_index: np.ndarray) -> np.ndarray:
     """Mask (cameras,) of registered cameras, after a check that they have rotations and that views name no others."""
     registered = cameras[:, 0] != 0
     used = np.bincount(camera_index, minlength=len(cameras)) > 0
@@ -124,7 +115,7 @@ def _check_cameras(reader: NumberReader, cameras: np.ndarray, camera_index: np.n
         (3, "is the first number of a matrix that is no rotation", registered & ~rotation),
     ):
         if bad.any():
-            reader.fail(2 + len(_CAMERA) * int(bad.argmax()) + start, complaint)
+            text.fail(2 + len(_CAMERA) * int(bad.argmax()) + start, complaint)
     return registered
 
 

@@ -10,8 +10,7 @@ import stat
 import sys
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from io import BufferedReader
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TypeAlias
 
@@ -19,9 +18,6 @@ from jaxba.problem.bundle_problem import ProblemError
 from jaxba.runtime.atomic import atomic_write
 
 StrPath: TypeAlias = str | os.PathLike[str]
-
-BLOCK_BYTES = 1 << 22
-"""Bytes that a parser gets at once. With 4 MiB its arrays stay near the cache, and memory is that of the result."""
 
 READ_ERRORS = (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError)
 """Errors of reading and decompressing a file that are the fault of the file, not of this program."""
@@ -32,6 +28,12 @@ STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/")
 _DESCRIPTORS = {"/dev/stdout": 1, "/dev/stderr": 2}
 
 _MAGIC = {".bz2": b"BZh", ".gz": b"\x1f\x8b", ".xz": b"\xfd7zXZ\0"}
+_DECODERS: dict[str, Callable[[], Any]] = {
+    ".bz2": bz2.BZ2Decompressor,
+    ".gz": lambda: zlib.decompressobj(wbits=31),  # 31: with a header of gzip
+    ".xz": lzma.LZMADecompressor,
+}
+_BZIP2_BLOCK = 1 << 20  # bytes; bzip2 gives nothing before the end of its first block of at most 900 kB
 
 
 def strip_compression(path: StrPath) -> str:
@@ -61,35 +63,39 @@ def reason(error: BaseException) -> str:
 
 def visible(folder: StrPath) -> list[Path]:
     """What lies in a folder, sorted, without names that begin with a dot: systems leave such files beside any other.
-
-    Raises:
-        OSError: it is no folder, or cannot be listed.
-    """
+    Raises OSError: it is no folder, or cannot be listed."""
     return sorted(path for path in Path(folder).iterdir() if not path.name.startswith("."))
 
 
-@contextmanager
-def open_input(path: StrPath) -> Iterator[Iterator[bytes]]:
-    """Blocks of a file's bytes, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name.
-
-    The iterator raises one of `READ_ERRORS` at damaged, cut-short or trailing compressed data.
-
-    Raises:
-        ProblemError: the file cannot be opened or read, or is not compressed as its name says.
-    """
+def read_bytes(path: StrPath) -> bytes:
+    """The contents of a file, decompressed if its first bytes are those of bzip2, gzip or xz, whatever its name. Raises
+    ProblemError: it cannot be read, is not compressed as its name says, or is damaged; one line."""
     name = display_name(path)
-    with ExitStack() as stack:
-        try:
-            file = stack.enter_context(open(path, "rb"))
-            blocks = _blocks(file, os.path.splitext(path)[1].lower(), name)
-        except ProblemError:
-            raise
-        except (*READ_ERRORS, ValueError) as error:  # ValueError: a name with NUL or a lone surrogate
-            raise ProblemError(f"cannot read {name}: {reason(error)}") from error
-        try:
-            yield blocks
-        except READ_ERRORS as error:
-            raise ProblemError(f"cannot read {name}: {reason(error)}") from error
+    try:
+        with open(path, "rb") as file:
+            data = file.read()
+        kind = _compression(data)
+        suffix = os.path.splitext(path)[1].lower()
+        if data and suffix in _MAGIC and kind is None:
+            raise ProblemError(f"{name}: the file is no {suffix[1:]} file, as its name says")
+        return data if kind is None else _decompressed(data, _DECODERS[kind])
+    except ProblemError:
+        raise
+    except (*READ_ERRORS, ValueError) as error:  # ValueError: a name with NUL or a lone surrogate
+        raise ProblemError(f"cannot read {name}: {reason(error)}") from error
+
+
+def beginning(path: StrPath, size: int) -> bytes:
+    """The first bytes of a regular file, decompressed; empty if they cannot be read."""
+    try:
+        if not os.path.isfile(path):
+            return b""
+        with open(path, "rb") as file:
+            data = file.read(_BZIP2_BLOCK)
+        kind = _compression(data)
+        return data[:size] if kind is None else _DECODERS[kind]().decompress(data, size)
+    except (*READ_ERRORS, ValueError):
+        return b""
 
 
 @contextmanager
@@ -97,11 +103,7 @@ def open_output(path: StrPath) -> Iterator[BinaryIO]:
     """A stream whose bytes become the file at the end of the block, or not at all (`atomic_write`).
 
     They are compressed if the name ends in `.bz2`, `.gz` or `.xz`. A device or pipe, such as standard output, is
-    written directly, an open stream from its current position.
-
-    Raises:
-        ProblemError: the file cannot be written.
-    """
+    written directly, an open stream from its current position. Raises ProblemError: the file cannot be written."""
     name = display_name(path)
     try:
         target = os.path.realpath(path)
@@ -134,34 +136,21 @@ def _open_stream(path: str) -> BinaryIO:
     return os.fdopen(os.dup(number), "wb")  # opening a redirected file by name would start at its beginning
 
 
-def _blocks(file: BufferedReader, suffix: str, name: str) -> Iterator[bytes]:
-    head = file.peek(8)
-    kind = next((kind for kind, magic in _MAGIC.items() if head.startswith(magic)), None)
-    if head and suffix in _MAGIC and kind is None:
-        raise ProblemError(f"{name}: the file is no {suffix[1:]} file, as its name says")
-    if kind == ".bz2":
-        return _decompressed(file, bz2.BZ2Decompressor)
-    if kind == ".xz":
-        return _decompressed(file, lzma.LZMADecompressor)
-    stream = gzip.GzipFile(fileobj=file, mode="rb") if kind == ".gz" else file
-    return iter(lambda: stream.read(BLOCK_BYTES), b"")
+def _compression(data: bytes) -> str | None:
+    """Ending of the compression that data begin with."""
+    return next((kind for kind, magic in _MAGIC.items() if data.startswith(magic)), None)
 
 
-def _decompressed(file: IO[bytes], new_decoder: Callable[[], Any]) -> Iterator[bytes]:
-    """Blocks of all streams of a file. BZ2File and LZMAFile would ignore garbage after the first one."""
-    rest = file.read(BLOCK_BYTES)
-    while rest:
+def _decompressed(data: bytes, new_decoder: Callable[[], Any]) -> bytes:
+    """The contents of all streams. The standard library's functions would ignore garbage after the first one."""
+    parts = []
+    while data:
         decoder = new_decoder()
-        while not decoder.eof:
-            if decoder.needs_input and not rest:
-                rest = file.read(BLOCK_BYTES)
-                if not rest:
-                    raise EOFError("the compressed data is cut short")
-            yield decoder.decompress(rest, BLOCK_BYTES)
-            rest = b""
-        rest = decoder.unused_data.lstrip(b"\0")  # xz allows zeros between streams
-        while not rest and (block := file.read(BLOCK_BYTES)):
-            rest = block.lstrip(b"\0")
+        parts.append(decoder.decompress(data))
+        if not decoder.eof:
+            raise EOFError("the compressed data is cut short")
+        data = decoder.unused_data.lstrip(b"\0")  # xz allows zeros between streams
+    return b"".join(parts)
 
 
 def _compressor(file: IO[bytes], path: StrPath) -> Any:

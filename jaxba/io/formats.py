@@ -11,11 +11,10 @@ from jaxba.io.bal import read_bal, write_bal
 from jaxba.io.bundler import read_bundler, write_bundler
 from jaxba.io.colmap import is_colmap, read_colmap
 from jaxba.io.colmap.model import PARTS, RIG_PARTS
-from jaxba.io.encoding import open_text
-from jaxba.io.files import READ_ERRORS, StrPath, display_name, strip_compression
+from jaxba.io.encoding import plain_text
+from jaxba.io.files import StrPath, beginning, display_name, strip_compression
 from jaxba.io.foreign import RECONSTRUCTION, TRACKS
 from jaxba.io.ply import write_ply
-from jaxba.io.recognise import nerfstudio, recognised
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 Reader = Callable[[StrPath], BundleProblem]
@@ -56,7 +55,8 @@ def _read_json(path: StrPath) -> BundleProblem:
     for program in (opensfm, openmvg, alicevision):
         if program.recognises(document):
             return program.from_document(document, path)
-    if nerfstudio(document.value):
+    frames = document.value.get("frames") if isinstance(document.value, dict) else None
+    if isinstance(frames, list) and any(isinstance(one, dict) and "transform_matrix" in one for one in frames):
         document.fail(
             "is nerfstudio's transforms.json, which has poses but no points: give the COLMAP model it was made from"
         )
@@ -73,18 +73,32 @@ FORMATS = (
 """Formats of files. The first is that of names whose ending says nothing. Folders are COLMAP models, or OpenSfM's."""
 
 OTHER_ENDINGS = (
-    *(".abc", ".b3dm", ".bin", ".blend", ".csv", ".dae", ".db", ".dot", ".e57", ".fbx", ".g2o", ".glb", ".gltf"),
-    *(".graph", ".h5", ".hdf5", ".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mg"),
-    *(".mvs", ".npy", ".npz", ".nvm2", ".obj", ".off", ".p4p", ".pcd", ".pdf", ".pickle", ".pkl", ".png", ".pose"),
-    *(".psx", ".psz", ".pt", ".pts", ".ptx", ".py", ".rcalign", ".safetensors", ".sql", ".sqlite", ".stl", ".svg"),
-    *(".tif", ".tiff", ".toml", ".toro", ".tsv", ".usd", ".usda", ".usdc", ".usdz", ".vrml", ".vtk", ".wrl", ".xml"),
-    *(".xyz", ".yaml", ".yml"),
-    *(".7z", ".lz4", ".lzma", ".rar", ".tar", ".tbz", ".tbz2", ".tgz", ".txz", ".z", ".zip", ".zst", ".zstd"),
+    *(".7z", ".abc", ".bin", ".csv", ".dae", ".db", ".fbx", ".g2o", ".glb", ".gltf", ".graph", ".h5", ".hdf5"),
+    *(".html", ".ini", ".jpeg", ".jpg", ".kml", ".las", ".laz", ".log", ".mat", ".md", ".mvs", ".npy", ".npz"),
+    *(".obj", ".pcd", ".pdf", ".pickle", ".pkl", ".png", ".psx", ".pt", ".py", ".rar", ".safetensors", ".sql"),
+    *(".sqlite", ".stl", ".tar", ".tbz2", ".tgz", ".tif", ".toml", ".tsv", ".txz", ".usd", ".vtk", ".xml"),
+    *(".xyz", ".yaml", ".yml", ".z", ".zip", ".zst"),
 )
 """Endings of what is neither read nor written, so that a name with one of them is a mistake."""
 
 _SNIFFED = 1024
 """Bytes at the beginning of a file that tell its format."""
+
+_ARCHIVE = "an archive: unpack it and give the problem in it"
+
+_MAGIC = {
+    **dict.fromkeys(
+        (b"PK\x03\x04", b"7z\xbc\xaf\x27\x1c", b"Rar!", b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"), _ARCHIVE
+    ),
+    b"SQLite format 3\0": "a COLMAP data base (SQLite), which holds no poses: give the folder that the mapper writes",
+}
+"""First bytes of files that are often given for a problem, and what they are."""
+
+_COLMAP_COMMENTS = re.compile(rb"# (Camera|Image|3D point|Rig|Frame) list|# \w+ calib list")
+"""First line of each text file of a COLMAP model."""
+
+_UNPRINTABLE = re.compile(rb"[\0-\x08\x0e-\x1a\x1c-\x1f]")
+"""Bytes that no text holds."""
 
 
 def ending(path: StrPath) -> str:
@@ -98,7 +112,7 @@ def by_ending(path: StrPath) -> Format | None:
 
 
 def is_file_name(path: StrPath) -> bool:
-    """Whether a name has an ending of compression, of a format or of another program's file: it is no folder's."""
+    """Whether a name has an ending that says what a file is, or how it is compressed: it is no folder's."""
     known = by_ending(path) is not None or ending(path) in OTHER_ENDINGS
     return known or strip_compression(path) != str(path)
 
@@ -117,44 +131,49 @@ def formats_written() -> str:
 
 def read(path: StrPath) -> BundleProblem:
     """Reads a file in the format of its ending, or else of its first bytes; a folder as OpenSfM's or a COLMAP model.
-
-    Raises:
-        ProblemError: it cannot be read; one line. Of a file of another program it says what that is.
-    """
+    Raises ProblemError: it cannot be read; one line. Of a file of another program it says what that is."""
     if Path(path).is_dir():
         reconstruction = Path(path) / RECONSTRUCTION
         return _read_json(reconstruction) if reconstruction.is_file() and not is_colmap(path) else read_colmap(path)
     known = by_ending(path)
     if known is not None and known.read is None:
         raise ProblemError(f"cannot read {display_name(path)}: {known.name} is only written; {formats_read()}")
+    begin = _beginning(path)
+    found = next((one for one in FORMATS if one.begins and begin.lstrip().startswith(one.begins)), None)
+    if found is not None and known in (None, FORMATS[0]):
+        known = found
+    elif begin and (what := recognised(path, begin)):
+        raise ProblemError(f"{display_name(path)}: is {what}{'' if ': ' in what else f'; {formats_read()}'}")
     try:
-        return read_bal(path) if known is None or known.read is None else known.read(path)
+        return known.read(path) if known is not None and known.read is not None else read_bal(path)
     except ProblemError as error:
-        begin = _beginning(path)
-        found = next((one for one in FORMATS if begin.lstrip().startswith(one.begins)), None) if begin else None
-        if found is not None and found.read is not None and known in (None, FORMATS[0]):
-            return found.read(path)
-        raise _explained(path, begin, error) from error
+        if known is None and ending(path) in OTHER_ENDINGS:
+            raise ProblemError(f"{error}; files with {ending(path)} are not read; {formats_read()}") from error
+        if known in (None, FORMATS[0]) and re.match(rb"\s*[^\s\d+.-]", begin):  # no number, as BAL begins
+            raise ProblemError(f"{error}; {formats_read()}") from error
+        raise
 
 
-def _explained(path: StrPath, begin: bytes, error: ProblemError) -> ProblemError:
-    """The error of a reader, or what the file is instead, if that is known."""
-    what = recognised(path, begin) if begin else None
-    if what is not None:
-        return ProblemError(f"{display_name(path)}: is {what}{'' if ': ' in what else f'; {formats_read()}'}")
-    if ending(path) in OTHER_ENDINGS and begin:
-        return ProblemError(f"{error}; files with {ending(path)} are not read; {formats_read()}")
-    if by_ending(path) in (None, FORMATS[0]) and re.match(rb"\s*[^\s\d+.-]", begin):  # no number, as BAL begins
-        return ProblemError(f"{error}; {formats_read()}")
-    return error
+def recognised(path: StrPath, begin: bytes) -> str | None:
+    """What a file is that no reader reads, by its name and its first bytes, decompressed, as part of a message; None if
+    it may be a text of a format here."""
+    place = Path(path)
+    beside = any(
+        (place.parent / f"{part}{place.suffix}").is_file() for part in (*PARTS, *RIG_PARTS) if part != place.stem
+    )
+    if place.stem in (*PARTS, *RIG_PARTS) and (place.suffix == ".bin" or (place.suffix == ".txt" and beside)):
+        return f"a file of a COLMAP model: give the folder that holds it, {display_name(place.parent)}"
+    if _COLMAP_COMMENTS.match(begin):
+        return "a file of a COLMAP model: give the folder of the model"
+    if begin[257:].startswith(b"ustar"):  # of a tar archive, whose compression is undone by then
+        return _ARCHIVE
+    known = next((what for magic, what in _MAGIC.items() if begin.startswith(magic)), None)
+    return known or ("a binary file of no format that is known here" if _UNPRINTABLE.search(begin) else None)
 
 
 def writer(path: StrPath) -> Writer:
-    """What writes a file of a name.
-
-    Raises:
-        ProblemError: the ending is that of a format that is not written; one line with the endings that are.
-    """
+    """What writes a file of a name. Raises ProblemError: the ending is that of a format that is not written; one line
+    with the endings that are."""
     known = by_ending(path)
     write = FORMATS[0].write if known is None and ending(path) not in OTHER_ENDINGS else known and known.write
     if write is None:
@@ -178,8 +197,7 @@ def holds_problem(path: StrPath) -> bool:
 def files_of(path: StrPath) -> list[StrPath]:
     """The files that a problem of this path is read from, or would be if they were there.
 
-    A folder has those of a COLMAP model and of OpenSfM, whose tracks also lie beside a `.json` file.
-    """
+    A folder has those of a COLMAP model and of OpenSfM, whose tracks also lie beside a `.json` file."""
     folder = Path(path)
     if not folder.is_dir():
         beside = [folder.with_name(name) for name in TRACKS] if ending(path) == ".json" else []
@@ -193,14 +211,8 @@ def model_files(folder: StrPath) -> list[Path]:
 
 
 def _beginning(path: StrPath) -> bytes:
-    """First bytes of a regular file, decompressed; empty if they cannot be read (again)."""
-    if not Path(path).is_file():
-        return b""
-    text = b""
+    """First bytes of the text of a regular file; empty if they cannot be read."""
     try:
-        with open_text(path) as blocks:
-            while len(text) < _SNIFFED and (block := next(blocks, None)) is not None:
-                text += block
-            return text[:_SNIFFED]
-    except (ProblemError, *READ_ERRORS):
+        return plain_text(beginning(path, _SNIFFED))
+    except UnicodeError:
         return b""

@@ -62,11 +62,8 @@ class Sidecar:
 def poses_of(poses: Poses, numbers: tuple[int, ...], calibration: Calibration) -> Float[np.ndarray, "frames 3 4"]:
     """Camera-to-world poses of this camera at the frames with these numbers.
 
-    The centre of camera 0 is at `offset` in the frame of this camera, so their paths differ.
-
-    Raises:
-        ProblemError: a frame has no pose.
-    """
+    The centre of camera 0 is at `offset` in the frame of this camera, so their paths differ. Raises ProblemError: a
+    frame has no pose."""
     there = np.isin(numbers, poses.numbers)
     if not there.all():
         raise ProblemError(f"{poses.name}: has {len(poses.numbers)} poses, none for frame {numbers[there.argmin()]}")
@@ -82,11 +79,7 @@ def write_sidecar(path: StrPath, contents: Mapping[str, Any]) -> None:
 
 
 def read_sidecar(path: StrPath) -> Sidecar:
-    """Reads the sidecar file of a problem.
-
-    Raises:
-        ProblemError: there is none, or it was not written by `jaxba-kitti`.
-    """
+    """Reads the sidecar file of a problem. Raises ProblemError: there is none, or `jaxba-kitti` did not write it."""
     side = sidecar_path(path)
     try:
         contents = parse_json(decode(side.read_bytes()))

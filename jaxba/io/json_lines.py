@@ -23,6 +23,9 @@ _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+LONGEST_LINE = 1 << 24
+"""Bytes at the end of a file that are looked at before it is appended to."""
+
 _NAMES = {int: "a whole number", str: "a text", bool: "true or false"}
 
 
@@ -43,11 +46,8 @@ def plain(value: Any) -> Any:
 
 
 def from_plain(kind: type[T], data: Any, path: str = "") -> T:
-    """The inverse of `plain` for a dataclass. Unknown keys are ignored.
-
-    Raises:
-        ProblemError: a key is missing, or its value has the wrong type.
-    """
+    """The inverse of `plain` for a dataclass. Unknown keys are ignored. Raises ProblemError: a key is missing, or its
+    value has the wrong type."""
     if not isinstance(data, Mapping):
         raise ProblemError(f"{path or 'the record'} is no object")
     hints = typing.get_type_hints(kind)
@@ -78,11 +78,8 @@ def _value(kind: Any, value: Any, path: str) -> Any:
 
 def read(path: str | os.PathLike[str], kind: type[T]) -> list[T]:
     """All lines of a file, in order. Empty lines are skipped; an incomplete last line is ignored with a warning in the
-    log.
-
-    Raises:
-        ProblemError: the file cannot be read, or another line is malformed; the message names the file and the line.
-    """
+    log. Raises ProblemError: the file cannot be read, or another line is malformed; the message names the file and
+    the line."""
     try:
         lines, found = Path(path).read_bytes().split(b"\n"), []
     except OSError as error:
@@ -105,34 +102,19 @@ def append(path: str | os.PathLike[str], value: Any) -> None:
     """Appends a line in a single write, followed by fsync.
 
     If the file ends in an incomplete line, that line is removed first. If only the newline after a complete line is
-    missing, it is added. Only one process may write at a time.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    missing, it is added. Only one process may write at a time. Raises OSError: the file cannot be written."""
     line = json.dumps(plain(value), allow_nan=False, separators=(",", ":")).encode() + b"\n"
     with open(path, "a+b") as file:
-        tail_start, tail = _unterminated_tail(file)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(0, size - LONGEST_LINE))
+        tail = file.read().rpartition(b"\n")[2]
         if tail:
             try:
                 json.loads(tail)
                 line = b"\n" + line
             except ValueError:
-                file.truncate(tail_start)
+                file.truncate(size - len(tail))
                 _log.warning("%s: half-written last line of an interrupted run removed", path)
         file.write(line)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _unterminated_tail(file: Any, block: int = 1 << 16) -> tuple[int, bytes]:
-    """Offset and bytes of what follows the last newline. Reads backwards from the end, so that the size of the file
-    does not matter."""
-    start, tail = file.seek(0, os.SEEK_END), b""
-    while start > 0 and b"\n" not in tail:
-        step = min(block, start)
-        start -= step
-        file.seek(start)
-        tail = file.read(step) + tail
-    cut = tail.rfind(b"\n") + 1
-    return start + cut, tail[cut:]

@@ -22,15 +22,8 @@ LEAST_PIXELS = 16
 
 
 def report(notes: Iterable[str], *, strict: bool = False) -> None:
-    """Warns of each note.
-
-    Args:
-        notes: one line each.
-        strict: refuse the problem instead.
-
-    Raises:
-        ProblemError: the first note, if `strict`.
-    """
+    """Warns of each note, one line each, or refuses the problem with the first one if `strict`. Raises ProblemError:
+    the first note, if `strict`."""
     for text in notes:
         if strict:
             raise ProblemError(text)
@@ -58,15 +51,8 @@ def notes_to(tell: Callable[[str], object]) -> Iterator[None]:
 def counted(
     file: str, found: Sequence[Any] | np.ndarray, noun: str, what: str, name: Callable[..., str] = str
 ) -> list[str]:
-    """A line that counts records of a file and names the first one; no line if there are none.
-
-    Args:
-        file: the file that they stand in.
-        found: the records, or positions of them.
-        noun: what one record is called.
-        what: what is to be said about them, after their number.
-        name: makes the name of the first one.
-    """
+    """A line that counts the records of a file that were found (or positions of them), says something of them and names
+    the first one; no line if there are none. `noun` is what one is called."""
     if not len(found):
         return []
     first = found[0].item() if isinstance(found, np.ndarray) else found[0]
@@ -79,26 +65,16 @@ def note(path: StrPath, text: str) -> None:
 
 
 def note_unused(path: StrPath, counts: Mapping[str, int]) -> None:
-    """Warns in one line of what a file holds and no reader uses, such as priors.
-
-    Args:
-        path: of the file.
-        counts: how many there are, by what they are called.
-    """
+    """Warns in one line of what a file holds and no reader uses, such as priors: how many there are, by what they are
+    called."""
     there = [f"{what} ({count})" for what, count in counts.items() if count]
     if there:
         note(path, f"not used: {', '.join(there)}")
 
 
 def note_center(path: StrPath, what: str, center: tuple[float, float], size: tuple[float, float]) -> None:
-    """Warns if a principal point lies at the edge of its image or outside.
-
-    Args:
-        path: of the file.
-        what: whose it is, such as `camera 3`.
-        center: the principal point from the corner of the image, pixels.
-        size: width and height of the image, pixels.
-    """
+    """Warns if a principal point, in pixels from the corner of the image, lies at the edge of its image or outside.
+    `what` says whose it is, such as `camera 3`."""
     if any(not EDGE * extent <= at <= (1 - EDGE) * extent for at, extent in zip(center, size, strict=True)):
         shown = f"({center[0]:g}, {center[1]:g}) of {size[0]:g} x {size[1]:g} pixels"
         note(path, f"the principal point of {what} lies at the edge of the image: {shown}; is the calibration its own?")

@@ -15,18 +15,17 @@ CAMERA_COLOUR = (0, 255, 0)
 """Green, as in the PLY files of Ceres' bundle adjuster."""
 
 _VERTEX = np.dtype([("position", "<f8", 3), ("colour", "u1", 3)])
-_WRITE_ROWS = 1 << 15
 
 
-def write_ply(problem: BundleProblem, path: StrPath, *, ascii: bool = False) -> None:
+def write_ply(problem: BundleProblem, path: StrPath) -> None:
     """Writes the points (grey), then the camera centres (green), as coloured vertices in scene units.
 
-    The file is replaced whole or not at all; it is compressed if the name ends in `.bz2`, `.gz` or `.xz`.
+    Vertices are binary, little-endian, and hold the float64 numbers exactly. The file is replaced whole or not at all;
+    it is compressed if the name ends in `.bz2`, `.gz` or `.xz`.
 
     Args:
         problem: of NumPy or JAX arrays.
         path: the file, replaced if it exists.
-        ascii: text instead of little-endian binary. Both hold the float64 numbers exactly.
 
     Raises:
         ProblemError: a point or camera centre is not finite, or the file cannot be written.
@@ -40,22 +39,15 @@ def write_ply(problem: BundleProblem, path: StrPath, *, ascii: bool = False) -> 
             raise ProblemError(f"{name} {bad[0]} is not finite: {positions[bad[0]].tolist()}")
     header = [
         "ply",
-        f"format {'ascii' if ascii else 'binary_little_endian'} 1.0",
+        "format binary_little_endian 1.0",
         f"comment {len(points)} points, then {len(centres)} camera centres",
         f"element vertex {len(points) + len(centres)}",
         *(f"property double {axis}" for axis in "xyz"),
         *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
         "end_header",
     ]
+    vertices = np.empty(len(points) + len(centres), dtype=_VERTEX)
+    vertices["position"] = np.concatenate([points, centres])
+    vertices["colour"][: len(points)], vertices["colour"][len(points) :] = POINT_COLOUR, CAMERA_COLOUR
     with open_output(path) as file:
-        file.write(("\n".join(header) + "\n").encode())
-        for positions, colour in ((points, POINT_COLOUR), (centres, CAMERA_COLOUR)):
-            tail = "{} {} {}\n".format(*colour)
-            for start in range(0, len(positions), _WRITE_ROWS):
-                rows = positions[start : start + _WRITE_ROWS]
-                if ascii:
-                    file.write("".join([f"{x} {y} {z} {tail}" for x, y, z in rows.tolist()]).encode())
-                else:
-                    vertices = np.empty(len(rows), dtype=_VERTEX)
-                    vertices["position"], vertices["colour"] = rows, colour
-                    file.write(vertices.tobytes())
+        file.write(("\n".join(header) + "\n").encode() + vertices.tobytes())

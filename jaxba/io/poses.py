@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.encoding import decode
-from jaxba.io.files import StrPath, display_name, reason
-from jaxba.io.text import number
+from jaxba.io.encoding import read_characters
+from jaxba.io.files import StrPath, display_name
+from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.geometry import are_rotations
 
@@ -37,11 +37,8 @@ class Poses(NamedTuple):
 
 
 def read_poses(path: StrPath) -> Poses:
-    """Poses of camera 0, camera to world, in metres.
-
-    Raises:
-        ProblemError: the file cannot be read, a line is malformed or holds no rotation, or a frame comes twice.
-    """
+    """Poses of camera 0, camera to world, in metres. Raises ProblemError: the file cannot be read, a line is malformed
+    or holds no rotation, or a frame comes twice."""
     name = display_name(path)
     lines = lines_of(Path(path))
     if not lines:
@@ -73,33 +70,16 @@ def read_poses(path: StrPath) -> Poses:
 
 
 def lines_of(path: Path) -> list[tuple[int, str]]:
-    """Lines of a text file that are not blank, each with its number from 1.
-
-    Raises:
-        ProblemError: the file cannot be read, or is no text.
-    """
-    try:
-        text = decode(path.read_bytes())
-    except (OSError, ValueError) as error:
-        if isinstance(error, UnicodeDecodeError):
-            raise ProblemError(f"{display_name(path)}: is no text") from None
-        raise ProblemError(f"{display_name(path)}: cannot be read: {reason(error)}") from None
+    """Lines of a text file that are not blank, each with its number from 1. Raises ProblemError: the file cannot be
+    read, or is no text."""
+    text = read_characters(path)
     return [(at, line.strip()) for at, line in enumerate(text.split("\n"), 1) if line.strip()]
 
 
 def numbers_of(text: str, count: int, where: str) -> np.ndarray:
-    """The finite numbers of a line, shape (count,).
-
-    Raises:
-        ProblemError: there are not so many, or one is none; the message begins with `where`.
-    """
-    words = text.split()
-    try:
-        numbers = np.array([number(word) for word in words])
-    except ValueError:
-        raise ProblemError(f"{where}: holds something that is no number") from None
+    """The finite numbers of a line, shape (count,). Raises ProblemError: there are not so many, or one is none; the
+    message begins with `where`."""
+    numbers = finite_numbers(text.split(), [f"number {at}" for at in range(1, len(text.split()) + 1)], where)
     if len(numbers) != count:
         raise ProblemError(f"{where}: has {len(numbers)} numbers instead of {count}")
-    if not np.isfinite(numbers).all():
-        raise ProblemError(f"{where}: holds a number that is not finite")
-    return numbers
+    return np.array(numbers)

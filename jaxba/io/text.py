@@ -1,25 +1,26 @@
-"""Reader of whitespace-separated numbers, a block at a time; every error names its line."""
+"""Reader of lines, of whitespace-separated numbers, and of points among them; every error names its line."""
 
 from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import chain
-from typing import NamedTuple, NoReturn
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 import numpy as np
+from jaxtyping import Int
 
-from jaxba.io.files import READ_ERRORS, reason
 from jaxba.problem.bundle_problem import ProblemError
+from jaxba.typing import LARGEST_COUNT
 
-MAX_WORD_BYTES = 1 << 16
-"""Longest word that may be cut by the end of a block. No number needs more than about 1100 characters; without the
-bound a large file without whitespace would be collected in memory as one word."""
+BLOCK_BYTES = 1 << 22
+"""Bytes that are parsed at once. With 4 MiB the arrays of a block stay near the cache."""
 
 SHOWN = 40
 """Characters of a wrong word that a message shows."""
 
+_SPACE = re.compile(rb"[ \t\n\r\v\f]")
 _WORD = re.compile(rb"[^ \t\n\r\v\f]+")
 _NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[ed][+-]?\d+)?", re.IGNORECASE)
 _NOT_FINITE = re.compile(
@@ -32,15 +33,8 @@ _FORTRAN_TO_C = bytes.maketrans(b"Dd", b"Ee")
 
 def number(word: str) -> float:
     """The number that a word is, also with Fortran's exponents (1.0D+00); NaN if it is one that is not finite in any
-    spelling (inf, -nan(ind), 1.#QNAN).
-
-    Raises:
-        ValueError: it is no number.
-    """
-    try:
-        text = word.encode("ascii")
-    except UnicodeEncodeError:
-        text = b""
+    spelling (inf, -nan(ind), 1.#QNAN). Raises ValueError: it is no number."""
+    text = word.encode("utf-8", "replace")
     if _NUMBER.fullmatch(text):
         return float(text.translate(_FORTRAN_TO_C))
     if _NOT_FINITE.fullmatch(text):
@@ -55,16 +49,8 @@ def shown_word(word: bytes) -> str:
 
 
 def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: str) -> list[float]:
-    """The words as finite numbers.
-
-    Args:
-        words: to read.
-        fields: what each of them is, for messages.
-        where: where they stand; begins the messages.
-
-    Raises:
-        ProblemError: a word is no number, or not finite.
-    """
+    """The words as finite numbers. `fields` say what each of them is, and `where` begins the messages. Raises
+    ProblemError: a word is no number, or not finite."""
     found = []
     for word, field in zip(words, fields, strict=True):
         text = word if isinstance(word, str) else word.decode("latin-1")
@@ -77,134 +63,70 @@ def finite_numbers(words: Sequence[str | bytes], fields: Sequence[str], where: s
     return found
 
 
-class LineReader:
-    """The first lines of a text; what follows them is handed on in blocks."""
+class Text:
+    """The text of a file: lines one after the other, then the numbers in all that follows.
 
-    def __init__(self, blocks: Iterable[bytes], name: str):
-        """Reads `blocks` of the file called `name`."""
+    Numbers are float64, correctly rounded. A number's *ordinal* is its position among them, from 0.
+    """
+
+    def __init__(self, text: bytes, name: str):
+        """`text` of the file called `name`, with lines that end in LF."""
         self.name = name
         self.line = 0
         """Number of the line that was read last, from 1."""
-        self._blocks = iter(blocks)
-        self._text = b""
-        self._at = 0  # where in it the next line begins
+        self.values = np.empty(0)
+        """The numbers, up to the first word that is none."""
+        self.field: Callable[[int], str]
+        """What the number at an ordinal is, such as "number of cameras"; may be replaced while reading."""
+        self._text, self._at = text, 0  # where the next line begins
+        self._blocks: list[tuple[int, int]] = []  # of each block the ordinal of its first number, and where it begins
+        self._complaint: str | None = None  # about the word after the last number
 
-    def next(self) -> bytes:
-        """The next line that is not blank, without blanks at its ends; empty at the end of the text.
+    @property
+    def where(self) -> str:
+        """The line that was read last, for messages."""
+        return f"{self.name} line {max(self.line, 1)}"
 
-        Raises:
-            ProblemError: the line is longer than any can be, or the data cannot be decompressed.
-        """
+    def next_line(self) -> bytes:
+        """The next line that is not blank, without blanks at its ends; empty at the end of the text."""
         line = b""
-        while not line:
-            while (end := self._text.find(b"\n", self._at)) < 0:
-                self._text, self._at = self._text[self._at :], 0
-                where = f"{self.name} line {self.line + 1}"
-                if len(self._text) > MAX_WORD_BYTES:
-                    raise ProblemError(f"{where}: is longer than {MAX_WORD_BYTES} characters")
-                try:
-                    block = next(self._blocks, None)
-                except READ_ERRORS as error:
-                    raise ProblemError(f"{where}: cannot read on: {reason(error)}") from error
-                if block is None and not self._text:
-                    return b""
-                self._text += b"\n" if block is None else block
+        while not line and self._at < len(self._text):
+            end = self._text.find(b"\n", self._at)
+            end = end if end >= 0 else len(self._text)
             line, self._at = self._text[self._at : end].strip(), end + 1
             self.line += 1
         return line
 
-    def rest(self) -> Iterator[bytes]:
-        """The blocks after the lines that were read."""
-        return chain([self._text[self._at :]], self._blocks)
+    def read_numbers(self, field: Callable[[int], str]) -> np.ndarray:
+        """Parses all that follows the lines that were read; returns `values`."""
+        self.field, parts, size, start = field, [], 0, self._at
+        while start < len(self._text) and self._complaint is None:
+            space = _SPACE.search(self._text, start + BLOCK_BYTES)
+            end = space.end() if space else len(self._text)
+            values, self._complaint = _parse(self._text[start:end])
+            self._blocks.append((size, start))
+            parts, size, start = [*parts, values], size + len(values), end
+        self.values = np.concatenate([np.empty(0), *parts])
+        return self.values
 
+    def need(self, count: int) -> None:
+        """Refuses a text of fewer numbers. Raises ProblemError: it says why there are no more of them."""
+        have = len(self.values)
+        if count > have and self._complaint is not None:
+            self.fail(have, self._complaint)
+        if count > have:
+            line = self._text.rstrip().count(b"\n") + 1
+            raise ProblemError(f"{self.name} line {line}: the file ends before the {self.field(have)}")
 
-class _Piece(NamedTuple):
-    text: bytes
-    ordinal: int  # position in the file of its first number, from 0
-    line: int  # line on which it starts, from 1
+    def finish(self, count: int) -> None:
+        """Refuses a text in which a word follows so many numbers. Raises ProblemError."""
+        if count < len(self.values) or self._complaint is not None:
+            self.fail(count, "is left over after the last number", field="")
 
-
-class NumberReader:
-    """The numbers of a text in their order, as float64, correctly rounded.
-
-    A number's *ordinal* is its position in the file, from 0. Only the text of numbers that were not taken yet (and of
-    the last block) is kept, so memory is that of the result, not of the file.
-    """
-
-    def __init__(self, blocks: Iterable[bytes], name: str, field: Callable[[int], str], *, line: int = 1):
-        """Reads `blocks` of the file called `name`.
-
-        Args:
-            blocks: the bytes, cut anywhere.
-            name: file name for messages.
-            field: describes the number at an ordinal, such as "number of cameras"; may be replaced while reading.
-            line: number of the line on which `blocks` start.
-        """
-        self.name = name
-        self.field = field
-        self._blocks = iter(blocks)
-        self._line = line
-        self._last_line = line
-        self._pieces: list[_Piece] = []  # the text of the numbers in self._parts, and a little more
-        self._parts: list[np.ndarray] = []  # numbers read and not yet taken
-        self._size = 0  # how many these are
-        self._taken = 0
-        self._carry = b""
-        self._complaint: str | None = None  # about the word after the last number read
-        self._ended = False
-
-    def rows(self, count: int, width: int) -> Iterator[tuple[int, np.ndarray]]:
-        """The next `count * width` numbers in blocks of shape (rows, width), each with its first number's ordinal.
-
-        Raises:
-            ProblemError: the file ends early, a word is no finite number, or the data cannot be decompressed.
-        """
-        while count:
-            while self._size < width:
-                if self._ended or self._complaint is not None:
-                    self.missing()
-                self._read()
-            ordinal, size = self._taken, min(count, self._size // width) * width
-            block = self._joined()[:size].reshape(-1, width)
-            self.skip(size)
-            count -= len(block)
-            yield ordinal, block
-
-    def peek_all(self) -> np.ndarray:
-        """All remaining numbers up to the end of the file or to the first bad word; none of them is taken."""
-        while not self._ended and self._complaint is None:
-            self._read()
-        return self._joined()
-
-    def skip(self, count: int) -> None:
-        """Takes `count` of the numbers that were read already."""
-        self._parts = [self._joined()[count:]]
-        self._size -= count
-        self._taken += count
-
-    def finish(self) -> None:
-        """Checks that nothing but whitespace follows.
-
-        Raises:
-            ProblemError: a word is left over, or the rest cannot be decompressed.
-        """
-        while not self._ended and not self._size and self._complaint is None:
-            self._read()
-        if self._size or self._complaint is not None:
-            self.fail(self._taken, "is left over after the last number", field="")
-
-    def integers(self, ordinals: Sequence[int] | np.ndarray, values: np.ndarray, low: int, high: int) -> np.ndarray:
-        """`values` as int32, shape (n,), after a check that they are integers in `[low, high]`.
-
-        Args:
-            ordinals: shape (n,), where the numbers stand in the file.
-            values: shape (n,), float64.
-            low: smallest allowed value.
-            high: largest allowed value, at most 2**31 - 1.
-
-        Raises:
-            ProblemError: one of them is not.
-        """
+    def integers(self, ordinals: Sequence[int] | np.ndarray, low: int, high: int) -> np.ndarray:
+        """The numbers at some ordinals as int32, after a check that they are integers in `[low, high]`. Raises
+        ProblemError: one of them is not."""
+        values = self.values[ordinals]
         whole = values == np.floor(values)
         bad = np.flatnonzero(~(whole & (values >= low) & (values <= high)))
         if bad.size:
@@ -212,75 +134,81 @@ class NumberReader:
             self.fail(int(ordinals[bad[0]]), complaint)
         return values.astype(np.int32)
 
-    def need(self, count: int) -> None:
-        """Raises a `ProblemError` if there are fewer numbers than `count` that were read and not yet taken."""
-        if count > self._size:
-            self.missing()
-
-    def missing(self) -> NoReturn:
-        """Raises a `ProblemError` that says why there are no more numbers than those that were read."""
-        ordinal = self._taken + self._size
-        if self._complaint is not None:
-            self.fail(ordinal, self._complaint)
-        raise ProblemError(f"{self.name} line {self._last_line}: the file ends before the {self.field(ordinal)}")
-
     def fail(self, ordinal: int, complaint: str, *, field: str | None = None) -> NoReturn:
-        """Raises a `ProblemError` about the number (or bad word) at an ordinal whose text is still kept."""
-        piece = next(piece for piece in reversed(self._pieces) if piece.ordinal <= ordinal)
-        offset = int(np.flatnonzero(_word_starts(_spaces(piece.text)))[ordinal - piece.ordinal])
-        line = piece.line + piece.text.count(b"\n", 0, offset)
-        shown = shown_word(piece.text[offset : offset + SHOWN + 1].split(None, 1)[0])
-        field = self.field(ordinal) if field is None else field
-        raise ProblemError(f"{self.name} line {line}: {shown} {complaint}" + (f" ({field})" if field else ""))
-
-    def _joined(self) -> np.ndarray:
-        if len(self._parts) != 1:
-            self._parts = [np.concatenate(self._parts) if self._parts else np.empty(0)]
-        return self._parts[0]
-
-    def _read(self) -> None:
-        """Parses one more block and appends its numbers to `self._parts`."""
-        try:
-            block = next(self._blocks, None)
-        except READ_ERRORS as error:
-            raise ProblemError(f"{self.name} line {self._line}: cannot read on: {reason(error)}") from error
-        data = self._carry if block is None else self._carry + block
-        self._ended = block is None
-        spaces = _spaces(data)
-        cut = len(data)
-        if not self._ended:  # the last word may go on in the next block
-            cut -= int(spaces[::-1].argmax()) if spaces.any() else cut
-        text, self._carry = data[:cut], data[cut:]
-        values, complaint = _parse(text, int(np.count_nonzero(_word_starts(spaces[:cut]))))
-        if complaint is None and len(self._carry) > MAX_WORD_BYTES:
-            complaint, text, self._carry = f"is longer than {MAX_WORD_BYTES} characters", data, b""
-        self._complaint = complaint
-        ends = [piece.ordinal for piece in self._pieces[1:]] + [self._taken + self._size]
-        self._pieces = [piece for piece, end in zip(self._pieces, ends, strict=False) if end > self._taken]
-        if text.strip():
-            self._pieces.append(_Piece(text, self._taken + self._size, self._line))
-            self._last_line = self._line + text.rstrip().count(b"\n")
-        self._line += text.count(b"\n")
-        if values.size:
-            self._parts.append(values)
-            self._size += values.size
+        """Raises a `ProblemError` about the number (or bad word) at an ordinal."""
+        first, start = self._blocks[bisect_right(self._blocks, ordinal, key=lambda block: block[0]) - 1]
+        for word in _WORD.finditer(self._text, start):
+            if first == ordinal:
+                field = self.field(ordinal) if field is None else field
+                line = self._text.count(b"\n", 0, word.start()) + 1
+                of = f" ({field})" if field else ""
+                raise ProblemError(f"{self.name} line {line}: {shown_word(word[0])} {complaint}{of}")
+            first += 1
+        raise AssertionError("the text has such a word")
 
 
-def _spaces(text: bytes) -> np.ndarray:
-    """Mask (bytes,) of the whitespace, as defined by isspace() of C."""
+POINT_FIELDS = ("x", "y", "z", "red", "green", "blue", "number of views")
+VIEW_FIELDS = ("camera index", "key", "x", "y")
+
+
+def read_tracks(
+    text: Text, start: int, count: int, num_cameras: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    """Reads points and their views, as Bundler and VisualSFM write them, from the position of the first one's x among
+    the numbers of a text, whose `field` describes those before the points.
+
+    Returns:
+        Positions (count, 3); of each view camera, point and pixel (views, 2); the position after the last number.
+
+    Raises:
+        ProblemError: the file ends early, or something is no number or out of range; or there are no views.
+    """
+    values, before, starts, end = text.values, text.field, [], start
+
+    def field(ordinal: int) -> str:
+        point = bisect_right(starts, ordinal) - 1
+        return before(ordinal) if point < 0 else _point_field(point, ordinal - starts[point])
+
+    text.field = field
+    for _ in range(count):
+        starts.append(end)
+        text.need(end + len(POINT_FIELDS))
+        views = float(values[end + 6])
+        if not 0 <= views <= LARGEST_COUNT or not views.is_integer():
+            text.integers([end + 6], 0, LARGEST_COUNT)
+        end += len(POINT_FIELDS) + len(VIEW_FIELDS) * int(views)
+        text.need(end)
+    first_view = np.array(starts, dtype=np.int64) + len(POINT_FIELDS)
+    views = values[first_view - 1].astype(np.int64)
+    at = np.repeat(first_view - 4 * (np.cumsum(views) - views), views) + 4 * np.arange(views.sum())
+    camera_index = text.integers(at, 0, num_cameras - 1)
+    if not camera_index.size:
+        raise ProblemError(f"{text.name}: no camera sees a point")
+    points = values[first_view[:, None] - len(POINT_FIELDS) + np.arange(3)]
+    return points, camera_index, np.repeat(np.arange(count), views), values[at[:, None] + [2, 3]], end
+
+
+def _point_field(point: int, at: int) -> str:
+    if at < len(POINT_FIELDS):
+        return f"{POINT_FIELDS[at]} of point {point}"
+    view, part = divmod(at - len(POINT_FIELDS), len(VIEW_FIELDS))
+    return f"{VIEW_FIELDS[part]} of view {view} of point {point}"
+
+
+def numbered(index: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """For each entry how many of the same value stand before it: numbers of key-points, from an index of cameras."""
+    order, counts = np.argsort(index, kind="stable"), np.bincount(index)
+    numbers = np.empty(len(index), np.int64)
+    numbers[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return numbers
+
+
+def _parse(text: bytes) -> tuple[np.ndarray, str | None]:
+    """The numbers of a text up to the first bad word, and what is wrong with that one, if any."""
     codes = np.frombuffer(text, np.uint8)
-    return (codes == 32) | (codes - np.uint8(9) < 5)
-
-
-def _word_starts(spaces: np.ndarray) -> np.ndarray:
-    starts = ~spaces
-    starts[1:] &= spaces[:-1]
-    return starts
-
-
-def _parse(text: bytes, count: int) -> tuple[np.ndarray, str | None]:
-    """The numbers of a text of `count` words up to the first bad one, and what is wrong with that one, if any."""
-    if count == 0:
+    spaces = (codes == 32) | (codes - np.uint8(9) < 5)  # isspace() of C
+    count = np.count_nonzero(~spaces[1:] & spaces[:-1]) + (not spaces[0])
+    if not count:
         return np.empty(0), None
     values = _parse_quickly(text)
     if values.size != count and _FORTRAN.search(text):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
-from jaxba.problem.similarity import Similarity, along_line, umeyama
+from jaxba.problem.similarity import Similarity, along_line, transformed, umeyama
 
 ROUNDS, KEPT = 10, 0.5
 """Rounds of a robust alignment, and the share of the images that each keeps: it stands half of the positions wrong."""
@@ -25,23 +25,15 @@ DOUBTFUL, MISFIT = 2.0, 5.0
 """Distance of this share, in terms of that of noise alone, from which other axes or units are tried, and from which the
 scene does not fit its positions."""
 
-BETTER = 0.3
-"""Share of the misfit that other axes or units leave before they are taken for the true ones."""
-
-EXPLAINED = 0.1
-"""Largest misfit that they leave, as a share of the extent."""
-
-LEAST_IMAGES = 5
-"""Fewest images by which other axes or units are recognised: four fit too well by chance."""
+BETTER, EXPLAINED, LEAST_IMAGES = 0.3, 0.1, 5
+"""Other axes or units are taken for the true ones if they leave this share of the misfit, and no more than this share
+of the extent, with so many images: four fit too well by chance."""
 
 MEDIAN, UPPER_QUARTER, NEARLY_ALL = 1.538, 2.027, 3.37
 """Norm of three standard normal numbers: its quantiles at 50, 75 and 99 percent."""
 
-LARGEST_AREA = 1.0
-"""Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent."""
-
-EARTH = 6.371e6
-"""Radius, metres."""
+LARGEST_AREA, EARTH = 1.0, 6.371e6
+"""Extent of what may be latitude and longitude, degrees: metres are no degrees of half a continent. Radius, metres."""
 
 NOT_DETERMINED = (
     "the positions are at one place within their noise: the alignment only moves the scene",
@@ -62,10 +54,7 @@ def aligned(
     a line, or all but the translation. Another one says that the positions do not fit.
 
     Source: `umeyama` in rounds that each keep the nearer half of the images (least trimmed squares; Rousseeuw 1984).
-
-    Raises:
-        ProblemError: the positions are latitude and longitude, or mirrored; or too far apart.
-    """
+    Raises ProblemError: the positions are latitude and longitude, or mirrored; or too far apart."""
     if not len(images):
         return problem
     centers = geometry.camera_centers(problem.cameras)[images]
@@ -86,13 +75,7 @@ def aligned(
             f"a quarter of the images of the aligned scene are {away:.3g} or more from their positions, {chi:.3g} "
             "times what the standard deviations explain"
         )
-    scale, rotation, shift = best
-    cameras = np.array(problem.cameras, np.float64)
-    matrices = geometry.rotation_matrices(cameras[:, :3]) @ rotation.T
-    cameras[:, :3] = geometry.angle_axis(matrices)
-    cameras[:, 3:6] = scale * cameras[:, 3:6] - np.einsum("nij,j->ni", matrices, shift)
-    rigs = None if problem.rigs is None else problem.rigs.scaled(scale)
-    return problem.replace(cameras=cameras, points=best.points(np.asarray(problem.points)), rigs=rigs)
+    return transformed(problem, best)
 
 
 def _note(text: str) -> None:
@@ -161,11 +144,8 @@ def _distances(
 
 
 def _refuse_other_axes(centers: np.ndarray, positions: np.ndarray) -> None:
-    """Refuses positions that fit well with other axes or units, and badly as they are.
-
-    Raises:
-        ProblemError: they are degrees, or mirrored.
-    """
+    """Refuses positions that fit well with other axes or units, and badly as they are. Raises ProblemError: they are
+    degrees, or mirrored."""
     if len(centers) < LEAST_IMAGES:
         return
     others = [(positions * [-1, 1, 1], "mirrored: are two axes swapped, or is one reversed?")]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.problem.checks import inverse_roots, plain_array, real_numbers
+from jaxba.problem.checks import indices, inverse_roots, real_numbers
 from jaxba.problem.constants import Constants, checked_constants
 from jaxba.problem.intrinsics import POSE_SIZE, Lenses, checked_lenses, lens_size
 from jaxba.problem.labels import Labels
@@ -133,20 +133,12 @@ class BundleProblem(ArrayRecord):
         try:
             cameras = _floats("cameras", cameras, POSE_SIZE + lens_size(lenses))
             points = _floats("points", points, POINT_SIZE)
-            problem = cls(
-                cameras=cameras,
-                points=points,
-                observations=_floats("observations", observations, 2),
-                camera_index=_indices("camera_index", camera_index, len(cameras)),
-                point_index=_indices("point_index", point_index, len(points)),
-            )
-            count = problem.num_observations
-            whitening = _whitening(covariance, weight, count)
-            if count == 0:
+            observations = _floats("observations", observations, 2)
+            whitening = _whitening(covariance, weight, len(observations))
+            if not len(observations):
                 raise ProblemError("the problem has no observations")
-            for name in ("camera_index", "point_index"):
-                if len(getattr(problem, name)) != count:
-                    raise ProblemError(f"{name} has {len(getattr(problem, name))} entries for {count} observations")
+            camera_index = indices("camera_index", camera_index, len(cameras), len(observations))
+            point_index = indices("point_index", point_index, len(points), len(observations))
             if lenses is not None:
                 lenses = checked_lenses(lenses, cameras)
             if constants is not None:
@@ -158,7 +150,8 @@ class BundleProblem(ArrayRecord):
                 priors = checked_priors(priors, len(cameras), of_lenses, lens_size(lenses))
         except ValueError as error:
             raise error if isinstance(error, ProblemError) else ProblemError(str(error)) from None
-        return replace(problem, whitening=whitening, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
+        arrays = (cameras, points, observations, camera_index, point_index, whitening)
+        return cls(*arrays, lenses=lenses, constants=constants, rigs=rigs, priors=priors)
 
     def __repr__(self) -> str:
         arrays = ("cameras", "points", "observations")
@@ -229,17 +222,6 @@ def _floats(name: str, values: Any, width: int) -> np.ndarray:
     if bad.size:
         raise ProblemError(f"{name}[{bad[0]}] is not finite: {array[bad[0]].tolist()}")
     return array
-
-
-def _indices(name: str, values: Any, bound: int) -> np.ndarray:
-    """An int32 vector, checked to be in [0, bound)."""
-    array = plain_array(name, values)
-    if array.ndim != 1 or (array.size and array.dtype.kind not in "iu"):
-        raise ProblemError(f"{name} must be a vector of integers, not {array.dtype} of shape {array.shape}")
-    bad = np.flatnonzero((array < 0) | (array >= bound))
-    if bad.size:
-        raise ProblemError(f"{name}[{bad[0]}] is {array[bad[0]]}, outside 0..{bound - 1}")
-    return np.ascontiguousarray(array, dtype=np.int32)
 
 
 def _whitening(covariance: Any, weight: Any, count: int) -> np.ndarray | None:

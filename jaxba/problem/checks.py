@@ -21,12 +21,8 @@ def shown(value: Any, longest: int = SHOWN) -> str:
 
 
 def plain_array(name: str, values: Any) -> np.ndarray:
-    """The values as a NumPy array.
-
-    Raises:
-        ValueError: rows differ in length, or entries are masked.
-        TypeError: JAX traces them.
-    """
+    """The values as a NumPy array. Raises ValueError: rows differ in length, or entries are masked. Raises TypeError:
+    JAX traces them."""
     if np.ma.is_masked(values):
         raise ValueError(f"{name} must have no masked entries")
     try:
@@ -38,12 +34,8 @@ def plain_array(name: str, values: Any) -> np.ndarray:
 
 
 def real_numbers(name: str, values: Any) -> np.ndarray:
-    """The values as a contiguous float64 array.
-
-    Raises:
-        ValueError: they are no real numbers, or no array.
-        TypeError: JAX traces them.
-    """
+    """The values as a contiguous float64 array. Raises ValueError: they are no real numbers, or no array. Raises
+    TypeError: JAX traces them."""
     array = plain_array(name, values)
     try:
         if array.dtype.kind in "biufO":
@@ -53,18 +45,20 @@ def real_numbers(name: str, values: Any) -> np.ndarray:
     raise ValueError(f"{name} must be real numbers, not {array.dtype}")
 
 
+def indices(name: str, values: Any, bound: int, count: int) -> Int[np.ndarray, " n"]:
+    """The values as an int32 vector of that many entries in [0, bound). Raises ValueError: they are none; one line."""
+    array = plain_array(name, values)
+    if array.shape != (count,) or (count and array.dtype.kind not in "iu"):
+        raise ValueError(f"{name} must be a vector of {count} integers, not {array.dtype} of shape {array.shape}")
+    bad = np.flatnonzero((array < 0) | (array >= bound))
+    if bad.size:
+        raise ValueError(f"{name}[{bad[0]}] is {array[bad[0]]}, outside 0..{bound - 1}")
+    return np.ascontiguousarray(array, dtype=np.int32)
+
+
 def finite(what: str, value: Any, *shapes: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Finite numbers as a float64 array of one of the given shapes.
-
-    Args:
-        what: whose they are, the beginning of the message.
-        value: what the user gave.
-        shapes: those that are allowed.
-
-    Raises:
-        ValueError: something else; one line.
-        TypeError: JAX traces them.
-    """
+    """Finite numbers as a float64 array of one of the given shapes; `what` begins the message. Raises ValueError:
+    something else; one line. Raises TypeError: JAX traces them."""
     wanted = "be one number" if shapes == ((),) else f"have shape {' or '.join(map(str, dict.fromkeys(shapes)))}"
     try:
         array = plain_array(what, value)

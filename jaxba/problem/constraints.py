@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import jax
 import numpy as np
@@ -109,7 +109,8 @@ def with_gauge(problem: BundleProblem, gauge: Gauge) -> BundleProblem:
     if scaled:
         if gauge == "three-points":
             raise ProblemError("the rigs give the scene its scale: use the gauge of two cameras, which then holds one")
-        constants.poses[_middle_camera(problem)] = True
+        seen = _placed(problem)
+        constants.poses[seen[np.argmin(_from_middle(geometry.camera_centers(problem.cameras)[seen]))]] = True
     elif gauge == "two-cameras":
         _fix_two_cameras(problem, constants)
     else:
@@ -125,11 +126,9 @@ def _placed(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
     return seen[~np.asarray(problem.rigs.free)[seen]]
 
 
-def _middle_camera(problem: BundleProblem) -> int:
-    """The observed camera that is nearest to the middle of all."""
-    seen = _placed(problem)
-    centers = geometry.camera_centers(problem.cameras)[seen]
-    return int(seen[np.argmin(np.linalg.norm(centers - np.median(centers, axis=0), axis=1))])
+def _from_middle(positions: np.ndarray) -> np.ndarray:
+    """Distances from the middle of all."""
+    return np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
 
 
 def _fix_two_cameras(problem: BundleProblem, constants: Constants) -> None:
@@ -140,8 +139,7 @@ def _fix_two_cameras(problem: BundleProblem, constants: Constants) -> None:
         raise ProblemError("a gauge of two cameras needs two that see points")
     centers = geometry.camera_centers(problem.cameras)[seen]
     whole = constants.poses[seen].all(axis=1)  # a constant pose is the first, if there is one
-    from_middle = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
-    first = int(np.argmin(np.where(whole | ~whole.any(), from_middle, np.inf)))
+    first = int(np.argmin(np.where(whole | ~whole.any(), _from_middle(centers), np.inf)))
     second = int(np.argmax(np.linalg.norm(centers - centers[first], axis=1)))
     constants.poses[seen[first]] = True
     # its distance from the first camera along the axis of its own on which that is largest
@@ -157,7 +155,7 @@ def _fix_three_points(problem: BundleProblem, constants: Constants) -> None:
         raise ProblemError("a gauge of three points needs three that two images see")
     points = np.asarray(problem.points)[seen]
     away = lambda at: np.linalg.norm(points - points[at], axis=1)
-    first = int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+    first = int(np.argmin(_from_middle(points)))
     # far, but not the farthest, which are the least certain
     second = int(np.argsort(away(first))[len(seen) * 3 // 4])
     line = (points[second] - points[first]) / max(away(first)[second], np.finfo(float).tiny)
@@ -181,47 +179,29 @@ def every_lens(problem: BundleProblem) -> Lenses:
 
 
 def _mask(problem: BundleProblem, which: Which, count: int, what: str) -> Bool[np.ndarray, " n"]:
-    if isinstance(which, str):
-        if which != "all":
-            raise ValueError(f"which {what} must be 'all' or a list, not {which!r}")
-        return np.ones(count, bool)
     mask = np.zeros(count, bool)
-    chosen = _listed(which, what)
-    if chosen.dtype == bool:
-        if chosen.shape != mask.shape:
-            raise ValueError(f"a mask for every {what} has shape {mask.shape}, not {chosen.shape}")
-        return chosen
-    mask[positions_of(problem, chosen, what, count)] = True
+    if isinstance(which, str) and which != "all":
+        raise ValueError(f"which {what} must be 'all' or a list, not {which!r}")
+    mask[slice(None) if isinstance(which, str) else positions_of(problem, which, what, count)] = True
     return mask
 
 
-def _listed(which: Any, what: str) -> np.ndarray:
-    """A list of positions, names or truth values as an array."""
+def positions_of(
+    problem: BundleProblem, which: Iterable[int] | Iterable[str] | np.ndarray, what: str, count: int | None = None
+) -> Int[np.ndarray, " n"]:
+    """Positions of `image`, `point` or `lens`, from positions, a mask, or the names of images. `count` is how many
+    there are; None: as images. Raises ValueError: it is none of these, or there are fewer; one line."""
+    count = problem.num_cameras if count is None else count
     try:
         chosen = np.asarray(which if isinstance(which, np.ndarray | jax.Array) else list(which))
     except (TypeError, ValueError):  # no list, or a list of lists
         chosen = np.asarray(None)
     if chosen.ndim != 1:
         raise ValueError(f"which {what} must be a list of positions or names, not {shown(which)}")
-    return chosen
-
-
-def positions_of(
-    problem: BundleProblem, which: Iterable[int] | Iterable[str] | np.ndarray, what: str, count: int | None = None
-) -> Int[np.ndarray, " n"]:
-    """Positions, of images perhaps from names.
-
-    Args:
-        problem: any problem.
-        which: positions or names.
-        what: `image`, `point` or `lens`.
-        count: how many there are; None: as images.
-
-    Raises:
-        ValueError: neither positions nor names, or there are fewer; one line.
-    """
-    chosen = _listed(which, what)
-    count = problem.num_cameras if count is None else count
+    if chosen.dtype == bool:
+        if chosen.shape != (count,):
+            raise ValueError(f"a mask for every {what} has shape {(count,)}, not {chosen.shape}")
+        return np.flatnonzero(chosen)
     if chosen.dtype.kind in "US":
         if problem.labels is None or what != "image":
             raise ValueError(f"this problem has no names for a {what}: give positions")
@@ -235,11 +215,7 @@ def positions_of(
 
 
 def number_columns(lenses: Lenses, numbers: Iterable[str]) -> Bool[np.ndarray, "lenses numbers"]:
-    """The numbers of each lens that names or groups mean.
-
-    Raises:
-        ValueError: no lens has such a number; one line.
-    """
+    """The numbers of each lens that names or groups mean. Raises ValueError: no lens has such a number; one line."""
     free = np.asarray(lenses.free)
     meant = np.zeros(free.shape, bool)
     if not isinstance(numbers, Iterable):

@@ -35,8 +35,7 @@ def facing_away(problem: BundleProblem) -> Int[np.ndarray, " away"]:
     """Cameras with more than half of their views behind them.
 
     None if at least half of the observed cameras have that: then the scene is mirrored, of another convention, or too
-    far from a solution for poses to be told from points.
-    """
+    far from a solution for poses to be told from points."""
     views = np.bincount(problem.camera_index, minlength=problem.num_cameras)
     behind = np.bincount(problem.camera_index[views_behind(problem)], minlength=problem.num_cameras)
     away = np.flatnonzero(2 * behind > views)

@@ -10,27 +10,23 @@ from jaxtyping import Bool, Float
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import angle_axis
 from jaxba.problem.intrinsics import POSE_SIZE
-from jaxba.problem.rigs import EXTRINSICS_SIZE, Rigs, first_of_group
+from jaxba.problem.rigs import EXTRINSICS_SIZE, Rigs, first_of_group, frame_poses, poses_in_frames
 
 
 def in_frames(problem: BundleProblem) -> BundleProblem:
     """The problem with the poses of frames, and the extrinsics of each camera after its lens.
 
-    Without rigs, or where no two observed cameras are of one frame, it is the problem itself, without rigs.
-    """
+    Without rigs, or where no two observed cameras are of one frame, it is the problem itself, without rigs."""
     rigs = problem.rigs
     if rigs is None:
         return problem
-    from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
-
-    frame, cameras = np.asarray(rigs.frame), np.array(problem.cameras)  # SciPy takes no read-only arrays
+    frame, cameras = np.asarray(rigs.frame), np.asarray(problem.cameras)
     seen = np.unique(problem.camera_index)
     if len(np.unique(frame[seen])) == len(seen):
         return problem.replace(rigs=None)
     rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
-    moved = cameras[:, 3:6] - translation
-    of_frame = rotation.transpose(0, 2, 1) @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
-    poses = np.hstack([angle_axis(of_frame), np.einsum("nji,nj->ni", rotation, moved)])
+    of_frame, at = frame_poses(rotation, translation, cameras)
+    poses = np.hstack([angle_axis(of_frame), at])
     poses = poses[first_of_group(frame, seen)]  # bit for bit the same in a frame
     extrinsics = np.hstack([angle_axis(rotation), translation])
     return problem.replace(cameras=np.hstack([poses, cameras[:, POSE_SIZE:], extrinsics]))
@@ -40,8 +36,7 @@ def free_poses(problem: BundleProblem) -> Bool[np.ndarray, "cameras numbers"]:
     """Which numbers of poses are optimised, and in rigs of extrinsics, of a problem `in_frames`.
 
     Constant numbers of one camera are constant in its frame, also of one that nothing sees. The extrinsics of a lens
-    are constant where the pose of some camera of it is.
-    """
+    are constant where the pose of some camera of it is."""
     constants, rigs = problem.constants, problem.rigs
     shape = problem.num_cameras, POSE_SIZE
     held = np.zeros(shape, bool) if constants is None else np.asarray(constants.poses)
@@ -71,12 +66,11 @@ def out_of_frames(
     from scipy.spatial.transform import Rotation
 
     assert problem.rigs is not None
+    turns = lambda vectors: Rotation.from_rotvec(vectors).as_matrix()
     rigs, extrinsics = problem.rigs, cameras[:, -EXTRINSICS_SIZE:]
     free = np.zeros(len(cameras), bool) if rigs.free is None else np.asarray(rigs.free)
-    rotation = np.where(free[:, None, None], Rotation.from_rotvec(extrinsics[:, :3]).as_matrix(), rigs.rotation)
+    rotation = np.where(free[:, None, None], turns(extrinsics[:, :3]), rigs.rotation)
     translation = np.where(free[:, None], extrinsics[:, 3:], rigs.translation)
-    turned = rotation @ Rotation.from_rotvec(cameras[:, :3]).as_matrix()
-    moved = np.einsum("nij,nj->ni", rotation, cameras[:, 3:6]) + translation
+    poses = poses_in_frames(rotation, translation, turns(cameras[:, :3]), cameras[:, 3:6])
     own = cameras[:, POSE_SIZE:-EXTRINSICS_SIZE]
-    cameras = np.hstack([angle_axis(turned), moved, own])
-    return cameras, replace(rigs, rotation=rotation, translation=translation)
+    return np.hstack([poses, own]), replace(rigs, rotation=rotation, translation=translation)

@@ -10,8 +10,6 @@ A point whose rays are all parallel, as one that is seen once, can move along th
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -30,49 +28,33 @@ RESOLVED = 1e-7
 it is a square, and this squared is some rounding errors of float64."""
 
 
-class _Freedoms(NamedTuple):
-    combinations: Float[np.ndarray, "7 directions"]
-    """An orthonormal basis of what is free: of w, e and s, in this order."""
-
-    steps: Float[np.ndarray, "cameras numbers 7"]
-    """Derivatives of poses, and of extrinsics in rigs, with lengths in extents; zero for what is constant."""
-
-    points_move: Bool[np.ndarray, " points"]
-    middle: Float[np.ndarray, "3"]
-    extent: float
-
-
 def fixed_freedoms(problem: BundleProblem) -> int:
-    """How many of the seven freedoms of a similarity constants, rigs and priors fix.
-
-    Args:
-        problem: any problem; one far from the origin as a solve shifts it.
-    """
-    return SIMILARITY - _freedoms(shift(problem, -far_middle(problem))).combinations.shape[1]
+    """How many of the seven freedoms of a similarity constants, rigs and priors fix, of a problem far from the origin
+    as a solve shifts it."""
+    return SIMILARITY - _freedoms(shift(problem, -far_middle(problem)))[0].shape[1]
 
 
 def free_directions(
     problem: BundleProblem,
 ) -> tuple[Float[np.ndarray, "directions cameras parameters"], Float[np.ndarray, "directions points 3"]]:
-    """The directions of a similarity that a problem leaves free.
-
-    Args:
-        problem: any problem near the origin.
-
-    Returns:
-        Up to seven independent directions, scene units: steps of the parameters of cameras as `in_frames` has them,
-        rotations on the manifold, and of points. What does not move, and what nothing observes, has zeros.
-    """
-    found = _freedoms(problem)
-    of_poses = np.einsum("nij,jk->kni", found.steps, found.combinations)
-    of_poses *= np.where(np.arange(of_poses.shape[2]) % POSE_SIZE < 3, 1.0, found.extent)  # rotation and translation
+    """The directions of a similarity that a problem near the origin leaves free, up to seven, scene units: steps of the
+    parameters of cameras as `in_frames` has them, rotations on the manifold, and of points. What does not move, and
+    what nothing observes, has zeros."""
+    combinations, steps, points_move, middle, extent = _freedoms(problem)
+    of_poses = np.einsum("nij,jk->kni", steps, combinations)
+    of_poses *= np.where(np.arange(of_poses.shape[2]) % POSE_SIZE < 3, 1.0, extent)  # rotation and translation
     lens = np.zeros((*of_poses.shape[:2], problem.cameras.shape[1] - POSE_SIZE))
-    moved = _motions((np.asarray(problem.points) - found.middle) / found.extent)
-    of_points = found.extent * np.einsum("nij,jk->kni", moved, found.combinations) * found.points_move[:, None]
+    moved = _motions((np.asarray(problem.points) - middle) / extent)
+    of_points = extent * np.einsum("nij,jk->kni", moved, combinations) * points_move[:, None]
     return np.concatenate([of_poses[:, :, :POSE_SIZE], lens, of_poses[:, :, POSE_SIZE:]], axis=2), of_points
 
 
-def _freedoms(problem: BundleProblem) -> _Freedoms:
+def _freedoms(
+    problem: BundleProblem,
+) -> tuple[Float[np.ndarray, "7 directions"], np.ndarray, np.ndarray, np.ndarray, float]:
+    """An orthonormal basis of the combinations of w, e and s (in this order) that are free; derivatives of poses by the
+    seven, and of extrinsics in rigs, (cameras, numbers, 7), with lengths in extents and zero for what is constant;
+    which points move; the middle and the extent."""
     here, constants, priors = in_frames(problem), problem.constants, problem.priors
     seen, points_move = observed(problem)
     middle, extent = middle_and_extent(problem)
@@ -103,7 +85,7 @@ def _freedoms(problem: BundleProblem) -> _Freedoms:
     staying /= np.maximum(np.abs(staying).max(axis=1, keepdims=True), 1.0)  # far away small turns are large motions
     _, values, basis = np.linalg.svd(staying, full_matrices=False)
     moves = free & seen[:, None]
-    return _Freedoms(basis[values <= RESOLVED].T, steps * moves[:, :, None], points_move, middle, extent)
+    return basis[values <= RESOLVED].T, steps * moves[:, :, None], points_move, middle, extent
 
 
 def _scale_rigs(
@@ -116,8 +98,7 @@ def _scale_rigs(
     """Adds to steps how the places of cameras in rigs change with the scale; returns what must not change besides.
 
     A rig becomes larger about the first of its cameras whose place is constant: the poses of frames move so that it is
-    where it has to be. All cameras of a lens have the same place.
-    """
+    where it has to be. All cameras of a lens have the same place."""
     assert here.rigs is not None
     frame, turn, moved = (np.asarray(x) for x in (here.rigs.frame, here.rigs.rotation, here.rigs.translation))
     places_move = free[:, POSE_SIZE:].any(axis=1)
@@ -139,13 +120,8 @@ def _motions(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 7"]:
 
 
 def determined_directions(problem: BundleProblem) -> Float[np.ndarray, "points 3 3"]:
-    """For each point the projection on the directions in which its rays determine it.
-
-    It is the identity for a point with rays that are not parallel, zero for one that is constant or has no rays.
-
-    Args:
-        problem: in the coordinates of its own cameras, not `in_frames`.
-    """
+    """For each point of a problem with cameras, not frames, the projection on the directions in which its rays
+    determine it: the identity where they are not parallel, zero for a point that is constant or has no rays."""
     centers = geometry.camera_centers(problem.cameras)
     rays = np.asarray(problem.points)[problem.point_index] - centers[problem.camera_index]
     rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(float).tiny)

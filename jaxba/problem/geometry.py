@@ -43,22 +43,20 @@ def rotation_matrices(vectors: Float[Array, "n 3"]) -> Float[np.ndarray, "n 3 3"
     angle = np.linalg.norm(w, axis=1)
     first = np.sinc(angle / np.pi)[:, None, None]
     second = (0.5 * np.sinc(angle / (2 * np.pi)) ** 2)[:, None, None]
-    x, y, z = w.T
-    cross = np.zeros((len(w), 3, 3))
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -z, y, -x
-    cross[:, 1, 0], cross[:, 2, 0], cross[:, 2, 1] = z, -y, x
+    cross = cross_matrices(w)
     return np.eye(3) + first * cross + second * (cross @ cross)
+
+
+def cross_matrices(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
+    """Matrices `[v]` with `[v] u = v x u`."""
+    return np.cross(vectors[:, None], np.eye(3)).transpose(0, 2, 1)
 
 
 def angle_axis(rotations: Float[Array, "n 3 3"]) -> Float[np.ndarray, "n 3"]:
     """Angle-axis vectors (radians, length at most pi) of rotation matrices, to full precision also near 0 and pi.
 
     At exactly pi either sign of the axis may come back. A matrix that is a rotation only to the digits of a file is
-    replaced by a rotation near it.
-
-    Raises:
-        ValueError: a determinant is not positive.
-    """
+    replaced by a rotation near it. Raises ValueError: a determinant is not positive."""
     from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
 
     return Rotation.from_matrix(np.array(rotations, dtype=np.float64)).as_rotvec()  # SciPy takes no read-only arrays
@@ -82,8 +80,7 @@ def colmap_quaternions(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "
 def bal_rotations(quaternions: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3"]:
     """Angle-axis vectors, of length at most pi: the inverse of `colmap_quaternions`.
 
-    The norm of a quaternion does not matter; where it is zero or not finite the vector is NaN.
-    """
+    The norm of a quaternion does not matter; where it is zero or not finite the vector is NaN."""
     from scipy.spatial.transform import Rotation
 
     norm = np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -112,8 +109,7 @@ def translations(rotations: Float[np.ndarray, "n 3 3"], centers: Float[np.ndarra
 def perspective(local: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Image plane coordinates `(X/Z, Y/Z)` of points in the frame of a camera, also behind it; not finite where Z is 0.
 
-    BAL's camera looks down -z, so that its coordinates are the negative of these.
-    """
+    BAL's camera looks down -z, so that its coordinates are the negative of these."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return local[:, :2] / local[:, 2:]
 
@@ -126,13 +122,8 @@ def radial_distortion(square: np.ndarray | float, k1: np.ndarray | float, k2: np
 def pixels(
     problem: BundleProblem, camera: Int[np.ndarray, " n"], local: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 2"]:
-    """Pixels of points in the frames of cameras, by the models of their lenses.
-
-    Args:
-        problem: whose cameras they are.
-        camera: of each point.
-        local: the points, in COLMAP's axes (x right, y down, z forwards).
-    """
+    """Pixels of points in the frames of cameras, in COLMAP's axes (x right, y down, z forwards), by the models of their
+    lenses."""
     numbers, lenses = np.asarray(problem.cameras, dtype=np.float64)[:, 6:][camera], problem.lenses
     models = (BAL,) if lenses is None else lenses.models
     own, result = [np.arange(len(camera))], np.empty((len(camera), 2))
@@ -148,8 +139,7 @@ def project(problem: BundleProblem) -> Float[np.ndarray, "observations 2"]:
     """Predicted pixels of every observation.
 
     Points behind a camera are projected by the same formula, as BAL does; a point at depth zero gives a result that is
-    not finite.
-    """
+    not finite."""
     predicted = np.empty((problem.num_observations, 2))
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         for part, camera, local in _camera_frames(problem):

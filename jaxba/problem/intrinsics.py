@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from jaxba.problem.camera_models import BAL, CameraModel
-from jaxba.problem.checks import plain_array
+from jaxba.problem.checks import indices, plain_array
 from jaxba.typing import AnyArray, ArrayRecord, register_pytree
 
 POSE_SIZE = 6
@@ -64,32 +64,15 @@ def lens_size(lenses: Lenses | None) -> int:
 
 
 def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
-    """Checks lenses and returns them as int32 and bool NumPy arrays.
-
-    Args:
-        lenses: lenses of a problem.
-        cameras: its cameras, shape (cameras, 6 + numbers).
-
-    Raises:
-        ValueError: shapes differ, an index is out of range, or cameras with the same lens differ in their intrinsics.
-            The message is one line.
-    """
-    index, free = plain_array("index of lenses", lenses.index), plain_array("free of lenses", lenses.free)
-    if index.shape != (len(cameras),) or index.dtype.kind not in "iu":
-        raise ValueError(f"lenses must name a lens for each of {len(cameras)} cameras, not {index.dtype}{index.shape}")
-    size = lens_size(lenses)
+    """Checks the lenses of cameras and returns them as int32 and bool NumPy arrays. Raises ValueError: shapes differ,
+    an index is out of range, or cameras with the same lens differ in their intrinsics. The message is one line."""
+    free, size = plain_array("free of lenses", lenses.free), lens_size(lenses)
     names = "f, k1 and k2" if lenses.all_bal else f"{size} numbers"
     if free.ndim != 2 or free.shape[1] != size or free.dtype != bool:
         raise ValueError(f"lenses must say of {names} what is free, shape (n, {size}), not {free.dtype}{free.shape}")
-    bad = np.flatnonzero((index < 0) | (index >= len(free)))
-    if bad.size:
-        raise ValueError(f"camera {bad[0]} has lens {index[bad[0]]}, outside 0..{len(free) - 1}")
-    model = np.zeros(len(free), int) if lenses.model is None else plain_array("model of lenses", lenses.model)
-    if model.shape != (len(free),) or model.dtype.kind not in "iu":
-        raise ValueError(f"lenses must name a model for each of {len(free)} lenses, not {model.dtype}{model.shape}")
-    bad = np.flatnonzero((model < 0) | (model >= len(lenses.models)))
-    if bad.size:
-        raise ValueError(f"lens {bad[0]} has model {model[bad[0]]}, outside 0..{len(lenses.models) - 1}")
+    index = indices("the lens of cameras", lenses.index, len(free), len(cameras))
+    given = np.zeros(len(free), int) if lenses.model is None else lenses.model
+    model = indices("the model of lenses", given, len(lenses.models), len(free))
     beyond = np.arange(size) >= np.array([len(one) for one in lenses.models])[model][:, None]
     _, first, group = np.unique(index, return_index=True, return_inverse=True)
     other = np.flatnonzero((cameras[first[group], POSE_SIZE:] != cameras[:, POSE_SIZE:]).any(axis=1))
@@ -97,9 +80,4 @@ def checked_lenses(lenses: Lenses, cameras: np.ndarray) -> Lenses:
         pair = f"{first[group[other[0]]]} and {other[0]}"
         differ = names.replace("and", "or") if lenses.all_bal else "their intrinsics"
         raise ValueError(f"cameras {pair} share lens {index[other[0]]}, but differ in {differ}")
-    return replace(
-        lenses,
-        index=np.ascontiguousarray(index, np.int32),
-        free=np.ascontiguousarray(free & ~beyond),
-        model=None if lenses.model is None else np.ascontiguousarray(model, np.int32),
-    )
+    return replace(lenses, index=index, free=free & ~beyond, model=None if lenses.model is None else model)

@@ -31,11 +31,7 @@ class Labels(ArrayRecord):
     """Ids of points."""
 
     def positions(self, kind: Part, wanted: Iterable[int | str]) -> Int[np.ndarray, " wanted"]:
-        """Positions of parts by id, of images also by name.
-
-        Raises:
-            ValueError: there is no such part; one line.
-        """
+        """Positions of parts by id, of images also by name. Raises ValueError: there is no such part; one line."""
         ids = {"image": self.images, "lens": self.lenses, "point": self.points}[kind]
         known: dict[int | str, int] = {number: at for at, number in enumerate(ids.tolist())}
         if kind == "image":

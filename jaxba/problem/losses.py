@@ -21,10 +21,6 @@ from jaxtyping import Float
 from jaxba.problem.checks import finite, shown
 
 
-def _squared(s: Array) -> tuple[Array, Array]:
-    return s, jnp.ones_like(s)
-
-
 def _huber(s: Array) -> tuple[Array, Array]:
     outside = s > 1
     root = jnp.sqrt(jnp.where(outside, s, jnp.ones_like(s)))
@@ -36,10 +32,6 @@ def _soft_l1(s: Array) -> tuple[Array, Array]:
     return 2 * (root - 1), 1 / root
 
 
-def _cauchy(s: Array) -> tuple[Array, Array]:
-    return jnp.log1p(s), 1 / (1 + s)
-
-
 def _tukey(s: Array) -> tuple[Array, Array]:
     rest = jnp.maximum(1 - s, 0)
     value = (1 - rest**3) / 3
@@ -47,10 +39,10 @@ def _tukey(s: Array) -> tuple[Array, Array]:
 
 
 _SHAPES: dict[str, Callable[[Array], tuple[Array, Array]]] = {
-    "squared": _squared,
+    "squared": lambda s: (s, jnp.ones_like(s)),
     "huber": _huber,
     "soft_l1": _soft_l1,
-    "cauchy": _cauchy,
+    "cauchy": lambda s: (jnp.log1p(s), 1 / (1 + s)),
     "tukey": _tukey,
 }
 

@@ -160,12 +160,8 @@ def _variances(stddev: Any, count: int) -> Float[np.ndarray, "n 3 3"]:
 def _covariances(
     problem: BundleProblem, what: str, covariance: Any, at: np.ndarray
 ) -> tuple[Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3 3"]]:
-    """A covariance for each image, and its inverse root.
-
-    Raises:
-        ValueError: shapes; one line.
-        ProblemError: one is not symmetric positive definite; it names the image.
-    """
+    """A covariance for each image, and its inverse root. Raises ValueError: shapes; one line. Raises ProblemError: one
+    is not symmetric positive definite; it names the image."""
     given = finite(f"the covariance of a {what}", covariance, (3, 3), (len(at), 3, 3))
     matrices = np.broadcast_to(given, (len(at), 3, 3))
     roots, bad = inverse_roots(matrices, LEAST_VARIANCE)

@@ -225,11 +225,8 @@ def _check_known(name: str, value: str, kind: Any) -> None:
 
 
 def check_count(name: str, value: Any, least: int) -> None:
-    """Checks that an option is an integer in [least, `LARGEST_COUNT`].
-
-    Raises:
-        ValueError: it is not; the message contains its name.
-    """
+    """Checks that an option is an integer in [least, `LARGEST_COUNT`]. Raises ValueError: it is not; the message
+    contains its name."""
     try:
         count = operator.index(value)
     except TypeError:

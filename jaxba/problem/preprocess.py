@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
-
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import camera_centers, depths, rotation_matrices, translations
+from jaxba.problem.similarity import Similarity, transformed
 
-POBA_SIZE = 100.0
-"""Size of a normalised scene. Source: Ceres `BALProblem::Normalize`, kept by rootba and PoBA."""
-
-POBA_NOISE = 0.01
-"""Standard deviation of translation and point noise in PoBA's experiments, for a scene of size 100."""
-
-POBA_MIN_DEPTH = 0.1
-"""Smallest depth of an observation in PoBA's experiments, for a scene of size 100."""
-
-POBA_SEED = 38401
-"""Default seed of rootba and PoBA. Their random generator is another one, so the same seed gives other numbers here."""
+POBA_SIZE, POBA_NOISE, POBA_MIN_DEPTH, POBA_SEED = 100.0, 0.01, 0.1, 38401
+"""Of PoBA's experiments: size of the normalised scene, as in Ceres' `BALProblem::Normalize`; standard deviation of
+translation and point noise; smallest depth of an observation; default seed (its random generator is another one, so the
+same seed gives other numbers here)."""
 
 FAR = 10.0
 """Distance of a scene from the origin, relative to its extent, from which it is shifted to the origin to be solved.
@@ -54,22 +45,14 @@ def normalize(problem: BundleProblem, size: float = POBA_SIZE) -> BundleProblem:
     spread = float(_upper_median(np.abs(points - middle).sum(axis=1)))
     if spread == 0:
         raise ProblemError("the scene has no extent: half of its points are at one place")
-    scale, rigs = size / spread, problem.rigs
-    moved = _shifted(problem, -middle, slice(None), slice(None))
-    cameras, priors = np.array(moved.cameras), moved.priors
-    cameras[:, 3:6] *= scale
-    if priors is not None:
-        whitening = np.asarray(priors.position_whitening) / scale
-        priors = dataclasses.replace(priors, positions=scale * priors.positions, position_whitening=whitening)
-    rigs = None if rigs is None else rigs.scaled(scale)
-    return moved.replace(cameras=cameras, points=scale * moved.points, rigs=rigs, priors=priors)
+    scale = size / spread
+    return transformed(problem, Similarity(scale, np.eye(3), -scale * middle))
 
 
 def far_middle(problem: BundleProblem) -> Float[np.ndarray, "3"]:
     """The marginal median of the points if a scene is far from the origin, as georeferenced scenes are; else zero.
 
-    "Far" is more than `FAR` times the extent. In scene units.
-    """
+    "Far" is more than `FAR` times the extent. In scene units."""
     middle, extent = middle_and_extent(problem)
     with np.errstate(all="ignore"):
         return middle if np.linalg.norm(middle) > FAR * extent > 0 else np.zeros(3)
@@ -95,28 +78,11 @@ def observed(problem: BundleProblem) -> tuple[Bool[np.ndarray, " cameras"], Bool
 
 
 def shift(problem: BundleProblem, offset: Float[np.ndarray, "3"]) -> BundleProblem:
-    """The same scene translated by an offset; all residuals are unchanged.
-
-    Cameras and points without observations are not moved.
-
-    Args:
-        problem: the problem to shift.
-        offset: translation, scene units; zero leaves the problem as it is.
-    """
+    """The same scene translated by an offset, scene units; all residuals are unchanged. Cameras and points without
+    observations are not moved."""
     if not np.any(offset):
         return problem
-    return _shifted(problem, offset, *observed(problem))
-
-
-def _shifted(problem: BundleProblem, offset: Float[np.ndarray, "3"], seen: Any, placed: Any) -> BundleProblem:
-    """As `shift`, of the cameras and points that the last two arguments choose."""
-    cameras, points = np.array(problem.cameras, np.float64), np.array(problem.points, np.float64)
-    cameras[seen, 3:6] -= rotation_matrices(cameras[seen, :3]) @ offset  # t = -R c
-    points[placed] += offset
-    priors = problem.priors
-    if priors is not None:
-        priors = dataclasses.replace(priors, positions=np.asarray(priors.positions) + offset)
-    return problem.replace(cameras=cameras, points=points, priors=priors)
+    return transformed(problem, Similarity(1.0, np.eye(3), offset), *observed(problem))
 
 
 def perturb(

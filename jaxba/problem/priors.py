@@ -48,17 +48,8 @@ class Priors(ArrayRecord):
 
 
 def checked_priors(priors: Priors, cameras: int, lenses: int, numbers: int) -> Priors:
-    """Checks priors and returns them as float64 NumPy arrays.
-
-    Args:
-        priors: of a problem.
-        cameras: its number of cameras.
-        lenses: its number of lenses.
-        numbers: numbers of a lens.
-
-    Raises:
-        ValueError: a shape differs, or something is not finite; one line.
-    """
+    """Checks the priors of so many cameras, and lenses of so many numbers, and returns them as float64 NumPy arrays.
+    Raises ValueError: a shape differs, or something is not finite; one line."""
     shapes = {
         "positions": (cameras, 3),
         "position_whitening": (cameras, 3, 3),

@@ -69,19 +69,9 @@ class Rigs(ArrayRecord):
 
 
 def checked_rigs(rigs: Rigs, cameras: np.ndarray, lenses: Lenses | None) -> Rigs:
-    """Checks rigs and returns them as NumPy arrays.
-
-    Args:
-        rigs: of a problem.
-        cameras: its cameras.
-        lenses: its checked lenses.
-
-    Raises:
-        ValueError: shapes differ, cameras of a frame are not where their rig has them, or cameras of a lens with free
-            extrinsics are in different places; one line.
-    """
-    from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
-
+    """Checks the rigs of cameras with checked lenses and returns them as NumPy arrays. Raises ValueError: shapes
+    differ, cameras of a frame are not where their rig has them, or cameras of a lens with free extrinsics are in
+    different places; one line."""
     frame = plain_array("frames of rigs", rigs.frame)
     rotation = real_numbers("rotations of rigs", rigs.rotation)
     translation = real_numbers("translations of rigs", rigs.translation)
@@ -96,10 +86,8 @@ def checked_rigs(rigs: Rigs, cameras: np.ndarray, lenses: Lenses | None) -> Rigs
     proper = finite & (away <= LARGEST_DISAGREEMENT) & (np.linalg.det(known) > 0)
     if not proper.all():
         raise ValueError(f"the place of camera {np.argmin(proper)} in its rig is no rotation and translation")
-    rotations = Rotation.from_rotvec(np.array(cameras[:, :3])).as_matrix()  # SciPy takes no read-only arrays
     _, first, group = np.unique(frame, return_index=True, return_inverse=True)
-    rig_rotation = np.einsum("nji,njk->nik", rotation, rotations)
-    rig_translation = np.einsum("nji,nj->ni", rotation, cameras[:, 3:6] - translation)
+    rig_rotation, rig_translation = frame_poses(rotation, translation, cameras)
     turned = np.abs(rig_rotation - rig_rotation[first][group]).max(axis=(1, 2), initial=0.0)
     size = np.linalg.norm(cameras[:, 3:6], axis=1) + np.linalg.norm(translation, axis=1) + np.finfo(float).tiny
     moved = np.linalg.norm(rig_translation - rig_translation[first][group], axis=1) / size
@@ -131,6 +119,31 @@ def _checked_free(
     return free
 
 
+def frame_poses(
+    rotation: Float[np.ndarray, "cameras 3 3"],
+    translation: Float[np.ndarray, "cameras 3"],
+    cameras: Float[np.ndarray, "cameras parameters"],
+) -> tuple[Float[np.ndarray, "cameras 3 3"], Float[np.ndarray, "cameras 3"]]:
+    """R_r and t_r of the frame of each camera, from M and m of its place."""
+    from scipy.spatial.transform import Rotation  # imported late: its import takes 0.05 s
+
+    turned = Rotation.from_rotvec(np.array(cameras[:, :3])).as_matrix()  # SciPy takes no read-only arrays
+    return rotation.transpose(0, 2, 1) @ turned, np.einsum("nji,nj->ni", rotation, cameras[:, 3:6] - translation)
+
+
+def poses_in_frames(
+    rotation: Float[np.ndarray, "n 3 3"],
+    translation: Float[np.ndarray, "n 3"],
+    of_frame: Float[np.ndarray, "n 3 3"],
+    at: Float[np.ndarray, "n 3"],
+) -> Float[np.ndarray, "n 6"]:
+    """Poses of cameras, from M and m of their places, and R_r and t_r of their frames."""
+    from scipy.spatial.transform import Rotation
+
+    turned = Rotation.from_matrix(rotation @ of_frame).as_rotvec()
+    return np.hstack([turned, np.einsum("nij,nj->ni", rotation, at) + translation])
+
+
 def first_of_group(
     group: Int[np.ndarray, " cameras"], chosen: Int[np.ndarray, " chosen"]
 ) -> Int[np.ndarray, " cameras"]:
@@ -145,17 +158,12 @@ def with_unseen_of_frames(
     rigs: Rigs, cameras: Float[np.ndarray, "cameras parameters"], seen: Int[np.ndarray, " seen"]
 ) -> Float[np.ndarray, "cameras parameters"]:
     """Cameras, with unobserved ones placed by their rig relative to the first observed camera of the frame."""
-    from scipy.spatial.transform import Rotation
-
-    frame = np.asarray(rigs.frame)
-    of = first_of_group(frame, seen)
+    of = first_of_group(np.asarray(rigs.frame), seen)
     unseen = np.setdiff1d(np.flatnonzero(of != np.arange(len(cameras))), seen)
     if not len(unseen):
         return cameras
-    of = of[unseen]
     rotation, translation = np.asarray(rigs.rotation), np.asarray(rigs.translation)
+    frames = frame_poses(rotation, translation, cameras)
     found = np.array(cameras)
-    back = np.einsum("nij,nkj->nik", rotation[unseen], rotation[of])  # M_unseen M_seen^T
-    found[unseen, :3] = Rotation.from_matrix(back @ Rotation.from_rotvec(cameras[of, :3]).as_matrix()).as_rotvec()
-    found[unseen, 3:6] = np.einsum("nij,nj->ni", back, cameras[of, 3:6] - translation[of]) + translation[unseen]
+    found[unseen, :6] = poses_in_frames(rotation[unseen], translation[unseen], *(x[of[unseen]] for x in frames))
     return found

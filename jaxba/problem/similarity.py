@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.problem.bundle_problem import ProblemError
+from jaxba.problem.bundle_problem import BundleProblem, ProblemError
+from jaxba.problem.geometry import angle_axis, rotation_matrices
 
 Poses = Float[np.ndarray, "poses 3 4"]
 """Camera-to-world poses `[R | c]`."""
@@ -34,21 +36,34 @@ class Similarity(NamedTuple):
         return np.concatenate([self.rotation @ poses[:, :, :3], centers[:, :, None]], axis=2)
 
 
+def transformed(
+    problem: BundleProblem, by: Similarity, seen: Any = slice(None), placed: Any = slice(None)
+) -> BundleProblem:
+    """A problem moved with the cameras and points that are chosen. Residuals stay as they are, but those of priors of
+    rotations where it is turned."""
+    scale, rotation, shift = by
+    cameras, points = (np.array(x, np.float64) for x in (problem.cameras, problem.points))
+    priors, rigs = problem.priors, problem.rigs
+    matrices = rotation_matrices(cameras[seen, :3])
+    if (rotation != np.eye(3)).any():
+        matrices = matrices @ rotation.T
+        cameras[seen, :3] = angle_axis(matrices)
+    cameras[seen, 3:6] = scale * cameras[seen, 3:6] - matrices @ shift
+    points[placed] = by.points(points[placed])
+    if priors is not None:
+        whitening = np.asarray(priors.position_whitening) / scale
+        priors = replace(priors, positions=by.points(np.asarray(priors.positions)), position_whitening=whitening)
+    rigs = rigs if rigs is None or scale == 1.0 else rigs.scaled(scale)
+    return problem.replace(cameras=cameras, points=points, rigs=rigs, priors=priors)
+
+
 def umeyama(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"] | None = None
 ) -> Similarity:
-    """The least-squares similarity from `source` to `target`.
+    """The least-squares similarity from `source` to `target`, with weights of the squared distances. Raises
+    ProblemError: fewer than three points, or all of them at one position or on one line.
 
-    Args:
-        source: points.
-        target: where they should be.
-        weights: of the squared distances; None: equal ones.
-
-    Raises:
-        ProblemError: fewer than three points, or all of them at one position or on one line.
-
-    Source: Umeyama 1991, eqs. 38-42; evo's `geometry.umeyama_alignment` is the same.
-    """
+    Source: Umeyama 1991, eqs. 38-42; evo's `geometry.umeyama_alignment` is the same."""
     if len(source) < 3:
         raise ProblemError(f"an alignment needs 3 poses, not {len(source)}")
     shares = np.full(len(source), 1 / len(source)) if weights is None else weights / weights.sum()
@@ -70,11 +85,10 @@ def umeyama(
 def along_line(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, " n"]
 ) -> Similarity:
-    """The similarity that takes the line through `source` to that through `target`, without a turn about it.
+    """The similarity that takes the line through `source` to that through `target`, by the smallest rotation, without a
+    turn about it. Arguments as for `umeyama`; the points of neither may be at one place."""
+    from scipy.spatial.transform import Rotation
 
-    Its rotation is the smallest one; where the lines are opposite it is about an axis as near to z as can be. Arguments
-    as for `umeyama`; the points of neither may be at one place.
-    """
     shares = weights / weights.sum()
     mean_source, mean_target = shares @ source, shares @ target
     a = source - mean_source
@@ -82,16 +96,5 @@ def along_line(
     along = a @ line
     slope = (shares * along) @ (target - mean_target) / (shares @ along**2)
     scale = float(np.linalg.norm(slope))
-    rotation = _smallest_rotation(line, slope / scale)
+    rotation = Rotation.align_vectors([slope / scale], [line])[0].as_matrix()
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
-
-
-def _smallest_rotation(start: Float[np.ndarray, "3"], end: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation by the smallest angle that takes one unit vector to another: two reflections."""
-    middle = start + end
-    if np.linalg.norm(middle) < 1e-9:  # opposite: half a turn about what is perpendicular and nearest to z
-        up = np.array([0.0, 0.0, 1.0] if abs(start[2]) < 0.9 else [1.0, 0.0, 0.0])
-        axis = up - (up @ start) * start
-        return 2 * np.outer(axis, axis) / (axis @ axis) - np.eye(3)
-    reflected = np.eye(3) - 2 * np.outer(middle, middle) / (middle @ middle)
-    return reflected @ (np.eye(3) - 2 * np.outer(start, start))

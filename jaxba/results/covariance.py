@@ -27,6 +27,7 @@ from jaxba.lm.step import initial_state
 from jaxba.model.linearize import Linearization, linearize, only_free
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError, ProblemWarning
+from jaxba.problem.constraints import every_lens
 from jaxba.problem.facing import facing_away
 from jaxba.problem.freedoms import SIMILARITY, fixed_freedoms
 from jaxba.problem.intrinsics import POSE_SIZE, lens_size
@@ -105,7 +106,8 @@ class Covariance(ArrayRecord):
         jacobian = np.zeros((6, 12))
         jacobian[:3, :3], jacobian[:3, 6:9] = -relative, np.eye(3)
         # R <- exp(d_2) R exp(-d_1): t_2 - R t_1 changes by d_2's and d_1's turn of R t_1
-        jacobian[3:, 6:9], jacobian[3:, :3] = _cross(moved), -_cross(moved) @ relative
+        (across,) = geometry.cross_matrices(moved[None])
+        jacobian[3:, 6:9], jacobian[3:, :3] = across, -across @ relative
         jacobian[3:, 3:6], jacobian[3:, 9:] = -relative, np.eye(3)
         return _through(jacobian, self.between(first, second))
 
@@ -157,7 +159,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
     poses = np.array([_through(change, _submatrix(of_cameras, row)) for change, row in pairs])
     poses[~seen] = np.nan
     lenses = _of_lenses(problem, layout, index, of_cameras)
-    unseen = np.setdiff1d(np.arange(len(lenses)), _lens_of(problem)[seen])
+    unseen = np.setdiff1d(np.arange(len(lenses)), np.asarray(every_lens(problem).index)[seen])
     has = lambda x: np.isnan(x).any(axis=(1, 2))
     undetermined: dict[Part, np.ndarray] = {
         "image": np.flatnonzero(has(poses) & seen),
@@ -184,13 +186,13 @@ def _changes(
         changes[:, :3, :3] = changes[:, 3:6, 3:6] = turn
         moved = np.einsum("nij,nj->ni", turn, np.asarray(problem.cameras)[:, 3:6])
         by_extrinsics = np.tile(np.eye(EXTRINSICS_SIZE), (len(rotations), 1, 1))
-        by_extrinsics[:, 3:, :3] = [-_cross(one) for one in moved]
+        by_extrinsics[:, 3:, :3] = -geometry.cross_matrices(moved)
         start = unknowns.lens_size
         for place, column in enumerate(unknowns.columns):
             if column >= start:
                 changes[:, :, POSE_SIZE + place] = by_extrinsics[:, :, column - start]
     back = np.tile(np.eye(6), (len(rotations), 1, 1))
-    back[:, 3:, :3] = [_cross(moved) for moved in rotations @ offset]  # -(w x R o) = [R o]x w
+    back[:, 3:, :3] = geometry.cross_matrices(rotations @ offset)  # -(w x R o) = [R o]x w
     return back @ changes
 
 
@@ -291,21 +293,18 @@ def _prior_rows(index: Int[np.ndarray, "cameras width"], count: int, blocks: Flo
     return csr_matrix((roots.reshape(place.shape)[used], (rows[used], place[used])), (index.size, count))
 
 
-def _block_diagonal(blocks: Float[np.ndarray, "n 3 3"]):
-    from scipy.sparse import bsr_matrix
-
-    count = len(blocks)
-    return bsr_matrix((blocks, np.arange(count), np.arange(count + 1)), (3 * count, 3 * count)).tocsr()
-
-
 def _inverse(system: _System) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n directions"]]:
     """The inverse of S without the directions that are not determined, and an orthonormal basis of these, in which each
     number is divided by its deviation if all others are known."""
+    from scipy.sparse import bsr_matrix
+
     whole = (system.jacobian.T @ system.jacobian).toarray()
     if not len(whole):
         return whole, whole
     cross = (system.jacobian.T @ system.by_point).tocsr()
-    eliminated = _block_diagonal(system.inverse) @ cross.T
+    count = len(system.inverse)
+    blocks = bsr_matrix((system.inverse, np.arange(count), np.arange(count + 1)), (3 * count, 3 * count))
+    eliminated = blocks.tocsr() @ cross.T
     own = np.sqrt(np.diagonal(whole))
     scale = 1 / np.where(own > 0, own, 1.0)
     values, vectors = np.linalg.eigh((whole - (cross @ eliminated).toarray()) * scale[:, None] * scale)
@@ -360,23 +359,16 @@ def _marginal(
 def _of_lenses(
     problem: BundleProblem, layout: Layout, index: np.ndarray, of_cameras: np.ndarray
 ) -> Float[np.ndarray, "lenses numbers numbers"]:
-    unknowns = layout.unknowns
-    lenses = problem.lenses
-    size = lens_size(lenses)
-    place = [(k, column) for k, column in enumerate(unknowns.columns) if column < size]
-    of_camera = _lens_of(problem)
-    count = problem.num_cameras if lenses is None else len(lenses.free)
-    found = np.full((count, size, size), np.nan)
+    lenses = every_lens(problem)
+    size = lens_size(problem.lenses)
+    found = np.full((len(lenses.free), size, size), np.nan)
     for camera in np.flatnonzero(layout.camera_seen):
         rows = np.full(size, -1)
-        for k, column in place:
-            rows[column] = index[camera, POSE_SIZE + k]
-        found[of_camera[camera]] = _submatrix(of_cameras, rows)
+        for k, column in enumerate(layout.unknowns.columns):
+            if column < size:
+                rows[column] = index[camera, POSE_SIZE + k]
+        found[lenses.index[camera]] = _submatrix(of_cameras, rows)
     return found
-
-
-def _lens_of(problem: BundleProblem) -> Int[np.ndarray, " cameras"]:
-    return np.arange(problem.num_cameras) if problem.lenses is None else np.asarray(problem.lenses.index)
 
 
 def _through(change: Float[np.ndarray, "m n"], matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"]:
@@ -394,7 +386,3 @@ def _submatrix(matrix: np.ndarray, rows: np.ndarray) -> np.ndarray:
     found = np.zeros((len(rows), len(rows)))
     found[np.ix_(known, known)] = matrix[np.ix_(rows[known], rows[known])]
     return found
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])

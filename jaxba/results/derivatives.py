@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.flatten_util import ravel_pytree
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Float
 
@@ -174,50 +175,38 @@ def _transposed(
     kept = np.flatnonzero(~np.isin(solved.camera_index, away))  # observations that count
     with numerics(np.float64):
         slots = jnp.asarray(np.append(kept, 0)[setup.layout.observation])
-        still = _symmetries(counted, setup.layout)
-        arguments = (setup.layout, slots, here, still, inputs, cotangents)
+        arguments = (setup.layout, slots, here, *_symmetries(counted, setup.layout), inputs, cotangents)
         found, residual = jit(_solve_transposed, static_argnames="options")(*arguments, options=step)
     if not float(residual) < LARGEST_RESIDUAL:
         raise ProblemError("the solution is not determined well enough for derivatives: the Hessian is singular")
     return found
 
 
-class Symmetries(NamedTuple):
+def _symmetries(
+    solved: BundleProblem, layout: Layout
+) -> tuple[Float[np.ndarray, "7 numbers"], Float[np.ndarray, "points 3 3"]]:
     """What leaves the cost as it is: an orthonormal basis of seven directions of the gauge, zero for those that are not
-    free, and the directions in which rays determine points, in layout order."""
-
-    gauge_cameras: Float[AnyArray, "7 cameras width"]
-    gauge_points: Float[AnyArray, "7 3 points"]
-    points: Float[AnyArray, "points 3 3"]
-
-
-def _symmetries(solved: BundleProblem, layout: Layout) -> Symmetries:
+    free, in all numbers of cameras and points; and the directions in which rays determine points, in layout order."""
     order, determined = np.asarray(layout.points), determined_directions(solved)
     cameras, points = free_directions(solved)
     cameras = layout.unknowns.restricted(cameras.swapaxes(1, 2)).swapaxes(1, 2)
     # only what of it is not already a motion of points along their rays
     points = np.einsum("pij,kpj->kpi", determined, points)
-    real = order < solved.num_points
-    at = np.minimum(order, solved.num_points - 1)
+    real, at = order < solved.num_points, np.minimum(order, solved.num_points - 1)
     points = np.where(real[:, None], points[:, at], 0.0).transpose(0, 2, 1)
     whole = np.hstack([x.reshape(len(x), math.prod(x.shape[1:])) for x in (cameras, points)])
     _, sizes, rows = np.linalg.svd(whole, full_matrices=False)
     basis = np.zeros((SIMILARITY, whole.shape[1]))
     basis[: len(whole)] = np.where((sizes > RESOLVED * sizes.max(initial=0.0))[:, None], rows, 0.0)
-    split = math.prod(cameras.shape[1:])
-    of_cameras, of_points = basis[:, :split], basis[:, split:]
-    return Symmetries(
-        of_cameras.reshape(SIMILARITY, *cameras.shape[1:]),
-        of_points.reshape(SIMILARITY, *points.shape[1:]),
-        np.where(real[:, None, None], determined[at], 0.0),
-    )
+    return basis, np.where(real[:, None, None], determined[at], 0.0)
 
 
 def _solve_transposed(
     layout: Layout,
     slots: Array,
     solved: BundleProblem,
-    still: Symmetries,
+    gauge: Float[Array, "7 numbers"],
+    determined: Float[Array, "points 3 3"],
     inputs: SolveInputs,
     cotangents: tuple[Array, Array],
     *,
@@ -231,18 +220,15 @@ def _solve_transposed(
     def project(y: tuple[Array, Array]) -> tuple[Array, Array]:
         """On the unknowns that a minimum determines, orthogonally."""
         cameras = unknowns.project(jnp.where(seen, y[0], 0))
-        points = jnp.einsum("pij,jp->ip", still.points, y[1], precision="highest")
-        along = jnp.einsum("kcw,cw->k", still.gauge_cameras, cameras, precision="highest")
-        along = along + jnp.einsum("kip,ip->k", still.gauge_points, points, precision="highest")
-        return (
-            cameras - jnp.einsum("k,kcw->cw", along, still.gauge_cameras, precision="highest"),
-            points - jnp.einsum("k,kip->ip", along, still.gauge_points, precision="highest"),
-        )
+        points = jnp.einsum("pij,jp->ip", determined, y[1], precision="highest")
+        flat, unravel = ravel_pytree((cameras, points))
+        along = jnp.matmul(gauge, flat, precision="highest")
+        return unravel(flat - jnp.matmul(along, gauge, precision="highest"))
 
     def moved(y: tuple[Array, Array], theta: SolveInputs) -> tuple[Array, Array]:
         """Parameters for a step of the unknowns from the solution; what is constant is that of the inputs."""
         cameras = state.cameras + _start_of_constants(layout, of_frames(theta.cameras))
-        points = state.points + _start_of_points(solved, still, jnp.asarray(theta.points), order)
+        points = state.points + _start_of_points(solved, determined, jnp.asarray(theta.points), order)
         return camera.moved(cameras, unknowns.expanded(y[0].T), unknowns), points + y[1]
 
     def of_frames(cameras: AnyArray) -> Array:
@@ -306,10 +292,10 @@ def _start_of_constants(layout: Layout, cameras: Array) -> Array:
     return (kept - jax.lax.stop_gradient(kept)).T
 
 
-def _start_of_points(solved: BundleProblem, still: Symmetries, points: Array, order: AnyArray) -> Array:
+def _start_of_points(solved: BundleProblem, determined: Array, points: Array, order: AnyArray) -> Array:
     """The same for points that are constant or that nothing sees, in layout order."""
     own = points.T[:, jnp.minimum(order, solved.num_points - 1)]
-    kept = jnp.where(jnp.any(still.points != 0, axis=(1, 2)), 0, own)
+    kept = jnp.where(jnp.any(determined != 0, axis=(1, 2)), 0, own)
     return kept - jax.lax.stop_gradient(kept)
 
 

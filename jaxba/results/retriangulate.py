@@ -12,7 +12,6 @@ section 4.4).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -79,13 +78,6 @@ class Retriangulation(ArrayRecord):
         return self.cost_before - self.cost_after > ftol * self.cost_before
 
 
-class _Found(NamedTuple):
-    points: Float[Array, "3 points"]
-    moved: Bool[Array, " points"]
-    cost_before: Float[Array, ""]
-    cost_after: Float[Array, ""]
-
-
 def retriangulate(problem: BundleProblem, loss: Loss | None = None) -> Retriangulation:
     """Searches a position with a lower cost for every point, with the cameras held fixed.
 
@@ -124,19 +116,20 @@ def retriangulate_without(
         level = "quick" if quick_runs("acceptance", here.num_observations) > EQUIVALENT_STEPS else "full"
         search = program(_search, "loss", level=level)
         arguments = (jax.device_put(layout), here, jnp.asarray(origin), loss or Loss())
-        found = jax.device_get(search(*arguments))
+        found, moved, before, after = jax.device_get(search(*arguments))
         process.release_programs()  # see `release_programs`: too many programs end a process
-    if not np.isfinite(found.cost_before):
+    if not np.isfinite(before):
         raise ProblemError(explain_start(problem, loss))
-    points, moved = np.array(problem.points, np.float64), np.asarray(found.moved) & real
-    points[order[moved]] = items_first(np.asarray(found.points))[moved] + offset
-    return Retriangulation(
-        problem.replace(points=points), int(moved.sum()), float(found.cost_before), float(found.cost_after)
-    )
+    points, moved = np.array(problem.points, np.float64), np.asarray(moved) & real
+    points[order[moved]] = items_first(np.asarray(found))[moved] + offset
+    return Retriangulation(problem.replace(points=points), int(moved.sum()), float(before), float(after))
 
 
-def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss) -> _Found:
-    """`retriangulate` in layout order; `origin` is the centre of the first camera of each point, scene units."""
+def _search(
+    layout: Layout, problem: BundleProblem, origin: Float[Array, "3 points"], loss: Loss
+) -> tuple[Float[Array, "3 points"], Bool[Array, " points"], Array, Array]:
+    """`retriangulate` in layout order, with the centre of the first camera of each point as `origin`, scene units:
+    points, which of them moved, and the cost before and after."""
     state = initial_state(layout, problem, StepOptions(loss=loss), jnp.float64)
     frames, start = slot_frames(layout, state.cameras), state.points
     one_pass = point_passes(layout, frames)
@@ -162,4 +155,4 @@ def _search(layout: Layout, problem: BundleProblem, origin: Float[Array, "3 poin
     before = jnp.sum(own)
     # XLA may sum the same numbers in two orders: where nothing moves the cost stays to the last digit
     after = jnp.where(jnp.any(moved), jnp.sum(jnp.where(moved, costs, own)), before)
-    return _Found(points, moved, before, after)
+    return points, moved, before, after

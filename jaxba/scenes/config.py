@@ -107,11 +107,7 @@ class SceneConfig:
 
 
 def check(config: SceneConfig) -> None:
-    """Refuses options that no scene can satisfy.
-
-    Raises:
-        ProblemError: with one line that names the option.
-    """
+    """Refuses options that no scene can satisfy. Raises ProblemError: with one line that names the option."""
     for field in fields(config):
         value = getattr(config, field.name)
         if not isinstance(value, str) and not np.isfinite(value).all():
@@ -123,16 +119,12 @@ def check(config: SceneConfig) -> None:
         raise ProblemError(f"observations must be {low} to {high} for these cameras and points, not {config.total}")
     positive = ("step", "lap", "min_depth", "image_width", "image_height")
     shares = ("gap_share", "revisit_share", "outlier_share")
-    sigmas = ("position_jitter", "rotation_jitter", "noise", "outlier_size")
-    starts = ("start_rotation", "start_center", "start_point", "start_focal", "start_drift")
-    for names, fits, what in (
-        (positive, lambda value: value > 0, "be positive, not"),
-        ((*sigmas, *starts), lambda value: value >= 0, "not be negative, got"),
-        (shares, lambda value: 0 <= value <= 1, "be between 0 and 1, not"),
-    ):
-        for name in names:
-            if not fits(getattr(config, name)):
-                raise ProblemError(f"{name} must {what} {getattr(config, name)}")
+    sigmas = ("position_jitter", "rotation_jitter", "noise", "outlier_size", "start_rotation", "start_center")
+    for name in (*positive, *shares, *sigmas, "start_point", "start_focal", "start_drift"):
+        value = getattr(config, name)
+        if value < 0 or (value == 0 and name in positive) or (value > 1 and name in shares):
+            what = "be positive" if name in positive else "be between 0 and 1" if name in shares else "not be negative"
+            raise ProblemError(f"{name} must {what}, not {value}")
     if config.trajectory not in get_args(Trajectory):
         raise ProblemError(f"trajectory must be forward, lateral, orbit or photos, not {config.trajectory}")
     ranges = {"depth": (config.min_depth, config.max_depth), "focal": config.focal, "k1": config.k1, "k2": config.k2}

@@ -63,20 +63,19 @@ def _path_and_truth(config: SceneConfig, rng: np.random.Generator) -> tuple[Path
 
 def _problem(path: Path, cameras: np.ndarray, views: Views) -> BundleProblem:
     """The truth without measurements: cameras by index, points in the order in which cameras first see them."""
+    points, along, point_index = views
     count = len(cameras)
     by_index = np.empty_like(cameras)
     by_index[path.index] = cameras
-    camera_index = path.index[views.camera_index]
-    first = np.full(len(views.points), count, dtype=np.int32)
-    np.minimum.at(first, views.point_index, camera_index)
+    camera_index = path.index[along]
+    first = np.full(len(points), count, dtype=np.int32)
+    np.minimum.at(first, point_index, camera_index)
     order = np.argsort(first, kind="stable")
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
-    key = number[views.point_index] * np.int64(count) + camera_index
-    key.sort()
+    key = np.sort(number[point_index] * np.int64(count) + camera_index)
     point_index, camera_index = np.divmod(key, count)
-    blank = np.zeros((len(key), 2))
-    return BundleProblem.create(by_index, views.points[order], blank, camera_index, point_index)
+    return BundleProblem.create(by_index, points[order], np.zeros((len(key), 2)), camera_index, point_index)
 
 
 def _measure(config: SceneConfig, truth: BundleProblem, rng: np.random.Generator) -> BundleProblem:

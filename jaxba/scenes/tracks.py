@@ -17,16 +17,10 @@ MIN_LENGTH = 2
 
 @lru_cache(maxsize=64)
 def track_lengths(points: int, observations: int, longest: int) -> Int[np.ndarray, " points"]:
-    """Numbers of views of each point, longest first, that add up to `observations`; read-only.
+    """Numbers of views of so many points, longest first, that add up to `observations`; read-only.
 
     A truncated power law with exponential cut-off, `p(k) ~ k^-a exp(-b k)` for 2 <= k <= longest. Lengths are not
-    drawn: each occurs as often as is expected, so that the histogram has no noise.
-
-    Args:
-        points: how many lengths.
-        observations: their sum, between `2 * points` and `longest * points`.
-        longest: largest length allowed.
-    """
+    drawn: each occurs as often as is expected, so that the histogram has no noise."""
     sizes = np.arange(MIN_LENGTH, longest + 1)
     share = _shares(sizes, observations / points)
     lengths = np.repeat(sizes[::-1], _round_counts(points * share)[::-1])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -23,28 +21,15 @@ WINDOW = 2.5
 """Candidate cameras per wanted view. At an end of the path half of the candidates do not exist, which takes 2; the rest
 is for missed views."""
 
-NEAREST = 0.5
-"""A view nearer than this part of min_depth does not count."""
-
-FARTHEST = 2.0
-"""A view farther than this many times max_depth does not count."""
+NEAREST, FARTHEST = 0.5, 2.0
+"""A view nearer than this part of min_depth, or farther than this many times max_depth, does not count."""
 
 MIN_VIEWS = 4
 """Every camera should see so many points: 8 residuals for its 6 degrees of freedom and focal length."""
 
 
-@dataclass(frozen=True)
-class Views:
-    """Points, and which cameras see them."""
-
-    points: Float[np.ndarray, "points 3"]
-    """Scene units."""
-
-    camera_index: Int[np.ndarray, " observations"]
-    """Camera of each observation, by its position along the path."""
-
-    point_index: Int[np.ndarray, " observations"]
-    """Point of each observation."""
+Views = tuple[Float[np.ndarray, "points 3"], Int[np.ndarray, " observations"], Int[np.ndarray, " observations"]]
+"""Points (scene units), and of each observation the camera, by its position along the path, and the point."""
 
 
 class TrueCameras:
@@ -90,15 +75,9 @@ class TrueCameras:
 def place_points(scene: TrueCameras, lengths: Int[np.ndarray, " points"], rng: np.random.Generator) -> Views:
     """Places points so that the total number of views is exactly the wanted one.
 
-    Args:
-        scene: the true cameras.
-        lengths: wanted views of each point, longest first. A point that fewer cameras can see gets as many views as
-            there are; the rest go to points that more cameras can see.
-        rng: source of the randomness.
-
-    Raises:
-        ProblemError: the cameras overlap too little for so many views.
-    """
+    `lengths` are the wanted views of each point, longest first. A point that fewer cameras can see gets as many
+    views as there are; the rest go to points that more cameras can see. Raises ProblemError: the cameras overlap too
+    little."""
     count = len(lengths)
     reference = rng.permutation(np.arange(count, dtype=np.int32) % scene.count)
     points = np.empty((count, 3))
@@ -117,8 +96,7 @@ def place_points(scene: TrueCameras, lengths: Int[np.ndarray, " points"], rng: n
             f"{missing} of {lengths.sum()} observations found no place: the cameras overlap too little "
             "(ask for fewer observations, deepen max_depth or shorten focal)"
         )
-    views = Views(points, np.concatenate(cameras), np.concatenate(owners))
-    return _rebalance(scene, views, rng)
+    return _rebalance(scene, points, np.concatenate(cameras), np.concatenate(owners), rng)
 
 
 def _width(scene: TrueCameras, longest: int) -> int:
@@ -138,8 +116,7 @@ def _place(scene: TrueCameras, lengths: np.ndarray, reference: np.ndarray, rng: 
     """Points (n, 3), candidate cameras (n, k) and which of them see the point (n, k).
 
     The best attempt of each point is kept. The second half of the attempts takes other reference cameras, since one in
-    a bend of the path may never share a point with enough others.
-    """
+    a bend of the path may never share a point with enough others."""
     count, width = len(lengths), _width(scene, int(lengths[0]))
     points, seen = np.empty((count, 3)), np.zeros(count, dtype=int)
     candidates, visible = np.zeros((count, width), dtype=np.int32), np.zeros((count, width), dtype=bool)
@@ -167,8 +144,7 @@ def _window(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Cameras around the reference, nearest first (n, width), and which of them exist.
 
-    For a share of the rows every other column is around the same position on another round of the path.
-    """
+    For a share of the rows every other column is around the same position on another round of the path."""
     column = np.arange(width)
     offset = (column + 1) // 2 * np.where(column % 2, 1, -1)
     cameras = reference[:, None] + offset.astype(np.int32)
@@ -208,21 +184,21 @@ def _choose(visible: np.ndarray, taken: np.ndarray, gap_share: float, rng: np.ra
     return first | rest
 
 
-def _rebalance(scene: TrueCameras, views: Views, rng: np.random.Generator) -> Views:
+def _rebalance(
+    scene: TrueCameras, points: np.ndarray, owner: np.ndarray, point_index: np.ndarray, rng: np.random.Generator
+) -> Views:
     """Moves views from cameras that see most points to those that see fewer than four, where these see the point."""
-    owner, points = views.camera_index, views.points
     load = np.bincount(owner, minlength=scene.count)
     for poor in np.flatnonzero(load < MIN_VIEWS):
-        known = views.point_index[owner == poor]
         could = scene.sees(points, np.full((len(points), 1), poor))[:, 0]
-        could[known] = False
+        could[point_index[owner == poor]] = False
         for point in rng.permutation(np.flatnonzero(could)):
             if load[poor] >= MIN_VIEWS:
                 break
-            track = np.flatnonzero(views.point_index == point)
+            track = np.flatnonzero(point_index == point)
             fullest = track[np.argmax(load[owner[track]])]
             if load[owner[fullest]] > MIN_VIEWS:
                 load[owner[fullest]] -= 1
                 load[poor] += 1
                 owner[fullest] = poor
-    return views
+    return points, owner, point_index

@@ -19,9 +19,9 @@ pytest.importorskip("requests", reason="the extra `data` is not installed")
 
 from jaxba import read_bal
 from jaxba.cli.data import run
-from jaxba.datasets.bal import download, transfer
-from jaxba.datasets.bal.catalog import Entry, find
+from jaxba.datasets.bal import download
 from jaxba.datasets.bal.download import DownloadError, UnreachableError, fetch, partial_path
+from jaxba.datasets.bal.paths import Entry, select
 
 
 def packed(cameras: int, points: int, seed: int = 0) -> bytes:
@@ -174,7 +174,7 @@ def test_a_second_run_beside_the_first_waits_for_it_and_asks_for_nothing(server,
 
 
 def test_progress_ends_at_the_size_of_the_file_and_counts_what_was_there(server, folder, monkeypatch):
-    monkeypatch.setattr(transfer, "BLOCK_BYTES", 1 << 14)
+    monkeypatch.setattr(download, "BLOCK_BYTES", 1 << 14)
     break_off(server, folder, after=100_000)
     seen: list = []
     fetch(ENTRY, folder, lambda *state: seen.append(state), server.url)
@@ -213,19 +213,11 @@ def test_a_server_that_cannot_continue_sends_the_whole_file_again(server, folder
     assert server.sent == len(BODY)
 
 
-def test_what_had_come_whole_is_taken_without_another_byte(server, folder):
+@pytest.mark.parametrize("more", [b"", b"more"])
+def test_a_leftover_that_is_not_shorter_than_the_file_is_replaced(server, folder, more):
     partial = partial_path(ENTRY, folder)
     partial.parent.mkdir(parents=True)
-    partial.write_bytes(BODY)
-    path, _ = get(server, folder)
-    assert path.read_bytes() == BODY
-    assert server.sent == 0
-
-
-def test_a_leftover_longer_than_the_file_is_replaced(server, folder):
-    partial = partial_path(ENTRY, folder)
-    partial.parent.mkdir(parents=True)
-    partial.write_bytes(BODY + b"more")
+    partial.write_bytes(BODY + more)
     path, _ = get(server, folder)
     assert path.read_bytes() == BODY
 
@@ -306,7 +298,7 @@ def _closed_port() -> int:
 
 
 def test_a_silent_server_is_given_up(folder, monkeypatch):
-    monkeypatch.setattr(transfer, "TIMEOUT_S", 0.2)
+    monkeypatch.setattr(download, "TIMEOUT_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"http://127.0.0.1:{silent.getsockname()[1]}"
         with pytest.raises(UnreachableError, match=r"cannot reach 127.0.0.1:\d+: no answer in 0.2 s"):
@@ -341,18 +333,18 @@ def test_an_address_that_is_none_is_one_line(folder, capsys, url):
 
 def test_one_bad_file_does_not_keep_the_others_from_coming(server, folder, capsys):
     body = packed(1723, 156502)
-    server.files["/" + find("ladybug-1723").file] = body
+    server.files["/" + select(["ladybug-1723"])[0].file] = body
     assert run(["download", "ladybug-49", "ladybug-1723", "--base-url", server.url + "/"]) == 2
     done = capsys.readouterr()
     check_one_line(done.err, "404 Not Found")
     assert "ladybug-1723: downloaded, unpacks, header fits its name: " in done.out
-    assert files(folder) == [find("ladybug-1723").file]
+    assert files(folder) == [select(["ladybug-1723"])[0].file]
 
 
 def test_ctrl_c_keeps_what_has_come_and_the_same_command_goes_on(server, folder, capsys, monkeypatch):
-    name = find("ladybug-1723")
+    (name,) = select(["ladybug-1723"])
     server.files["/" + name.file] = packed(1723, 156502)
-    monkeypatch.setattr(transfer, "BLOCK_BYTES", 1 << 14)
+    monkeypatch.setattr(download, "BLOCK_BYTES", 1 << 14)
     original = download.download_rest
 
     def interrupted(url, partial, report):
@@ -377,7 +369,7 @@ def test_ctrl_c_keeps_what_has_come_and_the_same_command_goes_on(server, folder,
     ("name", "file"), [("ladybug-49", "problem-49-7776-pre"), ("trafalgar-21", "problem-21-11315-pre")]
 )
 def test_the_real_files_have_the_stated_checksums_and_are_the_problems_of_their_names(server, folder, name, file):
-    server.files["/" + find(name).file] = support.bal_file(file).read_bytes()
+    server.files["/" + select([name])[0].file] = support.bal_file(file).read_bytes()
     assert run(["download", name, "--base-url", server.url]) == 0
-    problem = read_bal(folder / find(name).file)
-    assert (problem.num_cameras, problem.num_points) == (find(name).cameras, find(name).points)
+    problem = read_bal(folder / select([name])[0].file)
+    assert (problem.num_cameras, problem.num_points) == (select([name])[0].cameras, select([name])[0].points)

@@ -14,8 +14,7 @@ import yaml
 from jaxba import ProblemError, write_bal
 from jaxba.bench.sources import sources
 from jaxba.cli import bench, data, solve
-from jaxba.datasets.bal.catalog import ENTRIES, find, select
-from jaxba.datasets.bal.paths import data_folder, local_path, resolve
+from jaxba.datasets.bal.paths import ENTRIES, data_folder, local_path, resolve, select
 from jaxba.scenes.config import LIKE
 
 
@@ -69,7 +68,8 @@ def test_checksums_are_64_hexadecimal_digits_all_different():
 
 @pytest.mark.parametrize("name", [name for name in LIKE if name.partition("-")[0] in {e.family for e in ENTRIES}])
 def test_random_scenes_named_after_problems_have_their_sizes(name):
-    assert (find(name).cameras, find(name).points) == (LIKE[name].cameras, LIKE[name].points)
+    (entry,) = select([name])
+    assert (entry.cameras, entry.points) == (LIKE[name].cameras, LIKE[name].points)
 
 
 def test_a_family_stands_for_its_problems_and_nothing_comes_twice():
@@ -162,8 +162,7 @@ def test_list_of_some_names(folder, capsys):
 def test_download_without_names_and_without_requests_are_one_line(folder, capsys, monkeypatch):
     assert data.run(["download"]) == 2
     check_one_line(capsys.readouterr().err, "name a problem or a family")
-    for module in ("jaxba.datasets.bal.download", "jaxba.datasets.bal.transfer"):
-        monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.delitem(sys.modules, "jaxba.datasets.bal.download", raising=False)
     monkeypatch.delattr(sys.modules["jaxba.datasets.bal"], "download", raising=False)
     monkeypatch.setitem(sys.modules, "requests", None)
     assert data.run(["download", "ladybug-49"]) == 2

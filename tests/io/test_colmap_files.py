@@ -66,14 +66,14 @@ def same_numbers(model: Model, truth) -> None:
         other = truth.image(identity)
         pose = other.cam_from_world()
         assert (image.name.decode(), image.camera) == (other.name, other.camera_id)
-        assert list(image.pose.qvec) == pose.rotation.quat[[3, 0, 1, 2]].tolist()
-        assert list(image.pose.tvec) == pose.translation.tolist()
+        assert list(image.pose[:4]) == pose.rotation.quat[[3, 0, 1, 2]].tolist()
+        assert list(image.pose[4:]) == pose.translation.tolist()
         keys = other.points2D
         assert image.keys["xy"].tolist() == [key.xy.tolist() for key in keys]
         assert image.keys["point"].tolist() == [key.point3D_id if key.has_point3D() else NO_POINT for key in keys]
-    ends = np.cumsum(model.points.heads["length"].astype(int))
-    assert sorted(model.points.heads["id"].tolist()) == sorted(truth.point3D_ids())
-    for head, track in zip(model.points.heads, np.split(model.points.tracks, ends[:-1]), strict=True):
+    ends = np.cumsum(model.points["length"].astype(int))
+    assert sorted(model.points["id"].tolist()) == sorted(truth.point3D_ids())
+    for head, track in zip(model.points, np.split(model.tracks, ends[:-1]), strict=True):
         other = truth.point3D(int(head["id"]))
         assert head["xyz"].tolist() == other.xyz.tolist()
         assert head["rgb"].tolist() == other.color.tolist()
@@ -85,7 +85,7 @@ def same_numbers(model: Model, truth) -> None:
         for identity, frame in model.frames.items():
             other = truth.frame(identity)
             assert frame.rig == other.rig_id
-            assert list(frame.pose.tvec) == other.rig_from_world.translation.tolist()
+            assert list(frame.pose[4:]) == other.rig_from_world.translation.tolist()
             assert sorted(image for _, image in frame.images) == sorted(one.id for one in other.image_ids)
 
 
@@ -148,7 +148,7 @@ def test_a_solution_is_written_with_a_rig_of_each_camera_and_a_frame_of_each_ima
     for identity in before.point3D_ids():
         assert after.point3D(identity).xyz.tolist() == (before.point3D(identity).xyz + 1.0).tolist()
     after.update_point_3d_errors()
-    stored = read_model(tmp_path / "out").points.heads
+    stored = read_model(tmp_path / "out").points
     truth = [after.point3D(int(identity)).error for identity in stored["id"]]
     np.testing.assert_allclose(stored["error"], truth, rtol=1e-9)
 
@@ -162,7 +162,7 @@ def test_errors_of_points_are_colmaps_whatever_the_lens(tmp_path, kind):
     write_colmap(moved, tmp_path / "out", like=folder)
     truth = pycolmap.Reconstruction(str(tmp_path / "out"))
     truth.update_point_3d_errors()
-    stored = read_model(tmp_path / "out").points.heads
+    stored = read_model(tmp_path / "out").points
     assert stored["error"].min() > 1e-3
     np.testing.assert_allclose(stored["error"], [truth.point3D(int(i)).error for i in stored["id"]], rtol=1e-7)
 
@@ -179,5 +179,5 @@ def test_real_models_are_read_as_colmap_reads_them_and_written_bit_by_bit(tmp_pa
     assert [image.keys.tobytes() for image in again.images.values()] == [
         image.keys.tobytes() for image in model.images.values()
     ]
-    assert again.points.tracks.tobytes() == model.points.tracks.tobytes()
+    assert again.tracks.tobytes() == model.tracks.tobytes()
     assert again.cameras == model.cameras

@@ -141,7 +141,7 @@ def test_where_blocks_are_cut_changes_nothing(tmp_path, monkeypatch, size, suffi
     for path, changes in ((bad, {19: "1x"}), (out, {4: "0 3 1.25 2.25"})):
         with OPENERS[suffix](path, "wb") as file:
             file.write(text_of(changes).encode())
-    monkeypatch.setattr(files, "BLOCK_BYTES", size)
+    monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", size)
     assert_same_bits(read_bal(good), problem)
     assert message_of(out).endswith(" line 4: '3' is outside 0..2 (point index of observation 2)")
     assert message_of(bad).endswith("bad.txt" + suffix + " line 19: '1x' is not a number (translation y of camera 1)")
@@ -224,13 +224,6 @@ def test_a_file_that_is_no_text_of_numbers_is_refused(tmp_path, content):
     assert "line 1" in message_of(path)
 
 
-def test_a_word_longer_than_any_number_is_refused_and_not_gathered(tmp_path, monkeypatch):
-    monkeypatch.setattr(files, "BLOCK_BYTES", 100)
-    monkeypatch.setattr(text, "MAX_WORD_BYTES", 1000)
-    (tmp_path / "a.txt").write_text("2 3\n" + "4" * 5000)
-    assert message_of(tmp_path / "a.txt").endswith("is longer than 1000 characters (number of observations)")
-
-
 def test_a_number_of_many_digits_is_rounded_correctly(tmp_path):
     exact = f"{2**-1074:.1074f}"  # all digits of the smallest subnormal
     (tmp_path / "a.txt").write_text(text_of({24: exact, 25: "1" + 300 * "0", 26: "0." + 400 * "0" + "1"}))
@@ -304,7 +297,7 @@ def test_no_memory_is_set_aside_for_a_header_that_lies(tmp_path):
     message_of(path)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 4 * files.BLOCK_BYTES
+    assert peak < 4 * text.BLOCK_BYTES
 
 
 class TestWriting:

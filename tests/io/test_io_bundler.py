@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxba.io import files, read_bundler, read_problem
+from jaxba.io import read_bundler, read_problem
 from jaxba.problem.bundle_problem import ProblemError
 
 DATA = os.environ.get("JAXBA_DATA")
@@ -51,7 +51,7 @@ def message_of(path: Path) -> str:
 @pytest.mark.parametrize("suffix", OPENERS)
 @pytest.mark.parametrize("size", [1, 5, 1000])
 def test_a_small_model_is_read_as_it_stands(tmp_path, monkeypatch, suffix, size):
-    monkeypatch.setattr(files, "BLOCK_BYTES", size)
+    monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", size)
     problem = read_problem(write(tmp_path / f"bundle.out{suffix}", {}))
     np.testing.assert_array_equal(problem.points, [[1, 2, -3], [4, 5, -6]])
     np.testing.assert_array_equal(problem.point_index, [0, 0, 1])

@@ -16,7 +16,7 @@ from foreign_scene import Lens, Scene, write_alicevision, write_openmvg, write_o
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from jaxba.io import ProblemWarning, files, read_problem, write_problem
+from jaxba.io import ProblemWarning, read_problem, write_problem
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 
 BAL = b"2 3 4\n0 0 1.5 -2.5\n1 0 3.25 4e0\n0 1 -5 6\n1 2 .5 7.\n" + b"".join(b"%d.25\n" % i for i in range(27))
@@ -121,7 +121,7 @@ def check(path: Path, content: bytes) -> None:
 @given(data=st.data(), block=st.sampled_from([3, 17, 4096]))
 @pytest.mark.parametrize("name", SEEDS)
 def test_damaged_text_is_refused_or_still_a_problem(tmp_path, monkeypatch, name, data, block):
-    monkeypatch.setattr(files, "BLOCK_BYTES", block)
+    monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", block)
     check(tmp_path / name, data.draw(damaged(SEEDS[name])))
 
 
@@ -234,7 +234,7 @@ def test_random_bytes_are_refused(tmp_path, content, name):
     gaps=st.lists(st.text(" \t\n\r\v\f", min_size=1, max_size=4), min_size=46, max_size=46), block=st.integers(1, 99)
 )
 def test_any_layout_of_whitespace_reads_the_same(tmp_path, monkeypatch, gaps, block):
-    monkeypatch.setattr(files, "BLOCK_BYTES", block)
+    monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", block)
     words = BAL.decode().split()
     path = tmp_path / "a.txt"
     path.write_bytes("".join(gap + word for gap, word in zip(gaps, words, strict=True)).encode())

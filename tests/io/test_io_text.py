@@ -7,7 +7,7 @@ import pytest
 import support
 
 from jaxba import write_bal
-from jaxba.io import ProblemWarning, files, read_problem, write_bundler, write_problem
+from jaxba.io import ProblemWarning, read_problem, write_bundler, write_problem
 from jaxba.io.text import number
 from jaxba.problem import geometry
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -49,7 +49,7 @@ def same(one: BundleProblem, other: BundleProblem) -> None:
 def test_byte_order_marks_change_nothing(file, monkeypatch, encoding, block):
     expected = read_problem(file)
     file.write_bytes(ENCODINGS[encoding](file.read_text()))
-    monkeypatch.setattr(files, "BLOCK_BYTES", block)
+    monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", block)
     same(read_problem(file), expected)
 
 
@@ -60,7 +60,7 @@ def test_the_layout_of_lines_and_the_letter_of_exponents_change_nothing(file, mo
     text = file.read_text()
     assert layout != "Fortran" or "e-" in text
     file.write_bytes(LAYOUTS[layout](text).encode())
-    monkeypatch.setattr(files, "BLOCK_BYTES", block)
+    monkeypatch.setattr("jaxba.io.text.BLOCK_BYTES", block)
     same(read_problem(file), expected)
 
 

@@ -308,7 +308,7 @@ def test_images_that_cannot_be_used_are_named(sequence, tmp_path, capfd):
         (["--max-error", "inf"], "--max-error must be finite"),
         (["--keyframes", "99", "--frames", "0:5"], "--keyframes 99 leaves one key-frame of 5"),
         (["--frames", "0:99"], "ends after the last frame, 13"),
-        (["--poses", "nowhere.txt"], "cannot be read"),
+        (["--poses", "nowhere.txt"], "cannot read nowhere.txt"),
         (["--keyframes", "few", "--frames", "0:3"], "--keyframes must be"),
         (["--min-matches", "3000", "--frames", "0:3"], "at least 3000 are needed"),
         (

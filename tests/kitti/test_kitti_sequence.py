@@ -91,8 +91,8 @@ def test_a_range_outside_of_the_sequence_is_refused(folder, frames, words):
     [
         ("P1: 1 2 3\n", "no line P0"),
         ("P0: 1 2 3\n", "P0: has 3 numbers instead of 12"),
-        (CALIBRATION.replace("700", "seven", 1), "P0: holds something that is no number"),
-        (CALIBRATION.replace("700", "nan", 1), "not finite"),
+        (CALIBRATION.replace("700", "seven", 1), "P0: 'seven' is not a number"),
+        (CALIBRATION.replace("700", "nan", 1), "not a finite number"),
         (CALIBRATION.replace("700", "-700", 1), "is not"),
         (CALIBRATION.replace("700 0", "700 3", 1), "is not"),
         ("1 2\n", "has 2 numbers"),
@@ -117,7 +117,7 @@ def test_what_is_missing_is_named(folder, tmp_path):
     (folder / "calib.txt").unlink()
     with pytest.raises(ProblemError, match="has no calibration"):
         read_sequence(folder)
-    with pytest.raises(ProblemError, match="cannot be read: No such file"):
+    with pytest.raises(ProblemError, match=r"cannot read .*: No such file"):
         read_sequence(folder, calibration=folder / "other.txt")
 
 
@@ -135,7 +135,7 @@ def test_an_image_without_a_number_is_refused(folder):
         ("1 0 0 0 0 1 0 0 0 0 1\n", "line 1: has 11 numbers instead of 12"),
         ("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 0 0 2 0 0 0 0 1 0\n", "line 2: the left 3 x 3 numbers are no rotation"),
         ("1 0 0 0 0 1 0 0 0 0 -1 0\n", "are no rotation"),
-        ("1 0 0 0 0 1 0 0 0 0 1 x\n", "no number"),
+        ("1 0 0 0 0 1 0 0 0 0 1 x\n", "not a number"),
     ],
 )
 def test_malformed_poses_are_refused(tmp_path, text, words):
@@ -250,9 +250,9 @@ def test_poses_with_frame_numbers_may_miss_frames(tmp_path):
         (f"1 {IDENTITY}\n\n1 {IDENTITY}", "has two poses for frame 1"),
         (f"1 {IDENTITY}\n{IDENTITY}", "line 2: has 12 numbers instead of 13"),
         (f"1 {IDENTITY} 0 0 0 2", "line 1: the last row of the matrix is not 0 0 0 1"),
-        (f"{IDENTITY}\n\n{IDENTITY} x", "line 3: holds something that is no number"),
-        (f"{IDENTITY}\n\n{IDENTITY.replace('7', '-nan(ind)')}", "line 3: holds a number that is not finite"),
-        (f"{IDENTITY}\n{IDENTITY.replace('7', '1_0')}", "line 2: holds something that is no number"),
+        (f"{IDENTITY}\n\n{IDENTITY} x", "line 3: 'x' is not a number"),
+        (f"{IDENTITY}\n\n{IDENTITY.replace('7', '-nan(ind)')}", r"line 3: '-nan\(ind\)' is not a finite number"),
+        (f"{IDENTITY}\n{IDENTITY.replace('7', '1_0')}", "line 2: '1_0' is not a number"),
     ],
 )
 def test_malformed_poses_are_refused_by_the_line_of_the_file(tmp_path, text, words):

@@ -126,7 +126,7 @@ def test_lenses_with_impossible_models_are_refused():
     models = (CAMERA_MODELS["PINHOLE"],)
     index, free = problem.lenses.index, problem.lenses.free
     for lenses, message in (
-        (Lenses(index, free, np.array([1]), models), "lens 0 has model 1, outside 0..0"),
+        (Lenses(index, free, np.array([1]), models), r"the model of lenses\[0\] is 1, outside 0..0"),
         (Lenses(index, free[:, :3], None, models), "what is free, shape"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -214,8 +214,8 @@ def test_a_part_of_a_problem_keeps_its_lenses():
 @pytest.mark.parametrize(
     ("lenses", "message"),
     [
-        (Lenses(np.zeros(5, int), FREE), "a lens for each of 6 cameras"),
-        (Lenses(np.array([0, 1, 2, 3, 0, 0]), FREE), "camera 3 has lens 3, outside 0..2"),
+        (Lenses(np.zeros(5, int), FREE), "the lens of cameras must be a vector of 6 integers"),
+        (Lenses(np.array([0, 1, 2, 3, 0, 0]), FREE), r"the lens of cameras\[3\] is 3, outside 0..2"),
         (Lenses(INDEX, FREE), "cameras 0 and 2 share lens 0, but differ in f, k1 or k2"),
     ],
 )

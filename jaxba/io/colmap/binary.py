@@ -5,14 +5,15 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
-from jaxba.io.colmap.model import KEY, POINT, TRACK, Image, Model, Points
-from jaxba.io.colmap.poses import pose_of
+from jaxba.io.colmap.model import KEY, POINT, TRACK, Image, Model
+from jaxba.io.files import read_bytes
 from jaxba.problem.bundle_problem import ProblemError
 
 _COUNT = struct.Struct("<Q")
@@ -37,21 +38,17 @@ class _Bytes:
     def unpack(self, layout: struct.Struct, where: str) -> tuple[Any, ...]:
         if self.left < layout.size:
             self.fail(f"is cut short in {where}")
-        values = layout.unpack_from(self.data, self.at)
         self.at += layout.size
-        return values
+        return layout.unpack_from(self.data, self.at - layout.size)
 
     def take(self, fields: Fields, what: str = "") -> tuple[Any, ...]:
-        if what and self.left < fields.struct.size:
-            wanted = f"the parameters of {self.about} ({what}) should have {len(fields.names)}"
-            self.fail(f"is cut short: {wanted}, and {self.left} bytes follow")
         values = self.unpack(fields.struct, self.about)
         if not self._named:
             self.about, self._named = f"{self.record} {values[0]}", True
         if fields.kinds is not None:
-            number = values[fields.codes.index("i")]
-            if number not in fields.kinds.numbers.values():
-                self.fail(f"{self.about}{fields.kinds.unknown_number.format(number)}")
+            number, (known, _, unknown) = values[fields.codes.index("i")], fields.kinds
+            if number not in known.values():
+                self.fail(f"{self.about}{unknown.format(number)}")
         return values
 
     def count(self, field: str, each: Fields) -> int:
@@ -93,22 +90,14 @@ class _Bytes:
             self.fail(f"is too long, by {self.left} byte{plural} after {count} {self.record}s")
 
 
-def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
-    """The records of a file by id, in its order; of `points3D` all points and tracks.
-
-    Args:
-        part: `cameras`, `images`, `points3D`, `rigs` or `frames`.
-        data: content of the file.
-        name: its name for messages.
-
-    Raises:
-        ProblemError: the file is cut short or too long, or a record cannot be understood; one line that names the file
-            and the record.
-    """
-    file, found = _Bytes(data, name, part.removesuffix("3D")[:-1]), {}
+def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray, np.ndarray]:
+    """The records of a file by id, in its order; of `points3D` all points and tracks. `part` is the file's name without
+    its ending; `name` is for messages. Raises ProblemError: the file is cut short or too long, or a record cannot be
+    understood; one line that names the file and the record."""
+    file, found = _Bytes(read_bytes(path), name, part.removesuffix("3D")[:-1]), {}
     if part == "points3D":
         return _read_points(file)
-    first, read_one = fields.READERS.get(part, (fields.IMAGE, _read_image))
+    first, read_one = fields.FIRST[part], fields.READERS.get(part, _read_image)
     for _ in file.records(first.struct.size + (1 + _COUNT.size if first is fields.IMAGE else 0)):
         record = read_one(file)
         if record.id in found:
@@ -117,7 +106,7 @@ def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
     return found
 
 
-def _read_points(file: _Bytes) -> Points:
+def _read_points(file: _Bytes) -> tuple[np.ndarray, np.ndarray]:
     heads, tracks, length_of = [], [], _COUNT.unpack_from
     for where in file.records(POINT.itemsize):  # a track's length says where the next point is
         start, end = file.at, file.at + POINT.itemsize
@@ -128,12 +117,12 @@ def _read_points(file: _Bytes) -> Points:
             file.fail(f"is cut short in the track of point {length_of(file.data, start)[0]}")
         heads.append(file.data[start:end])
         tracks.append(file.data[end : file.at])
-    return Points(np.frombuffer(b"".join(heads), POINT), np.frombuffer(b"".join(tracks), TRACK))
+    return np.frombuffer(b"".join(heads), POINT), np.frombuffer(b"".join(tracks), TRACK)
 
 
 def _read_image(file: _Bytes) -> Image:
     identity, *pose, camera = file.take(fields.IMAGE)
-    image = Image(identity, pose_of(pose), camera, file.string(), np.empty(0, KEY))
+    image = Image(identity, tuple(pose), camera, file.string(), np.empty(0, KEY))
     return replace(image, keys=file.array(KEY, f"key-points of {image}"))
 
 
@@ -141,8 +130,7 @@ def encode(model: Model) -> Iterator[tuple[str, bytes]]:
     """Names and contents of the files of a model with rigs and frames."""
     for part, records in model.records.items():
         yield f"{part}.bin", b"".join([_COUNT.pack(len(records)), *map(_packed, records.values())])
-    points = model.points
-    yield "points3D.bin", b"".join([_COUNT.pack(len(points.heads)), *_packed_points(points)])
+    yield "points3D.bin", b"".join([_COUNT.pack(len(model.points)), *_packed_points(model)])
 
 
 def _packed(record: Any) -> bytes:
@@ -152,9 +140,9 @@ def _packed(record: Any) -> bytes:
     return b"".join(parts)
 
 
-def _packed_points(points: Points) -> Iterator[bytes]:
-    heads, tracks, at = points.heads.tobytes(), points.tracks.tobytes(), 0
-    for number, length in enumerate(points.heads["length"].tolist()):
+def _packed_points(model: Model) -> Iterator[bytes]:
+    heads, tracks, at = model.points.tobytes(), model.tracks.tobytes(), 0
+    for number, length in enumerate(model.points["length"].tolist()):
         end = at + length * TRACK.itemsize
         yield heads[number * POINT.itemsize : (number + 1) * POINT.itemsize] + tracks[at:end]
         at = end

@@ -12,22 +12,14 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from jaxba.io.colmap.model import MODELS, SENSORS, Camera, Frame, Image, Rig, Sensor
-from jaxba.io.colmap.poses import pose_of
 from jaxba.problem.camera_models import CAMERA_MODELS
 
-
-class Kinds(NamedTuple):
-    """A field that is a word in text and its number in a binary file."""
-
-    numbers: Mapping[str, int]
-    unknown_word: str
-    """What a message says of another word."""
-
-    unknown_number: str
-    """And of another number, after the name of the record."""
+Kinds = tuple[Mapping[str, int], str, str]
+"""Numbers in a binary file by their words in text, and what a message says of another word, and (after the name of the
+record) of another number."""
 
 
 class Fields:
@@ -46,7 +38,7 @@ _NUMBERS = {name: number for number, name in enumerate(MODELS)}
 CAMERA = Fields(
     "CAMERA_ID, model, width, height",
     "IiQQ",
-    Kinds(_NUMBERS, "is an unknown camera model", " has an unknown model, number {}"),
+    (_NUMBERS, "is an unknown camera model", " has an unknown model, number {}"),
 )
 PARAMETERS = {
     name: Fields(", ".join(f"parameter {k + 1}" for k in range(size)), size * "d")
@@ -60,7 +52,7 @@ RIG = Fields("RIG_ID", "I")
 SENSOR = Fields(
     "type of a sensor, id of a sensor",
     "iI",
-    Kinds(SENSORS, "is no type of sensors", ": {} is the number of no type of sensors"),
+    (SENSORS, "is no type of sensors", ": {} is the number of no type of sensors"),
 )
 PLACED = Fields("whether there is a pose", "B", largest=1)
 FRAME = Fields(f"FRAME_ID, RIG_ID, {_POSE_NAMES}", f"II{7 * 'd'}")
@@ -78,23 +70,22 @@ def _read_rig(file: Any) -> Rig:
     for number in range(file.count("number of sensors", SENSOR)):
         kind, sensor = file.take(SENSOR)
         placed = number and any(file.take(PLACED))
-        sensors.append(Sensor(kind, sensor, pose_of(file.take(POSE)) if placed else None))
+        sensors.append(Sensor(kind, sensor, file.take(POSE) if placed else None))
     return Rig(identity, tuple(sensors))
 
 
 def _read_frame(file: Any) -> Frame:
     identity, rig, *pose = file.take(FRAME)
     return Frame(
-        identity, rig, pose_of(pose), tuple(file.take(DATUM) for _ in range(file.count("number of data", DATUM)))
+        identity, rig, tuple(pose), tuple(file.take(DATUM) for _ in range(file.count("number of data", DATUM)))
     )
 
 
-READERS: dict[str, tuple[Fields, Callable[[Any], Any]]] = {
-    "cameras": (CAMERA, _read_camera),
-    "rigs": (RIG, _read_rig),
-    "frames": (FRAME, _read_frame),
-}
-"""Of each file of records that are read alike in both forms: the fields with which one begins, and what reads it."""
+READERS: dict[str, Callable[[Any], Any]] = {"cameras": _read_camera, "rigs": _read_rig, "frames": _read_frame}
+"""What reads a record of the files that are read alike in both forms."""
+
+FIRST = {"cameras": CAMERA, "images": IMAGE, "points3D": POINT, "rigs": RIG, "frames": FRAME}
+"""The fields with which a record of each file begins."""
 
 Values = Iterator[tuple[Fields, tuple[Any, ...]]]
 """Fields and their values, one group after the other."""
@@ -107,7 +98,7 @@ def values(record: Camera | Image | Rig | Frame) -> Values:
             yield CAMERA, (record.id, _NUMBERS[record.model], record.width, record.height)
             yield PARAMETERS[record.model], record.params
         case Image():
-            yield IMAGE, (record.id, *record.pose.numbers, record.camera)
+            yield IMAGE, (record.id, *record.pose, record.camera)
         case Rig():
             yield RIG, (record.id,)
             yield COUNT, (len(record.sensors),)
@@ -116,9 +107,9 @@ def values(record: Camera | Image | Rig | Frame) -> Values:
                 if number:
                     yield PLACED, (int(one.from_rig is not None),)
                 if number and one.from_rig is not None:
-                    yield POSE, one.from_rig.numbers
+                    yield POSE, one.from_rig
         case Frame():
-            yield FRAME, (record.id, record.rig, *record.pose.numbers)
+            yield FRAME, (record.id, record.rig, *record.pose)
             yield COUNT, (len(record.data),)
             for datum in record.data:
                 yield DATUM, datum

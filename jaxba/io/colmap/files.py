@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxba.io.colmap import binary, text
 from jaxba.io.colmap.model import PARTS, RIG_PARTS, Model, check_model, file_name
-from jaxba.io.files import READ_ERRORS, StrPath, display_name, reason
+from jaxba.io.files import StrPath, display_name, reason
 from jaxba.problem.bundle_problem import ProblemError
 
 _FORMS: dict[str, Any] = {".bin": binary, ".txt": text}
@@ -22,12 +22,9 @@ def is_colmap(path: StrPath) -> bool:
 
 
 def read_model(folder: StrPath) -> Model:
-    """Reads the files of a model, the binary ones where there are both, and checks its structure.
-
-    Raises:
-        ProblemError: a file is missing, cannot be read or understood, or `check_model` refuses the model; one line
-            that names the file.
-    """
+    """Reads the files of a model, the binary ones where there are both, and checks its structure. Raises ProblemError:
+    a file is missing, cannot be read or understood, or `check_model` refuses the model; one line that names the
+    file."""
     if not is_colmap(folder):
         raise ProblemError(f"{display_name(folder)}: no directory with a COLMAP model (cameras.bin or cameras.txt)")
     whole = [suffix for suffix in _FORMS if has_parts(folder, suffix)]
@@ -39,7 +36,7 @@ def read_model(folder: StrPath) -> Model:
     try:
         content = {part: _read(folder, part, suffix) for part in here}
         cameras, images, points = (content[part] for part in PARTS)
-        model = Model(os.fspath(folder), suffix, cameras, images, points, *map(content.get, RIG_PARTS))
+        model = Model(os.fspath(folder), suffix, cameras, images, *points, *map(content.get, RIG_PARTS))
         check_model(model)
     except MemoryError:
         raise ProblemError(f"cannot read {display_name(folder)}: not enough memory") from None
@@ -56,24 +53,13 @@ def _read(folder: StrPath, part: str, suffix: str) -> Any:
     name = file_name(os.fspath(folder), path.name)
     if path.exists() and not path.is_file():  # reading a pipe could wait for ever
         raise ProblemError(f"{name} is no file")
-    try:
-        data = path.read_bytes()
-    except (*READ_ERRORS, ValueError) as error:
-        raise ProblemError(f"cannot read {name}: {reason(error)}") from error
-    return _FORMS[suffix].read(part, data, name)
+    return _FORMS[suffix].read(part, path, name)
 
 
 def write_model(model: Model, folder: StrPath, suffix: str) -> None:
-    """Writes the files of a model: all to a hidden folder, then each replaces the old one.
-
-    Args:
-        model: with rigs and frames.
-        folder: made if it does not exist.
-        suffix: `.bin` or `.txt`.
-
-    Raises:
-        ProblemError: the folder cannot be written.
-    """
+    """Writes the files of a model with rigs and frames, `.bin` or `.txt` by the suffix: all to a hidden folder, then
+    each replaces the old one. The folder is made if it does not exist. Raises ProblemError: the folder cannot be
+    written."""
     target = Path(folder)
     beside = target if target.is_dir() else target.absolute().parent  # writable, and on the same file system
     try:

@@ -13,47 +13,20 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from jaxba.io.colmap.model import Camera, Model
-from jaxba.problem.bundle_problem import ProblemError
+from jaxba.io.colmap.model import Camera
 from jaxba.problem.camera_models import BAL, CAMERA_MODELS
 from jaxba.problem.intrinsics import Lenses
 
 AS_BAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 """Camera models that are BAL's but for the principal point and numbers that stay zero."""
 
-LARGEST_RATIO = 1e6
-"""Of the focal lengths of a lens; a larger one is damage."""
-
-
-def check_lens(model: Model, camera: Camera) -> None:
-    """Refuses a lens with parameters that cannot be.
-
-    Raises:
-        ProblemError: it cannot be used; one line that names file and camera.
-    """
-    focals = camera.focals
-    if not camera.possible or (focals and max(focals) / LARGEST_RATIO > min(focals)):
-        shown = ", ".join(f"{value:g}" for value in camera.params)
-        name = f"{model.file('cameras')}: camera {camera.id}"
-        raise ProblemError(f"{name} has impossible parameters: {shown} ({camera.model})")
-
 
 def lenses_of(
     cameras: Sequence[Camera], index: np.ndarray, *, refine_principal_point: bool
 ) -> tuple[Float[np.ndarray, "lenses numbers"], Lenses | None]:
-    """Numbers of lenses, and the lenses of a problem.
-
-    As in COLMAP, focal lengths and distortion are optimised, and principal points only if asked for; nothing of a model
-    without a focal length.
-
-    Args:
-        cameras: those of the lenses.
-        index: lens of each image.
-        refine_principal_point: whether principal points are optimised.
-
-    Returns:
-        The lenses are None if every image has its own, and all of it is optimised.
-    """
+    """Numbers of lenses, and the lenses of a problem whose images have them; None if every image has its own, and all
+    of it is optimised. As in COLMAP, focal lengths and distortion are optimised, and principal points only if asked
+    for; nothing of a model without a focal length."""
     bal = not refine_principal_point and all(camera.model in AS_BAL for camera in cameras)
     names = ["BAL"] if bal else sorted({camera.model for camera in cameras})
     models = tuple(CAMERA_MODELS[name] for name in names)
@@ -75,13 +48,8 @@ def lenses_of(
 
 
 def with_lens(camera: Camera, lens: Float[np.ndarray, " numbers"], *, bal: bool) -> Camera:
-    """A camera with new numbers, where its model has them; all else stays as it is, bit by bit.
-
-    Args:
-        camera: the old one.
-        lens: its numbers in the problem.
-        bal: whether these are BAL's.
-    """
+    """A camera with new numbers, which are BAL's if `bal`, where its model has them; all else stays as it is, bit by
+    bit."""
     if not bal:
         return replace(camera, params=tuple(lens[: len(camera.params)].tolist()))
     names = CAMERA_MODELS[camera.model].parameters

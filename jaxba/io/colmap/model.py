@@ -42,6 +42,9 @@ NO_ID = 2**32 - 1
 NO_POINT = 2**64 - 1
 """COLMAP's id of no point; -1 in a text file."""
 
+LARGEST_RATIO = 1e6
+"""Of the focal lengths of a lens; a larger one is damage."""
+
 CAMERA_SENSOR = 0
 """Number of the sensor type of cameras."""
 
@@ -82,9 +85,12 @@ class Camera:
         return self.params[x], self.params[y]
 
     @property
-    def possible(self) -> bool:
-        """Whether all parameters are finite and focal lengths positive."""
-        return bool(np.isfinite(self.params).all()) and all(f > 0 for f in self.focals)
+    def impossible(self) -> str | None:
+        """Its parameters for a message, if they are not finite, focal lengths not positive or too different."""
+        focals = self.focals
+        if np.isfinite(self.params).all() and (not focals or 0 < max(focals) <= LARGEST_RATIO * min(focals)):
+            return None
+        return f"{', '.join(f'{value:g}' for value in self.params)} ({self.model})"
 
 
 @dataclass(frozen=True)
@@ -138,17 +144,6 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Points:
-    """All points and their tracks."""
-
-    heads: Shaped[np.ndarray, " points"]
-    """Of type `POINT`."""
-
-    tracks: Shaped[np.ndarray, " elements"]
-    """Of type `TRACK`: those of the first point, then those of the second, and so on."""
-
-
-@dataclass(frozen=True)
 class Model:
     """A COLMAP model. Records are in the order of the files."""
 
@@ -158,7 +153,12 @@ class Model:
 
     cameras: dict[int, Camera]
     images: dict[int, Image]
-    points: Points
+    points: Shaped[np.ndarray, " points"]
+    """Of type `POINT`."""
+
+    tracks: Shaped[np.ndarray, " elements"]
+    """Of type `TRACK`: those of the first point, then those of the second, and so on."""
+
     rigs: dict[int, Rig] | None
     """None in models of COLMAP before 3.12, whose images are all registered."""
 
@@ -186,17 +186,14 @@ def file_name(folder: str, file: str) -> str:
 
 
 def check_model(model: Model) -> None:
-    """Refuses a model whose structure is damaged.
-
-    Raises:
-        ProblemError: an id stands for none or is there twice, an image names no camera or a frame no rig, a pose is not
-            finite or has no rotation; one line that names the file and the record.
-    """
+    """Refuses a model whose structure is damaged. Raises ProblemError: an id stands for none or is there twice, an
+    image names no camera or a frame no rig, a pose is not finite or has no rotation; one line that names the file
+    and the record."""
     rigs, frames = model.rigs or {}, model.frames or {}
     for part, records in model.records.items():
         if NO_ID in records:
             _fail(model, part, f"{NO_ID} is the id of no {part[:-1]}")
-    ids, counts = np.unique(model.points.heads["id"], return_counts=True)
+    ids, counts = np.unique(model.points["id"], return_counts=True)
     if (counts > 1).any():
         _fail(model, "points3D", f"point {ids[counts.argmax()]} is there twice")
     if len(ids) and ids[-1] == NO_POINT:
@@ -235,10 +232,10 @@ def _check_frames(model: Model, rigs: dict[int, Rig], frames: dict[int, Frame]) 
 
 
 def _check_pose(model: Model, part: str, record: str, pose: Pose) -> None:
-    for field, values in (("qvec", pose.qvec), ("tvec", pose.tvec)):
+    for field, values in (("qvec", pose[:4]), ("tvec", pose[4:])):
         if not np.isfinite(values).all():
             _fail(model, part, f"{record}: {field} is not finite: {' '.join(f'{value:g}' for value in values)}")
-    if not any(pose.qvec):
+    if not any(pose[:4]):
         _fail(model, part, f"{record}: qvec is zero, which is no rotation")
 
 

@@ -1,8 +1,8 @@
 """Which key-point of which image is of which point.
 
-A model says so twice: a key-point names its point, and a point's track its key-points. A view counts where they agree.
-Where a track names a wrong key-point of an image, or is empty, key-points are believed: each stands beside its pixel,
-while numbers in tracks go wrong when key-points are sorted or dropped. All else that is said once is left out.
+A model says so twice: a key-point names its point, and a point's track its key-points. Key-points are believed, as in
+COLMAP's bundle adjustment: each stands beside its pixel, while numbers in tracks go wrong when key-points are sorted or
+dropped.
 """
 
 from __future__ import annotations
@@ -10,10 +10,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Int, Shaped
+from jaxtyping import Int, Shaped
 
 from jaxba.io.colmap.model import KEY, NO_POINT, Image, Model
 from jaxba.io.notes import counted
+
+Views = Int[np.ndarray, "3 _"]
+"""Image, key-point and point of each view: positions in an `Ordered`."""
 
 
 class Ordered(NamedTuple):
@@ -41,93 +44,58 @@ class Ordered(NamedTuple):
         return f"point {self.points['id'][point]}"
 
 
-class Views(NamedTuple):
-    """Views: positions in an `Ordered`."""
-
-    image: Int[np.ndarray, " views"]
-    key: Int[np.ndarray, " views"]
-    point: Int[np.ndarray, " views"]
-
-    def of(self, chosen: Bool[np.ndarray, " views"] | Int[np.ndarray, " chosen"]) -> Views:
-        """Some of the views."""
-        return Views(self.image[chosen], self.key[chosen], self.point[chosen])
-
-
 def ordered(model: Model, images: list[Image]) -> Ordered:
     """Sorts the points and joins the key-points of the registered images, which are sorted by id."""
     keys = [image.keys for image in images]
-    order = np.argsort(model.points.heads["id"], kind="stable")
-    return Ordered(
-        model,
-        images,
-        np.concatenate(keys) if keys else np.empty(0, KEY),
-        np.cumsum([0, *map(len, keys)]),
-        model.points.heads[order],
-        order,
-    )
+    order = np.argsort(model.points["id"], kind="stable")
+    first = np.cumsum([0, *map(len, keys)])
+    return Ordered(model, images, np.concatenate([np.empty(0, KEY), *keys]), first, model.points[order], order)
 
 
 def find_views(table: Ordered) -> tuple[Views, list[str]]:
-    """Views, sorted by point and then as in the tracks, and notes on what was mended or left out, one line each."""
-    heads, elements = table.model.points.heads, table.model.points.tracks
+    """Views, sorted by point and key-point, and notes on what was left out and where tracks say something else."""
+    point, exists = _positions(table.points["id"], table.keys["point"])
+    key = np.flatnonzero(exists)
+    key = key[np.argsort(point[key], kind="stable")]
+    owner = np.repeat(np.arange(len(table.images)), np.diff(table.first_key))
+    views = np.stack([owner[key], key, point[key]])
+    dangling = np.flatnonzero(~exists & (table.keys["point"] != NO_POINT))
+    name = lambda key: f"{table.key_name(key)}, point {table.keys['point'][key]}"
+    no_point = f"left out, of a point that {table.model.file('points3D')} does not have"
+    return views, _track_notes(table, views) + counted(
+        table.model.file("images"), dangling, "key-point", no_point, name
+    )
+
+
+def _track_notes(table: Ordered, views: Views) -> list[str]:
+    """Lines on points whose tracks are not those of their key-points."""
+    heads, elements = table.model.points, table.model.tracks
     point = np.repeat(np.argsort(table.order), heads["length"].astype(np.int64))
     image, registered = _positions(np.array([image.id for image in table.images], np.uint32), elements["image"])
     first, index = np.append(table.first_key, 0), elements["key"].astype(np.int64)
-    in_range = registered & (index < first[image + 1] - first[image])
-    tracks = Views(image, np.where(in_range, first[image] + index, 0), point)
-    agree = in_range.copy()
-    agree[in_range] = table.keys["point"][tracks.key[in_range]] == table.points["id"][point[in_range]]
-    stated, wrong = tracks.of(agree), registered & ~agree
-    once = np.zeros(len(stated.key), bool)
-    once[np.unique(stated.key, return_index=True)[1]] = True
-    claims = _other_claims(table, stated.key)
-    pair = lambda views: views.image * max(len(table.points), 1) + views.point
-    without = (np.bincount(point, minlength=len(table.points)) == 0)[claims.point]
-    mends = np.isin(pair(claims), pair(tracks.of(wrong)))
-    mended = wrong & np.isin(pair(tracks), pair(claims.of(mends)))
+    same = registered & (index < first[image + 1] - first[image])
+    place = np.where(same, first[image] + index, 0)
+    same[same] = table.keys["point"][place[same]] == table.points["id"][point[same]]
     absent = ~np.isin(elements["image"], np.array(list(table.model.images), np.uint32))
+    wrong = np.flatnonzero(registered & ~same)
+    unnamed = views[2, ~np.isin(views[1], place[same])]
 
-    def name(at: int) -> str:
+    def element(at: int) -> str:
         seen = table.images[image[at]] if registered[at] else None
         where = f"image {elements['image'][at]}" if seen is None else str(seen)
-        size = f", which has {len(seen.keys)}" if seen is not None and not in_range[at] else ""
-        return f"{table.point_name(int(point[at]))}: key-point {elements['key'][at]} of {where}{size}"
+        size = f", which has {len(seen.keys)}" if seen is not None and index[at] >= len(seen.keys) else ""
+        return f"{table.point_name(int(point[at]))}: key-point {index[at]} of {where}{size}"
+
+    def differing(at: int) -> str:
+        of_point = wrong[point[wrong] == at]
+        return element(int(of_point[0])) if len(of_point) else table.point_name(at)
 
     images, points = (table.model.file(part) for part in ("images", "points3D"))
-    found = (
-        (np.flatnonzero(mended), f"with a wrong key-point, where {images} is believed"),
-        (np.flatnonzero(wrong & ~mended), "left out, of a key-point that is of another point or none"),
-        (np.flatnonzero(absent), f"left out, of an image that {images} does not have"),
-        (np.flatnonzero(agree)[~once], "left out, there twice"),
-    )
-    notes = [line for at, what in found for line in counted(points, at, "track element", what, name)]
-    notes += _key_notes(table, claims.of(without), claims.of(~(mends | without)))
-    parts = zip(stated.of(once), claims.of(mends | without), strict=True)
-    views = Views(*(np.concatenate(part) for part in parts))
-    return views.of(np.argsort(views.point, kind="stable")), notes
-
-
-def _other_claims(table: Ordered, used: Int[np.ndarray, " used"]) -> Views:
-    """What the other key-points say of existing points."""
-    point, exists = _positions(table.points["id"], table.keys["point"])
-    exists[used] = False
-    key = np.flatnonzero(exists)
-    image = np.repeat(np.arange(len(table.images)), np.diff(table.first_key))
-    return Views(image[key], key, point[key])
-
-
-def _key_notes(table: Ordered, untracked: Views, lost: Views) -> list[str]:
-    model, points = table.model, table.model.file("points3D")
-    exists = np.isin(table.keys["point"], table.points["id"])
-    dangling = np.flatnonzero(~exists & (table.keys["point"] != NO_POINT))
-    name = lambda key: f"{table.key_name(key)}, point {table.keys['point'][key]}"
-    believed = f"without a track, where {model.file('images')} is believed"
-    in_no_track = f"left out, in no track of {points}"
-    no_point = f"left out, of a point that {points} does not have"
+    believed = f"with another track than key-points say, where {images} is believed"
+    left_out = f"left out, of an image that {images} does not have"
     return [
-        *counted(points, np.unique(untracked.point), "point", believed, table.point_name),
-        *counted(model.file("images"), lost.key, "key-point", in_no_track, name),
-        *counted(model.file("images"), dangling, "key-point", no_point, name),
+        *counted(points, np.union1d(point[wrong], unnamed), "point", believed, differing),
+        *counted(points, np.flatnonzero(absent), "track element", left_out, element),
     ]
 
 

@@ -6,8 +6,7 @@ COLMAP's camera looks down +z with y downwards, BAL's down -z with y upwards: po
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -17,42 +16,24 @@ from jaxba.problem.geometry import COLMAP_FLIP, bal_rotations, colmap_quaternion
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+Pose = tuple[float, ...]
+"""A transform from the world (of a sensor: from its rig): quaternion wxyz, of any norm, and translation."""
+
 _WXYZ, _XYZW = [3, 0, 1, 2], [1, 2, 3, 0]  # from the order of `jaxba.problem.geometry` to COLMAP's, and back
 _LARGEST_EXPONENT = 500  # squares of larger numbers overflow float64, whose exponents end at 1023
 _SAME = 1e-6  # poses that differ by less, relatively, are the same
 
 
-@dataclass(frozen=True)
-class Pose:
-    """A transform from the world (of a sensor: from its rig)."""
-
-    qvec: tuple[float, float, float, float]
-    """Quaternion wxyz, of any norm."""
-
-    tvec: tuple[float, float, float]
-
-    @property
-    def numbers(self) -> tuple[float, ...]:
-        """All seven, quaternion first."""
-        return *self.qvec, *self.tvec
-
-
-def pose_of(numbers: Any) -> Pose:
-    """A pose of seven numbers, quaternion first."""
-    w, x, y, z, *tvec = map(float, numbers)
-    return Pose((w, x, y, z), (tvec[0], tvec[1], tvec[2]))
-
-
 def quaternions(poses: Sequence[Pose]) -> Float[np.ndarray, "n 4"]:
     """Quaternions xyzw of poses, scaled by a power of two where their norm could over- or underflow."""
-    found = np.array([pose.qvec for pose in poses]).reshape(-1, 4)[:, _XYZW]
+    found = np.array(poses).reshape(-1, 7)[:, _XYZW]
     _, exponents = np.frexp(np.abs(found).max(axis=1, initial=0.0, keepdims=True))
     return np.ldexp(found, np.where(np.abs(exponents) > _LARGEST_EXPONENT, -exponents, 0))
 
 
 def translations(poses: Sequence[Pose]) -> Float[np.ndarray, "n 3"]:
     """Translations of poses."""
-    return np.array([pose.tvec for pose in poses])
+    return np.array(poses).reshape(-1, 7)[:, 4:]
 
 
 def rotations(poses: Sequence[Pose]) -> Rotation:
@@ -70,7 +51,7 @@ def bal_poses(poses: Sequence[Pose]) -> Float[np.ndarray, "n 6"]:
 def colmap_poses(cameras: Float[np.ndarray, "n numbers"]) -> list[Pose]:
     """COLMAP's poses of BAL's, the first six numbers of cameras."""
     turns = colmap_quaternions(cameras[:, :3])[:, _WXYZ]
-    return list(map(pose_of, np.hstack([turns, cameras[:, 3:6] * COLMAP_FLIP])))
+    return list(map(tuple, np.hstack([turns, cameras[:, 3:6] * COLMAP_FLIP]).tolist()))
 
 
 def composed(outer: Pose | None, inner: Pose) -> Pose:
@@ -78,13 +59,14 @@ def composed(outer: Pose | None, inner: Pose) -> Pose:
     if outer is None:
         return inner
     first, second = rotations([inner])[0], rotations([outer])[0]
-    return pose_of([*(second * first).as_quat()[_WXYZ], *(second.apply(inner.tvec) + np.array(outer.tvec))])
+    moved = second.apply(inner[4:]) + np.array(outer[4:])
+    return *(second * first).as_quat()[_WXYZ].tolist(), *moved.tolist()
 
 
 def inverse(pose: Pose) -> Pose:
     """The inverse transform."""
     back = rotations([pose])[0].inv()
-    return pose_of([*back.as_quat()[_WXYZ], *(-back.apply(pose.tvec))])
+    return *back.as_quat()[_WXYZ].tolist(), *(-back.apply(pose[4:])).tolist()
 
 
 def differ(one: Pose, other: Pose) -> bool:
@@ -93,4 +75,4 @@ def differ(one: Pose, other: Pose) -> bool:
         return False
     first, second = quaternions([one, other])
     parallel = abs(first @ second) >= (1 - _SAME) * np.linalg.norm(first) * np.linalg.norm(second)
-    return not (parallel and np.allclose(one.tvec, other.tvec, rtol=_SAME, atol=_SAME))
+    return not (parallel and np.allclose(one[4:], other[4:], rtol=_SAME, atol=_SAME))

@@ -15,7 +15,7 @@ from jaxba.io.colmap import lenses
 from jaxba.io.colmap.files import read_model
 from jaxba.io.colmap.model import CAMERA_SENSOR, Camera, Frame, Image, Model
 from jaxba.io.colmap.observations import Ordered, Views, find_views, ordered
-from jaxba.io.colmap.poses import Pose, bal_poses, composed, differ, pose_of, rotations, translations
+from jaxba.io.colmap.poses import Pose, bal_poses, composed, differ, rotations, translations
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.notes import counted, report
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
@@ -35,7 +35,7 @@ class Assembled(NamedTuple):
     """Those of the problem's cameras."""
 
     points: Int[np.ndarray, " points"]
-    """Positions in `model.points.heads`."""
+    """Positions in `model.points`."""
 
     notes: list[str]
     """What was left out or mended, one line each."""
@@ -89,30 +89,24 @@ def read_colmap_with_looks(folder: StrPath) -> tuple[BundleProblem, Looks]:
     sizes = np.array([(one.width, one.height) for one in cameras], np.float64)
     found = [one.principal_point if one.focals else (np.nan, np.nan) for one in cameras]
     principal = np.where(np.isnan(found), sizes / 2, found)  # a panorama has its own in the middle
-    return assembled.problem, Looks(model.points.heads["rgb"][assembled.points], sizes, principal)
+    return assembled.problem, Looks(model.points["rgb"][assembled.points], sizes, principal)
 
 
 def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled:
-    """The problem of a model.
-
-    Args:
-        model: the model.
-        refine_principal_point: whether principal points are optimised.
-
-    Raises:
-        ProblemError: it is not known where a camera is in its rig, a lens cannot be used, or nothing is observed.
-    """
+    """The problem of a model, whose principal points are optimised if asked for. Raises ProblemError: it is not known
+    where a camera is in its rig, a lens cannot be used, or nothing is observed."""
     images, notes = _registered(model)
     table = ordered(model, images)
     for camera in sorted({image.camera for image in images}):
-        lenses.check_lens(model, model.cameras[camera])
+        if wrong := model.cameras[camera].impossible:
+            raise ProblemError(f"{model.file('cameras')}: camera {camera} has impossible parameters: {wrong}")
     views, found = find_views(table)
     views, odd = _finite(table, views)
     notes += found + odd
-    if not len(views.key):
+    if not views.size:
         raise ProblemError("; ".join([f"{display_name(model.folder)}: no image sees a point", *notes[:1]]))
-    sees = np.bincount(views.image, minlength=len(images)) > 0
-    observed = np.bincount(views.point, minlength=len(table.points)) > 0
+    sees = np.bincount(views[0], minlength=len(images)) > 0
+    observed = np.bincount(views[2], minlength=len(table.points)) > 0
     unseen = np.flatnonzero(~observed & np.isfinite(table.points["xyz"]).all(axis=1))
     seeing, blind = ([one for one, kept in zip(images, mask, strict=True) if kept] for mask in (sees, ~sees))
     other = [(one, rig) for rig in (model.rigs or {}).values() for one in rig.sensors if one.type != CAMERA_SENSOR]
@@ -120,9 +114,9 @@ def assemble(model: Model, *, refine_principal_point: bool = False) -> Assembled
     notes += counted(model.file("images"), blind, "image", "left out, without observations")
     notes += counted(model.file("points3D"), unseen, "point", "left out, seen by no image", table.point_name)
     notes += counted(model.file("rigs"), other, "sensor", "left out, no camera", name)
-    new = Views((np.cumsum(sees) - 1)[views.image], views.key, (np.cumsum(observed) - 1)[views.point])
+    views = np.stack([(np.cumsum(sees) - 1)[views[0]], views[1], (np.cumsum(observed) - 1)[views[2]]])
     points = table.order[observed]
-    problem = _problem(model, seeing, points, table.keys["xy"], new, refine_principal_point=refine_principal_point)
+    problem = _problem(model, seeing, points, table.keys["xy"], views, refine_principal_point=refine_principal_point)
     return Assembled(problem, seeing, points, notes)
 
 
@@ -153,11 +147,8 @@ def _posed(model: Model, image: Image) -> Image:
 
 
 def _registered(model: Model) -> tuple[list[Image], list[str]]:
-    """Registered images by id, with the poses of their frames, and notes on the others.
-
-    Raises:
-        ProblemError: it is not known where a camera is in its rig.
-    """
+    """Registered images by id, with the poses of their frames, and notes on the others. Raises ProblemError: it is not
+    known where a camera is in its rig."""
     images, frames = [model.images[identity] for identity in sorted(model.images)], model.frame_of
     if model.frames is None:
         return images, []
@@ -169,11 +160,7 @@ def _registered(model: Model) -> tuple[list[Image], list[str]]:
 
 
 def place_in_rig(model: Model, frame: Frame, camera: int) -> Pose | None:
-    """Where a camera is in the rig of a frame; None for the reference sensor.
-
-    Raises:
-        ProblemError: it is not known.
-    """
+    """Where a camera is in the rig of a frame; None for the reference sensor. Raises ProblemError: it is not known."""
     assert model.rigs is not None
     sensors = model.rigs[frame.rig].sensors
     at = next(at for at, one in enumerate(sensors) if (one.type, one.id) == (CAMERA_SENSOR, camera))
@@ -189,8 +176,7 @@ def _rigs_of(model: Model, images: list[Image]) -> Rigs | None:
     if model.frames is None or len(set(ids)) == len(ids):
         return None
     places = [place_in_rig(model, frames[image.id], image.camera) for image in images]
-    same = pose_of([1, 0, 0, 0, 0, 0, 0])
-    poses = [same if place is None else place for place in places]
+    poses = [(1.0, *6 * (0.0,)) if place is None else place for place in places]
     rotation = np.diag(COLMAP_FLIP) @ rotations(poses).as_matrix()
     # a rig whose reference sensor sees nothing has its frames where the first of its other cameras says
     rig, known = [frames[image.id].rig for image in images], {}
@@ -207,10 +193,10 @@ def _finite(table: Ordered, views: Views) -> tuple[Views, list[str]]:
     model, what = table.model, "left out, not finite"
     finite = np.asarray(np.isfinite(table.points["xyz"]).all(axis=1))
     notes = counted(model.file("points3D"), np.flatnonzero(~finite), "point", what, table.point_name)
-    views = views.of(finite[views.point])
-    visible = np.asarray(np.isfinite(table.keys["xy"][views.key]).all(axis=1))
-    notes += counted(model.file("images"), views.key[~visible], "key-point", what, table.key_name)
-    return views.of(visible), notes
+    views = views[:, finite[views[2]]]
+    visible = np.asarray(np.isfinite(table.keys["xy"][views[1]]).all(axis=1))
+    notes += counted(model.file("images"), np.sort(views[1, ~visible]), "key-point", what, table.key_name)
+    return views[:, visible], notes
 
 
 def _problem(
@@ -227,15 +213,16 @@ def _problem(
     lens = np.searchsorted(cameras, [image.camera for image in images])
     used = [model.cameras[camera] for camera in cameras]
     intrinsics, of_problem = lenses.lenses_of(used, lens, refine_principal_point=refine_principal_point)
-    pixels = keys[views.key]
+    image, key, point = views
+    pixels = keys[key]
     if of_problem is None or of_problem.all_bal:
-        centers = np.array([camera.principal_point for camera in used])[lens[views.image]]
+        centers = np.array([camera.principal_point for camera in used])[lens[image]]
         with np.errstate(over="ignore"):  # what is not finite is refused below
             pixels = (pixels - centers) * COLMAP_FLIP[:2]
     parameters = np.hstack([bal_poses([image.pose for image in images]), intrinsics[lens]])
-    heads = model.points.heads[points]
+    heads = model.points[points]
     try:
-        problem = BundleProblem.create(parameters, heads["xyz"], pixels, views.image, views.point, lenses=of_problem)
+        problem = BundleProblem.create(parameters, heads["xyz"], pixels, image, point, lenses=of_problem)
     except ProblemError as error:
         raise ProblemError(f"{display_name(model.folder)}: {error}") from error
     labels = Labels(

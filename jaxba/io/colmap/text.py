@@ -6,32 +6,23 @@ follows the ninth field of its line. Numbers are written with as many digits as 
 
 from __future__ import annotations
 
-import io
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 
 from jaxba.io.colmap import fields
 from jaxba.io.colmap.fields import Fields
-from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model, Points
-from jaxba.io.colmap.poses import pose_of
-from jaxba.io.encoding import utf8
+from jaxba.io.colmap.model import KEY, NO_ID, NO_POINT, POINT, TRACK, Image, Model
+from jaxba.io.encoding import read_text
 from jaxba.io.text import number, shown_word
 from jaxba.problem.bundle_problem import ProblemError
 
-_UNIT = 0.1  # how far the norm of a quaternion may be from 1, if that is to tell a pose from pixels
 _NAME = len(fields.IMAGE.names)  # fields before the name of an image
+_LONGEST = 30  # characters of an integer that is read exactly
 _LARGEST = {"B": 255, "I": NO_ID, "Q": NO_POINT}
-_HEADERS = {
-    "cameras": "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
-    "images": "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; next line: POINTS2D[] as (X, Y, POINT3D_ID)",
-    "points3D": "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)",
-    "rigs": "RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, [POSE])",
-    "frames": "FRAME_ID, RIG_ID, QW, QX, QY, QZ, TX, TY, TZ, NUM_DATA, DATA[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)",
-}
 
 
 class _Line:
@@ -52,41 +43,44 @@ class _Line:
         return tuple([self._value(name, code, fields) for name, code in zip(fields.names, fields.codes, strict=True)])
 
     def count(self, field: str, each: Fields) -> int:
-        largest = len(self.rest)
-        return self.integers([self._word(field)], field, largest)[0]
+        largest = len(self.rest)  # before the count itself is taken
+        return self.numbers([self._word(field)], "I", field, largest)[0]
 
-    def floats(self, words: list[bytes], field: str) -> list[float]:
-        """Words of this line as numbers, which may be infinite or no number."""
-        if b"_" not in self.text:  # Python takes 1_000 for a number
-            try:
-                return list(map(float, words))
-            except ValueError:
-                pass
-        return [self._float(word, field) for word in words]
-
-    def integers(self, words: list[bytes], field: str, high: int) -> list[int]:
-        """Words of this line as integers in 0..`high`, where -1, COLMAP's word for nothing, means `high`."""
+    def numbers(self, words: list[bytes], code: str, field: str, high: int | None = None) -> list[Any]:
+        """Words of this line as numbers: floats for the code `d`, which may be infinite or no number, else integers in
+        0..`high` (by default the largest of the code), where -1, COLMAP's word for nothing, means `high`."""
         try:
-            values = list(map(int, words)) if b"_" not in self.text else [self._integer(w, field) for w in words]
+            if b"_" in self.text:  # Python takes 1_000 for a number
+                raise ValueError
+            values = list(map(float if code == "d" else int, words))
         except ValueError:
-            values = [self._integer(word, field) for word in words]
-        if values and (min(values) < 0 or max(values) > high):
-            if min(values) < -1 or max(values) > high:
-                bad = next(word for word, value in zip(words, values, strict=True) if not -1 <= value <= high)
-                self.fail(f"{shown_word(bad)} is outside 0..{high} ({field})")
-            values = [high if value < 0 else value for value in values]
-        return values
+            values = [self._number(word, code, field) for word in words]
+        if code == "d" or not values:
+            return values
+        high = _LARGEST[code] if high is None else high
+        if min(values) < -1 or max(values) > high:
+            bad = next(word for word, value in zip(words, values, strict=True) if not -1 <= value <= high)
+            self.fail(f"{shown_word(bad)} is outside 0..{high} ({field})")
+        return [high if value < 0 else value for value in values] if min(values) < 0 else values
+
+    def _number(self, word: bytes, code: str, field: str) -> Any:
+        text = word.decode("latin-1")
+        if code != "d" and len(text) < _LONGEST and text.removeprefix("-").isdecimal():
+            return int(text)  # exact, as those of points have to be
+        try:
+            value = number(text)
+        except ValueError:
+            self.fail(f"{shown_word(word)} is not a number ({field})")
+        if code != "d" and not value.is_integer():
+            self.fail(f"{shown_word(word)} is not an integer ({field})")
+        return value if code == "d" else int(value)
 
     def _value(self, name: str, code: str, of: Fields) -> Any:
         word = self._word(name)
-        if code == "d":
-            return self.floats([word], name)[0]
         if code == "i" and of.kinds is not None:
-            kind = word.decode("latin-1")
-            if kind not in of.kinds.numbers:
-                self.fail(f"{kind!a} {of.kinds.unknown_word}")
-            return of.kinds.numbers[kind]
-        (value,) = self.integers([word], name, of.largest or _LARGEST[code])
+            kind, (known, unknown, _) = word.decode("latin-1"), of.kinds
+            return known[kind] if kind in known else self.fail(f"{kind!a} {unknown}")
+        (value,) = self.numbers([word], code, name, of.largest)
         self.about = self.about or f"{self.record} {value}"
         return value
 
@@ -95,46 +89,24 @@ class _Line:
             self.fail(f"the line ends before its {field}")
         return self.rest.pop(0)
 
-    def _float(self, word: bytes, field: str) -> float:
-        try:
-            return float(word) if b"_" not in word else number("")
-        except ValueError:
-            pass
-        try:
-            return number(word.decode("latin-1"))
-        except ValueError:
-            self.fail(f"{shown_word(word)} is not a number ({field})")
 
-    def _integer(self, word: bytes, field: str) -> int:
-        try:
-            return int(word) if b"_" not in word else int("")
-        except ValueError:
-            value = self._float(word, field)
-        if not value.is_integer():
-            self.fail(f"{shown_word(word)} is not an integer ({field})")
-        return int(value)
-
-
-def _lines(data: bytes, name: str, record: str, *, empty: bool = False) -> Iterator[_Line]:
+def _lines(path: Path, name: str, record: str, *, empty: bool = False) -> Iterator[_Line]:
     """Lines of a file that are no comments, without blanks at their ends; also `empty` ones if asked for."""
-    for at, line in enumerate(io.BytesIO(b"".join(utf8(iter([data]), name))), 1):
+    for at, line in enumerate(read_text(path).split(b"\n"), 1):
         text = line.strip()
         if (text or empty) and not text.startswith(b"#"):
             yield _Line(f"{name} line {at}", text, record)
 
 
-def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
+def read(part: str, path: Path, name: str) -> dict[int, Any] | tuple[np.ndarray, np.ndarray]:
     """The records of a file by id, in its order; of `points3D` all points and tracks. The line of an image's key-points
-    may be empty or missing. Arguments as for `binary.read`.
-
-    Raises:
-        ProblemError: a line cannot be understood; one line that names the file, the line and the field.
-    """
-    lines = _lines(data, name, part.removesuffix("3D")[:-1], empty=part == "images")
+    may be empty, and missing in the last. Arguments as for `binary.read`. Raises ProblemError: a line cannot be
+    understood; one line that names the file, the line and the field."""
+    lines = _lines(path, name, part.removesuffix("3D")[:-1], empty=part == "images")
     if part == "points3D":
         return _read_points(lines)
     found = {}
-    for line, record in _images(lines) if part == "images" else ((one, fields.READERS[part][1](one)) for one in lines):
+    for line, record in _images(lines) if part == "images" else ((one, fields.READERS[part](one)) for one in lines):
         if line.rest:
             line.fail(f"{shown_word(line.rest[0])} is left over")
         if record.id in found:
@@ -143,51 +115,30 @@ def read(part: str, data: bytes, name: str) -> dict[int, Any] | Points:
     return found
 
 
-def _read_points(lines: Iterator[_Line]) -> Points:
+def _read_points(lines: Iterator[_Line]) -> tuple[np.ndarray, np.ndarray]:
     heads, tracks = [], []
     for line in lines:
         identity, x, y, z, red, green, blue, error = line.take(fields.POINT)
         if len(line.rest) % 2:
             line.fail(f"the track has {len(line.rest)} numbers, which are no pairs of IMAGE_ID and POINT2D_IDX")
-        track = line.integers(line.rest, "IMAGE_ID or POINT2D_IDX of the track", NO_ID)
+        track = line.numbers(line.rest, "I", "IMAGE_ID or POINT2D_IDX of the track")
         heads.append((identity, (x, y, z), (red, green, blue), error, len(track) // 2))
         tracks.extend(zip(track[::2], track[1::2], strict=True))
-    return Points(np.array(heads, POINT), np.array(tracks, TRACK))
+    return np.array(heads, POINT), np.array(tracks, TRACK)
 
 
-def _images(file: Iterator[_Line]) -> Iterator[tuple[_Line, Image]]:
-    line = next(file, None)
-    while line is not None:
+def _images(lines: Iterator[_Line]) -> Iterator[tuple[_Line, Image]]:
+    for line in lines:
         if not line.rest:
-            line = next(file, None)
             continue
         identity, *pose, camera = line.take(fields.IMAGE)
         name, line.rest = line.text.split(None, _NAME)[_NAME:], []
-        image = Image(identity, pose_of(pose), camera, b"".join(name), np.empty(0, KEY))
-        below = next(file, None)
-        if below is not None and not _starts_image(below):
+        image = Image(identity, tuple(pose), camera, b"".join(name), np.empty(0, KEY))
+        below = next(lines, None)
+        if below is not None:
             below.about = str(image)
             image = replace(image, keys=_keys(below))
-            below = next(file, None)
         yield line, image
-        line = below
-
-
-def _starts_image(line: _Line) -> bool:
-    """Whether a line where key-points are due is that of the next image."""
-    words = line.rest
-    if len(words) <= _NAME or not _all(int, [words[0], words[_NAME - 1]]) or not _all(float, words[1 : _NAME - 1]):
-        return False
-    if not abs(math.hypot(*map(float, words[1:5])) - 1) < _UNIT:  # pixels of a damaged line are no unit quaternion
-        return False
-    return len(words) % 3 != 0 or not _all(float, words)
-
-
-def _all(convert: Callable[[bytes], object], words: list[bytes]) -> bool:
-    try:
-        return bool([convert(word) for word in words])
-    except ValueError:
-        return False
 
 
 def _keys(line: _Line) -> np.ndarray:
@@ -195,23 +146,23 @@ def _keys(line: _Line) -> np.ndarray:
     if len(words) % 3:
         line.fail(f"{len(words)} numbers, which are no key-points of x, y and POINT3D_ID")
     keys = np.empty(len(words) // 3, KEY)
-    keys["point"] = np.array(line.integers(words[2::3], "POINT3D_ID of a key-point", NO_POINT), np.uint64)
+    keys["point"] = np.array(line.numbers(words[2::3], "Q", "POINT3D_ID of a key-point"), np.uint64)
     for axis, field in enumerate("xy"):
-        keys["xy"][:, axis] = line.floats(words[axis::3], f"{field} of a key-point")
+        keys["xy"][:, axis] = line.numbers(words[axis::3], "d", f"{field} of a key-point")
     return keys
 
 
 def encode(model: Model) -> Iterator[tuple[str, bytes]]:
     """Names and contents of the files of a model with rigs and frames."""
     lines = {part: map(_joined, records.values()) for part, records in model.records.items()}
-    for part, found in {**lines, "points3D": _point_lines(model.points)}.items():
-        yield f"{part}.txt", b"\n".join([f"# {_HEADERS[part]}".encode(), *found, b""])
+    for part, found in {**lines, "points3D": _point_lines(model)}.items():
+        yield f"{part}.txt", b"\n".join([f"# {', '.join(fields.FIRST[part].names)}, ...".encode(), *found, b""])
 
 
 def _joined(record: Any) -> bytes:
     words: list[str] = []
     for of, numbers in fields.values(record):
-        kinds = {number: word for word, number in of.kinds.numbers.items()} if of.kinds is not None else {}
+        kinds = {number: word for word, number in of.kinds[0].items()} if of.kinds is not None else {}
         words += [kinds[v] if code == "i" else str(v) for code, v in zip(of.codes, numbers, strict=True)]
     text = " ".join(words).encode()
     if not isinstance(record, Image):
@@ -222,10 +173,10 @@ def _joined(record: Any) -> bytes:
     return b"".join([text, b" ", record.name, b"\n", keys.encode()])
 
 
-def _point_lines(points: Points) -> Iterator[bytes]:
-    elements = [f" {image} {key}" for image, key in points.tracks.tolist()]
+def _point_lines(model: Model) -> Iterator[bytes]:
+    elements = [f" {image} {key}" for image, key in model.tracks.tolist()]
     at = 0
-    columns = (points.heads[field].tolist() for field in ("id", "xyz", "rgb", "error", "length"))
+    columns = (model.points[field].tolist() for field in ("id", "xyz", "rgb", "error", "length"))
     for identity, (x, y, z), (red, green, blue), error, length in zip(*columns, strict=True):
         track = "".join(elements[at : at + length])
         yield f"{identity} {x} {y} {z} {red} {green} {blue} {error}{track}".encode()

@@ -11,9 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from jaxba.io.files import StrPath
-from jaxba.io.foreign.cameras import BROWN, FISHEYE, FIXED, ForeignLens
+from jaxba.io.foreign.cameras import BROWN, FISHEYE, UNDEFINED, ForeignLens, Landmark, build, checked_pose, part
 from jaxba.io.foreign.json_records import Record
-from jaxba.io.foreign.views import UNDEFINED, Landmark, build, checked_pose, part
 from jaxba.io.notes import note, note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -54,24 +53,20 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     """The problem of a scene of AliceVision.
 
     Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. Intrinsics without
-    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Those of
-    the others in `DISTORTIONS` stay as they are.
-
-    Raises:
-        ProblemError: the file lacks a part, names a model that is not in `DISTORTIONS`, or views are of a rig; one line
-            that names the file, the record and the field.
-    """
+    distortion, with `radial1`, and with `radial3` where k3 is 0 are optimised unless the file locks them. Those of the
+    others in `DISTORTIONS` stay as they are. Raises ProblemError: the file lacks a part, names a model that is not in
+    `DISTORTIONS`, or views are of a rig; one line that names the file, the record and the field."""
     version = tuple(row.integer() for row in document.get("version").rows())
     views = {}
-    for number, value in _numbered(part(document, "views", _PROGRAM), "viewId", "view"):
+    for number, value in part(document, "views", _PROGRAM).numbered("viewId", "view"):
         independent = value.get("isPoseIndependant", True).flag()
         rig, pose, intrinsic = (value.get(key, UNDEFINED).integer() for key in ("rigId", "poseId", "intrinsicId"))
         if rig >= 0 and rig != UNDEFINED and not independent:
             value.fail("is of a rig of several cameras, whose poses depend on it; rigs are not read")
         views[number] = pose, intrinsic
-    intrinsics = dict(_numbered(part(document, "intrinsics", _PROGRAM), "intrinsicId", "intrinsic"))
+    intrinsics = dict(part(document, "intrinsics", _PROGRAM).numbered("intrinsicId", "intrinsic"))
     poses, locked = {}, 0
-    for number, value in _numbered(part(document, "poses", _PROGRAM), "poseId", "pose"):
+    for number, value in part(document, "poses", _PROGRAM).numbered("poseId", "pose"):
         pose = value.get("pose")
         inside = pose.get("transform") if pose.has("transform") else pose
         rotation = np.array(inside.get("rotation").vector(9)).reshape(3, 3).T
@@ -91,12 +86,6 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
     return build(path, views, poses, intrinsics, lens, [landmark for landmark, _ in landmarks])
 
 
-def _numbered(record: Record, key: str, what: str) -> Iterator[tuple[int, Record]]:
-    for row in record.rows():
-        number = row.get(key).integer()
-        yield number, row.called(f"{what} {number}")
-
-
 def _lens(value: Record, version: tuple[int, ...]) -> ForeignLens:
     """The lens of an intrinsic in pixels from the corner of the image, whatever the version of the file."""
     kind = value.get("type").text()
@@ -114,7 +103,7 @@ def _lens(value: Record, version: tuple[int, ...]) -> ForeignLens:
         x, y = x + width / 2, y + height / 2
     fisheye = model == "fisheye4"
     distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
-    free = FIXED if value.get("locked", False).flag() else (True, count > 0, count > 1)
+    free = not value.get("locked", False).flag()
     return ForeignLens(value.where, _focal(value, version, width), (x, y), distortion, fisheye, free, (width, height))
 
 
@@ -135,11 +124,10 @@ def _focal(value: Record, version: tuple[int, ...], width: float) -> tuple[float
 
 def _landmarks(structure: Record) -> Iterator[tuple[Landmark, list[float]]]:
     """The points, and the scales of their key-points where the file has them."""
-    for number, value in _numbered(structure, "landmarkId", "landmark"):
+    for number, value in structure.numbered("landmarkId", "landmark"):
         views, pixels, scales = [], [], []
-        for view, seen in _numbered(
-            value.get("observations"), "observationId", f"landmark {number}: observation in view"
-        ):
+        observations = value.get("observations")
+        for view, seen in observations.numbered("observationId", f"landmark {number}: observation in view"):
             if not seen.has("x"):
                 seen.fail("has no x: have AliceVision write observations with their features")
             views.append(view)

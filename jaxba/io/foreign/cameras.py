@@ -1,29 +1,41 @@
 """From the cameras of other programs to a problem: lenses in pixels, poses that look down +z with y downwards.
 
-This is the convention of COLMAP, VisualSFM, OpenSfM, OpenMVG and AliceVision. BAL's camera looks down -z with y
+This is the convention of COLMAP, VisualSFM, OpenSfM, OpenMVG and AliceVision; the last three also have views with poses
+and intrinsics, and points with observations, in common (`build`). BAL's camera looks down -z with y
 upwards, has no principal point, one focal length, and two coefficients of distortion. Lenses with more of it become
 those of `jaxba.CAMERA_MODELS`: Brown's FULL_OPENCV, and OPENCV_FISHEYE.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from jaxba.io.files import StrPath, display_name
+from jaxba.io.foreign.json_records import Record
 from jaxba.io.notes import note, note_center
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.camera_models import CAMERA_MODELS
-from jaxba.problem.geometry import COLMAP_FLIP, angle_axis
+from jaxba.problem.geometry import COLMAP_FLIP, angle_axis, are_rotations
+from jaxba.problem.geometry import translations as translations_of
 from jaxba.problem.intrinsics import Lenses
-
-FIXED = (False, False, False)
 
 BROWN, FISHEYE = ("k1", "k2", "k3", "p1", "p2"), ("k1", "k2", "k3", "k4")
 """Coefficients of the two kinds of distortion, in the order in which OpenMVG and AliceVision write them."""
+
+
+UNDEFINED = 2**32 - 1
+"""Number that stands for no pose or no intrinsic. Source: `UndefinedIndexT` in types.hpp of both programs."""
+
+Pose = tuple[Float[np.ndarray, "3 3"], list[float]]
+"""Rotation and centre of a camera whose frame is `rotation (X - center)`, x to the right, y down, z forward."""
+
+Landmark = tuple[list[float], list[int], list[list[float]]]
+"""A point: its position, the numbers of its views, and their pixels."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +57,9 @@ class ForeignLens:
     fisheye: bool = False
     """Whether radii are angles."""
 
-    free: tuple[bool, bool, bool] = (True, True, True)
-    """Which of f, k1 and k2 may be optimised, if the distortion is BAL's; other lenses stay as they are."""
+    free: bool = True
+    """Whether f, k1 and k2 may be optimised, the last two where they are among the coefficients, if the distortion is
+    BAL's; other lenses stay as they are."""
 
     size: tuple[float, float] | None = None
     """Width and height of the image, pixels, if the principal point is measured from its corner."""
@@ -77,26 +90,11 @@ def assemble(
     point_index: Int[np.ndarray, " observations"],
     whitening: Float[np.ndarray, "observations 2 2"] | None = None,
 ) -> BundleProblem:
-    """The problem of cameras in the convention of this module.
+    """The problem of cameras in the convention of this module, `P = R X + t`, with pixels x to the right, y down.
 
-    Where the distortion of all lenses is BAL's, so are those of the problem; else all are of the other models. Pixels
-    that are not finite are left out, with a warning that counts them.
-
-    Args:
-        path: of the file, for messages.
-        lenses: of the cameras.
-        lens_of: lens of each camera.
-        rotations: from the world to the camera, right-handed.
-        translations: the same, `P = R X + t`.
-        points: in the world.
-        pixels: observations, x to the right, y down.
-        camera_index: camera of each observation.
-        point_index: point of each observation.
-        whitening: matrices that multiply the residuals of lenses of BAL; None: the identity.
-
-    Raises:
-        ProblemError: a lens is impossible, no observation is left, or something is not finite.
-    """
+    Where the distortion of all lenses is BAL's, so are those of the problem, and `whitening` multiplies their
+    residuals; else all are of the other models. Pixels that are not finite are left out, with a warning that counts
+    them. Raises ProblemError: a lens is impossible, no observation is left, or something is not finite."""
     name = display_name(path)
     for lens in lenses:
         _check(lens, name)
@@ -108,11 +106,11 @@ def assemble(
     intrinsics = np.zeros((len(lenses), max(map(len, models))))
     free = np.zeros(intrinsics.shape, bool)
     for at, (lens, model) in enumerate(zip(lenses, names, strict=True)):
-        (fx, fy), (cx, cy), (f, k1, k2) = lens.focal, lens.center, lens.free if lens.is_bal else FIXED
+        (fx, fy), (cx, cy) = lens.focal, lens.center
         values = {"f": fx, "fx": fx, "fy": fy, "cx": cx, "cy": cy, **lens.distortion}
-        moves = {"f": f, "fx": f, "fy": f, "k1": k1, "k2": k2}
+        moves = {"f", "fx", "fy", *({"k1", "k2"} & set(lens.distortion))} if lens.free and lens.is_bal else set()
         for place, parameter in enumerate(CAMERA_MODELS[model].parameters):
-            intrinsics[at, place], free[at, place] = values.get(parameter, 0.0), moves.get(parameter, False)
+            intrinsics[at, place], free[at, place] = values.get(parameter, 0.0), parameter in moves
     lens_of = np.asarray(lens_of)
     observations = pixels
     if bal:
@@ -157,3 +155,73 @@ def _covariance(whitening: np.ndarray) -> np.ndarray | None:
     root = np.linalg.inv(whitening)
     covariance = root @ root.transpose(0, 2, 1)
     return 0.5 * (covariance + covariance.transpose(0, 2, 1))
+
+
+def checked_pose(record: Record, rotation: np.ndarray, center: list[float]) -> Pose:
+    """A pose after a check of its rotation. Raises ProblemError."""
+    if rotation.shape != (3, 3) or not are_rotations(rotation[None])[0]:
+        record.fail("has a rotation that is none")
+    return rotation, center
+
+
+def part(document: Record, key: str, program: str) -> Record:
+    """One of the parts of a file, which must be there and not empty. Raises ProblemError: it is not; the message says
+    what the file has."""
+    if document.has(key) and document.value[key] not in ([], {}, ""):
+        return document.get(key)
+    names = ("views", "intrinsics", "extrinsics", "poses", "structure")
+    there = [name for name in names if document.has(name) and document.value[name] not in ([], {}, "")]
+    document.fail(f"has no {key}, only {', '.join(there) or 'other parts'}: have {program} write its whole result")
+
+
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite then is refused or left out
+def build(
+    path: StrPath,
+    views: Mapping[int, tuple[int, Any]],
+    poses: Mapping[int, Pose],
+    intrinsics: Container[Any],
+    lens: Callable[[Any], ForeignLens],
+    landmarks: Iterable[Landmark],
+) -> BundleProblem:
+    """The problem of a file. Cameras are the views that see a point, by their numbers; points are in the file's order.
+
+    Views have the numbers of a pose and an intrinsic; observations in views whose pose or intrinsic is not there are
+    left out, with a warning that counts them. `lens` makes the lens of an intrinsic."""
+    name = display_name(path)
+    points, seen_views, pixels, point_index = [], [], [], []
+    for number, (position, seen_by, at) in enumerate(landmarks):
+        points.append(position)
+        seen_views += seen_by
+        pixels += at
+        point_index += [number] * len(seen_by)
+    there = [key for key, (pose, intrinsic) in views.items() if pose in poses and intrinsic in intrinsics]
+    seen = np.array(seen_views, dtype=np.int64)
+    kept = np.isin(seen, np.array(there, dtype=np.int64))
+    if not kept.all():
+        note(path, f"{np.sum(~kept)} of {len(kept)} observations left out: their views have no pose or no intrinsic")
+    if not kept.any():
+        raise ProblemError(f"{name}: no view that has a pose and an intrinsic sees a point")
+    names, camera_index = np.unique(seen[kept], return_inverse=True)
+    owner: dict[int, int] = {}
+    for key in names.tolist():
+        other = owner.setdefault(views[key][0], key)
+        if other != key:
+            raise ProblemError(
+                f"{name}: views {other} and {key} share pose {views[key][0]}, as in a rig; rigs are not read"
+            )
+    if len(there) > len(names):
+        note(path, f"{len(there) - len(names)} of {len(there)} views with a pose left out: they see no point")
+    of_cameras = [views[key][1] for key in names.tolist()]
+    used = list(dict.fromkeys(sorted(of_cameras)))
+    rotations, centers = (np.array(parts) for parts in zip(*(poses[pose] for pose in owner), strict=True))
+    return assemble(
+        path,
+        [lens(key) for key in used],
+        np.array([used.index(key) for key in of_cameras]),
+        rotations,
+        translations_of(rotations, centers),
+        np.array(points),
+        np.array(pixels)[kept],
+        camera_index,
+        np.array(point_index)[kept],
+    )

@@ -7,9 +7,8 @@ from collections.abc import Collection, Iterator
 from typing import Any, NoReturn
 
 import numpy as np
-from jaxtyping import Float
 
-from jaxba.io.encoding import parse_json, read_text
+from jaxba.io.encoding import parse_json, read_characters
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.text import number
 from jaxba.problem.bundle_problem import ProblemError
@@ -75,6 +74,13 @@ class Record:
         for key, value in self.value.items():
             yield key, Record(value, self.name, f"{what} {display_name(key)}")
 
+    def numbered(self, key: str, what: str, inside: str = "") -> Iterator[tuple[int, Record]]:
+        """Rows of a list, or the values of their key `inside`, by their numbers at a key, called `what NUMBER`. Raises
+        ProblemError."""
+        for row in self.rows():
+            number = row.get(key).integer()
+            yield number, (row.get(inside) if inside else row).called(f"{what} {number}")
+
     def number(self) -> float:
         """A finite number. Raises ProblemError."""
         value = self.value
@@ -125,21 +131,12 @@ class Record:
             return value
         return [row.number() for row in self.rows()]
 
-    def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """A 3 x 3 matrix as a list of its rows. Raises ProblemError."""
-        if not isinstance(self.value, list) or len(self.value) != 3:
-            self.fail(f"must be a list of 3 rows, is {_shown(self.value)}")
-        return np.array([row.vector(3) for row in self.rows()])
-
 
 def read_json(path: StrPath) -> Record:
     """The contents of a JSON file, decompressed; NaN and Infinity, which JSON lacks, are found when they are taken.
-
-    Raises:
-        ProblemError: the file cannot be read, is no JSON, is nested too deeply, or an object has a key twice.
-    """
+    Raises ProblemError: the file cannot be read, is no JSON, is nested too deeply, or an object has a key twice."""
     name = display_name(path)
-    text = read_text(path)
+    text = read_characters(path)
     try:
         return Record(parse_json(text), name)
     except ProblemError as error:

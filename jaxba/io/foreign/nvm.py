@@ -15,12 +15,11 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxba.io.encoding import open_text
+from jaxba.io.encoding import read_text
 from jaxba.io.files import StrPath, display_name
-from jaxba.io.foreign.cameras import FIXED, ForeignLens, assemble
+from jaxba.io.foreign.cameras import ForeignLens, assemble
 from jaxba.io.notes import note, note_origin
-from jaxba.io.text import LineReader, NumberReader, finite_numbers
-from jaxba.io.tracks import read_tracks
+from jaxba.io.text import Text, finite_numbers, read_tracks
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
 from jaxba.problem.geometry import COLMAP_FLIP, are_rotations, translations
 from jaxba.typing import LARGEST_COUNT
@@ -41,36 +40,26 @@ def read_nvm(path: StrPath) -> BundleProblem:
 
     An image without distortion is a camera of BAL, whose f, k1 and k2 are optimised. With one, its pixels are
     undistorted once and residuals weighted so that to first order they are those of the measured image; its f is
-    optimised, k1 and k2 stay zero. With `FixedK` all intrinsics stay as they are.
-
-    Args:
-        path: the file, plain or compressed; may be a pipe.
-
-    Raises:
-        ProblemError: the file cannot be read or is no valid model; one line that names the file and, where there is
-            one, the line and the field.
-    """
-    name = display_name(path)
-    with open_text(path) as blocks:
-        lines = LineReader(blocks, name)
-        matrices, calibration = _header(lines)
-        images = _images(lines, matrices)
-        reader = NumberReader(lines.rest(), name, lambda _: "number of points", line=lines.line + 1)
-        values = reader.peek_all()
-        reader.need(1)
-        count = int(reader.integers([0], values[:1], 0, LARGEST_COUNT)[0])
-        if not count:
-            raise ProblemError(f"{name}: its first model has no points")
-        tracks = read_tracks(reader, 1, count, len(images), reader.field)
-        if tracks.end < values.size and values[tracks.end] > 0:  # the number of images of the next model, or 0
-            note(path, "only the first model of the file is read")
-    note_origin(path, tracks.pixels)
+    optimised, k1 and k2 stay zero. With `FixedK` all intrinsics stay as they are. Raises ProblemError: the file cannot
+    be read or is no valid model; one line that names the file and, where there is one, the line and the field."""
+    text = Text(read_text(path), display_name(path))
+    matrices, calibration = _header(text)
+    images = _images(text, matrices)
+    values = text.read_numbers(lambda _: "number of points")
+    text.need(1)
+    count = int(text.integers([0], 0, LARGEST_COUNT)[0])
+    if not count:
+        raise ProblemError(f"{text.name}: its first model has no points")
+    points, camera_index, point_index, measured, end = read_tracks(text, 1, count, len(images))
+    if end < values.size and values[end] > 0:  # the number of images of the next model, or 0
+        note(path, "only the first model of the file is read")
+    note_origin(path, measured)
     lenses, lens_of, coefficients = _lenses(images, calibration)
     focal = np.array([lens.focal for lens in lenses])
-    of_views = lens_of[tracks.camera_index]
-    pixels, whitening = _undistorted(tracks.pixels, focal[of_views], coefficients[of_views])
-    seen = tracks.points, pixels, tracks.camera_index, tracks.point_index
-    return assemble(path, lenses, lens_of, *_poses(images, matrices), *seen, whitening)
+    of_views = lens_of[camera_index]
+    pixels, whitening = _undistorted(measured, focal[of_views], coefficients[of_views])
+    poses = _poses(images, matrices)
+    return assemble(path, lenses, lens_of, *poses, points, pixels, camera_index, point_index, whitening)
 
 
 def _lenses(
@@ -79,9 +68,9 @@ def _lenses(
     """The lenses without distortion, the lens of each image, and r of each lens."""
     if calibration is not None:
         fx, _, fy, _, r = calibration
-        return [ForeignLens("FixedK", (fx, fy), free=FIXED)], np.zeros(len(images), np.int64), np.array([r])
+        return [ForeignLens("FixedK", (fx, fy), free=False)], np.zeros(len(images), np.int64), np.array([r])
     lenses = [
-        ForeignLens(f"image {image}", (f, f), free=(True, r == 0, r == 0))
+        ForeignLens(f"image {image}", (f, f), distortion={} if r else {"k1": 0.0, "k2": 0.0})
         for image, (f, *_, r, _) in enumerate(images.tolist())
     ]
     return lenses, np.arange(len(lenses)), images[:, -2]
@@ -117,10 +106,9 @@ def _poses(
     return rotations, translations(rotations, images[:, 5:8])
 
 
-def _header(lines: LineReader) -> tuple[bool, list[float] | None]:
+def _header(text: Text) -> tuple[bool, list[float] | None]:
     """Whether poses are rotation matrices and translations, and fx cx fy cy r of all images."""
-    words = lines.next().split()
-    where = f"{lines.name} line {max(lines.line, 1)}"
+    words, where = text.next_line().split(), text.where
     if not words or words[0] not in HEADERS:
         shown = ascii(b" ".join(words)[:40].decode("latin-1"))
         raise ProblemError(f"{where}: {shown} is not the header 'NVM_V3' of a VisualSFM file")
@@ -131,10 +119,9 @@ def _header(lines: LineReader) -> tuple[bool, list[float] | None]:
     return words[0] == HEADERS[1], finite_numbers(words[2:], ("fx", "cx", "fy", "cy", "r"), where)
 
 
-def _images(lines: LineReader, matrices: bool) -> Float[np.ndarray, "images numbers"]:
+def _images(text: Text, matrices: bool) -> Float[np.ndarray, "images numbers"]:
     """The numbers of the images' lines."""
-    line = lines.next()
-    where = f"{lines.name} line {max(lines.line, 1)}"
+    line, where = text.next_line(), text.where
     if not line:
         raise ProblemError(f"{where}: the file ends before the number of images")
     count = finite_numbers([line], ("number of images",), where)[0]
@@ -143,8 +130,7 @@ def _images(lines: LineReader, matrices: bool) -> Float[np.ndarray, "images numb
     fields = _FIELDS_R9T if matrices else _FIELDS
     rows = []
     for image in range(int(count)):
-        words = lines.next().rsplit(maxsplit=len(fields))  # names may have blanks
-        where = f"{lines.name} line {max(lines.line, 1)}"
+        words, where = text.next_line().rsplit(maxsplit=len(fields)), text.where  # names may have blanks
         if not words:
             raise ProblemError(f"{where}: the file ends before image {image} of {count:g}")
         if len(words) != len(fields) + 1:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from jaxba.io.files import StrPath
-from jaxba.io.foreign.cameras import BROWN, FISHEYE, ForeignLens
+from jaxba.io.foreign.cameras import BROWN, FISHEYE, UNDEFINED, ForeignLens, Landmark, build, checked_pose, part
 from jaxba.io.foreign.json_records import Record
-from jaxba.io.foreign.views import UNDEFINED, Landmark, build, checked_pose, part
 from jaxba.io.notes import note_unused
 from jaxba.problem.bundle_problem import BundleProblem
 
@@ -50,15 +51,11 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
 
     Cameras are the views that have a pose and see a point; they share the lens of their intrinsic. `pinhole`,
     `pinhole_radial_k1` and, where k3 is 0, `pinhole_radial_k3` are optimised. The intrinsics of the others in `MODELS`
-    stay as they are.
-
-    Raises:
-        ProblemError: the file lacks a part, names a camera model that is not in `MODELS`, or views share a pose; one
-            line that names the file, the record and the field.
-    """
+    stay as they are. Raises ProblemError: the file lacks a part, names a camera model that is not in `MODELS`, or views
+    share a pose; one line that names the file, the record and the field."""
     views = {}
     unused = dict.fromkeys(PRIORS.values(), 0)
-    for key, value in _map(part(document, "views", _PROGRAM), "view"):
+    for key, value in part(document, "views", _PROGRAM).numbered("key", "view", "value"):
         data = value.get("ptr_wrapper").get("data").called(value.where)
         for flag, what in PRIORS.items():
             unused[what] += data.get(flag, False).flag()
@@ -66,25 +63,19 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
         views[data.get("id_view", key).integer()] = pose, intrinsic
     intrinsics = _intrinsics(part(document, "intrinsics", _PROGRAM))
     poses = {}
-    for key, value in _map(part(document, "extrinsics", _PROGRAM), "pose"):
-        poses[key] = checked_pose(value, value.get("rotation").matrix(), value.get("center").vector(3))
+    for key, value in part(document, "extrinsics", _PROGRAM).numbered("key", "pose", "value"):
+        rotation = [row.vector(3) for row in value.get("rotation").rows()]
+        poses[key] = checked_pose(value, np.array(rotation), value.get("center").vector(3))
     landmarks = _landmarks(part(document, "structure", _PROGRAM))
     note_unused(path, unused | document.unknown(PARTS))
     return build(path, views, poses, intrinsics, lambda key: _lens(*intrinsics[key]), landmarks)
-
-
-def _map(record: Record, what: str) -> Iterator[tuple[int, Record]]:
-    """Keys and values of a map, which is a list of pairs."""
-    for row in record.rows():
-        key = row.get("key").integer()
-        yield key, row.get("value").called(f"{what} {key}")
 
 
 def _intrinsics(record: Record) -> dict[int, tuple[str, Record]]:
     """Model and parameters of each intrinsic, with the references of the serialisation library resolved."""
     found = {}
     models, objects = {}, {}
-    for key, value in _map(record, "intrinsic"):
+    for key, value in record.numbered("key", "intrinsic", "value"):
         identity = value.get("polymorphic_id").integer()
         if value.has("polymorphic_name"):
             models[identity & ~_FIRST] = value.get("polymorphic_name").text()
@@ -109,11 +100,10 @@ def _lens(model: str, data: Record) -> ForeignLens:
     x, y = data.get("principal_point").vector(2)
     fisheye = model == "fisheye"
     distortion = dict(zip(FISHEYE if fisheye else BROWN, numbers, strict=False))
-    return ForeignLens(data.where, (focal, focal), (x, y), distortion, fisheye, (True, count > 0, count > 1), size)
+    return ForeignLens(data.where, (focal, focal), (x, y), distortion, fisheye, size=size)
 
 
 def _landmarks(structure: Record) -> Iterator[Landmark]:
-    for key, value in _map(structure, "landmark"):
-        seen = list(_map(value.get("observations"), f"landmark {key}: observation in view"))
-        pixels = [one.get("x").vector(2) for _, one in seen]
-        yield value.get("X").vector(3), [view for view, _ in seen], pixels
+    for key, value in structure.numbered("key", "landmark", "value"):
+        seen = dict(value.get("observations").numbered("key", f"landmark {key}: observation in view", "value"))
+        yield value.get("X").vector(3), list(seen), [one.get("x").vector(2) for one in seen.values()]

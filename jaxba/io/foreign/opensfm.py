@@ -12,15 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxba.io.encoding import read_text
+from jaxba.io.encoding import read_characters
 from jaxba.io.files import StrPath, display_name
 from jaxba.io.foreign import TRACKS
-from jaxba.io.foreign.cameras import ForeignLens, assemble
+from jaxba.io.foreign.cameras import ForeignLens, Landmark, build, checked_pose
 from jaxba.io.foreign.json_records import Record
 from jaxba.io.notes import note, note_unused
 from jaxba.io.text import finite_numbers
 from jaxba.problem.bundle_problem import BundleProblem, ProblemError
-from jaxba.problem.geometry import are_rotations
 
 TRACKS_HEADER = "OPENSFM_TRACKS_VERSION_v"
 """Begins the first line of tracks; files of version 0 have no such line."""
@@ -54,12 +53,9 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
 
     `perspective`, `simple_radial` and `radial` cameras are optimised; intrinsics of `brown`, `fisheye` and
     `fisheye_opencv` stay as they are. Images share the lens of their camera. Images and tracks that are not
-    reconstructed are ignored; of repeated observations the last one counts.
-
-    Raises:
-        ProblemError: tracks are missing or malformed, a camera model is not one of `MODELS`, or images are of a rig;
-            one line that names the file, the record and the field.
-    """
+    reconstructed are ignored, images that see no point are left out; of repeated observations the last one counts.
+    Raises ProblemError: tracks are missing or malformed, a camera model is not one of `MODELS`, or images are of a rig;
+    one line that names the file, the record and the field."""
     if isinstance(document.value, list):
         if not document.value:
             document.fail("holds no reconstruction")
@@ -67,49 +63,33 @@ def from_document(document: Record, path: StrPath) -> BundleProblem:
             note(path, f"only the first of {len(document.value)} reconstructions is read")
         document = Record(document.value[0], document.name)
     _refuse_rigs(document)
+    from scipy.spatial.transform import Rotation
+
     cameras = dict(document.get("cameras").entries("camera"))
     lenses: dict[str, ForeignLens] = {}  # of the cameras that shots name
-    shots: dict[str, int] = {}
-    lens_keys, turns, shifts = [], [], []
-    for key, shot in document.get("shots").entries("shot"):
+    shots, views, poses = {}, {}, {}
+    for number, (key, shot) in enumerate(document.get("shots").entries("shot")):
         camera = shot.get("camera").text()
         if camera not in cameras:
             shot.fail(f"names camera {display_name(camera)}, which is not there")
         if camera not in lenses:
             lenses[camera] = _lens(cameras[camera])
-        shots[key] = len(shots)
-        lens_keys.append(camera)
-        turns.append(shot.get("rotation").vector(3))
-        shifts.append(shot.get("translation").vector(3))
+        shots[key], views[number] = number, (number, camera)
+        rotation = Rotation.from_rotvec(shot.get("rotation").vector(3)).as_matrix()
+        poses[number] = checked_pose(shot, rotation, (-rotation.T @ shot.get("translation").vector(3)).tolist())
     if not document.has("points"):
         document.fail("has no points, only cameras and shots")
-    points = {key: point.get("coordinates").vector(3) for key, point in document.get("points").entries("point")}
-    if not shots or not points:
+    entries = document.get("points").entries("point")
+    landmarks: dict[str, Landmark] = {key: (point.get("coordinates").vector(3), [], []) for key, point in entries}
+    if not shots or not landmarks:
         document.fail(f"has no {'points' if shots else 'shots'}")
-    seen, unused = _read_tracks(_tracks_beside(path), shots, set(points))
+    seen, unused = _read_tracks(_tracks_beside(path), shots, landmarks)
     note_unused(path, document.unknown(PARTS) | _unused(document, path) | unused)
-    from scipy.spatial.transform import Rotation
-
-    rotations = Rotation.from_rotvec(np.array(turns)).as_matrix()
-    bad = np.flatnonzero(~are_rotations(rotations))
-    if bad.size:
-        document.fail(f"has shot {display_name(list(shots)[bad[0]])} with a rotation that is none")
-    point_number = {key: at for at, key in enumerate(points)}
-    lens_number = {key: at for at, key in enumerate(lenses)}
-    lens_of = np.array([lens_number[key] for key in lens_keys])
-    camera_index = np.array([shots[image] for image, _ in seen])
-    size = np.array([lens.size for lens in lenses.values()])[lens_of][camera_index]
-    return assemble(
-        path,
-        list(lenses.values()),
-        lens_of,
-        rotations,
-        np.array(shifts),
-        np.array(list(points.values())),
-        size.max(axis=1)[:, None] * np.array(list(seen.values())) + size / 2,
-        camera_index,
-        np.array([point_number[track] for _, track in seen]),
-    )
+    for (image, track), (x, y) in seen.items():
+        width, height = lenses[views[shots[image]][1]].size or (0.0, 0.0)
+        landmarks[track][1].append(shots[image])
+        landmarks[track][2].append([max(width, height) * x + width / 2, max(width, height) * y + height / 2])
+    return build(path, views, poses, lenses, lenses.__getitem__, landmarks.values())
 
 
 def _unused(document: Record, path: StrPath) -> dict[str, int]:
@@ -158,8 +138,7 @@ def _lens(camera: Record) -> ForeignLens:
         (width / 2 + side * offset[0], height / 2 + side * offset[1]),
         {name: optional(name) for name in names},
         model.startswith("fisheye"),
-        (True, True, count > 1),
-        (width, height),
+        size=(width, height),
     )
 
 
@@ -175,7 +154,7 @@ def _read_tracks(
 ) -> tuple[dict[tuple[str, str], tuple[float, float]], dict[str, int]]:
     """The pixels of reconstructed images and points by image and track, and what else the file holds."""
     name = display_name(path)
-    lines = read_text(path).split("\n")
+    lines = read_characters(path).split("\n")
     version, first = 0, 0
     if lines[0].startswith(TRACKS_HEADER):
         stated = lines[0].removeprefix(TRACKS_HEADER).strip()
