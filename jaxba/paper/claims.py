@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from jaxba.bench.tables import number
-from jaxba.paper.rows import Row
+from jaxba.paper.results import Row
 
 Status = Literal["reproduced", "partly", "not", "not run"]
 
@@ -68,7 +68,7 @@ class Statement(NamedTuple):
     """A claim before it is tested: the rule, the claim in words, the paper's number, and the methods."""
 
     test: Callable[..., Claim]
-    """`ratio_claim`, `time_claim`, `order_claim` or `success_claim`."""
+    """`ratio_claim`, `time_claim`, `longer_claim`, `order_claim` or `success_claim`."""
 
     text: str
     """In words; `{}` stands for the set of problems."""
@@ -128,6 +128,15 @@ def ratio_claim(text: str, paper: float, ours: Row | None, base: Row | None, of:
 def time_claim(text: str, paper: float, ours: Row | None, base: Row | None) -> Claim:
     """The claim that `ours` takes the fraction `paper` of the seconds of `base`, by the rule of `ratio_claim`."""
     return ratio_claim(text, paper, ours, base, "seconds")
+
+
+def longer_claim(text: str, paper: str, ours: Row | None, base: Row | None) -> Claim:
+    """The claim that `ours` takes more seconds than `base`."""
+    if ours is None or base is None or not _comparable("seconds", ours, base):
+        return Claim(text, paper, "-", "not run")
+    longer = 1e3 * (ours.seconds - base.seconds)
+    detail = f"{longer:+.1f} ms ({number(1e3 * ours.seconds)} / {number(1e3 * base.seconds)} ms)"
+    return Claim(text, paper, detail, "reproduced" if longer > 0 else "not")
 
 
 def order_claim(text: str, paper: str, better: Row | None, worse: Row | None) -> Claim:
