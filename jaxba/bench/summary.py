@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from jaxba.bench import profile
-from jaxba.bench.profile import Reach, Target
+from jaxba.bench.profile import Target
 from jaxba.bench.virtual import rules_of_one_step
 from jaxba.game.statistics import SHORTEST_TIME, Comparison, Reached, capped, compare, geometric_mean
 from jaxba.io import json_lines
@@ -55,7 +55,7 @@ class Cell:
     """Median over the iterations of all repeats; NaN without iterations."""
     setup_s: float
     compile_s: float
-    reach: dict[str, Reach]
+    reach: dict[str, Reached]
     """By `Target.key`."""
 
 
@@ -118,7 +118,7 @@ class ProblemSummary:
     best_cost: float
     """f*, pixels squared."""
     best_solver: str
-    """First solver that reached f*; "known" if f* comes from `known_best`."""
+    """First solver that reached f*."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,6 @@ class Summary:
 def summarize(
     records: Sequence[Record],
     tolerance: float = 1e-3,
-    known_best: Mapping[str, float] | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> Summary:
     """Computes the statistics of all tables.
@@ -147,12 +146,11 @@ def summarize(
     Args:
         records: any number, also none.
         tolerance: tau of the target `tau`.
-        known_best: best known costs of some problems, pixels squared; see `profile.best_cost`.
         metadata: device, threads, versions and the like; copied into the result.
     """
     targets = profile.standard_targets(tolerance)
-    starts, bests = profile.initial_costs(records), profile.best_cost(records, known_best)
-    tables = {target.key: profile.reach_table(records, target, known_best) for target in targets}
+    starts, bests = profile.initial_costs(records), profile.best_cost(records)
+    tables = {target.key: profile.reach_table(records, target) for target in targets}
     names, solvers = profile.problem_names(records), profile.solver_names(records)
     found = {key: {s: profile.reached(table.get(s, {}), names) for s in solvers} for key, table in tables.items()}
     cells = []
@@ -181,7 +179,7 @@ def _median(values: Iterable[float]) -> float:
     return statistics.median(known) if known else math.nan
 
 
-def _cell(runs: Sequence[Record], reaches: dict[str, Reach], f0: float, f_star: float) -> Cell:
+def _cell(runs: Sequence[Record], reaches: dict[str, Reached], f0: float, f_star: float) -> Cell:
     final = statistics.median(r.final_cost if math.isfinite(r.final_cost) else math.inf for r in runs)
     steps = [b.time_s - a.time_s for r in runs for a, b in zip(r.trace, r.trace[1:], strict=False)]
     floor = profile.ZERO_RESIDUAL_FLOOR * f0
@@ -205,9 +203,9 @@ def _cell(runs: Sequence[Record], reaches: dict[str, Reach], f0: float, f_star: 
 
 def _problem(runs: Sequence[Record], f0: float, f_star: float) -> ProblemSummary:
     first = runs[0]
-    holder = [r.solver for r in runs if profile.lowest_cost(r) <= f_star]
+    holder = next((r.solver for r in runs if profile.lowest_cost(r) <= f_star), "the start")
     sizes = (first.cameras, first.points, first.observations)
-    return ProblemSummary(first.problem, first.family, *sizes, f0, f_star, holder[0] if holder else "known")
+    return ProblemSummary(first.problem, first.family, *sizes, f0, f_star, holder)
 
 
 def _solver(

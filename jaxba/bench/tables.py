@@ -152,6 +152,17 @@ def _details(summary: Summary) -> Table:
     return Table("Problems", (*header, "s to f*(1+0.001)", "time s", "termination"), rows, note, text_columns=2)
 
 
+def problem_table(summary: Summary) -> Table:
+    """Sizes and costs of the problems."""
+    header = ("problem", "family", "cameras", "points", "observations", "initial cost", "best cost f*", "reached by")
+    rows = []
+    for p in summary.problems:
+        sizes = (str(p.cameras), str(p.points), str(p.observations))
+        rows.append((p.problem, p.family, *sizes, f"{p.initial_cost:.7g}", f"{p.best_cost:.7g}", p.best_solver))
+    note = "Costs are half the sum of squared residuals, pixels²."
+    return Table("Problems and their sizes", header, rows, note, text_columns=2)
+
+
 def print_summary(summary: Summary, console: Console, details: bool = True) -> None:
     """Prints all tables to a rich console, warnings first."""
     from rich.text import Text

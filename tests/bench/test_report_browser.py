@@ -126,9 +126,9 @@ def test_a_solver_is_hidden_in_every_chart_and_table_and_equal_curves_are_named(
 
 def test_no_button_of_a_chart_sends_it_anywhere(page):
     titles = page.execute_script("return [...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)")
-    assert set(titles) == {"Download plot as a PNG", "Zoom", "Pan", "Reset axes"}
-    made = "Plotly.toImage('chart0').then(arguments[0], arguments[0])"
-    assert page.execute_async_script(made).startswith("data:image/png;base64,")
+    assert set(titles) == {"Download plot", "Zoom", "Pan", "Reset axes"}
+    made = "Plotly.toImage('chart0', {format: 'svg'}).then(arguments[0], arguments[0])"
+    assert page.execute_async_script(made).startswith("data:image/svg+xml,")
 
 
 def test_dark_and_light_differ_and_black_curves_turn_white(page):

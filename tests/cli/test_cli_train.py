@@ -97,7 +97,7 @@ def test_a_run_writes_policy_curve_log_and_configuration(finished):
     names = {path.name for path in finished.iterdir()}
     assert names == {
         *("config.yaml", "bank.npz", "rules.npz", "metrics.jsonl", "tensorboard", "checkpoints"),
-        *("policy.safetensors", "curve.png", "curve.svg", "report.html"),
+        *("policy.safetensors", "report.html"),
     }
     assert load(str(finished / "config.yaml")) == load("fast", TINY)
     assert [row["chunk"] for row in log.read(finished)] == [1, 2, 3, 4]
