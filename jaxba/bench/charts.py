@@ -167,9 +167,9 @@ def _dashed(lines: Mapping[str, float], low: float, high: float) -> list[dict[st
     ]
 
 
-def profile_chart(records: Sequence[Record], target: Target) -> Chart:
+def profile_chart(records: Sequence[Record], target: Target, styles: Mapping[str, Style]) -> Chart:
     """Performance profiles by iterations and by time."""
-    styles, count = solver_styles(profile.solver_names(records)), len(profile.problem_names(records))
+    count = len(profile.problem_names(records))
     table = profile.reach_table(records, target)
     found: dict[str, dict[str, profile.Curve]] = {}
     for name, measure in zip(AXES, ("iterations", "seconds"), strict=True):
@@ -191,7 +191,9 @@ def profile_chart(records: Sequence[Record], target: Target) -> Chart:
     return chart(target.label, traces, axes, height, note=_equal(found["iterations"]), height=340)
 
 
-def problem_charts(records: Sequence[Record], problem: str, tolerance: float) -> list[Chart]:
+def problem_charts(
+    records: Sequence[Record], problem: str, tolerance: float, styles: Mapping[str, Style]
+) -> list[Chart]:
     """Accepted cost, distance to the best cost, and lambda on one problem.
 
     The cost has dashed lines at `f* + tau (f0 - f*)` for the paper's tolerances and the given one; the distance,
@@ -199,11 +201,12 @@ def problem_charts(records: Sequence[Record], problem: str, tolerance: float) ->
     line are drawn at the bottom. The repeat of median time is drawn.
 
     Args:
-        records: of all problems, so that colours are those of all other charts.
+        records: of any problems.
         problem: name of one of them.
         tolerance: tau of a dashed line.
+        styles: of the solvers.
     """
-    styles, runs = solver_styles(profile.solver_names(records)), representatives(records, problem)
+    runs = representatives(records, problem)
     axes = {"iterations": axis("iteration"), "time": axis("solve time (s)", log=_time_is_log(runs.values()))}
     f0, f_star = profile.initial_costs(records)[problem], profile.best_cost(records)[problem]
     gaps = {e: profile.relative_threshold(f0, f_star, e) - f_star for e in profile.RELATIVE_TOLERANCES}

@@ -75,10 +75,10 @@ def to_html(records: Sequence[Record], summary: Summary, tolerance: float = 1e-3
     styles = solver_styles(profile.solver_names(records))
     facts = {str(name): str(value) for name, value in summary.metadata.items()}
     whole = page.Page("jaxba benchmark", facts, styles, AXES)
-    profiles = [profile_chart(records, target) for target in profile.cost_targets(tolerance)]
+    profiles = [profile_chart(records, target, styles) for target in profile.cost_targets(tolerance)]
     whole.add("Performance profiles", page.note(PROFILES), whole.charts(profiles))
     names = profile.problem_names(records)
-    by_problem = {name: whole.charts(problem_charts(records, name, tolerance)) for name in names}
+    by_problem = {name: whole.charts(problem_charts(records, name, tolerance, styles)) for name in names}
     whole.add("Convergence and damping", page.note(RUNS), page.groups("problem", by_problem))
     for table in (*tables(summary), problem_table(summary)):
         whole.add_table(table)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxba.bench.report import to_html
+from jaxba.bench import profile
+from jaxba.bench.charts import AXES, problem_charts, profile_chart, solver_styles
+from jaxba.bench.page import Page
 from jaxba.bench.run import machine
-from jaxba.bench.summary import summarize
 from jaxba.paper.agents import updates
 from jaxba.paper.claims import CRITERION, Claim
 from jaxba.paper.config import to_yaml
@@ -18,6 +19,9 @@ from jaxba.runtime.atomic import write_text
 
 CLAIMS = "claims.md"
 """File of the table of claims alone, in the folder of the run."""
+
+TAU = 0.001
+"""The smaller tolerance of the paper's figures."""
 
 INTERPRETATIONS = "interpretations.md"
 """Section on the subjects on which the paper's text and its released code are open or contradict each other: what both
@@ -48,13 +52,10 @@ def write(runner: Runner, path: Path, command: str) -> list[Path]:
         *(paragraph for body, _ in sections for paragraph in body),
         f"## Settings\n\n```yaml\n{to_yaml(runner.config).strip()}\n```",
     ]
-    parts = [part for figure in FIGURES for part in figure.parts(runner)]
-    records = {(r.problem, r.solver, r.repeat): r for part in parts for r in part.records(runner)}
     files = [path, runner.folder / CLAIMS]
-    if records:
+    if page := _figures(runner, command):
         files.append(path.with_suffix(".html"))
-        drawn = [*records.values()]
-        write_text(files[-1], to_html(drawn, summarize(drawn, metadata={"command": command})))
+        write_text(files[-1], page)
         rest.insert(1, f"Figures: [{files[-1].name}]({files[-1].name}).")
     write_text(path, "\n\n".join([claims, *rest]) + "\n")
     write_text(runner.folder / CLAIMS, claims)
@@ -81,3 +82,21 @@ def _claims(runner: Runner, claims: list[Claim], command: str) -> str:
         table(("claim", "paper", "ours", "to f\\*(1+1e-3)", "result"), cells).replace("\\*\\*", "**"),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _figures(runner: Runner, command: str) -> str:
+    """The page of the figures: of several problems their performance profiles, of a single one its convergence and
+    lambdas. Empty if nothing of them was run."""
+    drawn = {
+        f"{figure.heading}: {part.problems.name}": records
+        for figure in FIGURES
+        for part in figure.parts(runner)
+        if (records := part.records(runner))
+    }
+    styles = solver_styles(r.solver for records in drawn.values() for r in records)
+    page = Page("The paper's figures", {"command": command}, styles, AXES)
+    for title, records in drawn.items():
+        first, *others = profile.problem_names(records)
+        profiles = [profile_chart(records, target, styles) for target in profile.cost_targets(TAU) if others]
+        page.add(title, page.charts(profiles or problem_charts(records, first, TAU, styles)))
+    return page.to_html() if drawn else ""

@@ -155,7 +155,7 @@ def test_many_solvers_have_different_styles_and_yardsticks_always_the_same():
 
 
 def test_convergence_charts_have_dashed_lines_at_the_tolerances():
-    cost, distance, _ = charts.problem_charts([make_record("a", "x", 30)], "a", 1e-2)
+    cost, distance, _ = charts.problem_charts([make_record("a", "x", 30)], "a", 1e-2, charts.solver_styles("x"))
     heights = lambda chart: sorted(shape["y0"] for shape in chart["layout"]["shapes"])
     assert heights(cost) == pytest.approx([100.9, 109.0, 190.0])
     assert heights(distance) == pytest.approx([1e-4, 1e-3, 1e-2])
