@@ -13,7 +13,7 @@ import os
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,81 +32,58 @@ FORMAT = 1
 """Version of `summary.json`; it changes when a key changes its meaning."""
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """One solver on one problem; numbers are medians over repeats."""
 
     problem: str
     solver: str
     repeats: int
-    converged: bool
-    """Whether more than half of the repeats converged within `ITERATION_LIMIT` iterations."""
-    termination: str
-    """Distinct reasons of the repeats to stop, joined by a slash."""
-    final_cost: float
-    """Pixels squared; infinite if not finite."""
-    final_ratio: float
-    """(final cost + floor) / (f* + floor) with floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best."""
+    converged: bool  # more than half of the repeats within `ITERATION_LIMIT` iterations
+    termination: str  # distinct reasons of the repeats to stop, joined by a slash
+    final_cost: float  # pixels squared; infinite if not finite
+    final_ratio: float  # (final cost + floor) / (f* + floor), floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best
     iterations: float
     rejected: float
-    seconds: float
-    """Solve time without compilation."""
-    seconds_per_iteration: float
-    """Median over the iterations of all repeats; NaN without iterations."""
+    seconds: float  # solve time without compilation
+    seconds_per_iteration: float  # median over the iterations of all repeats; NaN without iterations
     setup_s: float
     compile_s: float
-    reach: dict[str, Reached]
-    """By `Target.key`."""
+    reach: dict[str, Reached]  # by `Target.key`
 
 
-@dataclass(frozen=True)
-class TargetSummary:
-    """Statistics of a solver on one target over all problems."""
+class TargetSummary(NamedTuple):
+    """Statistics of a solver on one target over all problems, `total`, also those that it was not run on.
+
+    Means are geometric: over the reached problems, with a count of 0 taken as 1, NaN if there are none; of
+    `iterations_capped` over all problems, with counts capped at `ITERATION_LIMIT`.
+    """
 
     reached: int
-    """Number of problems on which the target was reached."""
     total: int
-    """Number of all problems, including those that the solver was not run on."""
     iterations: float
-    """Geometric mean over the reached problems, with a count of 0 taken as 1. NaN if there are none."""
     iterations_capped: float
-    """Geometric mean over all problems, with counts capped at `ITERATION_LIMIT`."""
     seconds: float
-    """Geometric mean over the reached problems. NaN if none."""
 
 
-@dataclass(frozen=True)
-class SolverSummary:
-    """One solver over all problems."""
+class SolverSummary(NamedTuple):
+    """One solver over all problems; ratios of ends, and medians, over those that it was run on."""
 
     solver: str
-    run: int
-    """Number of problems that it was run on."""
-    total: int
-    """Number of problems of the benchmark."""
-    targets: dict[str, TargetSummary]
-    """By `Target.key`."""
-    against: dict[str, dict[str, Comparison]]
-    """By yardstick, then by `Target.key`; a yardstick is not compared with itself."""
+    run: int  # number of problems that it was run on
+    total: int  # of the benchmark
+    targets: dict[str, TargetSummary]  # by `Target.key`
+    against: dict[str, dict[str, Comparison]]  # by yardstick and `Target.key`; none is compared with itself
     final_ratio_worst: float
-    """Largest `Cell.final_ratio` over the problems that it was run on."""
-    final_ratio_mean: float
-    """Geometric mean of `Cell.final_ratio` over the problems that it was run on."""
-    rejected_share: float
-    """Rejected iterations / iterations, over all runs."""
-    linear_failure_share: float
-    """Rejected iterations without a finite gain ratio (failed factorisation, non-finite cost) / iterations. NaN if the
-    traces have no gain ratios at all."""
+    final_ratio_mean: float  # geometric
+    rejected_share: float  # rejected iterations / iterations, over all runs
+    linear_failure_share: float  # of rejected iterations without a gain ratio; NaN if the traces have none at all
     seconds_per_iteration: float
-    """Median over problems."""
     setup_s: float
     compile_s: float
-    """Medians over problems."""
 
 
-@dataclass(frozen=True)
-class ProblemSummary:
-    """Size and costs of one problem."""
+class ProblemSummary(NamedTuple):
+    """Size of a problem, its initial and best cost (pixels squared), and the first solver that reached that."""
 
     problem: str
     family: str
@@ -114,11 +91,8 @@ class ProblemSummary:
     points: int
     observations: int
     initial_cost: float
-    """f0, pixels squared."""
     best_cost: float
-    """f*, pixels squared."""
     best_solver: str
-    """First solver that reached f*."""
 
 
 @dataclass(frozen=True)

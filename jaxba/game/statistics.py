@@ -29,14 +29,6 @@ class Reached(NamedTuple):
     seconds: Any
 
 
-class Ratio(NamedTuple):
-    """A geometric mean of paired ratios, with its 95% interval."""
-
-    mean: float
-    low: float
-    high: float
-
-
 @dataclass(frozen=True)
 class Comparison:
     """A solver compared with a yardstick on one target."""
@@ -80,10 +72,10 @@ def compare(ours: Reached, theirs: Reached) -> Comparison:
     )
 
 
-def paired_ratio(ours: Float[np.ndarray, " cases"], theirs: Float[np.ndarray, " cases"]) -> Ratio:
-    """Geometric mean of `ours / theirs` over cases that both had, and the percentile interval of a bootstrap over the
-    cases. Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", section 13.3."""
+def paired_ratio(ours: Float[np.ndarray, " cases"], theirs: Float[np.ndarray, " cases"]) -> tuple[float, float, float]:
+    """Geometric mean of `ours / theirs` over cases that both had, and the ends of the 95% percentile interval of a
+    bootstrap over the cases. Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", section 13.3."""
     logs = np.log(np.asarray(ours) / np.asarray(theirs))
     rows = np.random.default_rng(0).integers(len(logs), size=(RESAMPLES, len(logs)))
     low, high = np.percentile(logs[rows].mean(axis=1), [2.5, 97.5])
-    return Ratio(*(float(np.exp(x)) for x in (logs.mean(), low, high)))
+    return float(np.exp(logs.mean())), float(np.exp(low)), float(np.exp(high))

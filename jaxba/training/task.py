@@ -21,7 +21,7 @@ from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, best_constant_action, best_costs, evaluate, iterations_to, play_all, scores
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks, select
-from jaxba.game.statistics import Ratio, paired_ratio
+from jaxba.game.statistics import paired_ratio
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.solver.methods import DEFAULT_METHOD, make_method
@@ -68,8 +68,9 @@ class Comparison(NamedTuple):
     scores: dict[str, Score]
     """By name: of every agent if there are several, of all agents (means) and of their twins, and of the baselines."""
 
-    ratios: dict[str, Ratio]
-    """Iterations of the trained policies over those of each other row, scene by scene; geometric mean over agents."""
+    ratios: dict[str, tuple[float, float, float]]
+    """Iterations of the trained policies over those of each other row, scene by scene (`paired_ratio`); geometric mean
+    over agents."""
 
     by_agent: dict[str, list[float]]
     """The same for every agent, over its own twin."""

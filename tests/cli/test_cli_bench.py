@@ -211,14 +211,6 @@ def test_ctrl_c_keeps_the_results_and_the_next_run_does_the_rest(tmp_path, undra
     assert [line["solver"] for line in lines(folder)] == ["classic", "ceres"]
 
 
-def test_two_processes_may_not_write_into_one_folder(folder, undrawn, capsys):
-    before = (folder / "results.jsonl").read_bytes()
-    with bench_run.only_writer(folder):
-        status = bench(folder, "scene:tiny", "--solvers", "gtsam", "--repeats", "1", "--max-iterations", "5")
-    check_one_line(status, capsys.readouterr().err, "another jaxba-bench is writing here")
-    assert (folder / "results.jsonl").read_bytes() == before
-
-
 def test_a_run_with_two_records_counts_once(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     path.write_bytes(2 * path.read_bytes())
@@ -290,7 +282,7 @@ def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undraw
     assert bench(tmp_path / "run[bold]", *argv) == 0
     out = capsys.readouterr().out
     assert "\nseq[red]:cat: ceres #1: 1 iteration," in f"\n{out}"
-    assert f"see {tmp_path / 'run[bold]' / 'report.html'}" in out.replace("\n", "")
+    assert str(tmp_path / "run[bold]" / "report.html") in out
 
 
 def test_a_file_name_that_is_not_valid_text_is_escaped(tmp_path, capsys):
