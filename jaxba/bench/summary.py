@@ -19,7 +19,6 @@ import numpy as np
 
 from jaxba.bench import profile
 from jaxba.bench.profile import Target
-from jaxba.bench.virtual import rules_of_one_step
 from jaxba.game.statistics import SHORTEST_TIME, Comparison, Reached, capped, compare, geometric_mean
 from jaxba.io import json_lines
 from jaxba.runtime.atomic import write_text
@@ -104,8 +103,6 @@ class Summary:
     solvers: list[SolverSummary]
     cells: list[Cell]
     warnings: list[str]
-    virtual: dict[str, dict[str, TargetSummary]] = field(default_factory=dict)
-    """Virtual best of the hand-written rules with the same step (`virtual.py`): by name, then by `Target.key`."""
     metadata: dict[str, Any] = field(default_factory=dict)
     """Device, threads, versions and the like."""
 
@@ -140,10 +137,6 @@ def summarize(
         solvers=[_solver(solver, records, cells, found, len(names)) for solver in solvers],
         cells=cells,
         warnings=profile.cost_warnings(records) + _coverage_warnings(cells, solvers, names),
-        virtual={
-            best: {key: _target(_best([rows[rule] for rule in rules])) for key, rows in found.items()}
-            for best, rules in rules_of_one_step(solvers).items()
-        },
         metadata=dict(metadata or {}),
     )
 
@@ -210,11 +203,6 @@ def _solver(
         setup_s=_median(cell.setup_s for cell in own),
         compile_s=_median(cell.compile_s for cell in own),
     )
-
-
-def _best(rows: Sequence[Reached]) -> Reached:
-    """The fewest iterations and the least time on each problem, which may be those of different solvers."""
-    return Reached(*(np.min(numbers, axis=0) for numbers in zip(*rows, strict=True)))
 
 
 def _target(own: Reached) -> TargetSummary:

@@ -28,11 +28,6 @@ class Table:
     """Number of columns that are aligned left."""
 
 
-_VIRTUAL = (
-    " Best of the rules: for each problem, the result of the hand-written rule with this step that is best on it."
-)
-
-
 def number(value: float, digits: int = 3) -> str:
     """A number with `digits` significant digits, infinity as ∞, NaN as a dash."""
     if math.isnan(value):
@@ -61,7 +56,6 @@ def tables(summary: Summary, details: bool = True) -> list[Table]:
 
 
 def _overview(summary: Summary) -> Table:
-    virtual = _VIRTUAL if summary.virtual else ""
     header = ("solver", "converged", "iterations", "capped", "time s", "s / iteration", "final / best worst", "mean")
     rows = []
     for s in summary.solvers:
@@ -72,15 +66,11 @@ def _overview(summary: Summary) -> Table:
         rows.append(
             (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *fractions, number(s.compile_s))
         )
-    for name, targets in summary.virtual.items():
-        end = targets["converged"]
-        means = (end.iterations, end.iterations_capped, end.seconds)
-        rows.append((name, f"{end.reached}/{end.total}", *map(number, means), *["-"] * 6))
     note = (
         f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
         "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
         f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): fractions of all iterations. "
-        f"Seconds per iteration and compilation: medians over problems.{virtual}"
+        f"Seconds per iteration and compilation: medians over problems."
     )
     return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
 
@@ -89,9 +79,7 @@ def _reach_tables(summary: Summary) -> list[Table]:
     targets = [target for target in summary.targets if target.kind != "converged"]
     header = ("solver", *(target.label for target in targets))
     iterations, seconds = [], []
-    virtual = _VIRTUAL if summary.virtual else ""
-    found = {**{s.solver: s.targets for s in summary.solvers}, **summary.virtual}
-    for name, by_key in found.items():
+    for name, by_key in ((s.solver, s.targets) for s in summary.solvers):
         cells = [by_key[target.key] for target in targets]
         reached = [f"{cell.reached}/{cell.total}" for cell in cells]
         capped = [
@@ -101,7 +89,7 @@ def _reach_tables(summary: Summary) -> list[Table]:
         seconds.append((name, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
     note = (
         "Geometric mean over the problems reached, k of n (k/n). f*: lowest accepted cost of any solver; "
-        f"τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged.{virtual}"
+        "τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged."
     )
     capped_note = f" In brackets: over all n, with {profile.ITERATION_LIMIT} for those not reached."
     return [
