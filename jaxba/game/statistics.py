@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,20 +28,14 @@ class Reached(NamedTuple):
     seconds: Any
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A solver compared with a yardstick on one target."""
+class Comparison(NamedTuple):
+    """A solver compared with a yardstick on one target: ratios, and numbers of problems that they are not of."""
 
-    both: int
-    """Number of problems on which both reached the target; the ratios are geometric means over these."""
-    only_solver: int
-    """Number of problems on which only the solver reached it."""
+    both: int  # problems on which both reached the target; the ratios are geometric means over these
+    only_solver: int  # problems on which only the solver reached it
     only_yardstick: int
-    """Number of problems on which only the yardstick reached it."""
     iterations: float
-    """Ratio of iterations."""
     seconds: float
-    """Ratio of times."""
 
 
 def capped(iterations: Float[np.ndarray, " *shape"], limit: int) -> Float[np.ndarray, " *shape"]:

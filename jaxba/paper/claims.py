@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from jaxba.bench.tables import number
@@ -44,24 +43,14 @@ CRITERION = (
 )
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper and whether it is reproduced."""
+class Claim(NamedTuple):
+    """A claim of the paper and whether it is reproduced, by `CRITERION`."""
 
-    text: str
-    """The claim in words."""
-
-    paper: str
-    """The paper's number."""
-
+    text: str  # in words
+    paper: str  # the paper's number
     ours: str
-    """Our number."""
-
     status: Status
-    """Whether it is reproduced, by `CRITERION`."""
-
-    near: str = "-"
-    """The same as `ours` in iterations to f*(1+1e-3)."""
+    near: str = "-"  # as `ours`, in iterations to f*(1+1e-3)
 
 
 class Statement(NamedTuple):
@@ -156,18 +145,13 @@ def order_claim(text: str, paper: str, better: Row | None, worse: Row | None) ->
 
 def success_claim(text: str, paper: float, ours: Row | None) -> Claim:
     """The claim that a method succeeds on the fraction `paper` of the problems."""
-    return fraction_claim(text, paper, ours.success if ours else math.nan)
-
-
-def fraction_claim(text: str, paper: float, ours: float) -> Claim:
-    """The claim that a fraction is `paper`."""
-    if math.isnan(ours):
+    if ours is None or math.isnan(ours.success):
         return Claim(text, f"{100 * paper:.0f} %", "-", "not run")
-    gap = abs(paper - ours)
+    gap = abs(paper - ours.success)
     status: Status = (
         "reproduced" if gap <= FRACTION_TOLERANCE else "partly" if gap <= PARTLY_FRACTION_TOLERANCE else "not"
     )
-    return Claim(text, f"{100 * paper:.0f} %", f"{100 * ours:.0f} %", status)
+    return Claim(text, f"{100 * paper:.0f} %", f"{100 * ours.success:.0f} %", status)
 
 
 def error_claim(text: str, paper: float, excess: Sequence[float]) -> Claim:

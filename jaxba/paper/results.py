@@ -125,39 +125,19 @@ class Outcome(NamedTuple):
     seconds: float = math.nan
 
 
-@dataclass(frozen=True)
-class Row:
-    """A method in a table. Numbers are NaN if nothing was run."""
+class Row(NamedTuple):
+    """A method in a table: means over problems and training runs. Numbers are NaN if nothing was run."""
 
-    method: str
-    """Name in records."""
-
-    iterations: float
-    """Mean iterations to convergence, with the limit for a failure."""
-
-    low: float
-    """Lowest mean of a training run."""
-
+    method: str  # name in records
+    iterations: float  # to convergence, with the limit for a failure
+    low: float  # lowest mean of a training run
     high: float
-    """Highest mean of a training run."""
-
-    near: float
-    """Mean iterations until the cost is within `NEAR` of the best known cost, with the limit for never."""
-
-    success: float
-    """Fraction of the solves that converged within the limit."""
-
-    good_ends: float
-    """Fraction of the solves that ended within `GOOD_END` of the best known cost."""
-
-    seeds: int
-    """Number of training runs; 0 for a rule."""
-
-    solves: int
-    """Number of problems or scenes of each training run."""
-
-    seconds: float = math.nan
-    """Mean time of set-up and iterations, without compilation. NaN if it was not measured."""
+    near: float  # iterations until the cost is within `NEAR` of the best known cost, with the limit for never
+    success: float  # fraction of the solves that converged within the limit
+    good_ends: float  # fraction of the solves that ended within `GOOD_END` of the best known cost
+    seeds: int  # training runs; 0 for a rule
+    solves: int  # problems or scenes of each training run
+    seconds: float = math.nan  # set-up and iterations, without compilation; NaN if that was not measured
 
 
 def row_of(method: str, outcomes: Mapping[int, Sequence[Outcome]], trained: bool) -> Row:

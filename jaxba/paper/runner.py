@@ -138,7 +138,7 @@ class Runner:
         agent = agents.train_config(self.config, agents.OURS, seed).game.agent
         path = self.folder / "agents" / f"zero-net-{seed}.npz"
         if path.is_file():
-            net = zero_net.restore(path, agent)
+            net = zero_net.restore(path, self.config.zero_net, agent)
         else:
             self.report(f"zero-net {seed + 1}: training")
             settings = agents.train_config(self.config, agents.OURS, 0)

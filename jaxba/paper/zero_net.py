@@ -13,6 +13,7 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -33,8 +34,8 @@ from jaxba.game.scene_bank import Bank
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
-from jaxba.runtime.atomic import atomic_write
 from jaxba.runtime.jit import jit
+from jaxba.training import checkpoint
 from jaxba.typing import register_pytree
 
 MAX_SLOPE = 1.0
@@ -174,20 +175,12 @@ def _train(
     return layers, means
 
 
-def save(path: Any, net: ZeroNet) -> None:
+def save(path: Path, net: ZeroNet) -> None:
     """Writes the weights to a .npz file atomically."""
-    with atomic_write(path) as file:
-        arrays: dict[str, Any] = {
-            f"{name}{k}": np.asarray(getattr(layer, name))
-            for k, layer in enumerate(net.layers)
-            for name in Layer._fields
-        }
-        np.savez(file, **arrays)
+    checkpoint.write_arrays(path, checkpoint.pack(net.layers))
 
 
-def restore(path: Any, agent: AgentConfig) -> ZeroNet:
+def restore(path: Path, config: ZeroNetConfig, agent: AgentConfig) -> ZeroNet:
     """Reads the network that `save` wrote."""
-    with np.load(path) as file:
-        count = len(file.files) // 2
-        layers = tuple(Layer(file[f"kernel{k}"], file[f"bias{k}"]) for k in range(count))
-    return ZeroNet(layers, agent)
+    like = jax.eval_shape(lambda: initial_network(config, agent, jax.random.key(0)).layers)
+    return ZeroNet(jax.tree.map(np.asarray, checkpoint.unpack(checkpoint.read_arrays(path), like)), agent)
