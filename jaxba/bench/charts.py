@@ -9,8 +9,7 @@ from __future__ import annotations
 import html
 import itertools
 import math
-import operator
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 from jaxba.bench import profile
@@ -25,13 +24,10 @@ DASHES = ("solid", "12px,3px", "12px,3px,2px,3px", "3px,2.4px")
 """Line styles, a different one for each next solver, so that curves can be told apart in black and white."""
 
 SYMBOLS = ("circle", "square", "diamond", "triangle-up", "triangle-down", "cross", "star", "x")
-"""Markers, one per colour."""
+"""Markers."""
 
 RESERVED = ("classic", "ceres", "learned", "guarded", "bold", "ceres+refine3", "ceres+embedded", "nielsen+embedded")
 """Solvers that have the first styles in every figure, those of the documents included."""
-
-SAME_COST = 1e-9
-"""Largest relative difference of the costs of two runs that are said to be equal."""
 
 CLIPPING = 1e3
 """A convergence plot reaches below the lowest tolerance line by this factor."""
@@ -72,7 +68,8 @@ def solver_styles(solvers: Iterable[str]) -> dict[str, Style]:
     taken = {name: RESERVED.index(name) for name in names if name in RESERVED}
     free = (i for i in itertools.count() if i not in taken.values())
     rank = {name: taken[name] if name in taken else next(free) for name in names}
-    return {name: Style(COLOURS[i % n], DASHES[(i + i // n) % len(DASHES)], SYMBOLS[i % n]) for name, i in rank.items()}
+    pick = lambda values, i: values[(i + i // n) % len(values)]  # other ones when colours come again
+    return {name: Style(COLOURS[i % n], pick(DASHES, i), pick(SYMBOLS, i)) for name, i in rank.items()}
 
 
 def line(name: str, x: Values, y: Values, style: Style, *, label: str = "", marked: bool = True, **own: Any) -> Chart:
@@ -188,7 +185,7 @@ def profile_chart(records: Sequence[Record], target: Target, styles: Mapping[str
     label = "\N{GREEK SMALL LETTER ALPHA} = {0} / least {0} of any solver"
     axes = {name: axis(label.format(name), log=True, limits=limits[name]) for name in AXES}
     height = axis(f"% of all {count} problems", limits=(-3.0, 103.0))
-    return chart(target.label, traces, axes, height, note=_equal(found["iterations"]), height=340)
+    return chart(target.label, traces, axes, height, height=340)
 
 
 def problem_charts(
@@ -237,9 +234,8 @@ def problem_charts(
     floors = {"zero-residual floor" if e in floored else f"f*(1+{e:g})": gap / unit for e, gap in gaps.items()}
     note = f"Hollow: the step was rejected.{f' λ = 0 is drawn at {zero:.1g}.' if 0.0 in dampings else ''}"
     cost, distance, damping = (axis(x, log=True) for x in ("cost (pixels²)", f"(f - f*) / {unit_name}", "λ"))
-    equal = _equal(runs, _same_costs)
     return [
-        chart("Accepted cost (pixels²)", costs, axes, cost, dashed=taus, note=equal),
+        chart("Accepted cost (pixels²)", costs, axes, cost, dashed=taus),
         chart("Distance to the best cost", distances, axes, distance, dashed=floors),
         chart("Damping λ", lambdas, axes, damping, note=note),
     ]
@@ -259,22 +255,3 @@ def _time_is_log(runs: Iterable[Record]) -> bool:
 
 def _end(record: Record) -> float:
     return record.trace[-1].time_s if record.trace and math.isfinite(record.trace[-1].time_s) else math.inf
-
-
-def _equal(curves: Mapping[str, Any], same: Callable[[Any, Any], bool] = operator.eq) -> str:
-    """Says which curves lie on each other, by iterations."""
-    groups: list[tuple[Any, list[str]]] = []
-    for solver, curve in curves.items():
-        names = next((names for first, names in groups if same(first, curve)), None)
-        if names is None:
-            groups.append((curve, [solver]))
-        else:
-            names.append(solver)
-    shared = [" = ".join(names) for _, names in groups if len(names) > 1]
-    return f"The same curve by iterations: {'; '.join(shared)}." if shared else ""
-
-
-def _same_costs(one: Record, other: Record) -> bool:
-    """Whether two runs had the same costs up to rounding."""
-    pairs = zip(one.trace, other.trace, strict=False)
-    return len(one.trace) == len(other.trace) and all(math.isclose(a.cost, b.cost, rel_tol=SAME_COST) for a, b in pairs)

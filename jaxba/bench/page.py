@@ -13,11 +13,14 @@ from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
-from jaxba.bench.charts import Chart, Style
+from jaxba.bench.charts import SYMBOLS, Chart, Style
 from jaxba.bench.tables import Table
 
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 """What the page may load: its own text, and pictures that it makes."""
+
+MARKS: dict[str, str] = dict(zip(SYMBOLS, "●■◆▲▼✚★✖", strict=True))
+"""Characters that look like plotly's markers."""
 
 DIGITS = 7
 """Significant digits of the numbers in a page."""
@@ -124,26 +127,9 @@ def _plain(value: Any) -> Any:
 
 
 def swatch(style: Style) -> str:
-    """A piece of a solver's line with its marker, as SVG."""
-    ink = 'class="swatch black"' if style.color == "#000000" else 'class="swatch"'
-    color = "currentColor" if style.color == "#000000" else style.color
-    dashes = "" if style.dash == "solid" else f' stroke-dasharray="{style.dash.replace("px", "")}"'
-    return (
-        f'<svg {ink} viewBox="0 0 36 12" aria-hidden="true"><path d="M0 6H36" fill="none" stroke="{color}" '
-        f'stroke-width="2"{dashes}/><path d="{_SHAPES[style.symbol]}" fill="{color}"/></svg>'
-    )
-
-
-_SHAPES = {
-    "circle": "M14 6a4 4 0 1 0 8 0a4 4 0 1 0-8 0",
-    "square": "M14 2h8v8h-8z",
-    "diamond": "M18 1l5 5l-5 5l-5-5z",
-    "triangle-up": "M18 2l4.5 8h-9z",
-    "triangle-down": "M18 10l4.5-8h-9z",
-    "cross": "M16.5 1.5h3v3h3v3h-3v3h-3v-3h-3v-3h3z",
-    "star": "M18 1l1.4 3.6l3.8.2l-3 2.4l1 3.7l-3.2-2.1l-3.2 2.1l1-3.7l-3-2.4l3.8-.2z",
-    "x": "M14.5 2.5l3.5 2.5l3.5-2.5l-2.5 3.5l2.5 3.5l-3.5-2.5l-3.5 2.5l2.5-3.5z",
-}
+    """A solver's marker in its colour."""
+    ink = "" if style.color == "#000000" else f' style="color: {style.color}"'
+    return f'<span class="swatch"{ink} data-mark="{MARKS[style.symbol]}" aria-hidden="true"></span>'
 
 
 def note(text: str) -> str:

@@ -30,9 +30,6 @@ PAPER_TOLERANCES = (0.1, 0.001)
 RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)
 """Values of epsilon in the target `f <= f*(1 + epsilon)`."""
 
-OWN_END_TOLERANCE = 1e-3
-"""Value of epsilon in the target `f <= f_end (1 + epsilon)`, where f_end is the solver's own final cost."""
-
 ZERO_RESIDUAL_FLOOR = 1e-12
 """Costs up to f* plus this times f0 satisfy every relative tolerance. Without it, a problem whose best cost is rounding
 error (f* ~ 1e-26) would demand the same rounding error of every solver."""
@@ -53,10 +50,9 @@ members of `Termination`; other libraries write "converged" or "CONVERGENCE"."""
 class Target:
     """A cost threshold, or convergence, at which the time and iterations of a solve are measured."""
 
-    kind: Literal["tau", "relative", "own_end", "converged"]
-    """`tau`: cost at most f* + tau (f0 - f*). `relative`: cost at most f*(1 + epsilon). `own_end`: cost at most
-    (1 + epsilon) times the solver's own final cost, if it converged. `converged`: the end of a solve that converged
-    within `ITERATION_LIMIT` iterations."""
+    kind: Literal["tau", "relative", "converged"]
+    """`tau`: cost at most f* + tau (f0 - f*). `relative`: cost at most f*(1 + epsilon). `converged`: the end of a solve
+    that converged within `ITERATION_LIMIT` iterations."""
 
     value: float = 0.0
     """tau or epsilon; unused for `converged`."""
@@ -71,9 +67,7 @@ class Target:
         """Name for tables and figures."""
         if self.kind == "converged":
             return "converged"
-        return {"tau": "τ = {:g}", "relative": "f*(1+{:g})", "own_end": "own end (1+{:g})"}[self.kind].format(
-            self.value
-        )
+        return f"τ = {self.value:g}" if self.kind == "tau" else f"f*(1+{self.value:g})"
 
 
 def taus(tolerance: float) -> list[float]:
@@ -88,8 +82,8 @@ def cost_targets(tolerance: float) -> tuple[Target, ...]:
 
 
 def standard_targets(tolerance: float) -> tuple[Target, ...]:
-    """The targets in tables: those of `cost_targets`, own end, converged."""
-    return (*cost_targets(tolerance), Target("own_end", OWN_END_TOLERANCE), Target("converged"))
+    """The targets in tables: those of `cost_targets`, converged."""
+    return (*cost_targets(tolerance), Target("converged"))
 
 
 NEVER = Reached(math.inf, math.inf)
@@ -152,16 +146,6 @@ def converged(record: Record) -> bool:
     return record.termination.strip().lower() in CONVERGED and record.iterations <= ITERATION_LIMIT
 
 
-def own_end_threshold(record: Record) -> float:
-    """The largest cost within `OWN_END_TOLERANCE` of the final cost of a solve; NaN if the solve did not converge.
-
-    Without that exception, a solve that stalls at its start would satisfy the target at iteration 0.
-    """
-    if not converged(record):
-        return math.nan
-    return relative_threshold(record.initial_cost, record.final_cost, OWN_END_TOLERANCE)
-
-
 def first(record: Record, cost: float) -> Reached:
     """Iterations and seconds until the accepted cost is at most `cost`."""
     return next((_reach(p.iteration, p.time_s) for p in record.trace if p.cost <= cost), NEVER)
@@ -176,8 +160,6 @@ def reach(record: Record, target: Target, f0: float, f_star: float) -> Reached:
     if target.kind == "converged":
         end = record.trace[-1].time_s if record.trace else record.total_s
         return _reach(record.iterations, end) if converged(record) else NEVER
-    if target.kind == "own_end":
-        return first(record, own_end_threshold(record))
     level = relative_threshold if target.kind == "relative" else threshold
     return first(record, level(f0, f_star, target.value))
 

@@ -89,7 +89,7 @@ def _reach_tables(summary: Summary) -> list[Table]:
         seconds.append((name, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
     note = (
         "Geometric mean over the problems reached, k of n (k/n). f*: lowest accepted cost of any solver; "
-        "τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged."
+        "τ: f* + τ(f0 - f*)."
     )
     capped_note = f" In brackets: over all n, with {profile.ITERATION_LIMIT} for those not reached."
     return [
@@ -118,20 +118,10 @@ def _ratio_text(item: Comparison) -> str:
 
 
 def _details(summary: Summary) -> Table:
-    keys = (f"relative_{1e-3:g}", f"own_end_{profile.OWN_END_TOLERANCE:g}", "converged")
-    header = (
-        "problem",
-        "solver",
-        "its to f*(1+0.001)",
-        "own end",
-        "converged",
-        "rejected",
-        "final cost",
-        "final / best",
-    )
+    header = ("problem", "solver", "its to f*(1+0.001)", "converged", "rejected", "final cost", "final / best")
     rows = []
     for c in summary.cells:
-        reaches = [c.reach[key] for key in keys]
+        reaches = [c.reach[key] for key in ("relative_0.001", "converged")]
         counts = [number(item.iterations) for item in reaches] + [number(c.rejected)]
         ends = [number(c.final_cost, 7), number(c.final_ratio, 6)]
         times = [number(reaches[0].seconds), number(c.seconds)]

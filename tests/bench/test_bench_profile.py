@@ -37,7 +37,6 @@ NEVER = (math.inf, math.inf)
         (Target("relative", 1e-2), (2.0, 2.0), (4.0, 8.0), NEVER),  # 101, reached exactly by slow
         (Target("relative", 1e-3), (2.0, 2.0), NEVER, NEVER),  # 100.1
         (Target("relative", 1e-4), (3.0, 3.0), NEVER, NEVER),  # 100.01
-        (Target("own_end", 1e-3), (2.0, 2.0), (5.0, 10.0), NEVER),  # 100.1; 100.3002; no end without convergence
         (Target("converged"), (3.0, 3.0), (5.0, 10.0), NEVER),
     ],
 )

@@ -94,7 +94,6 @@ def test_charts_of_the_report_have_the_numbers_of_the_records():
     # x needs 3 accepted steps to 1e-2 of its best cost, y and z 9 iterations with two rejections
     assert [x["x"]["iterations"][0], x["y"]["iterations"][0]] == [1.0, 100.0]
     assert [3.0, 100.0] in [list(p) for p in zip(y["x"]["iterations"], y["y"]["iterations"], strict=True)]
-    assert text.count("The same curve by iterations: y = z.") == 6 + 2
     cost = charts["Accepted cost (pixels²)"]["data"][1]
     rows = np.array([row[:4] for row in cost["customdata"]], float)
     trace = records[1].trace
