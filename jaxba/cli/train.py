@@ -237,14 +237,15 @@ def _table(compared: Any, tolerance: float, count: int) -> Table:
     """Scores on the held-out scenes, and the iterations of the trained policies over those of each other row."""
     from jaxba.bench.tables import Table
 
-    agents = len(next(iter(compared.by_agent.values())))
+    scores, ratios, by_agent = compared
+    agents = len(next(iter(by_agent.values())))
     single = tuple(f"agent {k + 1}" for k in range(agents)) if agents > 1 else ()
     rows = []
-    for name, score in compared.scores.items():
-        own = [f"{x:.2f}" for x in compared.by_agent.get(name, ())] or ["-"] * agents
+    for name, score in scores.items():
+        own = [f"{x:.2f}" for x in by_agent.get(name, ())] or ["-"] * agents
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
         ends = f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}"
-        ratio = "{:.3f} [{:.3f}, {:.3f}]".format(*compared.ratios[name]) if name in compared.ratios else "-"
+        ratio = "{:.3f} [{:.3f}, {:.3f}]".format(*ratios[name]) if name in ratios else "-"
         rows.append((name, *numbers, *ends, *(own if single else ()), ratio))
     header = ("policy", "mean", "geom. mean", "median", "p90", "failures", "converged", "final gap")
     return Table(

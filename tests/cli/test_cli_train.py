@@ -116,7 +116,7 @@ def test_the_policy_file_has_the_best_policy_and_its_origin(finished):
     assert "cameras: 4" in metadata["config"]
     actor = {"params": {"MLP_0": {f"Dense_{k}": x._asdict() for k, x in enumerate(policy.layers)}}}
     work = task.build(load("fast", TINY), finished)
-    assert work.compare([actor]).scores["trained"].mean == pytest.approx(best["held_out/score"], abs=1)
+    assert work.compare([actor])[0]["trained"].mean == pytest.approx(best["held_out/score"], abs=1)
 
 
 def test_a_finished_run_resumed_prints_the_table_again(finished, capsys):
