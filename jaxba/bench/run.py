@@ -44,9 +44,6 @@ class RunSettings:
     max_iterations: int = MAX_ITERATIONS
     """Limit of linear solves."""
 
-    ftol: float = Tolerances().ftol
-    """A solve has converged when an accepted step decreases the cost by less than this, relatively."""
-
     linear_solver: str = "auto"
     """`auto`, `explicit`, `sparse` or `implicit`. Applies to the method `lm`; others have their own solver."""
 
@@ -78,7 +75,7 @@ def run_solver(
     """
     steps: list[IterationRecord] = []
     watch = lambda step: steps.append(step)
-    limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances(ftol=settings.ftol)}
+    limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances()}
     if solver.peer:
         solution, backend = _solve_by_peer(problem, solver, callback=watch, threads=threads(), **limits)
     else:

@@ -37,7 +37,8 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
 
 
-def _percent(fraction: float) -> str:
+def percentage(fraction: float) -> str:
+    """A fraction as a percentage; a dash for NaN."""
     return "-" if math.isnan(fraction) else f"{100 * fraction:.0f} %"
 
 
@@ -61,7 +62,7 @@ def _overview(summary: Summary) -> Table:
     for s in summary.solvers:
         end = s.targets["converged"]
         means = (end.iterations, end.iterations_capped, end.seconds, s.seconds_per_iteration)
-        fractions = (_percent(s.rejected_share), _percent(s.linear_failure_share))
+        fractions = (percentage(s.rejected_share), percentage(s.linear_failure_share))
         ratios = (number(s.final_ratio_worst, 6), number(s.final_ratio_mean, 6))
         rows.append(
             (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *fractions, number(s.compile_s))

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from jaxba.bench.profile import ITERATION_LIMIT
-from jaxba.bench.tables import number
+from jaxba.bench.tables import number, percentage
 from jaxba.paper.claims import Claim, Statement, judge
 from jaxba.paper.real_problems import Problems
 from jaxba.paper.results import Row
@@ -150,11 +150,6 @@ def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
 def format_iterations(value: float) -> str:
     """A number of iterations with at most one decimal; a dash for NaN."""
     return "-" if math.isnan(value) else f"{value:.1f}".removesuffix(".0")
-
-
-def percentage(value: float) -> str:
-    """A fraction as a percentage; a dash for NaN."""
-    return "-" if math.isnan(value) else f"{100 * value:.0f} %"
 
 
 def _cell(row: Row) -> str:
