@@ -103,7 +103,7 @@ def _open(folder: Path, config: Any) -> None:
             if other:
                 raise common.UsageError(f"{folder} holds a run with another {other[0]}; --out names another folder")
         else:
-            write_text(path, configs.to_yaml(config))
+            write_text(path, settings.to_yaml(config))
     except OSError as error:
         raise common.UsageError(f"--out {folder}: {error.strerror or error}") from None
 

@@ -185,7 +185,7 @@ def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -
     """Writes the policy of every agent if there are several, and that of the best agent; the files."""
     from jaxba import __version__
     from jaxba.damping.policy_file import save_policy
-    from jaxba.training.config import to_yaml
+    from jaxba.settings import to_yaml
     from jaxba.training.driver import best_of
 
     files = {folder / OF_AGENT.format(one.agent + 1): one for one in best} if len(best) > 1 else {}

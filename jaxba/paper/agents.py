@@ -20,6 +20,7 @@ from jaxba.paper import real_problems
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions
+from jaxba.settings import to_yaml
 from jaxba.training import config as train_configs
 from jaxba.training import driver, task
 from jaxba.training.config import TrainConfig
@@ -131,7 +132,7 @@ def trained(
     note = lambda rows: report(f"{agent.name} {seed + 1}: {rows[0]['chunk']} of {settings.chunks} parts")
     outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
     (best,) = outcome.best  # of one agent
-    save_policy(own / POLICY, work.policy(best.actor), {"config": train_configs.to_yaml(settings)})
+    save_policy(own / POLICY, work.policy(best.actor), {"config": to_yaml(settings)})
     shutil.rmtree(own / driver.CHECKPOINTS, ignore_errors=True)
     return load_policy(own / POLICY), True
 

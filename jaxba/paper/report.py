@@ -10,12 +10,12 @@ from jaxba.bench.page import Page
 from jaxba.bench.run import machine
 from jaxba.paper.agents import updates
 from jaxba.paper.claims import CRITERION, Claim
-from jaxba.paper.config import to_yaml
 from jaxba.paper.runner import Runner
 from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
 from jaxba.paper.tables_and_figures.common import table
 from jaxba.paper.tables_and_figures.figures import FIGURES
 from jaxba.runtime.atomic import write_text
+from jaxba.settings import to_yaml
 
 CLAIMS = "claims.md"
 """File of the table of claims alone, in the folder of the run."""

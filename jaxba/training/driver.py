@@ -29,7 +29,7 @@ from jaxba.runtime.atomic import write_text
 from jaxba.runtime.numerics import for_traces
 from jaxba.training import checkpoint
 from jaxba.training.checkpoint import TrainError
-from jaxba.training.config import TrainConfig, load, to_yaml
+from jaxba.training.config import TrainConfig, load
 from jaxba.training.log import Log, Row
 from jaxba.training.placement import Placement
 from jaxba.training.train_loop import LoopState, agent_shares, run_agents, start_agents, state_shares
@@ -120,7 +120,7 @@ def prepare_folder(
         folder.mkdir(parents=True, exist_ok=True)
         if not resume and _others(folder):
             raise TrainError(f"{folder} is not empty; --out names another folder")
-        write_text(path, to_yaml(config))
+        write_text(path, settings.to_yaml(config))
     except OSError as error:
         raise TrainError(f"{folder}: {error.strerror or error}") from None
     return config

@@ -16,7 +16,7 @@ from jaxba.paper.results import PLAYS, SOLVES, Outcome, Play, Row, Store, averag
 from jaxba.paper.runner import method_named
 from jaxba.paper.subproblem import neighbourhood, neighbouring_cameras, sub_problem
 from jaxba.paper.tables_and_figures import common, figures
-from jaxba.settings import SettingsError
+from jaxba.settings import SettingsError, configurations, to_yaml
 from jaxba.solver.record import Record, TracePoint
 
 # Sub-problems
@@ -318,16 +318,16 @@ def test_the_error_names_a_damaged_line(tmp_path):
 # Configuration and real problems
 
 
-@pytest.mark.parametrize("name", config.preset_names())
+@pytest.mark.parametrize("name", configurations.names("paper"))
 def test_presets_are_read_as_they_were_written(name, tmp_path):
     loaded = config.load(name)
     path = tmp_path / "again.yaml"
-    path.write_text(config.to_yaml(loaded))
+    path.write_text(to_yaml(loaded))
     assert config.load(str(path)) == loaded
 
 
 def test_the_presets_are_full_and_fast():
-    assert config.preset_names() == ["fast", "full"]
+    assert configurations.names("paper") == ["fast", "full"]
     assert config.load("fast").agents.seeds < config.load("full").agents.seeds
 
 
