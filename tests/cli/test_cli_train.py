@@ -93,7 +93,7 @@ def error_of(capsys, *argv: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_run_writes_policy_curve_log_and_configuration(finished):
+def test_a_run_writes_policy_page_log_and_configuration(finished):
     names = {path.name for path in finished.iterdir()}
     assert names == {
         *("config.yaml", "bank.npz", "rules.npz", "metrics.jsonl", "tensorboard", "checkpoints"),
