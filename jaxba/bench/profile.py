@@ -14,7 +14,7 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -29,9 +29,6 @@ PAPER_TOLERANCES = (0.1, 0.001)
 
 RELATIVE_TOLERANCES = (1e-2, 1e-3, 1e-4)
 """Values of epsilon in the target `f <= f*(1 + epsilon)`."""
-
-OWN_END_TOLERANCE = 1e-3
-"""Value of epsilon in the target `f <= f_end (1 + epsilon)`, where f_end is the solver's own final cost."""
 
 ZERO_RESIDUAL_FLOOR = 1e-12
 """Costs up to f* plus this times f0 satisfy every relative tolerance. Without it, a problem whose best cost is rounding
@@ -53,10 +50,9 @@ members of `Termination`; other libraries write "converged" or "CONVERGENCE"."""
 class Target:
     """A cost threshold, or convergence, at which the time and iterations of a solve are measured."""
 
-    kind: Literal["tau", "relative", "own_end", "converged"]
-    """`tau`: cost at most f* + tau (f0 - f*). `relative`: cost at most f*(1 + epsilon). `own_end`: cost at most
-    (1 + epsilon) times the solver's own final cost, if it converged. `converged`: the end of a solve that converged
-    within `ITERATION_LIMIT` iterations."""
+    kind: Literal["tau", "relative", "converged"]
+    """`tau`: cost at most f* + tau (f0 - f*). `relative`: cost at most f*(1 + epsilon). `converged`: the end of a solve
+    that converged within `ITERATION_LIMIT` iterations."""
 
     value: float = 0.0
     """tau or epsilon; unused for `converged`."""
@@ -71,9 +67,7 @@ class Target:
         """Name for tables and figures."""
         if self.kind == "converged":
             return "converged"
-        return {"tau": "τ = {:g}", "relative": "f*(1+{:g})", "own_end": "own end (1+{:g})"}[self.kind].format(
-            self.value
-        )
+        return f"τ = {self.value:g}" if self.kind == "tau" else f"f*(1+{self.value:g})"
 
 
 def taus(tolerance: float) -> list[float]:
@@ -88,22 +82,11 @@ def cost_targets(tolerance: float) -> tuple[Target, ...]:
 
 
 def standard_targets(tolerance: float) -> tuple[Target, ...]:
-    """The targets in tables: those of `cost_targets`, own end, converged."""
-    return (*cost_targets(tolerance), Target("own_end", OWN_END_TOLERANCE), Target("converged"))
+    """The targets in tables: those of `cost_targets`, converged."""
+    return (*cost_targets(tolerance), Target("converged"))
 
 
-@dataclass(frozen=True)
-class Reach:
-    """Iterations and time to a target; both are infinite if it is never reached."""
-
-    iterations: float
-    """Linear solves to the target; 0 if the start satisfies it."""
-
-    seconds: float
-    """Solve time to the target, without compilation."""
-
-
-NEVER = Reach(math.inf, math.inf)
+NEVER = Reached(math.inf, math.inf)
 """The value for a target that is never reached."""
 
 
@@ -131,18 +114,13 @@ def initial_costs(records: Iterable[Record]) -> dict[str, float]:
     return {name: max(costs, default=math.nan) for name, costs in starts.items()}
 
 
-def best_cost(records: Iterable[Record], known_best: Mapping[str, float] | None = None) -> dict[str, float]:
-    """f* of each problem: the lowest accepted cost of any solver, NaN if none is finite.
-
-    Args:
-        records: of all solvers, converged or not. Of float32 solvers only the initial and final costs count, which were
-            computed in float64.
-        known_best: costs of some problems known from other runs, pixels squared; used where lower.
-    """
+def best_cost(records: Iterable[Record]) -> dict[str, float]:
+    """f* of each problem: the lowest accepted cost of any solver, converged or not, NaN if none is finite. Of float32
+    solvers only the initial and final costs count, which were computed in float64."""
     found = {}
     for name, runs in by_problem(records).items():
         costs = [cost for r in runs for cost in (r.initial_cost, lowest_cost(r))]
-        found[name] = min(filter(math.isfinite, [*costs, (known_best or {}).get(name, math.nan)]), default=math.nan)
+        found[name] = min(filter(math.isfinite, costs), default=math.nan)
     return found
 
 
@@ -168,70 +146,49 @@ def converged(record: Record) -> bool:
     return record.termination.strip().lower() in CONVERGED and record.iterations <= ITERATION_LIMIT
 
 
-def own_end_threshold(record: Record) -> float:
-    """The largest cost within `OWN_END_TOLERANCE` of the final cost of a solve; NaN if the solve did not converge.
-
-    Without that exception, a solve that stalls at its start would satisfy the target at iteration 0.
-    """
-    if not converged(record):
-        return math.nan
-    return relative_threshold(record.initial_cost, record.final_cost, OWN_END_TOLERANCE)
-
-
-def first(record: Record, cost: float) -> Reach:
+def first(record: Record, cost: float) -> Reached:
     """Iterations and seconds until the accepted cost is at most `cost`."""
     return next((_reach(p.iteration, p.time_s) for p in record.trace if p.cost <= cost), NEVER)
 
 
-def _reach(iterations: int, seconds: float) -> Reach:
-    return Reach(float(iterations), seconds if math.isfinite(seconds) else math.inf)
+def _reach(iterations: int, seconds: float) -> Reached:
+    return Reached(float(iterations), seconds if math.isfinite(seconds) else math.inf)
 
 
-def reach(record: Record, target: Target, f0: float, f_star: float) -> Reach:
+def reach(record: Record, target: Target, f0: float, f_star: float) -> Reached:
     """Iterations and time of one solve to a target, given the problem's initial cost f0 and best cost f*."""
     if target.kind == "converged":
         end = record.trace[-1].time_s if record.trace else record.total_s
         return _reach(record.iterations, end) if converged(record) else NEVER
-    if target.kind == "own_end":
-        return first(record, own_end_threshold(record))
     level = relative_threshold if target.kind == "relative" else threshold
     return first(record, level(f0, f_star, target.value))
 
 
-def reach_table(
-    records: Sequence[Record], target: Target, known_best: Mapping[str, float] | None = None
-) -> dict[str, dict[str, Reach]]:
+def reach_table(records: Sequence[Record], target: Target) -> dict[str, dict[str, Reached]]:
     """Iterations and time to a target as `table[solver][problem]`, medians over repeats. Pairs that were not run are
     absent."""
-    starts, bests = initial_costs(records), best_cost(records, known_best)
-    found: dict[str, dict[str, list[Reach]]] = {}
+    starts, bests = initial_costs(records), best_cost(records)
+    found: dict[str, dict[str, list[Reached]]] = {}
     for r in records:
         item = reach(r, target, starts[r.problem], bests[r.problem])
         found.setdefault(r.solver, {}).setdefault(r.problem, []).append(item)
     return {solver: {name: _median_reach(items) for name, items in row.items()} for solver, row in found.items()}
 
 
-def reached(row: Mapping[str, Reach], names: Sequence[str]) -> Reached:
+def reached(row: Mapping[str, Reached], names: Sequence[str]) -> Reached:
     """A row of `reach_table` as arrays over problems; a problem that was not run counts as not reached."""
     found = [row.get(name, NEVER) for name in names]
     return Reached(np.array([r.iterations for r in found]), np.array([r.seconds for r in found]))
 
 
-def _median_reach(items: Sequence[Reach]) -> Reach:
+def _median_reach(items: Sequence[Reached]) -> Reached:
     iterations = statistics.median(item.iterations for item in items)
-    return Reach(float(iterations), float(statistics.median(item.seconds for item in items)))
+    return Reached(float(iterations), float(statistics.median(item.seconds for item in items)))
 
 
-@dataclass(frozen=True)
-class Curve:
-    """Performance profile of a solver: the fraction of all problems solved within alpha times the fastest solver's
-    time, a step function of alpha."""
-
-    alphas: tuple[float, ...]
-    """Positions of the steps, ascending; the first is 1."""
-
-    fractions: tuple[float, ...]
-    """Value of the function from each position on, in [0, 1]."""
+Curve: TypeAlias = tuple[tuple[float, ...], tuple[float, ...]]
+"""Performance profile of a solver: the fraction of all problems solved within alpha times the fastest solver's time, a
+step function of alpha. Positions of the steps, ascending from 1, and the value from each position on, in [0, 1]."""
 
 
 def performance_profile(times: Mapping[str, Mapping[str, float]]) -> dict[str, Curve]:
@@ -254,7 +211,7 @@ def performance_profile(times: Mapping[str, Mapping[str, float]]) -> dict[str, C
         ratios = sorted(_ratio(row.get(name, math.inf), best[name]) for name in names)
         solved = [ratio for ratio in ratios if math.isfinite(ratio)]
         steps = {1.0: 0.0} | {ratio: (i + 1) / len(names) for i, ratio in enumerate(solved)}
-        curves[solver] = Curve(tuple(steps), tuple(steps.values()))
+        curves[solver] = tuple(steps), tuple(steps.values())
     return curves
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,11 +30,6 @@ from jaxba.solver.options import MAX_ITERATIONS
 from jaxba.solver.record import Record, record_of
 from jaxba.solver.solve import Solution, solve
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
 RESULTS = "results.jsonl"
 """File of the records, one line per run."""
 
@@ -50,9 +43,6 @@ class RunSettings:
 
     max_iterations: int = MAX_ITERATIONS
     """Limit of linear solves."""
-
-    ftol: float = Tolerances().ftol
-    """A solve has converged when an accepted step decreases the cost by less than this, relatively."""
 
     linear_solver: str = "auto"
     """`auto`, `explicit`, `sparse` or `implicit`. Applies to the method `lm`; others have their own solver."""
@@ -73,7 +63,6 @@ def run_solver(
     solver: SolverName,
     repeat: int,
     settings: RunSettings,
-    on_iteration: Callable[[IterationRecord], Any] | None = None,
 ) -> Record:
     """Solves one problem once, with a Python callback after each iteration, and so with measured times.
 
@@ -83,16 +72,10 @@ def run_solver(
         solver: what solves it.
         repeat: number of the repeat, from 0, for the record.
         settings: shared settings.
-        on_iteration: called after every iteration.
     """
     steps: list[IterationRecord] = []
-
-    def watch(step: IterationRecord) -> None:
-        steps.append(step)
-        if on_iteration:
-            on_iteration(step)
-
-    limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances(ftol=settings.ftol)}
+    watch = lambda step: steps.append(step)
+    limits = {"max_iterations": settings.max_iterations, "tolerances": Tolerances()}
     if solver.peer:
         solution, backend = _solve_by_peer(problem, solver, callback=watch, threads=threads(), **limits)
     else:
@@ -156,30 +139,6 @@ def _check_options(solver: SolverName) -> None:
         options.step_options(policy)
     except ValueError as error:
         raise SolverNameError(f"{error} (in {str(solver)!r})") from None
-
-
-@contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
-    """Creates the folder and locks it against other writers, where the file system supports locks.
-
-    Raises:
-        ProblemError: another process has locked it.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    if fcntl is None:
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ProblemError(f"{folder}: another jaxba-bench is writing here") from None
-        except OSError:
-            pass  # some network file systems cannot lock folders
-        yield
-    finally:
-        os.close(handle)
 
 
 def open_folder(folder: Path, settings: RunSettings, jobs: Sequence[Job]) -> list[Record]:
@@ -247,9 +206,7 @@ def execute(
     done: Sequence[Record],
     folder: Path,
     settings: RunSettings,
-    on_start: Callable[[Job], Any],
-    on_iteration: Callable[[IterationRecord], Any],
-    on_error: Callable[[Job, ProblemError], Any],
+    on_error: Callable[[ProblemError], Any],
     *,
     strict: bool = False,
 ) -> Iterator[Record]:
@@ -263,8 +220,6 @@ def execute(
         done: records of earlier runs.
         folder: where the results file is.
         settings: shared settings.
-        on_start: called before each job.
-        on_iteration: called after every iteration.
         on_error: called for what is skipped.
         strict: skip problems of which a part would be left out.
 
@@ -276,24 +231,23 @@ def execute(
     for job in jobs:
         if (job.source.name, str(job.solver), job.repeat) in finished or job.source in broken:
             continue
-        on_start(job)
         if loaded != job.source:
             try:
                 problem, loaded = job.source.read(strict=strict), job.source
             except ProblemError as error:
                 broken.add(job.source)
-                on_error(job, error)
+                on_error(error)
                 continue
         assert problem is not None
         try:
-            record = run_solver(problem, job.source, job.solver, job.repeat, settings, on_iteration)
+            record = run_solver(problem, job.source, job.solver, job.repeat, settings)
         except ProblemError as error:  # another solver may be able to solve it
-            on_error(job, ProblemError(f"{job.source.name}, {job.solver}: {error}"))
+            on_error(ProblemError(f"{job.source.name}, {job.solver}: {error}"))
             continue
         except Exception as error:
             if not out_of_memory(error):
                 raise
-            on_error(job, ProblemError(f"{job.source.name}, {job.solver}: not enough memory"))
+            on_error(ProblemError(f"{job.source.name}, {job.solver}: not enough memory"))
             continue
         json_lines.append(folder / RESULTS, record)
         yield record

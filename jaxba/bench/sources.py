@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from jaxba.datasets.bal.paths import resolve
@@ -34,6 +35,9 @@ class Source:
     location: str
     """Path, or `scene:NAME:SEED`."""
 
+    make: Callable[[], BundleProblem] | None = field(default=None, compare=False)
+    """Makes the problem, where its location does not say how."""
+
     def read(self, *, strict: bool = False) -> BundleProblem:
         """Reads or generates the problem.
 
@@ -43,6 +47,8 @@ class Source:
         Raises:
             ProblemError: the input is invalid; the message is one line.
         """
+        if self.make is not None:
+            return self.make()
         if not self.location.startswith(SCENE_PREFIX):
             problem = read_problem(self.location, strict=strict)
             return without_views_of(problem, set_aside(problem))  # of all solvers alike

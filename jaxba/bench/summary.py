@@ -13,13 +13,12 @@ import os
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxba.bench import profile
-from jaxba.bench.profile import Reach, Target
-from jaxba.bench.virtual import rules_of_one_step
+from jaxba.bench.profile import Target
 from jaxba.game.statistics import SHORTEST_TIME, Comparison, Reached, capped, compare, geometric_mean
 from jaxba.io import json_lines
 from jaxba.runtime.atomic import write_text
@@ -32,81 +31,58 @@ FORMAT = 1
 """Version of `summary.json`; it changes when a key changes its meaning."""
 
 
-@dataclass(frozen=True)
-class Cell:
+class Cell(NamedTuple):
     """One solver on one problem; numbers are medians over repeats."""
 
     problem: str
     solver: str
     repeats: int
-    converged: bool
-    """Whether more than half of the repeats converged within `ITERATION_LIMIT` iterations."""
-    termination: str
-    """Distinct reasons of the repeats to stop, joined by a slash."""
-    final_cost: float
-    """Pixels squared; infinite if not finite."""
-    final_ratio: float
-    """(final cost + floor) / (f* + floor) with floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best."""
+    converged: bool  # more than half of the repeats within `ITERATION_LIMIT` iterations
+    termination: str  # distinct reasons of the repeats to stop, joined by a slash
+    final_cost: float  # pixels squared; infinite if not finite
+    final_ratio: float  # (final cost + floor) / (f* + floor), floor = `ZERO_RESIDUAL_FLOOR` f0; 1 is the best
     iterations: float
     rejected: float
-    seconds: float
-    """Solve time without compilation."""
-    seconds_per_iteration: float
-    """Median over the iterations of all repeats; NaN without iterations."""
+    seconds: float  # solve time without compilation
+    seconds_per_iteration: float  # median over the iterations of all repeats; NaN without iterations
     setup_s: float
     compile_s: float
-    reach: dict[str, Reach]
-    """By `Target.key`."""
+    reach: dict[str, Reached]  # by `Target.key`
 
 
-@dataclass(frozen=True)
-class TargetSummary:
-    """Statistics of a solver on one target over all problems."""
+class TargetSummary(NamedTuple):
+    """Statistics of a solver on one target over all problems, `total`, also those that it was not run on.
+
+    Means are geometric: over the reached problems, with a count of 0 taken as 1, NaN if there are none; of
+    `iterations_capped` over all problems, with counts capped at `ITERATION_LIMIT`.
+    """
 
     reached: int
-    """Number of problems on which the target was reached."""
     total: int
-    """Number of all problems, including those that the solver was not run on."""
     iterations: float
-    """Geometric mean over the reached problems, with a count of 0 taken as 1. NaN if there are none."""
     iterations_capped: float
-    """Geometric mean over all problems, with counts capped at `ITERATION_LIMIT`."""
     seconds: float
-    """Geometric mean over the reached problems. NaN if none."""
 
 
-@dataclass(frozen=True)
-class SolverSummary:
-    """One solver over all problems."""
+class SolverSummary(NamedTuple):
+    """One solver over all problems; ratios of ends, and medians, over those that it was run on."""
 
     solver: str
-    run: int
-    """Number of problems that it was run on."""
-    total: int
-    """Number of problems of the benchmark."""
-    targets: dict[str, TargetSummary]
-    """By `Target.key`."""
-    against: dict[str, dict[str, Comparison]]
-    """By yardstick, then by `Target.key`; a yardstick is not compared with itself."""
+    run: int  # number of problems that it was run on
+    total: int  # of the benchmark
+    targets: dict[str, TargetSummary]  # by `Target.key`
+    against: dict[str, dict[str, Comparison]]  # by yardstick and `Target.key`; none is compared with itself
     final_ratio_worst: float
-    """Largest `Cell.final_ratio` over the problems that it was run on."""
-    final_ratio_mean: float
-    """Geometric mean of `Cell.final_ratio` over the problems that it was run on."""
-    rejected_share: float
-    """Rejected iterations / iterations, over all runs."""
-    linear_failure_share: float
-    """Rejected iterations without a finite gain ratio (failed factorisation, non-finite cost) / iterations. NaN if the
-    traces have no gain ratios at all."""
+    final_ratio_mean: float  # geometric
+    rejected_share: float  # rejected iterations / iterations, over all runs
+    linear_failure_share: float  # of rejected iterations without a gain ratio; NaN if the traces have none at all
     seconds_per_iteration: float
-    """Median over problems."""
     setup_s: float
     compile_s: float
-    """Medians over problems."""
 
 
-@dataclass(frozen=True)
-class ProblemSummary:
-    """Size and costs of one problem."""
+class ProblemSummary(NamedTuple):
+    """Size of a problem, its initial and best cost (pixels squared), and the first solver that reached that."""
 
     problem: str
     family: str
@@ -114,11 +90,8 @@ class ProblemSummary:
     points: int
     observations: int
     initial_cost: float
-    """f0, pixels squared."""
     best_cost: float
-    """f*, pixels squared."""
     best_solver: str
-    """First solver that reached f*; "known" if f* comes from `known_best`."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +103,6 @@ class Summary:
     solvers: list[SolverSummary]
     cells: list[Cell]
     warnings: list[str]
-    virtual: dict[str, dict[str, TargetSummary]] = field(default_factory=dict)
-    """Virtual best of the hand-written rules with the same step (`virtual.py`): by name, then by `Target.key`."""
     metadata: dict[str, Any] = field(default_factory=dict)
     """Device, threads, versions and the like."""
 
@@ -139,7 +110,6 @@ class Summary:
 def summarize(
     records: Sequence[Record],
     tolerance: float = 1e-3,
-    known_best: Mapping[str, float] | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> Summary:
     """Computes the statistics of all tables.
@@ -147,12 +117,11 @@ def summarize(
     Args:
         records: any number, also none.
         tolerance: tau of the target `tau`.
-        known_best: best known costs of some problems, pixels squared; see `profile.best_cost`.
         metadata: device, threads, versions and the like; copied into the result.
     """
     targets = profile.standard_targets(tolerance)
-    starts, bests = profile.initial_costs(records), profile.best_cost(records, known_best)
-    tables = {target.key: profile.reach_table(records, target, known_best) for target in targets}
+    starts, bests = profile.initial_costs(records), profile.best_cost(records)
+    tables = {target.key: profile.reach_table(records, target) for target in targets}
     names, solvers = profile.problem_names(records), profile.solver_names(records)
     found = {key: {s: profile.reached(table.get(s, {}), names) for s in solvers} for key, table in tables.items()}
     cells = []
@@ -168,10 +137,6 @@ def summarize(
         solvers=[_solver(solver, records, cells, found, len(names)) for solver in solvers],
         cells=cells,
         warnings=profile.cost_warnings(records) + _coverage_warnings(cells, solvers, names),
-        virtual={
-            best: {key: _target(_best([rows[rule] for rule in rules])) for key, rows in found.items()}
-            for best, rules in rules_of_one_step(solvers).items()
-        },
         metadata=dict(metadata or {}),
     )
 
@@ -181,7 +146,7 @@ def _median(values: Iterable[float]) -> float:
     return statistics.median(known) if known else math.nan
 
 
-def _cell(runs: Sequence[Record], reaches: dict[str, Reach], f0: float, f_star: float) -> Cell:
+def _cell(runs: Sequence[Record], reaches: dict[str, Reached], f0: float, f_star: float) -> Cell:
     final = statistics.median(r.final_cost if math.isfinite(r.final_cost) else math.inf for r in runs)
     steps = [b.time_s - a.time_s for r in runs for a, b in zip(r.trace, r.trace[1:], strict=False)]
     floor = profile.ZERO_RESIDUAL_FLOOR * f0
@@ -205,9 +170,9 @@ def _cell(runs: Sequence[Record], reaches: dict[str, Reach], f0: float, f_star: 
 
 def _problem(runs: Sequence[Record], f0: float, f_star: float) -> ProblemSummary:
     first = runs[0]
-    holder = [r.solver for r in runs if profile.lowest_cost(r) <= f_star]
+    holder = next((r.solver for r in runs if profile.lowest_cost(r) <= f_star), "the start")
     sizes = (first.cameras, first.points, first.observations)
-    return ProblemSummary(first.problem, first.family, *sizes, f0, f_star, holder[0] if holder else "known")
+    return ProblemSummary(first.problem, first.family, *sizes, f0, f_star, holder)
 
 
 def _solver(
@@ -238,11 +203,6 @@ def _solver(
         setup_s=_median(cell.setup_s for cell in own),
         compile_s=_median(cell.compile_s for cell in own),
     )
-
-
-def _best(rows: Sequence[Reached]) -> Reached:
-    """The fewest iterations and the least time on each problem, which may be those of different solvers."""
-    return Reached(*(np.min(numbers, axis=0) for numbers in zip(*rows, strict=True)))
 
 
 def _target(own: Reached) -> TargetSummary:

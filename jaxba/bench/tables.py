@@ -28,11 +28,6 @@ class Table:
     """Number of columns that are aligned left."""
 
 
-_VIRTUAL = (
-    " Best of the rules: for each problem, the result of the hand-written rule with this step that is best on it."
-)
-
-
 def number(value: float, digits: int = 3) -> str:
     """A number with `digits` significant digits, infinity as ∞, NaN as a dash."""
     if math.isnan(value):
@@ -42,7 +37,8 @@ def number(value: float, digits: int = 3) -> str:
     return f"{value:.0f}" if 10**digits <= abs(value) < 1e7 else f"{value:.{digits}g}"
 
 
-def _percent(fraction: float) -> str:
+def percentage(fraction: float) -> str:
+    """A fraction as a percentage; a dash for NaN."""
     return "-" if math.isnan(fraction) else f"{100 * fraction:.0f} %"
 
 
@@ -61,26 +57,21 @@ def tables(summary: Summary, details: bool = True) -> list[Table]:
 
 
 def _overview(summary: Summary) -> Table:
-    virtual = _VIRTUAL if summary.virtual else ""
     header = ("solver", "converged", "iterations", "capped", "time s", "s / iteration", "final / best worst", "mean")
     rows = []
     for s in summary.solvers:
         end = s.targets["converged"]
         means = (end.iterations, end.iterations_capped, end.seconds, s.seconds_per_iteration)
-        fractions = (_percent(s.rejected_share), _percent(s.linear_failure_share))
+        fractions = (percentage(s.rejected_share), percentage(s.linear_failure_share))
         ratios = (number(s.final_ratio_worst, 6), number(s.final_ratio_mean, 6))
         rows.append(
             (s.solver, f"{end.reached}/{end.total}", *map(number, means), *ratios, *fractions, number(s.compile_s))
         )
-    for name, targets in summary.virtual.items():
-        end = targets["converged"]
-        means = (end.iterations, end.iterations_capped, end.seconds)
-        rows.append((name, f"{end.reached}/{end.total}", *map(number, means), *["-"] * 6))
     note = (
         f"Converged within {profile.ITERATION_LIMIT} iterations, of all problems. Iterations and time to that: "
         "geometric means over the converged problems, without compilation; capped: over all problems, a failure "
         f"counting as {profile.ITERATION_LIMIT}. Rejected and failed (no usable step): fractions of all iterations. "
-        f"Seconds per iteration and compilation: medians over problems.{virtual}"
+        f"Seconds per iteration and compilation: medians over problems."
     )
     return Table("Solvers", (*header, "rejected", "failed", "compile s"), rows, note)
 
@@ -89,9 +80,7 @@ def _reach_tables(summary: Summary) -> list[Table]:
     targets = [target for target in summary.targets if target.kind != "converged"]
     header = ("solver", *(target.label for target in targets))
     iterations, seconds = [], []
-    virtual = _VIRTUAL if summary.virtual else ""
-    found = {**{s.solver: s.targets for s in summary.solvers}, **summary.virtual}
-    for name, by_key in found.items():
+    for name, by_key in ((s.solver, s.targets) for s in summary.solvers):
         cells = [by_key[target.key] for target in targets]
         reached = [f"{cell.reached}/{cell.total}" for cell in cells]
         capped = [
@@ -101,7 +90,7 @@ def _reach_tables(summary: Summary) -> list[Table]:
         seconds.append((name, *(f"{number(c.seconds)} {k}" for c, k in zip(cells, reached, strict=True))))
     note = (
         "Geometric mean over the problems reached, k of n (k/n). f*: lowest accepted cost of any solver; "
-        f"τ: f* + τ(f0 - f*); own end: the solver's own final cost, for solves that converged.{virtual}"
+        "τ: f* + τ(f0 - f*)."
     )
     capped_note = f" In brackets: over all n, with {profile.ITERATION_LIMIT} for those not reached."
     return [
@@ -130,26 +119,27 @@ def _ratio_text(item: Comparison) -> str:
 
 
 def _details(summary: Summary) -> Table:
-    keys = (f"relative_{1e-3:g}", f"own_end_{profile.OWN_END_TOLERANCE:g}", "converged")
-    header = (
-        "problem",
-        "solver",
-        "its to f*(1+0.001)",
-        "own end",
-        "converged",
-        "rejected",
-        "final cost",
-        "final / best",
-    )
+    header = ("problem", "solver", "its to f*(1+0.001)", "converged", "rejected", "final cost", "final / best")
     rows = []
     for c in summary.cells:
-        reaches = [c.reach[key] for key in keys]
+        reaches = [c.reach[key] for key in ("relative_0.001", "converged")]
         counts = [number(item.iterations) for item in reaches] + [number(c.rejected)]
         ends = [number(c.final_cost, 7), number(c.final_ratio, 6)]
         times = [number(reaches[0].seconds), number(c.seconds)]
         rows.append((c.problem, c.solver, *counts, *ends, *times, c.termination))
     note = "Medians over repeats; ∞: never. Times in seconds, without compilation; time s is that of the whole solve."
     return Table("Problems", (*header, "s to f*(1+0.001)", "time s", "termination"), rows, note, text_columns=2)
+
+
+def problem_table(summary: Summary) -> Table:
+    """Sizes and costs of the problems."""
+    header = ("problem", "family", "cameras", "points", "observations", "initial cost", "best cost f*", "reached by")
+    rows = []
+    for p in summary.problems:
+        sizes = (str(p.cameras), str(p.points), str(p.observations))
+        rows.append((p.problem, p.family, *sizes, f"{p.initial_cost:.7g}", f"{p.best_cost:.7g}", p.best_solver))
+    note = "Costs are half the sum of squared residuals, pixels²."
+    return Table("Problems and their sizes", header, rows, note, text_columns=2)
 
 
 def print_summary(summary: Summary, console: Console, details: bool = True) -> None:

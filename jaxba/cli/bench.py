@@ -98,8 +98,7 @@ def _bench(args: Arguments, command: str) -> int:
     _check_apart(args, jobs)
     settings = run.RunSettings(max_iterations=max_iterations, linear_solver=args.linear_solver)
     try:
-        with run.only_writer(Path(args.out)):
-            return _run_missing(Path(args.out), jobs, settings, tolerance, args.strict, command)
+        return _run_missing(Path(args.out), jobs, settings, tolerance, args.strict, command)
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
 
@@ -136,52 +135,16 @@ def _run_missing(folder: Path, jobs: Any, settings: Any, tolerance: float, stric
     if records:
         console.print(f"{len(records)} of {common.counted(len(jobs), 'run')} already in {folder}", highlight=False)
     status = 0
+
+    def fail(error: Exception) -> None:
+        nonlocal status
+        status = common.BAD_INPUT
+        common.print_error(str(error))
+
     try:
         with common.notes_printed(lambda note: console.print(note, highlight=False, soft_wrap=True)):
-            status = _execute(jobs, done, folder, settings, console, records, strict)
-    except KeyboardInterrupt:
-        console.print("interrupted; what is done is kept, run the same command again to continue", highlight=False)
-        status = common.INTERRUPTED
-    if records:
-        console.print("drawing", highlight=False)
-        metadata = {"command": command, **report.run_metadata(records), **run.machine()}
-        files = report.write_all(records, folder, tolerance, metadata=metadata)
-        print_summary(summarize(records, tolerance), console, details=console.width >= DETAILS_WIDTH)
-        console.print(f"wrote {len(files)} files; see {folder / 'report.html'}", highlight=False)
-    return status
-
-
-def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, records: list, strict: bool) -> int:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    from jaxba.bench import run
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("{task.fields[now]}", markup=False),
-    )
-    failures = []
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("runs", total=len(jobs), completed=len(records), now="")
-
-        def start(job: Any) -> None:
-            progress.update(task, now=f"{job.source.name} {job.solver} #{job.repeat + 1}: compiling")
-
-        def iterate(step: Any) -> None:
-            now = progress.tasks[0].fields["now"].rpartition(":")[0]
-            progress.update(task, now=f"{now}: iteration {step.iteration}, cost {step.step.cost:.6g}")
-
-        def fail(job: Any, error: Exception) -> None:
-            failures.append(job)
-            common.print_error(str(error))
-
-        for record in run.execute(jobs, done, folder, settings, start, iterate, fail, strict=strict):
-            records.append(record)
-            progress.advance(task)
-            if not console.is_terminal:
+            for record in run.execute(jobs, done, folder, settings, fail, strict=strict):
+                records.append(record)
                 iterations = common.counted(record.iterations, "iteration")
                 console.print(
                     f"{record.problem} {record.solver} #{record.repeat + 1}: {iterations}, "
@@ -189,7 +152,15 @@ def _execute(jobs: Any, done: Any, folder: Path, settings: Any, console: Any, re
                     highlight=False,
                     soft_wrap=True,
                 )
-    return common.BAD_INPUT if failures else 0
+    except KeyboardInterrupt:
+        console.print("interrupted; what is done is kept, run the same command again to continue", highlight=False)
+        status = common.INTERRUPTED
+    if records:
+        metadata = {"command": command, **report.run_metadata(records), **run.machine()}
+        files = report.write_all(records, folder, tolerance, metadata=metadata)
+        print_summary(summarize(records, tolerance), console, details=console.width >= DETAILS_WIDTH)
+        console.print(f"wrote {len(files)} files; see {folder / 'report.html'}", highlight=False, soft_wrap=True)
+    return status
 
 
 @dataclass(frozen=True)

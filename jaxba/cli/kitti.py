@@ -220,7 +220,6 @@ def _build_table(title: str, parts: list[tuple[BundleProblem, Frames, str]], pos
 
 def _evaluate(args: EvaluateArguments) -> int:
     common.require(bool(args.lengths) and all(length > 0 for length in args.lengths), "--lengths must be positive")
-    from jaxba.bench.plots import save_figure
     from jaxba.kitti import plots
 
     _check_results_apart(args)
@@ -240,7 +239,7 @@ def _evaluate(args: EvaluateArguments) -> int:
             evaluate.write_poses(folder / f"poses-{at}-{numbers['name']}.txt", poses)
         if truth is not None:
             evaluate.write_poses(folder / "poses-truth.txt", truth)
-        files = save_figure(figure, folder / "top-view")
+        files = plots.save_figure(figure, folder / "top-view")
     except OSError as error:
         raise common.UsageError(f"--out {args.out}: {error.strerror or error}") from None
     console = common.console()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +12,6 @@ from jaxba.cli.options import options
 
 FULL, FAST = "full", "fast"
 """Names of the presets."""
-
-TIMES = "times.json"
-"""File of the times spent on each table or figure."""
 
 REPORT = "paper.md"
 """File of the report, unless `--report` names another."""
@@ -42,8 +38,8 @@ class Arguments:
     second run with the same folder computes only what is missing."""
 
     report: str | None = None
-    """Markdown file of the report; figures go into a folder of the same name beside it. Default: OUT/paper.md. The
-    table of claims alone is OUT/claims.md."""
+    """Markdown file of the report; an interactive page of the figures stands beside it, with the ending .html. Default:
+    OUT/paper.md. The table of claims alone is OUT/claims.md."""
 
 
 def main() -> None:
@@ -80,7 +76,7 @@ def _paper(args: Arguments) -> int:
     folder = Path(args.out or Path("runs") / ("paper" if stem == FULL else f"paper-{stem}"))
     report = Path(args.report or folder / REPORT)
     check_apart(
-        {"--report": [report], "--out": [folder / TIMES, folder / CLAIMS]},
+        {"--report": [report, report.with_suffix(".html")], "--out": [folder / CLAIMS]},
         {"the file of --config": [find("paper", name)]},
     )
     _open(folder, config)
@@ -107,7 +103,7 @@ def _open(folder: Path, config: Any) -> None:
             if other:
                 raise common.UsageError(f"{folder} holds a run with another {other[0]}; --out names another folder")
         else:
-            write_text(path, configs.to_yaml(config))
+            write_text(path, settings.to_yaml(config))
     except OSError as error:
         raise common.UsageError(f"--out {folder}: {error.strerror or error}") from None
 
@@ -124,51 +120,19 @@ def _work(args: Arguments, config: Any, folder: Path, report: Path, console: Any
     status = 0
     with process.single_blas_thread():
         runner = Runner(config, folder, lambda line: console.print(f"  {line}"))
-        seconds = _read_times(folder)
         wanted = [entry for name, entry in TABLES_AND_FIGURES.items() if not args.only or name in args.only]
         try:
             for number, entry in enumerate(wanted, start=1):
                 console.print(f"{number} of {len(wanted)}: {entry.title}")
-                started, cpu, before = time.perf_counter(), time.process_time(), runner.done
-                try:
-                    entry.run(runner)
-                finally:
-                    spent, cpu = time.perf_counter() - started, time.process_time() - cpu
-                    if runner.done > before:
-                        wall, busy = seconds.get(entry.name, (0.0, 0.0))
-                        seconds[entry.name] = wall + spent, busy + cpu
-                        _write_times(folder, seconds)
+                started, before = time.perf_counter(), runner.done
+                entry.run(runner)
+                spent = time.perf_counter() - started
                 console.print(f"  {common.counted(runner.done - before, 'run')}, {spent:.1f} s")
         except KeyboardInterrupt:
             console.print("interrupted; what is done is kept, run the same command again to continue")
             status = common.INTERRUPTED
-        console.print("drawing")
-        sections = [entry.section(runner) for entry in TABLES_AND_FIGURES.values()]
-        listed = {name: seconds[name] for name in TABLES_AND_FIGURES if name in seconds}
-        files = write(runner, sections, report, _command(args), listed)
-    console.print(
-        f"wrote {report}, {files[1]} and {len(files) - 2} figures; "
-        f"{sum(wall for wall, _ in seconds.values()):.0f} s of work in {folder}"
-    )
+        # the command without paths of this machine
+        chosen = " --fast" if args.fast else f" --config {Path(args.config).name}" if args.config else ""
+        files = write(runner, report, f"jaxba-paper{chosen}")
+    console.print(f"wrote {', '.join(str(file) for file in files)}")
     return status
-
-
-def _command(args: Arguments) -> str:
-    """The command line without paths of this machine, for the report."""
-    chosen = " --fast" if args.fast else f" --config {Path(args.config).name}" if args.config else ""
-    return f"jaxba-paper{chosen}"
-
-
-def _read_times(folder: Path) -> dict[str, tuple[float, float]]:
-    """Wall-clock time and processor time in seconds for each table or figure."""
-    try:
-        found = json.loads((folder / TIMES).read_text(encoding="utf-8"))
-        return {str(name): (float(wall), float(cpu)) for name, (wall, cpu) in found.items()}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return {}
-
-
-def _write_times(folder: Path, seconds: dict[str, tuple[float, float]]) -> None:
-    from jaxba.runtime.atomic import write_text
-
-    write_text(folder / TIMES, json.dumps(seconds, indent=1) + "\n")

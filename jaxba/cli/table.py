@@ -18,7 +18,6 @@ from jaxba.problem.losses import Loss
 from jaxba.problem.options import StepOptions
 from jaxba.problem.preprocess import MIN_TRACK
 from jaxba.results.retriangulate import Retriangulation
-from jaxba.runtime.compilation import Part, compiler_options, quick_runs
 from jaxba.solver.loop import IterationRecord
 from jaxba.solver.methods import DEFAULT_METHOD
 from jaxba.solver.names import split_refinement
@@ -46,8 +45,7 @@ def heading(name: str, problem: BundleProblem, args: Any, options: StepOptions) 
     counts = ("camera", problem.num_cameras), ("point", problem.num_points), ("observation", problem.num_observations)
     sizes = ", ".join(counted(count, noun) for noun, count in counts)
     sizes += "".join(f", {part}" for part in [*_lenses(problem, options), *_constants(problem)])
-    how = f"{args.dtype}, {solver}, {compiled(args.compilation, problem)}"
-    return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {how}"
+    return f"{name}: {sizes}\npolicy {split_refinement(args.policy)[0]}{refine}, {args.dtype}, {solver}"
 
 
 def _lenses(problem: BundleProblem, options: StepOptions) -> Iterator[str]:
@@ -72,17 +70,6 @@ def _constants(problem: BundleProblem) -> list[str]:
     part = int(poses.any(axis=1).sum()) - whole
     found = (whole, "constant pose"), (part, "partly constant pose"), (points, "constant point")
     return [counted(count, what) for count, what in found if count]
-
-
-def compiled(compilation: str, problem: BundleProblem) -> str:
-    """How the step of a solve is compiled, as text."""
-    if compilation == "full" or not compiler_options("quick"):
-        return "compiled fully"
-    if compilation == "quick":
-        return "compiled quickly"
-    parts: tuple[Part, ...] = ("factorization", "acceptance")
-    later = any(quick_runs(part, problem.num_observations) for part in parts)
-    return "compiled quickly at first" if later else "compiled fully"
 
 
 def header(initial_cost: float) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,12 +12,10 @@ import tyro
 from jaxba.cli import common, processes
 from jaxba.cli.options import options
 from jaxba.runtime.interrupt import Interrupt
-from jaxba.training.view import TrainingView
 from jaxba.typing import InputError
 
 if TYPE_CHECKING:
     from jaxba.bench.tables import Table
-    from jaxba.training.log import Row
 
 DEFAULT_CONFIG = "default"
 """Default preset of a new run."""
@@ -28,9 +25,6 @@ POLICY = "policy.safetensors"
 
 OF_AGENT = "policy-{}.safetensors"
 """File of an agent's policy, if there are several agents."""
-
-CURVE = "curve"
-"""Stem of the files with the learning curve."""
 
 PAGE = "report.html"
 """File with curves, episodes and the table, interactive."""
@@ -65,9 +59,6 @@ class Run:
     """Real problems to train on: BAL files, COLMAP models, output of jaxba-kitti. Scenes are windows of neighbouring
     cameras; the last fifth of every problem is held out. They replace the configuration's classes of windows, or all
     classes if it has none."""
-
-    wandb: Annotated[str | None, "PROJECT"] = None
-    """Write the log to this project at Weights & Biases, too (extra wandb)."""
 
     resume: bool = False
     """Continue the run in the folder from its last checkpoint. The results are those of an uninterrupted run, bit for
@@ -129,20 +120,10 @@ def _prepare(args: Arguments, folder: Path, name: str) -> Any:
     return driver.prepare_folder(folder, config, args.resume, overrides)
 
 
-def _board(args: Arguments, folder: Path, config: Any) -> Any:
-    """The log at Weights & Biases, if one is asked for."""
-    if not args.wandb:
-        return None
-    from jaxba import settings
-    from jaxba.training.wandb_log import WandbLog
-
-    return WandbLog(args.wandb, folder, settings.plain(config))
-
-
 def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
     from jaxba.runtime import process
     from jaxba.runtime.distributed import is_main, together
-    from jaxba.training import driver, task
+    from jaxba.training import driver, task, view
     from jaxba.training.placement import Placement
 
     name = args.config or DEFAULT_CONFIG
@@ -152,35 +133,24 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
         Placement(devices).check(config)
     except ValueError as error:
         raise common.UsageError(f"--devices: {error}") from None
-    boards: list[Any] = []
-    together(lambda: boards.append(_board(args, folder, config)))
-    board = boards[0] if boards else None  # of the first process alone
     common.prepare_process()
     console = common.console(FILE_WIDTH, markup=False, quiet=not is_main())
-    with (
-        process.single_blas_thread(),
-        Interrupt("chunk", graceful=False, announce=is_main()) as interrupt,
-        TrainingView(console, config) as view,
-        ExitStack() as ends,
-    ):
-        if board:
-            ends.callback(board.close)
+    with process.single_blas_thread(), Interrupt("chunk", graceful=False, announce=is_main()) as interrupt:
         try:
             with common.notes_printed(lambda _: None):  # they were printed when the problems were checked
-                work = task.build(config, folder, view.stage)
-            view.rules = work.rules
+                work = task.build(config, folder, console.print)
+            best: list[int] = []  # chunks of the best policies
             interrupt.graceful = True
 
-            def keep(best: tuple[driver.Best, ...]) -> None:
-                _write_policies(folder, config, work, best)
-                view.best = best
+            def keep(policies: tuple[driver.Best, ...]) -> None:
+                _write_policies(folder, config, work, policies)
+                best[:] = [one.chunk for one in policies]
 
-            def show(rows: list[Row]) -> None:
-                view.rows(rows)
-                if board:
-                    board.write(rows)
+            def show(rows: list[Any]) -> None:
+                for line in view.lines(rows, config.chunks, work.rules, rows[0]["chunk"] in best):
+                    console.print(line)
 
-            hooks = driver.Hooks(view.stage, show, keep, lambda: interrupt.requested)
+            hooks = driver.Hooks(console.print, show, keep, lambda: interrupt.requested)
             outcome = driver.train(config, work.game, work.evaluate, folder, hooks, devices)
             interrupt.graceful = False
         except KeyboardInterrupt:
@@ -193,7 +163,7 @@ def _run(args: Arguments, devices: Sequence[Any], command: str) -> int:
         if not outcome.finished:
             console.print(f"interrupted and saved; go on with {_again(folder)}")
             return interrupt.status
-        return together(lambda: _finish(folder, work, outcome.best, console, view, command))
+        return together(lambda: _finish(folder, work, outcome.best, console, command))
 
 
 def _check_problems(problems: Sequence[str]) -> list[str]:
@@ -215,7 +185,7 @@ def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -
     """Writes the policy of every agent if there are several, and that of the best agent; the files."""
     from jaxba import __version__
     from jaxba.damping.policy_file import save_policy
-    from jaxba.training.config import to_yaml
+    from jaxba.settings import to_yaml
     from jaxba.training.driver import best_of
 
     files = {folder / OF_AGENT.format(one.agent + 1): one for one in best} if len(best) > 1 else {}
@@ -232,11 +202,10 @@ def _write_policies(folder: Path, config: Any, work: Any, best: Sequence[Any]) -
     return list(files)
 
 
-def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: TrainingView, command: str) -> int:
-    """Writes the policies, the learning curve and the page, and prints the comparison with the rules."""
+def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, command: str) -> int:
+    """Writes the policies and the page, and prints the comparison with the rules."""
     from jaxba.bench import run as bench_run
     from jaxba.bench import training_page
-    from jaxba.bench.plots import save_figure
     from jaxba.bench.tables import to_rich
     from jaxba.game.rollout import play
     from jaxba.runtime.atomic import write_text
@@ -245,13 +214,10 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
 
     files, rows = _write_policies(folder, work.config, work, best), log.read(folder)
     rules_of_game = work.config.game
-    panels = training_page.held_out_panels(rows, work.rules)
-    figure = training_page.plot_curve(panels, rules_of_game.tolerance, work.config.seeds)
-    files += save_figure(figure, folder / CURVE)
-    view.stage("comparing with the rules")
+    console.print("comparing with the rules")
     compared = work.compare([one.actor for one in best])
     table = _table(compared, rules_of_game.tolerance, sum(len(bank.initial_cost) for bank in work.held_out))
-    view.stage("playing some episodes")
+    console.print("playing some episodes")
     chosen = best_of(best)
     kind, bank = work.config.bank.classes[0], work.held_out[0]
     policy, limit = work.policy(chosen.actor), rules_of_game.max_iterations
@@ -259,7 +225,6 @@ def _finish(folder: Path, work: Any, best: Sequence[Any], console: Any, view: Tr
     facts = {"command": command, "agents": str(work.config.seeds), **bench_run.machine()}
     page = folder / PAGE
     write_text(page, training_page.to_html(rows, work.rules, table, episodes, facts))
-    view.__exit__()
     drawn = to_rich(table)
     drawn.columns[0].no_wrap = drawn.columns[-1].no_wrap = True
     console.print(drawn)
@@ -272,14 +237,15 @@ def _table(compared: Any, tolerance: float, count: int) -> Table:
     """Scores on the held-out scenes, and the iterations of the trained policies over those of each other row."""
     from jaxba.bench.tables import Table
 
-    agents = len(next(iter(compared.by_agent.values())))
+    scores, ratios, by_agent = compared
+    agents = len(next(iter(by_agent.values())))
     single = tuple(f"agent {k + 1}" for k in range(agents)) if agents > 1 else ()
     rows = []
-    for name, score in compared.scores.items():
-        own = [f"{x:.2f}" for x in compared.by_agent.get(name, ())] or ["-"] * agents
+    for name, score in scores.items():
+        own = [f"{x:.2f}" for x in by_agent.get(name, ())] or ["-"] * agents
         numbers = [f"{x:.2f}" for x in (score.mean, score.geometric_mean, score.median, score.p90)]
         ends = f"{100 * score.failures:.1f} %", f"{score.to_convergence:.2f}", f"{score.end:.1e}"
-        ratio = "{:.3f} [{:.3f}, {:.3f}]".format(*compared.ratios[name]) if name in compared.ratios else "-"
+        ratio = "{:.3f} [{:.3f}, {:.3f}]".format(*ratios[name]) if name in ratios else "-"
         rows.append((name, *numbers, *ends, *(own if single else ()), ratio))
     header = ("policy", "mean", "geom. mean", "median", "p90", "failures", "converged", "final gap")
     return Table(

@@ -180,15 +180,6 @@ class Game:
         seen = observe(self.config.agent, episode.memory)
         return jnp.concatenate([seen, decades[None].astype(seen.dtype)])
 
-    def merged(self, chosen: Bool[Array, " envs"], one: GameState, other: GameState) -> GameState:
-        """The state with the episodes of `one` where chosen, those of `other` elsewhere, and the key of `one`."""
-        parts, start = [], 0
-        for first, second, count in zip(one.episodes, other.episodes, self.envs, strict=True):
-            own, start = chosen[start : start + count], start + count
-            pick = lambda a, b, own=own: jnp.where(own.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-            parts.append(jax.tree.map(pick, first, second))
-        return GameState(tuple(parts), one.key)
-
     def _fresh(self, bank: Bank, key: Array) -> Episode:
         count = bank.initial_cost.shape[0]
         return self.start(bank, jax.random.randint(key, (), 0, count, jnp.int32))

@@ -47,17 +47,6 @@ class Trajectories(NamedTuple):
     """Whether the convergence test ended it, and not the limit."""
 
 
-class _Lane(NamedTuple):
-    scene: Int[Array, " lanes"]
-    carry: Carry
-
-
-class _Loop(NamedTuple):
-    lane: _Lane
-    next_scene: Int[Array, ""]
-    found: Any  # `Trajectories` of JAX arrays, with an extra row for idle lanes; costs without the start
-
-
 @for_traces
 def play(
     kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: float = 1e-6
@@ -73,8 +62,8 @@ def play(
         ftol: relative decrease of an accepted step below which a scene has converged (`converged_in_cost`).
     """
     check_x64(bank.initial_cost.dtype)
-    loop = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
-    found: Trajectories = jax.tree.map(lambda x: np.asarray(x)[:-1], loop.found)
+    played = _play(kind, bank, policy, options, limit, jnp.asarray(ftol, bank.initial_cost.dtype))
+    found: Trajectories = jax.tree.map(lambda x: np.asarray(x)[:-1], played)
     costs = np.concatenate([np.asarray(bank.initial_cost)[:, None], found.costs], axis=1)
     past = np.arange(limit + 1) > found.iterations[:, None]
     last = np.take_along_axis(costs, found.iterations[:, None], axis=1)
@@ -82,42 +71,44 @@ def play(
 
 
 @functools.partial(jit, static_argnames=("kind", "options", "limit"))
-def _play(kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: Array) -> _Loop:
+def _play(
+    kind: SceneClass, bank: Any, policy: DampingPolicy, options: StepOptions, limit: int, ftol: Array
+) -> Trajectories:
+    """`Trajectories` of JAX arrays, with an extra row for idle lanes; costs without the start."""
     layout = class_layout(kind, options)
     count = bank.initial_cost.shape[0]
     lanes = min(LANES, count)
 
-    def fresh(scene: Int[Array, ""]) -> _Lane:
+    def fresh(scene: Int[Array, ""]) -> tuple[Array, Carry]:
         at = lambda tree: jax.tree.map(lambda x: x[jnp.minimum(scene, count - 1)], tree)  # idle lanes repeat the last
         start = at(bank.scenes)
         state = state_at(start.cameras, start.points, at(bank.initial_cost), options)
-        return _Lane(scene, begin(at(bank.info), policy, state))
+        return scene, begin(at(bank.info), policy, state)
 
-    def advance(lane: _Lane) -> tuple[_Lane, StepInfo]:
-        row = jnp.minimum(lane.scene, count - 1)
+    def advance(scene: Array, carry: Carry) -> tuple[Carry, StepInfo]:
+        row = jnp.minimum(scene, count - 1)
         seen = with_scene(layout, bank.scenes.pixels[row], bank.scenes.mask[row])
-        carry, step = iterate(seen, lane.carry, policy, Tolerances(), options, limit)
-        return _Lane(lane.scene, carry), step
+        return iterate(seen, carry, policy, Tolerances(), options, limit)
 
-    def body(loop: _Loop) -> _Loop:
-        lane, step = step_groups(advance, loop.lane)
-        row = jnp.minimum(lane.scene, count)  # idle lanes write to an extra row that is dropped
+    def body(loop: tuple[Any, ...]) -> tuple[Any, ...]:
+        (scene, carry), next_scene, found = loop
+        carry, step = step_groups(advance, scene, carry)
+        row = jnp.minimum(scene, count)  # idle lanes write to an extra row that is dropped
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, ftol)
-        iteration = lane.carry.iteration
+        iteration = carry.iteration
         done = converged | (iteration >= limit)
-        found = loop.found._replace(
-            costs=loop.found.costs.at[row, iteration - 1].set(step.cost),
-            dampings=loop.found.dampings.at[row, iteration - 1].set(step.damping),
-            iterations=loop.found.iterations.at[row].set(iteration),
-            converged=loop.found.converged.at[row].set(converged),
+        found = found._replace(
+            costs=found.costs.at[row, iteration - 1].set(step.cost),
+            dampings=found.dampings.at[row, iteration - 1].set(step.damping),
+            iterations=found.iterations.at[row].set(iteration),
+            converged=found.converged.at[row].set(converged),
         )
-        upcoming = loop.next_scene + jnp.cumsum(done) - 1
-        new = jax.vmap(fresh)(upcoming.astype(jnp.int32))
+        new = jax.vmap(fresh)((next_scene + jnp.cumsum(done) - 1).astype(jnp.int32))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-        return _Loop(jax.tree.map(pick, new, lane), (loop.next_scene + jnp.sum(done)).astype(jnp.int32), found)
+        return jax.tree.map(pick, new, (scene, carry)), (next_scene + jnp.sum(done)).astype(jnp.int32), found
 
     rows = np.zeros((count + 1, limit), bank.initial_cost.dtype)
     nothing = Trajectories(rows, rows, np.zeros(count + 1, np.int32), np.zeros(count + 1, bool))
     first = jax.vmap(fresh)(jnp.arange(lanes, dtype=jnp.int32))
-    loop = _Loop(first, jnp.asarray(lanes, jnp.int32), jax.tree.map(jnp.asarray, nothing))
-    return lax.while_loop(lambda loop: jnp.any(loop.lane.scene < count), body, loop)
+    loop = first, jnp.asarray(lanes, jnp.int32), jax.tree.map(jnp.asarray, nothing)
+    return lax.while_loop(lambda loop: jnp.any(loop[0][0] < count), body, loop)[2]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,34 +21,21 @@ RESAMPLES = 2000
 
 
 class Reached(NamedTuple):
-    """What a solver needed to a target on every problem."""
+    """Linear solves and seconds, without compilation, that a solver needed to a target: on one problem, or arrays of
+    all. Infinite if it never reached it, 0 if the start satisfies it."""
 
-    iterations: Float[np.ndarray, " problems"]
-    seconds: Float[np.ndarray, " problems"]
-
-
-class Ratio(NamedTuple):
-    """A geometric mean of paired ratios, with its 95% interval."""
-
-    mean: float
-    low: float
-    high: float
+    iterations: Any
+    seconds: Any
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A solver compared with a yardstick on one target."""
+class Comparison(NamedTuple):
+    """A solver compared with a yardstick on one target: ratios, and numbers of problems that they are not of."""
 
-    both: int
-    """Number of problems on which both reached the target; the ratios are geometric means over these."""
-    only_solver: int
-    """Number of problems on which only the solver reached it."""
+    both: int  # problems on which both reached the target; the ratios are geometric means over these
+    only_solver: int  # problems on which only the solver reached it
     only_yardstick: int
-    """Number of problems on which only the yardstick reached it."""
     iterations: float
-    """Ratio of iterations."""
     seconds: float
-    """Ratio of times."""
 
 
 def capped(iterations: Float[np.ndarray, " *shape"], limit: int) -> Float[np.ndarray, " *shape"]:
@@ -79,10 +65,10 @@ def compare(ours: Reached, theirs: Reached) -> Comparison:
     )
 
 
-def paired_ratio(ours: Float[np.ndarray, " cases"], theirs: Float[np.ndarray, " cases"]) -> Ratio:
-    """Geometric mean of `ours / theirs` over cases that both had, and the percentile interval of a bootstrap over the
-    cases. Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", section 13.3."""
+def paired_ratio(ours: Float[np.ndarray, " cases"], theirs: Float[np.ndarray, " cases"]) -> tuple[float, float, float]:
+    """Geometric mean of `ours / theirs` over cases that both had, and the ends of the 95% percentile interval of a
+    bootstrap over the cases. Source: Efron and Tibshirani 1993, "An Introduction to the Bootstrap", section 13.3."""
     logs = np.log(np.asarray(ours) / np.asarray(theirs))
     rows = np.random.default_rng(0).integers(len(logs), size=(RESAMPLES, len(logs)))
     low, high = np.percentile(logs[rows].mean(axis=1), [2.5, 97.5])
-    return Ratio(*(float(np.exp(x)) for x in (logs.mean(), low, high)))
+    return float(np.exp(logs.mean())), float(np.exp(low)), float(np.exp(high))

@@ -35,9 +35,11 @@ def key_of(field: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """JSON of dataclasses, mappings and tuples; numbers that are not finite become None."""
+    """JSON of dataclasses, named tuples, mappings and tuples; numbers that are not finite become None."""
     if is_dataclass(value):
         return {key_of(field): plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, tuple) and hasattr(value, "_asdict"):
+        value = value._asdict()  # pyright: ignore[reportAttributeAccessIssue]
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
+import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
@@ -56,3 +59,13 @@ def plot_top_view(
         if handle is not None and handle.get_label() == "points":
             handle.set_sizes([12.0])  # type: ignore[attr-defined]
     return figure
+
+
+def save_figure(figure: Figure, stem: Path) -> list[Path]:
+    """Writes `stem.png` (150 dpi) and `stem.svg`, reproducibly to the byte. Raises OSError."""
+    paths = [stem.with_name(f"{stem.name}.{kind}") for kind in ("png", "svg")]
+    with warnings.catch_warnings(), matplotlib.rc_context({"svg.hashsalt": "jaxba"}):
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # names in other scripts
+        figure.savefig(paths[0], dpi=150)
+        figure.savefig(paths[1], metadata={"Date": None})
+    return paths

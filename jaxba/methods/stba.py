@@ -17,7 +17,7 @@ and the authors' code.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -43,11 +43,9 @@ MIN_CONSENSUS_DAMPING = 1.0
 1)."""
 
 
-class SplitSystem(NamedTuple):
-    """The eliminated point replicas (linear/schur.py)."""
-
-    projected: list[list[Array]]  # Q = J_p L^-T of each slot's replica, [2][3] of (slots,)
-    solved: list[Array]  # h = L^-1 g of each slot's replica, [3] of (slots,)
+SplitSystem: TypeAlias = tuple[list[list[Array]], list[Array]]
+"""The eliminated point replicas (linear/schur.py), of each slot's replica: Q = J_p L^-T, [2][3] of (slots,), and
+h = L^-1 g, [3] of (slots,)."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ def clustered_step(
     """
     split = eliminate_replicas(layout, linear, damping, partition, options)
     right = split_right_hand_side(layout, linear, system, split)
-    step = solve_clusters(layout, linear, points._replace(projected=split.projected), system, right, partition)
+    step = solve_clusters(layout, linear, points._replace(projected=split[0]), system, right, partition)
     return richardson(layout, linear, points, system, step, repairs)
 
 
@@ -120,7 +118,7 @@ def eliminate_replicas(
     solved = jnp.stack(factor.forward(list(gradient)))
     at_slot = Cholesky3(*take(jnp.stack(factor), partition.slot_replica))
     projected = [at_slot.forward(row) for row in linear.point_jacobian]
-    return SplitSystem(projected, take_each(solved, partition.slot_replica))
+    return projected, take_each(solved, partition.slot_replica)
 
 
 def consensus_gradient(
@@ -154,7 +152,8 @@ def split_right_hand_side(
     layout: Layout, linear: Linearization, system: CameraSystem, split: SplitSystem
 ) -> Float[Array, "cameras width"]:
     """Right-hand side of the split system, `-sum J_c^T (r - Q h)`."""
-    inner = [sum(split.projected[k][i] * split.solved[i] for i in range(3)) for k in range(2)]
+    projected, solved = split
+    inner = [sum(projected[k][i] * solved[i] for i in range(3)) for k in range(2)]
     first, second = linear.camera_jacobian
     rows = as_rows([a * inner[0] + b * inner[1] for a, b in zip(first, second, strict=True)])
     return tree_sum(rows, layout.camera_levels) - system.gradient

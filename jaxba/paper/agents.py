@@ -20,7 +20,7 @@ from jaxba.paper import real_problems
 from jaxba.paper.config import PAPER_STATE, PaperConfig
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.problem.options import StepOptions
-from jaxba.runtime.atomic import atomic_write
+from jaxba.settings import to_yaml
 from jaxba.training import config as train_configs
 from jaxba.training import driver, task
 from jaxba.training.config import TrainConfig
@@ -126,15 +126,14 @@ def trained(
     wanted = train_config(config, agent, seed)
     begun = (own / driver.CONFIG).is_file()
     settings = driver.prepare_folder(own, wanted, resume=begun)
-    _copy_shared_scenes(config, agent, folder, own, report)
-    work = task.build(settings, own)
+    _shared_scenes(config, agent, folder, report)
+    work = task.build(settings, _scenes_folder(agent, folder))
     played = work.game if agent.problems else game(config, agent, settings, scenes(config, folder, report)[0])
     note = lambda rows: report(f"{agent.name} {seed + 1}: {rows[0]['chunk']} of {settings.chunks} parts")
     outcome = driver.train(settings, played, work.evaluate, own, driver.Hooks(rows=note))
     (best,) = outcome.best  # of one agent
-    save_policy(own / POLICY, work.policy(best.actor), {"config": train_configs.to_yaml(settings)})
+    save_policy(own / POLICY, work.policy(best.actor), {"config": to_yaml(settings)})
     shutil.rmtree(own / driver.CHECKPOINTS, ignore_errors=True)
-    (own / task.BANK).unlink(missing_ok=True)
     return load_policy(own / POLICY), True
 
 
@@ -174,14 +173,3 @@ def _shared_scenes(config: PaperConfig, agent: Agent, folder: Path, report: Call
 
 def _scenes_folder(agent: Agent, folder: Path) -> Path:
     return folder / (f"{SCENES}-{agent.name}" if agent.problems else SCENES)
-
-
-def _copy_shared_scenes(
-    config: PaperConfig, agent: Agent, folder: Path, own: Path, report: Callable[[str], None]
-) -> None:
-    """Copies the scenes of the run into the folder of a training run."""
-    _shared_scenes(config, agent, folder, report)
-    for name in (task.BANK, task.RULES):
-        if not (own / name).is_file():
-            with open(_scenes_folder(agent, folder) / name, "rb") as source, atomic_write(own / name) as file:
-                shutil.copyfileobj(source, file)

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from jaxba.bench.tables import number
-from jaxba.paper.rows import Row
+from jaxba.paper.results import Row
 
 Status = Literal["reproduced", "partly", "not", "not run"]
 
@@ -44,31 +43,21 @@ CRITERION = (
 )
 
 
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper and whether it is reproduced."""
+class Claim(NamedTuple):
+    """A claim of the paper and whether it is reproduced, by `CRITERION`."""
 
-    text: str
-    """The claim in words."""
-
-    paper: str
-    """The paper's number."""
-
+    text: str  # in words
+    paper: str  # the paper's number
     ours: str
-    """Our number."""
-
     status: Status
-    """Whether it is reproduced, by `CRITERION`."""
-
-    near: str = "-"
-    """The same as `ours` in iterations to f*(1+1e-3)."""
+    near: str = "-"  # as `ours`, in iterations to f*(1+1e-3)
 
 
 class Statement(NamedTuple):
     """A claim before it is tested: the rule, the claim in words, the paper's number, and the methods."""
 
     test: Callable[..., Claim]
-    """`ratio_claim`, `time_claim`, `order_claim` or `success_claim`."""
+    """`ratio_claim`, `time_claim`, `longer_claim`, `order_claim` or `success_claim`."""
 
     text: str
     """In words; `{}` stands for the set of problems."""
@@ -130,6 +119,15 @@ def time_claim(text: str, paper: float, ours: Row | None, base: Row | None) -> C
     return ratio_claim(text, paper, ours, base, "seconds")
 
 
+def longer_claim(text: str, paper: str, ours: Row | None, base: Row | None) -> Claim:
+    """The claim that `ours` takes more seconds than `base`."""
+    if ours is None or base is None or not _comparable("seconds", ours, base):
+        return Claim(text, paper, "-", "not run")
+    longer = 1e3 * (ours.seconds - base.seconds)
+    detail = f"{longer:+.1f} ms ({number(1e3 * ours.seconds)} / {number(1e3 * base.seconds)} ms)"
+    return Claim(text, paper, detail, "reproduced" if longer > 0 else "not")
+
+
 def order_claim(text: str, paper: str, better: Row | None, worse: Row | None) -> Claim:
     """The claim that `better` takes fewer iterations than `worse`."""
     if better is None or worse is None or not _comparable("iterations", better, worse):
@@ -147,18 +145,13 @@ def order_claim(text: str, paper: str, better: Row | None, worse: Row | None) ->
 
 def success_claim(text: str, paper: float, ours: Row | None) -> Claim:
     """The claim that a method succeeds on the fraction `paper` of the problems."""
-    return fraction_claim(text, paper, ours.success if ours else math.nan)
-
-
-def fraction_claim(text: str, paper: float, ours: float) -> Claim:
-    """The claim that a fraction is `paper`."""
-    if math.isnan(ours):
+    if ours is None or math.isnan(ours.success):
         return Claim(text, f"{100 * paper:.0f} %", "-", "not run")
-    gap = abs(paper - ours)
+    gap = abs(paper - ours.success)
     status: Status = (
         "reproduced" if gap <= FRACTION_TOLERANCE else "partly" if gap <= PARTLY_FRACTION_TOLERANCE else "not"
     )
-    return Claim(text, f"{100 * paper:.0f} %", f"{100 * ours:.0f} %", status)
+    return Claim(text, f"{100 * paper:.0f} %", f"{100 * ours.success:.0f} %", status)
 
 
 def error_claim(text: str, paper: float, excess: Sequence[float]) -> Claim:

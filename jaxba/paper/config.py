@@ -164,7 +164,7 @@ def load(name: str) -> PaperConfig:
     """The configuration of a preset or a file.
 
     Args:
-        name: a preset (`preset_names`), or the path of a YAML file: anything with a slash or an ending.
+        name: a preset, or the path of a YAML file: anything with a slash or an ending.
 
     Raises:
         SettingsError: no such file or base, not YAML, an unknown key or an impossible value; one line.
@@ -174,15 +174,3 @@ def load(name: str) -> PaperConfig:
         return settings.read(PaperConfig, data)
     except SettingsError as error:
         raise SettingsError(f"{name}: {error}") from None
-
-
-def to_yaml(config: PaperConfig) -> str:
-    """All settings, defaults included; `load` of it gives the same configuration."""
-    import yaml
-
-    return yaml.safe_dump(settings.plain(config), sort_keys=False)
-
-
-def preset_names() -> list[str]:
-    """Names that `load` finds without a path."""
-    return configurations.names("paper")

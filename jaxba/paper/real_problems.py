@@ -11,7 +11,7 @@ from pathlib import Path
 from jaxba.bench.sources import Source
 from jaxba.datasets.bal.paths import resolve
 from jaxba.paper.config import FamilyConfig, RealConfig
-from jaxba.paper.subproblem import SubProblem
+from jaxba.paper.subproblem import neighbourhood
 from jaxba.problem.bundle_problem import ProblemError
 
 DATA_VARIABLE = "JAXBA_DATA"
@@ -23,63 +23,45 @@ _SUFFIXES = re.compile(r"(\.(txt|out|bal))?(\.(bz2|gz|xz))?$")
 
 
 @dataclass(frozen=True)
-class FamilyProblems:
-    """The real problems of one family that are on this machine."""
+class Problems:
+    """A set of problems of a table."""
 
-    family: str
-    """Name of the family."""
+    name: str
+    """Name in the report."""
 
-    whole: tuple[Source, ...]
-    """Complete problems."""
+    sources: tuple[Source, ...]
+    """Complete problems, then sub-problems of them."""
 
-    sub_problems: tuple[SubProblem, ...]
-    """Sub-problems of the files."""
-
-    missing: tuple[str, ...]
+    missing: tuple[str, ...] = ()
     """Entries of the configuration for which no file exists."""
 
     reason: str = ""
     """Why there are no problems; empty if there are some."""
 
-    @property
-    def all(self) -> tuple[Source, ...]:
-        """Complete problems, then sub-problems."""
-        return (*self.whole, *self.sub_problems)
 
-
-def find(config: FamilyConfig) -> FamilyProblems:
-    """Looks for the files of a family. Missing files are not an error."""
-    found, missing = [], []
-    for entry in config.files:
-        paths = _paths(entry)
-        found += [Source(label(path), config.name, path) for path in paths]
-        if not paths:
-            missing.append(entry)
-    sub_problems = tuple(
-        SubProblem(f"{source.name}-first{count}", config.name, source.location, cameras=count)
-        for source in found
-        for count in config.cameras
-    )
+def find(config: FamilyConfig) -> Problems:
+    """The problems of a family that are on this machine. Missing files are not an error."""
+    paths = {entry: _paths(entry) for entry in config.files}
+    found = [Source(label(path), config.name, path) for one in paths.values() for path in one]
+    parts = [neighbourhood(source, count) for source in found for count in config.cameras]
     reason = ""
     if not found:
         uses_variable = any(DATA_VARIABLE in entry for entry in config.files)
         reason = NOT_SET if uses_variable and not os.environ.get(DATA_VARIABLE) else "not run: no file of it is here"
-    return FamilyProblems(config.name, tuple(found) if config.whole else (), sub_problems, tuple(missing), reason)
+    missing = tuple(entry for entry, one in paths.items() if not one)
+    return Problems(config.name, (*(found if config.whole else ()), *parts), missing, reason)
 
 
-def families(config: RealConfig) -> list[FamilyProblems]:
-    """The problems of each BAL family."""
-    return [find(family) for family in config.bal]
-
-
-def bal(config: RealConfig) -> tuple[Source, ...]:
+def bal(config: RealConfig) -> Problems:
     """The BAL problems on this machine and their sub-problems."""
-    return tuple(source for family in families(config) for source in family.all)
-
-
-def lens_is_known(config: RealConfig, source: Source) -> bool:
-    """Whether only poses and points are unknown, as in the paper: on KITTI, whose cameras are calibrated."""
-    return source.family == config.kitti.name
+    families = [find(family) for family in config.bal]
+    reasons = [found.reason for found in families] or ["not run: the configuration names no problem of BAL"]
+    return Problems(
+        "BAL",
+        tuple(source for found in families for source in found.sources),
+        tuple(entry for found in families for entry in found.missing),
+        "" if "" in reasons else NOT_SET if NOT_SET in reasons else reasons[0],
+    )
 
 
 def training_files(config: RealConfig, source: Source) -> tuple[str, tuple[str, ...]]:
@@ -89,21 +71,13 @@ def training_files(config: RealConfig, source: Source) -> tuple[str, tuple[str, 
     Returns:
         Name of what is left out, and the paths of the rest; none for a problem of neither data set.
     """
-    if lens_is_known(config, source):
+    if source.family == config.kitti.name:
         files = _files(config.kitti)
         return label(source.location), tuple(path for path in files if path != source.location)
     if source.family not in [family.name for family in config.bal]:
         return source.name, ()
     others = [family for family in config.bal if family.name != source.family]
     return source.family, tuple(path for family in others for path in _files(family))
-
-
-def reason_without_bal(config: RealConfig) -> str:
-    """Why there are no BAL problems; empty if there are some."""
-    reasons = [found.reason for found in families(config)]
-    if not reasons:
-        return "not run: the configuration names no problem of BAL"
-    return "" if "" in reasons else NOT_SET if NOT_SET in reasons else reasons[0]
 
 
 def _files(config: FamilyConfig) -> list[str]:

@@ -1,42 +1,40 @@
-"""The report in Markdown: claims, interpretations of the paper, all tables and figures, settings and times."""
+"""The report: claims, interpretations of the paper, all tables and settings in Markdown, and a page of the figures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from jaxba.bench import profile
+from jaxba.bench.charts import AXES, problem_charts, profile_chart, solver_styles
+from jaxba.bench.page import Page
 from jaxba.bench.run import machine
-from jaxba.bench.tables import number
 from jaxba.paper.agents import updates
-from jaxba.paper.claims import CRITERION
-from jaxba.paper.config import to_yaml
-from jaxba.paper.markdown import Section, claims_table, table
+from jaxba.paper.claims import CRITERION, Claim
 from jaxba.paper.runner import Runner
-from jaxba.paper.tables_and_figures import figures
-from jaxba.runtime.atomic import atomic_write, write_text
+from jaxba.paper.tables_and_figures import TABLES_AND_FIGURES
+from jaxba.paper.tables_and_figures.common import table
+from jaxba.paper.tables_and_figures.figures import FIGURES
+from jaxba.runtime.atomic import write_text
+from jaxba.settings import to_yaml
 
 CLAIMS = "claims.md"
 """File of the table of claims alone, in the folder of the run."""
 
-BUSY_CORES = 0.9
-"""With fewer processor cores in use on average, other programs must have slowed the run down."""
+TAU = 0.001
+"""The smaller tolerance of the paper's figures."""
 
 INTERPRETATIONS = "interpretations.md"
 """Section on the subjects on which the paper's text and its released code are open or contradict each other: what both
 say, and what is done here. Beside this module."""
 
 
-def write(
-    runner: Runner, sections: Sequence[Section], path: Path, command: str, seconds: Mapping[str, tuple[float, float]]
-) -> list[Path]:
-    """Writes the report and its table of claims, and copies the figures into a folder beside the report.
+def write(runner: Runner, path: Path, command: str) -> list[Path]:
+    """Writes the report, its table of claims, and the page of the figures if anything of them was run.
 
     Args:
         runner: the run, with its settings and results.
-        sections: sections of the tables and figures, in order.
-        path: the Markdown file; figures go into a folder with the same stem.
+        path: the Markdown file; the page stands beside it, with the ending `.html`.
         command: command line that made the report.
-        seconds: for each table or figure, wall-clock time and processor time spent on it in this folder.
 
     Returns:
         All files written.
@@ -44,29 +42,31 @@ def write(
     Raises:
         OSError: a file cannot be written.
     """
-    pictures = path.parent / path.stem
-    files = []
-    drawn = sorted((runner.folder / figures.FIGURES).glob("*.png"))
-    if drawn:
-        pictures.mkdir(parents=True, exist_ok=True)
-    for source in drawn:
-        target = pictures / source.name
-        with atomic_write(target) as file:
-            file.write(source.read_bytes())
-        files.append(target)
-    claims = _claims(runner, sections, command)
-    rest = "\n\n".join(_rest(runner, sections, seconds)).replace(f"]({figures.FIGURES}/", f"]({path.stem}/")
-    write_text(path, f"{claims}\n{rest}\n")
+    sections = [entry.section(runner) for entry in TABLES_AND_FIGURES.values()]
+    claims = _claims(runner, [claim for _, own in sections for claim in own], command)
+    rest = [
+        Path(__file__).with_name(INTERPRETATIONS).read_text(encoding="utf-8").rstrip(),
+        "## Tables and figures",
+        "`good ends`: fraction of the solves that end within 1 % of the best cost found in this run. `seeds: range`: "
+        "number of training runs and the range of their means.",
+        *(paragraph for body, _ in sections for paragraph in body),
+        f"## Settings\n\n```yaml\n{to_yaml(runner.config).strip()}\n```",
+    ]
+    files = [path, runner.folder / CLAIMS]
+    if page := _figures(runner, command):
+        files.append(path.with_suffix(".html"))
+        write_text(files[-1], page)
+        rest.insert(1, f"Figures: [{files[-1].name}]({files[-1].name}).")
+    write_text(path, "\n\n".join([claims, *rest]) + "\n")
     write_text(runner.folder / CLAIMS, claims)
-    return [path, runner.folder / CLAIMS, *files]
+    return files
 
 
-def _claims(runner: Runner, sections: Sequence[Section], command: str) -> str:
+def _claims(runner: Runner, claims: list[Claim], command: str) -> str:
     """What the report begins with: how it was made, and the table of claims."""
-    properties = machine()
-    claims = [claim for section in sections for claim in section.claims]
+    properties, agents = machine(), runner.config.agents
     tally = {status: sum(c.status == status for c in claims) for status in ("reproduced", "partly", "not", "not run")}
-    agents = runner.config.agents
+    cells = [(c.text, c.paper, c.ours, c.near, f"**{c.status}**") for c in claims]
     parts = [
         "# The paper, claim by claim",
         'Belder, Vivanti, Tal, "A Game of Bundle Adjustment - Learning Efficient Convergence", ICCV 2023, beside what '
@@ -79,29 +79,24 @@ def _claims(runner: Runner, sections: Sequence[Section], command: str) -> str:
         "## Claims",
         "; ".join(f"{count} {status}" for status, count in tally.items()) + f" of {len(claims)}.",
         CRITERION,
-        claims_table(claims) if claims else "None was tested.",
+        table(("claim", "paper", "ours", "to f\\*(1+1e-3)", "result"), cells).replace("\\*\\*", "**"),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _rest(runner: Runner, sections: Sequence[Section], seconds: Mapping[str, tuple[float, float]]) -> list[str]:
-    """What follows the claims: interpretations, every table and figure, settings and times."""
-    parts = [
-        Path(__file__).with_name(INTERPRETATIONS).read_text(encoding="utf-8").rstrip(),
-        "## Tables and figures",
-        "`good ends`: fraction of the solves that end within 1 % of the best cost found in this run. `seeds: range`: "
-        "number of training runs and the range of their means.",
-    ]
-    for section in sections:
-        parts += [f"## {section.title}", *(paragraph for paragraph in section.body if paragraph)]
-    parts += ["## Settings", f"```yaml\n{to_yaml(runner.config).strip()}\n```"]
-    if seconds:
-        wall, cpu = (sum(pair[k] for pair in seconds.values()) for k in (0, 1))
-        cells = [(name, number(pair[0]), number(pair[1])) for name, pair in seconds.items()]
-        parts += [
-            "## Time",
-            table(("table or figure", "s", "processor s"), [*cells, ("total", number(wall), number(cpu))]),
-            f"Compilation is included. The program used {cpu / wall:.2f} processor cores on average"
-            + ("; other programs slowed it down, so that all times are too long." if cpu < BUSY_CORES * wall else "."),
-        ]
-    return parts
+def _figures(runner: Runner, command: str) -> str:
+    """The page of the figures: of several problems their performance profiles, of a single one its convergence and
+    lambdas. Empty if nothing of them was run."""
+    drawn = {
+        f"{figure.heading}: {part.problems.name}": records
+        for figure in FIGURES
+        for part in figure.parts(runner)
+        if (records := part.records(runner))
+    }
+    styles = solver_styles(r.solver for records in drawn.values() for r in records)
+    page = Page("The paper's figures", {"command": command}, styles, AXES)
+    for title, records in drawn.items():
+        first, *others = profile.problem_names(records)
+        profiles = [profile_chart(records, target, styles) for target in profile.cost_targets(TAU) if others]
+        page.add(title, page.charts(profiles or problem_charts(records, first, TAU, styles)))
+    return page.to_html() if drawn else ""

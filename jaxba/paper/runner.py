@@ -19,12 +19,10 @@ from jaxba.bench.sources import Source
 from jaxba.damping import DampingPolicy
 from jaxba.game.rollout import play
 from jaxba.game.scene_bank import Bank, reach
-from jaxba.paper import agents, real_problems, rows, zero_net
+from jaxba.paper import agents, results, zero_net
 from jaxba.paper.agents import Agent
 from jaxba.paper.config import PaperConfig
-from jaxba.paper.rows import NEAR, Row
-from jaxba.paper.schedule import LENGTH
-from jaxba.paper.store import Play, Store
+from jaxba.paper.results import NEAR, SCHEDULE, Play, Row, Store
 from jaxba.peers import require
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.options import LinearSolverChoice, StepOptions
@@ -44,8 +42,10 @@ ELSEWHERE = "agent-elsewhere"
 TEST = "test"
 """Name of the scenes of the tables in records."""
 
-Build: TypeAlias = Callable[[int], tuple[DampingPolicy, SolveOptions]]
-"""Gives policy and options of a training run."""
+SMALL = "small"
+"""Family of the small random scenes."""
+
+Built: TypeAlias = tuple[DampingPolicy, SolveOptions]
 
 
 @dataclass(frozen=True)
@@ -55,25 +55,16 @@ class Method:
     name: str
     """Name in records."""
 
-    build: Build
-    """Gives policy and options of a training run, by its number; rules ignore the number. This may train the policy, so
-    it is called only if something has to be run."""
+    build: Callable[[int, Source | None], Built | None]
+    """Policy and options of a training run, by its number, for a real problem or else the scenes of the tables; None
+    if there is none for this problem. Rules ignore both. This may train the policy, so it is called only if something
+    has to be run."""
 
     seeds: int = 0
     """Number of training runs; 0 for a rule."""
 
     peer: SolverName | None = None
     """Another library that solves real problems, in place of `build`."""
-
-    build_for: Callable[[Source], Build | None] | None = None
-    """Gives `build` for one real problem, None if there is none, where it depends on the problem."""
-
-    def on(self, source: Source) -> Method | None:
-        """The method for one problem, None if there is none."""
-        if self.build_for is None:
-            return self
-        build = self.build_for(source)
-        return None if build is None else replace(self, build=build)
 
     @property
     def numbers(self) -> range:
@@ -90,7 +81,7 @@ def method_named(name: str) -> Method:
     solver, slash, linear = name.partition("/")
     parsed = parse_solver(solver)
 
-    def build(_: int) -> tuple[DampingPolicy, SolveOptions]:
+    def build(*_: Any) -> Built:
         policy, options = parsed.build()
         return policy, replace(options, linear_solver=cast(LinearSolverChoice, linear if slash else "auto"))
 
@@ -121,37 +112,33 @@ class Runner:
 
     def agent(self, agent: Agent, method: str = "lm") -> Method:
         """The method with a trained agent; the agent is trained when the method is first built."""
-
-        def build(seed: int) -> tuple[DampingPolicy, SolveOptions]:
-            policy, fresh = agents.trained(self.config, agent, seed, self.folder, self.report)
-            self.done += fresh
-            return policy, SolveOptions(method=method)
-
         name = agent.name if method == "lm" else f"{method}+{agent.name}"
-        return Method(name, build, self.config.agents.seeds)
+        return Method(name, lambda seed, _: self._trained(agent, seed, method), self.config.agents.seeds)
 
     def agent_trained_elsewhere(self, method: str = "lm") -> Method:
         """The method with agents trained on windows of real problems other than the one to solve."""
 
-        def build_for(source: Source) -> Build | None:
-            agent = agents.trained_elsewhere(self.config, source)
-            return None if agent is None else self.agent(agent, method).build
-
-        def build(_: int) -> tuple[DampingPolicy, SolveOptions]:
-            raise AssertionError("depends on the problem")
+        def build(seed: int, source: Source | None) -> Built | None:
+            agent = agents.trained_elsewhere(self.config, source) if source else None
+            return agent and self._trained(agent, seed, method)
 
         name = ELSEWHERE if method == "lm" else f"{method}+{ELSEWHERE}"
-        return Method(name, build, self.config.agents.seeds, build_for=build_for)
+        return Method(name, build, self.config.agents.seeds)
+
+    def _trained(self, agent: Agent, seed: int, method: str) -> Built:
+        policy, fresh = agents.trained(self.config, agent, seed, self.folder, self.report)
+        self.done += fresh
+        return policy, SolveOptions(method=method)
 
     def zero_net(self) -> Method:
         """The method with the Zero-net, with as many training runs as an agent."""
         return Method("zero-net", self._zero_net, self.config.agents.seeds)
 
-    def _zero_net(self, seed: int) -> tuple[DampingPolicy, SolveOptions]:
+    def _zero_net(self, seed: int, _: Any) -> Built:
         agent = agents.train_config(self.config, agents.OURS, seed).game.agent
         path = self.folder / "agents" / f"zero-net-{seed}.npz"
         if path.is_file():
-            net = zero_net.restore(path, agent)
+            net = zero_net.restore(path, self.config.zero_net, agent)
         else:
             self.report(f"zero-net {seed + 1}: training")
             settings = agents.train_config(self.config, agents.OURS, 0)
@@ -178,7 +165,7 @@ class Runner:
             if self.store.play(TEST, method.name, seed):
                 continue
             process.release_programs()
-            policy, options = method.build(seed)
+            policy, options = cast(Built, method.build(seed, None))
             settings = agents.train_config(self.config, agents.OURS, 0)
             options = replace(options, intrinsics=settings.bank.intrinsics).step_options(policy)
             bank = self.test_scenes
@@ -186,7 +173,7 @@ class Runner:
             started = time.perf_counter()
             found = play(settings.bank.classes[0], bank, policy, options, LIMIT)
             best = np.asarray(bank.best_cost)
-            first = [row[: min(LENGTH, count)] for row, count in zip(found.dampings, found.iterations, strict=True)]
+            first = [row[: min(SCHEDULE, count)] for row, count in zip(found.dampings, found.iterations, strict=True)]
             self.store.add_play(
                 Play(
                     scenes=TEST,
@@ -213,7 +200,7 @@ class Runner:
             repeats: repeats of each solve; as in the configuration if 0.
         """
         for source in sources:
-            for method in filter(None, (method.on(source) for method in methods)):
+            for method in methods:
                 for seed in method.numbers:
                     for repeat in range(repeats or self.config.real.repeats):
                         if self.store.solve(source.name, method.label(seed), repeat) is None:
@@ -225,20 +212,24 @@ class Runner:
     def _solve(self, source: Source, method: Method, seed: int, repeat: int, limit: int) -> None:
         if method.peer:
             require(method.peer)
-        built = None if method.peer else method.build(seed)
+        built = None if method.peer else method.build(seed, source)
+        if built is None and not method.peer:
+            return
         if self._read is None or self._read[0] != source:
             self._read = source, source.read()
         problem = self._read[1]
         self.report(f"{source.name} by {method.label(seed)}")
-        if method.peer:
+        if built is None:
+            assert method.peer
             record = run_solver(problem, source, method.peer, repeat, RunSettings(max_iterations=limit))
         else:
-            assert built is not None
             policy, options = built
-            if real_problems.lens_is_known(self.config.real, source):
-                options = replace(options, intrinsics="fixed")
-            steps: list[IterationRecord] = []
             options = replace(options, max_iterations=limit, compilation="full")
+            if source.family in (self.config.real.kitti.name, SMALL):  # poses and points are unknown, as in the paper
+                options = replace(options, intrinsics="fixed")
+            if source.family == SMALL:
+                options = replace(options, linear_solver="explicit")
+            steps: list[IterationRecord] = []
             solution = solve(problem, policy, options, callback=lambda step: steps.append(step))
             known: Any = {"name": source.name, "family": source.family, "solver": SolverName("ceres")}
             record = record_of(solution, steps, repeat=repeat, **known)
@@ -250,7 +241,9 @@ class Runner:
     def row_on_scenes(self, method: Method) -> Row:
         """The row of a method on the scenes of the tables, from the results so far."""
         plays = [self.store.play(TEST, method.name, seed) for seed in method.numbers]
-        return rows.row(method.name, {p.seed: rows.of_play(p) for p in plays if p is not None}, method.seeds > 0)
+        return results.row_of(
+            method.name, {p.seed: results.of_play(p) for p in plays if p is not None}, method.seeds > 0
+        )
 
     def row_on(self, sources: Iterable[Source], method: Method) -> Row:
         """The row of a method on real problems, from the results so far."""
@@ -260,8 +253,8 @@ class Runner:
         for seed in method.numbers:
             records = self.store.solves_of(names, [method.label(seed)])
             if records:
-                found[seed] = rows.of_records(records, best)
-        return rows.row(method.name, found, method.seeds > 0)
+                found[seed] = results.of_records(records, best)
+        return results.row_of(method.name, found, method.seeds > 0)
 
     def records_on(self, sources: Iterable[Source], methods: Iterable[Method], seed: int = 0) -> list[Record]:
         """Records of solves with one training run of each method, with `Method.name` as the solver."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int
@@ -78,18 +77,11 @@ def neighbouring_cameras(problem: BundleProblem, count: int) -> Int[np.ndarray, 
     return np.sort(np.array(chosen))
 
 
-@dataclass(frozen=True)
-class SubProblem(Source):
-    """A named sub-problem of neighbouring cameras that has not been read yet."""
+def neighbourhood(whole: Source, count: int) -> Source:
+    """The sub-problem of so many neighbouring cameras of a problem, which is read with it."""
 
-    cameras: int = 0
-    """Number of cameras."""
+    def make() -> BundleProblem:
+        problem = whole.read()
+        return sub_problem(problem, neighbouring_cameras(problem, count))
 
-    def read(self) -> BundleProblem:
-        """Reads the complete problem and restricts it.
-
-        Raises:
-            ProblemError: the input is invalid; the message is one line.
-        """
-        whole = Source(self.name, self.family, self.location).read()
-        return sub_problem(whole, neighbouring_cameras(whole, self.cameras))
+    return Source(f"{whole.name}-first{count}", whole.family, whole.location, make)

@@ -13,7 +13,8 @@ from __future__ import annotations
 import functools
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -33,8 +34,8 @@ from jaxba.game.scene_bank import Bank
 from jaxba.lm.records import StepInfo
 from jaxba.lm.termination import Tolerances, converged_in_cost
 from jaxba.paper.config import ZeroNetConfig
-from jaxba.runtime.atomic import atomic_write
 from jaxba.runtime.jit import jit
+from jaxba.training import checkpoint
 from jaxba.typing import register_pytree
 
 MAX_SLOPE = 1.0
@@ -114,13 +115,6 @@ def slope_of_next_cost(
     return change, slope, after, step
 
 
-class _Training(NamedTuple):
-    layers: tuple[Layer, ...]
-    adam: Any
-    episodes: Episode
-    key: Array
-
-
 def train(config: ZeroNetConfig, game: Game, agent: AgentConfig, key: Array) -> tuple[ZeroNet, np.ndarray]:
     """Trains a network on the first bank of a game.
 
@@ -150,49 +144,43 @@ def _train(
         scene = jax.random.randint(key, (), 0, bank.initial_cost.shape[0], jnp.int32)
         return game.start(bank, scene)
 
-    def update(state: _Training, _: None) -> tuple[_Training, Array]:
+    def update(state: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], Array]:
+        layers, optimiser, episodes, key = state
+
         def loss(layers: tuple[Layer, ...]) -> tuple[Array, tuple[Episode, StepInfo, Array]]:
             policy = ZeroNet(layers, net.config)
-            actions = jax.vmap(lambda episode: policy.act(episode.memory))(state.episodes)
+            actions = jax.vmap(lambda episode: policy.act(episode.memory))(episodes)
             step_one = lambda episode, action: slope_of_next_cost(game, episode, action)
-            change, slope, after, step = step_groups(step_one, state.episodes, lax.stop_gradient(actions))
+            change, slope, after, step = step_groups(step_one, episodes, lax.stop_gradient(actions))
             known = jnp.isfinite(change) & jnp.isfinite(slope)
             slope = jnp.clip(jnp.where(known, slope, -MAX_SLOPE), -MAX_SLOPE, MAX_SLOPE).astype(jnp.float32)
             counted = jnp.sum(jnp.where(known, change, 0.0)) / jnp.maximum(jnp.sum(known), 1)
             return jnp.mean(lax.stop_gradient(slope) * actions), (after, step, counted)
 
-        (_, (after, step, counted)), gradient = jax.value_and_grad(loss, has_aux=True)(state.layers)
-        change, optimiser = adam.update(gradient, state.adam, state.layers)
-        key, *keys = jax.random.split(state.key, 1 + config.batch)
+        (_, (after, step, counted)), gradient = jax.value_and_grad(loss, has_aux=True)(layers)
+        change, optimiser = adam.update(gradient, optimiser, layers)
+        key, *keys = jax.random.split(key, 1 + config.batch)
         converged = jax.vmap(converged_in_cost, in_axes=(0, None))(step, Tolerances().ftol)
         done = converged | (after.memory.iteration >= config.max_iterations)
         new = jax.vmap(another)(jnp.stack(keys))
         pick = lambda new, old: jnp.where(done.reshape(-1, *[1] * (old.ndim - 1)), new, old)
         episodes = jax.tree.map(pick, new, after)
-        layers: Any = optax.apply_updates(state.layers, change)
-        return _Training(layers, optimiser, episodes, key), counted
+        layers = optax.apply_updates(layers, change)
+        return (layers, optimiser, episodes, key), counted
 
     key, *keys = jax.random.split(key, 1 + config.batch)
     episodes = jax.vmap(another)(jnp.stack(keys))
-    first = _Training(net.layers, adam.init(net.layers), episodes, key)
-    last, means = lax.scan(update, first, None, length=config.updates)
-    return last.layers, means
+    first = net.layers, adam.init(net.layers), episodes, key
+    (layers, *_), means = lax.scan(update, first, None, length=config.updates)
+    return layers, means
 
 
-def save(path: Any, net: ZeroNet) -> None:
+def save(path: Path, net: ZeroNet) -> None:
     """Writes the weights to a .npz file atomically."""
-    with atomic_write(path) as file:
-        arrays: dict[str, Any] = {
-            f"{name}{k}": np.asarray(getattr(layer, name))
-            for k, layer in enumerate(net.layers)
-            for name in Layer._fields
-        }
-        np.savez(file, **arrays)
+    checkpoint.write_arrays(path, checkpoint.pack(net.layers))
 
 
-def restore(path: Any, agent: AgentConfig) -> ZeroNet:
+def restore(path: Path, config: ZeroNetConfig, agent: AgentConfig) -> ZeroNet:
     """Reads the network that `save` wrote."""
-    with np.load(path) as file:
-        count = len(file.files) // 2
-        layers = tuple(Layer(file[f"kernel{k}"], file[f"bias{k}"]) for k in range(count))
-    return ZeroNet(layers, agent)
+    like = jax.eval_shape(lambda: initial_network(config, agent, jax.random.key(0)).layers)
+    return ZeroNet(jax.tree.map(np.asarray, checkpoint.unpack(checkpoint.read_arrays(path), like)), agent)

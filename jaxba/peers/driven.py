@@ -4,34 +4,51 @@ Each iteration is a call of `pyceres.solve` with one iteration and `initial_trus
 the same algorithm as one long solve: between iterations Ceres keeps only the radius and the column scaling, and
 `lambda diag(H)` does not depend on the scaling. Every call repeats Ceres' preprocessing and one linearisation, so that
 these times are comparable with each other only.
+
+Ceres itself accepts every step: its problem has an additional residual (`_AcceptAnyStep`) that no parameter changes,
+large before a step and zero after it. jaxba then refines the step if that is asked for, and accepts or rejects it as it
+does its own, and Ceres continues from the result.
 """
 
 from __future__ import annotations
 
+import functools
 import time
+from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jaxtyping import Float
 
 from jaxba.damping import DampingPolicy, ProblemInfo
-from jaxba.lm.records import KINDS, StepInfo
+from jaxba.linear.schur import jacobian_product
+from jaxba.linear.step import Step
+from jaxba.lm.records import KINDS, LMState, StepInfo
+from jaxba.lm.step import Proposal, initial_state, try_step
 from jaxba.lm.termination import Termination, Tolerances
-from jaxba.peers.acceptance import StepAcceptance, reported
+from jaxba.model.linearize import linearize
 from jaxba.peers.ceres import Callback, Run, solver_options, step_info, step_of
 from jaxba.peers.colmap import pyceres
 from jaxba.problem.bundle_problem import BundleProblem
-from jaxba.problem.options import StepOptions
+from jaxba.problem.geometry import COLMAP_FLIP as FLIP
+from jaxba.problem.options import ConjugateGradients, StepOptions
 from jaxba.runtime.compilation import CompileClock
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.iteration import Carry, advance, begin
 from jaxba.solver.options import MAX_ITERATIONS
+from jaxba.solver.place import Placed
 from jaxba.solver.solve import Solution
+from jaxba.structure.layout import Layout, layout_for
 
 LARGEST_RADIUS, SMALLEST_RADIUS = 1e300, 1e-300
 """Limits of the radius, so wide that they do not change the lambda of any policy."""
+
+FORCED_DECREASE = 1e200
+"""Decrease of the cost by `_AcceptAnyStep`, pixels squared: larger than the cost of any useful candidate."""
 
 _advance, _begin = jit(advance), jit(begin)
 
@@ -51,6 +68,32 @@ class _SummaryRecorder(pyceres.IterationCallback):
         return pyceres.CallbackReturnType.SOLVER_CONTINUE
 
 
+class _AcceptAnyStep(pyceres.CostFunction):
+    """A residual that makes Ceres accept any step: large at the first evaluation after `reset`, zero afterwards.
+
+    Its Jacobian is zero, so that it does not enter the linear system. It has two residuals and depends on one point,
+    as an observation does, since Ceres has code specialised for these sizes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.set_num_residuals(2)
+        self.set_parameter_block_sizes([3])
+        self.reset()
+
+    def reset(self) -> None:
+        """Must be called before each call of Ceres."""
+        self.value = float(np.sqrt(FORCED_DECREASE))
+
+    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+        """Writes the residuals and the zero Jacobian; called by Ceres."""
+        residuals[:] = self.value, self.value
+        self.value = 0.0
+        if jacobians is not None and jacobians[0] is not None:
+            jacobians[0][:] = 0.0
+        return True
+
+
 def drive_ceres(
     problem: BundleProblem,
     mode: str,
@@ -64,9 +107,9 @@ def drive_ceres(
 ) -> Solution:
     """Solves with Ceres' steps, lambda from a policy, and jaxba's acceptance and convergence tests.
 
-    The policy gets the same record of a step as from `lm_step`, from jaxba's acceptance test (`acceptance.py`), which
-    counts points behind their camera. The gradient is Ceres': by the three tangent coordinates of a quaternion it is
-    twice the one by angles.
+    The policy gets the same record of a step as from `lm_step`, from jaxba's acceptance test, which counts points
+    behind their camera. The gradient is Ceres': by the three tangent coordinates of a quaternion it is twice the one by
+    angles.
 
     Args:
         problem: start of the optimisation.
@@ -87,20 +130,58 @@ def drive_ceres(
     """
     tolerances = tolerances or Tolerances()
     run = Run(problem, callback)
-    options = solver_options(mode, threads)
-    options.max_num_iterations = 1
-    options.function_tolerance = options.parameter_tolerance = options.gradient_tolerance = 0.0
-    recorder = _SummaryRecorder()
-    options.callbacks = [recorder]
-    options.max_trust_region_radius, options.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
+    colmap, recorder, accept_any = run.colmap, _SummaryRecorder(), _AcceptAnyStep()
+    colmap.add_point_cost(accept_any, int(problem.point_index[0]))
+    ceres = solver_options(mode, threads)
+    ceres.max_num_iterations = 1
+    ceres.function_tolerance = ceres.parameter_tolerance = ceres.gradient_tolerance = 0.0
+    ceres.callbacks = [recorder]
+    ceres.max_trust_region_radius, ceres.min_trust_region_radius = LARGEST_RADIUS, SMALLEST_RADIUS
+    own = embedded or StepOptions()
+    # Ceres solves the linear system, so that the layout needs nothing for it and no past steps are kept
+    own = replace(
+        own,
+        linear_solver="implicit",
+        method=None,
+        conjugate_gradients=ConjugateGradients(preconditioner="jacobi"),
+        coordinates=replace(own.coordinates, rotation="manifold"),
+    )
+
+    def tried(before: Any, damping: float, step: StepInfo) -> tuple[LMState, StepInfo]:
+        """The next state after the step from the parameters `before` to Ceres' current ones, and its record."""
+        numbers = np.float64(step.gradient_max), np.int32(step.cg_iterations), np.float64(step.forcing)
+        after, least = colmap.parameters(), np.float64(policy.min_gain)
+        found = _evaluate(layout, state, before, after, np.float64(damping), numbers, least, options=own)
+        return jax.block_until_ready(found)
+
+    def iterate(damping: float) -> StepInfo:
+        """One linear solve by one call of Ceres; jaxba accepts or rejects the step."""
+        nonlocal state
+        before, summaries = colmap.parameters(), recorder.summaries
+        accept_any.reset()
+        ceres.initial_trust_region_radius = float(np.clip(1 / damping, SMALLEST_RADIUS, LARGEST_RADIUS))
+        summaries.clear()
+        pyceres.solve(ceres, colmap.ceres, pyceres.SolverSummary())
+        if len(summaries) < 2 or not summaries[1].step_is_successful:  # no step could be computed
+            return _null_step(run.cost, damping, *(summary.gradient_max_norm for summary in summaries[:1]))
+        state, step = tried(before, damping, step_of(summaries[1], summaries[0], np.nan, np.nan, mode))
+        if not step.accepted:
+            colmap.restore(before)
+            return step
+        start = colmap.start
+        colmap.set_parameters_of(Placed(start, np.zeros(3), start).after(layout, layout.points, state, own))
+        if (behind := run.newly_behind()).any():
+            run.count_behind(behind)
+        return step
+
     with numerics(np.float64), CompileClock() as clock:
         started = time.perf_counter()
         carry = _begin(_problem_info(problem, run.initial_cost, max_iterations), policy, None)
-        damping = float(carry.damping)
         # everything is compiled before the clock starts
-        acceptance = StepAcceptance(run, embedded or StepOptions(), policy.min_gain)
-        null_step = _null_step(run.cost, damping)
-        jax.block_until_ready(acceptance.evaluate(run.colmap.parameters(), damping, reported(null_step)))
+        layout = jax.device_put(layout_for(colmap.start, own))
+        state = initial_state(layout, colmap.start, own)
+        null_step = _null_step(run.cost, float(carry.damping))
+        tried(colmap.parameters(), float(carry.damping), null_step)
         # twice, since the state that a policy returns may differ in type from its initial state
         warm = _after_step(policy, carry, null_step, tolerances, max_iterations)
         jax.block_until_ready(_after_step(policy, warm, null_step, tolerances, max_iterations))
@@ -108,27 +189,12 @@ def drive_ceres(
         run.start()
         end = Termination.RUNNING
         while end == Termination.RUNNING:
-            step = _iterate(run, options, recorder.summaries, acceptance, mode, float(carry.damping))
+            step = iterate(float(carry.damping))
             carry = _after_step(policy, carry, step, tolerances, max_iterations)
             end = Termination(int(carry.termination))
             if run.record(step) and end == Termination.RUNNING:
                 end = Termination.STOPPED
     return run.solution(end, mode, clock.seconds)
-
-
-def _iterate(
-    run: Run, options: Any, summaries: list[Any], acceptance: StepAcceptance, mode: str, damping: float
-) -> StepInfo:
-    """One linear solve by one call of Ceres, whose callback fills `summaries`; jaxba accepts or rejects the step."""
-    before = run.colmap.parameters()
-    acceptance.accept_any.reset()
-    options.initial_trust_region_radius = float(np.clip(1 / damping, SMALLEST_RADIUS, LARGEST_RADIUS))
-    summaries.clear()
-    pyceres.solve(options, run.colmap.ceres, pyceres.SolverSummary())
-    if len(summaries) < 2 or not summaries[1].step_is_successful:  # no step could be computed
-        return _null_step(run.cost, damping, *(summary.gradient_max_norm for summary in summaries[:1]))
-    step = step_of(summaries[1], summaries[0], np.nan, np.nan, mode)
-    return acceptance.apply(before, damping, reported(step))
 
 
 def _null_step(cost: float, damping: float, gradient_max: float = np.nan) -> StepInfo:
@@ -149,3 +215,44 @@ def _problem_info(problem: BundleProblem, cost: float, max_iterations: int) -> P
     seen = np.bincount(problem.camera_index, minlength=problem.num_cameras) > 0
     points, focal = len(np.unique(problem.point_index)), np.asarray(problem.cameras)[:, 6]
     return ProblemInfo.of(jnp.asarray(cost), problem.num_observations, points, seen, focal, max_iterations)
+
+
+@functools.partial(jit, static_argnames="options")
+def _evaluate(
+    layout: Layout,
+    state: LMState,
+    before: Any,
+    after: Any,
+    damping: Float[Array, ""],
+    numbers: tuple[Array, Array, Array],
+    min_gain: Float[Array, ""],
+    options: StepOptions,
+) -> tuple[LMState, StepInfo]:
+    """jaxba's acceptance test of a step between two sets of COLMAP's parameters.
+
+    `before` and `after` are `(poses [c, 7], lenses [c, 5], points [p, 3])`. `numbers` of a step are known to Ceres
+    alone: the largest gradient entry before it, and the iterations and the forcing term of conjugate gradients, 0 for a
+    direct linear solver.
+    """
+    flip = jnp.asarray(FLIP)[:, None]
+    rotation = 2 * half_rotation(before[0][:, :4].T, after[0][:, :4].T)
+    lens = (after[1] - before[1]).T
+    cameras = jnp.concatenate(
+        [flip * rotation, flip * (after[0][:, 4:] - before[0][:, 4:]).T, lens[jnp.array([0, 3, 4])]]
+    )
+    points = (after[2] - before[2]).at[layout.points].get(mode="fill", fill_value=0).T
+    linear = linearize(layout, state.cameras, state.points, options.loss)
+    residual, change = jnp.stack(linear.residual), jnp.stack(jacobian_product(layout, linear, cameras.T, points))
+    slope = -jnp.sum(residual * change)
+    damped = slope - jnp.sum(change * change)
+    proposal = Proposal(Step(cameras, points, slope, damped, *numbers), linear.reference, jnp.zeros((), bool))
+    return try_step(layout, state, damping, proposal, options, min_gain)
+
+
+def half_rotation(before: Float[Array, "4 n"], after: Float[Array, "4 n"]) -> Float[Array, "3 n"]:
+    """`v` with `after = exp(v) before` for unit quaternions: half of the rotation vector between them, radians."""
+    v, w = before[:3], before[3]
+    vector = w * after[:3] - after[3] * v - jnp.cross(after[:3], v, axis=0)
+    real = w * after[3] + jnp.sum(after[:3] * v, axis=0)
+    sine = jnp.linalg.norm(vector, axis=0)
+    return jnp.where(sine > 0, jnp.arctan2(sine, real) / jnp.where(sine > 0, sine, 1), 1) * vector

@@ -61,6 +61,13 @@ def plain(value: Any) -> Any:
     return [plain(item) for item in value] if isinstance(value, tuple) else value
 
 
+def to_yaml(value: Any) -> str:
+    """The text of a YAML file with all settings, defaults included."""
+    import yaml
+
+    return yaml.safe_dump(plain(value), sort_keys=False)
+
+
 def assign(data: dict[str, Any], path: str, value: Any, kind: type) -> None:
     """Sets one value inside nested mappings; missing mappings are created.
 

@@ -19,13 +19,15 @@ import numpy as np
 
 from jaxba.runtime import distributed
 from jaxba.runtime.atomic import TEMPORARY, atomic_write
+from jaxba.typing import InputError
 
 _PREFIX, _SUFFIX = "step_", ".npz"
 _METADATA = "metadata"
 
 
-class CheckpointError(ValueError):
-    """A checkpoint that cannot be used. The message is one line for a person."""
+class TrainError(InputError):
+    """A run that cannot start or continue, or a checkpoint that cannot be used. The message is one line for a
+    person."""
 
 
 def pack(tree: Any) -> dict[str, np.ndarray]:
@@ -43,15 +45,15 @@ def check(arrays: Mapping[str, Any], like: Any) -> None:
         like: a tree of the expected structure, of arrays or of `jax.ShapeDtypeStruct`.
 
     Raises:
-        CheckpointError: a leaf is missing, or is of another shape or type.
+        TrainError: a leaf is missing, or is of another shape or type.
     """
     for path, leaf in jax.tree_util.tree_flatten_with_path(like)[0]:
         if (name := _name(path)) not in arrays:
-            raise CheckpointError(f"{name} is missing")
+            raise TrainError(f"{name} is missing")
         value, expected = arrays[name], jax.eval_shape(jax.random.key_data, leaf) if _is_key(leaf) else leaf
         if (value.shape, value.dtype) != (expected.shape, expected.dtype):
             found, wanted = (f"{x.dtype}{list(x.shape)}" for x in (value, expected))
-            raise CheckpointError(f"{name} is {found}, not {wanted}")
+            raise TrainError(f"{name} is {found}, not {wanted}")
 
 
 def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
@@ -62,7 +64,7 @@ def unpack(arrays: Mapping[str, Any], like: Any) -> Any:
         like: see `check`; a `jax.ShapeDtypeStruct` with a sharding says on which devices a leaf lies.
 
     Raises:
-        CheckpointError: see `check`.
+        TrainError: see `check`.
     """
     check(arrays, like)
 
@@ -96,7 +98,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """All arrays of an `.npz` file, in their order in the file.
 
     Raises:
-        CheckpointError: the file is damaged.
+        TrainError: the file is damaged.
         OSError: it cannot be opened.
     """
     with path.open("rb") as stream:
@@ -104,7 +106,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             with np.load(stream) as file:
                 return dict(file)
         except Exception:  # zipfile and NumPy name no set of errors for damaged files; checksums tell the rest
-            raise CheckpointError("damaged") from None
+            raise TrainError("damaged") from None
 
 
 def _path(folder: Path, step: int) -> Path:
@@ -130,7 +132,7 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
         keep: number of checkpoints kept, this one included.
 
     Raises:
-        CheckpointError: it cannot be written; those before are still there.
+        TrainError: it cannot be written; those before are still there.
         OSError: the folder cannot be created.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -140,7 +142,7 @@ def save(folder: Path, step: int, arrays: Mapping[str, np.ndarray], metadata: Ma
     try:
         write_arrays(path, {**arrays, _METADATA: np.frombuffer(json.dumps(metadata).encode(), np.uint8)})
     except OSError as error:
-        raise CheckpointError(f"{path} cannot be written: {error.strerror or error}") from None
+        raise TrainError(f"{path} cannot be written: {error.strerror or error}") from None
     kept = {_path(folder, number).name for number in [n for n in steps(folder) if n <= step][-keep:]}
     for item in folder.iterdir():
         if item.name not in kept and (item.name.startswith(_PREFIX) or fnmatch(item.name, TEMPORARY.format("*"))):
@@ -151,7 +153,7 @@ def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, A
     """Arrays and metadata of a checkpoint.
 
     Raises:
-        CheckpointError: it cannot be read.
+        TrainError: it cannot be read.
     """
     path = _path(folder, step)
     try:
@@ -159,4 +161,4 @@ def restore(folder: Path, step: int) -> tuple[dict[str, np.ndarray], dict[str, A
         return arrays, dict(json.loads(arrays.pop(_METADATA).tobytes()))
     except (OSError, KeyError, ValueError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
-        raise CheckpointError(f"{path} cannot be read: {reason}") from None
+        raise TrainError(f"{path} cannot be read: {reason}") from None

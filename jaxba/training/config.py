@@ -134,7 +134,7 @@ def load(name: str, overrides: Sequence[str] = ()) -> TrainConfig:
     """The configuration of a preset or a file.
 
     Args:
-        name: a preset (`preset_names`), or the path of a YAML file: anything with a slash or an ending.
+        name: a preset, or the path of a YAML file: anything with a slash or an ending.
         overrides: `key.key=value` each, the value in YAML; they override the file.
 
     Raises:
@@ -161,15 +161,3 @@ def with_problems(config: TrainConfig, problems: Sequence[str]) -> TrainConfig:
     if not any(kind.family == "windows" for kind in classes):
         classes = tuple(replace(kind, family="windows") for kind in classes)
     return replace(config, bank=replace(config.bank, problems=tuple(problems), classes=classes))
-
-
-def to_yaml(config: TrainConfig) -> str:
-    """All settings, defaults included; `load` of it gives the same configuration."""
-    import yaml
-
-    return yaml.safe_dump(settings.plain(config), sort_keys=False)
-
-
-def preset_names() -> list[str]:
-    """Names of the presets."""
-    return configurations.names("train")

@@ -28,11 +28,11 @@ from jaxba.runtime import distributed
 from jaxba.runtime.atomic import write_text
 from jaxba.runtime.numerics import for_traces
 from jaxba.training import checkpoint
-from jaxba.training.config import TrainConfig, load, to_yaml
+from jaxba.training.checkpoint import TrainError
+from jaxba.training.config import TrainConfig, load
 from jaxba.training.log import Log, Row
 from jaxba.training.placement import Placement
 from jaxba.training.train_loop import LoopState, agent_shares, run_agents, start_agents, state_shares
-from jaxba.typing import InputError
 
 CONFIG = "config.yaml"
 CHECKPOINTS = "checkpoints"
@@ -45,10 +45,6 @@ CHANGEABLE = ("chunks", "keep", "checkpoint_every")
 
 SCORE = "training/score"
 """The metric by which policies are chosen: lower is better."""
-
-
-class TrainError(InputError):
-    """A run that cannot start or continue. The message is one line for a person."""
 
 
 class Best(NamedTuple):
@@ -124,7 +120,7 @@ def prepare_folder(
         folder.mkdir(parents=True, exist_ok=True)
         if not resume and _others(folder):
             raise TrainError(f"{folder} is not empty; --out names another folder")
-        write_text(path, to_yaml(config))
+        write_text(path, settings.to_yaml(config))
     except OSError as error:
         raise TrainError(f"{folder}: {error.strerror or error}") from None
     return config
@@ -228,7 +224,7 @@ class _Run:
         for step in reversed(checkpoint.steps(self.folder)):
             try:
                 metadata, arrays = self._read(step, like)
-            except checkpoint.CheckpointError as error:
+            except TrainError as error:
                 reasons.append(str(error))
                 continue
             if reasons:
@@ -243,7 +239,7 @@ class _Run:
             found = [metadata[name] for name in _METADATA]
             best = [Best(None, agent=k, **one) for k, one in enumerate(found[-1])]
         except (KeyError, TypeError) as error:
-            raise checkpoint.CheckpointError(f"checkpoint {step} was written by another version: {error}") from None
+            raise TrainError(f"checkpoint {step} was written by another version: {error}") from None
         checkpoint.check(arrays, {"state": like, **({"best": like.learner.actor} if best else {})})
         return found, arrays
 
@@ -259,7 +255,7 @@ class _Run:
         metadata: dict[str, Any] = dict(zip(_METADATA, (self.chunk, self.wall_s, self.evaluated, best), strict=True))
         try:
             checkpoint.save(self.folder, self.chunk, arrays, metadata, self.config.keep)
-        except checkpoint.CheckpointError as error:
+        except TrainError as error:
             raise TrainError(f"{error}; --resume goes on from the one before") from None
 
     def finish(self) -> Outcome:

@@ -22,7 +22,11 @@ Row = dict[str, Any]
 
 
 class Log:
-    """Appends rows, after removing those that a killed run wrote after its last checkpoint, and damaged ones."""
+    """Appends rows, after removing those that a killed run wrote after its last checkpoint, and damaged ones.
+
+    Files for TensorBoard are written by the thread that calls: that of tensorboardX's `SummaryWriter` ends when the
+    disk is full, and is then waited for for ever.
+    """
 
     def __init__(self, folder: Path, chunk: int, report: Callable[[str], None] = lambda _: None) -> None:
         """Opens the log of a run.
@@ -35,10 +39,8 @@ class Log:
         Raises:
             OSError: the file cannot be read or written.
         """
-        self.path = folder / FILE
-        self._boards = folder / BOARD
-        self._open: dict[int, _Board] = {}
-        self._purge = chunk + 1 if chunk else 0
+        self.path, self._chunk = folder / FILE, chunk
+        self._boards: dict[int, Any] = {}  # by the number of the agent
         lines, damaged = _lines(self.path)
         kept = [line for line, row in lines if row["chunk"] <= chunk]
         if damaged and kept:
@@ -48,66 +50,37 @@ class Log:
         self._file = self.path.open("a", encoding="utf-8")
 
     def write(self, row: Mapping[str, Any]) -> Row:
-        """Appends a row and returns it as `read` does."""
+        """Appends a row and returns it as `read` does. Raises OSError."""
+        from tensorboardX.summary import scalar
+
         clean: Row = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
         self._file.write(json.dumps(clean, allow_nan=False) + "\n")
         self._file.flush()
-        board = self._writer(clean["seed"])
         for name, value in clean.items():
             if isinstance(value, (int, float)) and name not in ("seed", "chunk"):
-                board.add_scalar(name if "/" in name else f"train/{name}", value, clean["chunk"])
-        board.flush()
+                number = scalar(name if "/" in name else f"train/{name}", value)
+                self._event(clean["seed"], clean["chunk"], summary=number)
+        self._boards[clean["seed"]].flush()
         return clean
 
-    def _writer(self, agent: int) -> _Board:
-        if agent not in self._open:
-            self._open[agent] = _Board(self._boards / f"seed{agent}", self._purge)
-        return self._open[agent]
-
-    def close(self) -> None:
-        """Closes all files."""
-        self._file.close()
-        for board in self._open.values():
-            board.close()
-
-
-class _Board:
-    """A file for TensorBoard, written by the thread that calls: that of tensorboardX's `SummaryWriter` ends when
-    the disk is full, and is then waited for for ever."""
-
-    def __init__(self, folder: Path, purge: int) -> None:
-        """
-        Args:
-            folder: created if missing.
-            purge: TensorBoard ignores what earlier files have from this step on, which a killed run wrote; 0: nothing.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
+    def _event(self, agent: int, step: int, **content: Any) -> None:
+        """Writes an event for TensorBoard, which ignores what earlier files have after the chunks that are done."""
         from tensorboardX.event_file_writer import EventsWriter
-        from tensorboardX.proto import event_pb2 as messages
+        from tensorboardX.proto import event_pb2
 
-        folder.mkdir(parents=True, exist_ok=True)
-        self._writer, self._messages = EventsWriter(str(folder / "events")), cast(Any, messages)
-        if purge:
-            self._write(purge, session_log=self._messages.SessionLog(status=self._messages.SessionLog.START))
-
-    def _write(self, step: int, **content: Any) -> None:
-        self._writer.write_event(self._messages.Event(wall_time=time.time(), step=step, **content))
-
-    def add_scalar(self, name: str, value: float | int, step: int) -> None:
-        """Adds a number. Raises OSError."""
-        from tensorboardX.summary import scalar
-
-        self._write(step, summary=scalar(name, value))
-
-    def flush(self) -> None:
-        """Raises OSError."""
-        self._writer.flush()
+        messages = cast(Any, event_pb2)
+        if agent not in self._boards:
+            board = self.path.parent / BOARD / f"seed{agent}"
+            board.mkdir(parents=True, exist_ok=True)
+            self._boards[agent] = EventsWriter(str(board / "events"))
+            if self._chunk:
+                self._event(agent, self._chunk + 1, session_log=messages.SessionLog(status=messages.SessionLog.START))
+        self._boards[agent].write_event(messages.Event(wall_time=time.time(), step=step, **content))
 
     def close(self) -> None:
-        """Raises OSError."""
-        self._writer.close()
+        """Closes all files. Raises OSError."""
+        for file in (self._file, *self._boards.values()):
+            file.close()
 
 
 def read(folder: Path) -> list[Row]:

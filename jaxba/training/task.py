@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,13 @@ from jaxba.game.env import Game, make_game
 from jaxba.game.evaluate import Runs, Score, best_constant_action, best_costs, evaluate, iterations_to, play_all, scores
 from jaxba.game.rollout import Trajectories
 from jaxba.game.scene_bank import Bank, Split, make_banks, select
-from jaxba.game.statistics import Ratio, paired_ratio
+from jaxba.game.statistics import paired_ratio
 from jaxba.problem.options import StepOptions
 from jaxba.runtime import distributed
 from jaxba.solver.methods import DEFAULT_METHOD, make_method
 from jaxba.training import checkpoint
+from jaxba.training.checkpoint import TrainError
 from jaxba.training.config import TrainConfig
-from jaxba.training.driver import TrainError
 
 BANK = "bank.npz"
 RULES = "rules.npz"
@@ -62,17 +62,10 @@ WEIGHTLESS = "its weights zero"
 """Name of the trained policy without its weights (`without_weights`)."""
 
 
-class Comparison(NamedTuple):
-    """Trained policies on the held-out scenes."""
-
-    scores: dict[str, Score]
-    """By name: of every agent if there are several, of all agents (means) and of their twins, and of the baselines."""
-
-    ratios: dict[str, Ratio]
-    """Iterations of the trained policies over those of each other row, scene by scene; geometric mean over agents."""
-
-    by_agent: dict[str, list[float]]
-    """The same for every agent, over its own twin."""
+Comparison: TypeAlias = tuple[dict[str, Score], dict[str, tuple[float, float, float]], dict[str, list[float]]]
+"""Trained policies on the held-out scenes: scores by name (of every agent if there are several, of all agents and of
+their twins, means, and of the baselines); iterations of the trained policies over those of each other row, scene by
+scene (`paired_ratio`), geometric mean over agents; and the same for every agent, over its own twin."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +132,7 @@ class Task:
             theirs = taken(runs)
             ratios[name] = paired_ratio(np.exp(ours.mean(axis=0)), np.exp(theirs.mean(axis=0)))
             by_agent[name] = [float(x) for x in np.exp(np.mean(ours - theirs, axis=1))]
-        return Comparison({**each, **mean, **found}, ratios, by_agent)
+        return {**each, **mean, **found}, ratios, by_agent
 
 
 def first_scenes(training: Sequence[Bank], held_out: Sequence[Bank]) -> tuple[Bank, ...]:
@@ -280,7 +273,7 @@ def _read_runs(path: Path) -> dict[str, Runs]:
 def _read(path: Path) -> dict[str, np.ndarray]:
     try:
         return checkpoint.read_arrays(path)
-    except checkpoint.CheckpointError as error:
+    except TrainError as error:
         raise TrainError(f"{path}: {error}; begin in a new folder") from None
 
 

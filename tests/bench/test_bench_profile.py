@@ -7,7 +7,8 @@ from itertools import pairwise
 import pytest
 
 from jaxba.bench import profile
-from jaxba.bench.profile import Curve, Reach, Target
+from jaxba.bench.profile import Target
+from jaxba.game.statistics import Reached
 from jaxba.solver.record import Record, TracePoint
 
 
@@ -36,23 +37,20 @@ NEVER = (math.inf, math.inf)
         (Target("relative", 1e-2), (2.0, 2.0), (4.0, 8.0), NEVER),  # 101, reached exactly by slow
         (Target("relative", 1e-3), (2.0, 2.0), NEVER, NEVER),  # 100.1
         (Target("relative", 1e-4), (3.0, 3.0), NEVER, NEVER),  # 100.01
-        (Target("own_end", 1e-3), (2.0, 2.0), (5.0, 10.0), NEVER),  # 100.1; 100.3002; no end without convergence
         (Target("converged"), (3.0, 3.0), (5.0, 10.0), NEVER),
     ],
 )
 def test_targets_are_reached_when_computed_by_hand(target, fast, slow, stuck):
     table = profile.reach_table(RECORDS, target)
     assert {solver: row["p"] for solver, row in table.items()} == {
-        "fast": Reach(*fast),
-        "slow": Reach(*slow),
-        "stuck": Reach(*stuck),
+        "fast": Reached(*fast),
+        "slow": Reached(*slow),
+        "stuck": Reached(*stuck),
     }
 
 
-def test_best_cost_is_the_lowest_accepted_cost_of_any_solver_or_a_known_one():
+def test_best_cost_is_the_lowest_accepted_cost_of_any_solver():
     assert profile.best_cost(RECORDS) == {"p": 100.0}
-    assert profile.best_cost(RECORDS, {"p": 99.0, "other": 1.0}) == {"p": 99.0}
-    assert profile.best_cost(RECORDS, {"p": 120.0}) == {"p": 100.0}
     assert profile.initial_costs(RECORDS) == {"p": 1000.0}
 
 
@@ -65,13 +63,13 @@ def test_of_a_float32_run_only_the_final_cost_counts_which_is_computed_in_float6
 def test_non_finite_costs_are_never_best_and_never_reached():
     broken = make_record("p", "broken", [math.nan, math.nan])
     assert profile.best_cost([broken, FAST]) == {"p": 100.0}
-    assert profile.first(broken, 1e9) == Reach(math.inf, math.inf)
+    assert profile.first(broken, 1e9) == Reached(math.inf, math.inf)
     assert math.isnan(profile.best_cost([broken])["p"])
-    assert profile.reach_table([broken], Target("tau", 0.1))["broken"]["p"] == Reach(math.inf, math.inf)
+    assert profile.reach_table([broken], Target("tau", 0.1))["broken"]["p"] == Reached(math.inf, math.inf)
 
 
 def test_start_below_the_threshold_counts_as_iteration_zero():
-    assert profile.first(FAST, 1000.0) == Reach(0.0, 0.0)
+    assert profile.first(FAST, 1000.0) == Reached(0.0, 0.0)
 
 
 def test_a_zero_residual_problem_does_not_demand_the_same_rounding_error_of_every_solver():
@@ -104,12 +102,12 @@ def test_repeats_are_combined_by_their_median_and_half_failed_is_failed():
     def repeats(*steps):
         return [make_record("p", "a", [1000.0, 100.0], step_s=step, repeat=i) for i, step in enumerate(steps)]
 
-    assert profile.reach_table(repeats(5.0, 1.0, 2.0), Target("converged"))["a"]["p"] == Reach(1.0, 2.0)
+    assert profile.reach_table(repeats(5.0, 1.0, 2.0), Target("converged"))["a"]["p"] == Reached(1.0, 2.0)
     failed = make_record("p", "a", [1000.0, 1000.0], repeat=9, termination="max_iterations")
     two_of_three = [*repeats(1.0, 3.0), failed]
-    assert profile.reach_table(two_of_three, Target("converged"))["a"]["p"] == Reach(1.0, 3.0)
+    assert profile.reach_table(two_of_three, Target("converged"))["a"]["p"] == Reached(1.0, 3.0)
     one_of_two = [*repeats(1.0), failed]
-    assert profile.reach_table(one_of_two, Target("converged"))["a"]["p"] == Reach(math.inf, math.inf)
+    assert profile.reach_table(one_of_two, Target("converged"))["a"]["p"] == Reached(math.inf, math.inf)
 
 
 def test_profile_with_a_tie_a_failure_and_a_problem_that_no_solver_solves():
@@ -120,17 +118,17 @@ def test_profile_with_a_tie_a_failure_and_a_problem_that_no_solver_solves():
         "d": {"p": math.inf, "q": math.inf, "r": math.inf, "s": math.inf},
     }
     curves = profile.performance_profile(times)
-    assert curves["a"] == Curve((1.0, 2.0), (0.25, 0.5))
-    assert curves["b"] == Curve((1.0,), (0.75,))  # never 1: s stays in the denominator
-    assert curves["c"] == Curve((1.0, 3.0), (0.0, 0.25))
-    assert curves["d"] == Curve((1.0,), (0.0,))
+    assert curves["a"] == ((1.0, 2.0), (0.25, 0.5))
+    assert curves["b"] == ((1.0,), (0.75,))  # never 1: s stays in the denominator
+    assert curves["c"] == ((1.0, 3.0), (0.0, 0.25))
+    assert curves["d"] == ((1.0,), (0.0,))
 
 
 def test_profile_of_problems_solved_at_the_start_and_of_nothing():
     curves = profile.performance_profile({"a": {"p": 0.0}, "b": {"p": 0.0}, "c": {"p": 1.0}})
-    assert [curves[s] for s in "abc"] == [Curve((1.0,), (1.0,)), Curve((1.0,), (1.0,)), Curve((1.0,), (0.0,))]
+    assert [curves[s] for s in "abc"] == [((1.0,), (1.0,)), ((1.0,), (1.0,)), ((1.0,), (0.0,))]
     assert profile.performance_profile({}) == {}
-    assert profile.performance_profile({"a": {}}) == {"a": Curve((1.0,), (0.0,))}
+    assert profile.performance_profile({"a": {}}) == {"a": ((1.0,), (0.0,))}
 
 
 def test_different_starts_and_different_cost_definitions_are_reported():

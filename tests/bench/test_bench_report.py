@@ -1,19 +1,17 @@
-"""Figures and the report: files, names, consistency of styles, odd inputs. Warnings are errors."""
+"""The report: files, names, consistency of styles, odd inputs. Warnings are errors."""
 
 import html
 import json
 import math
 import re
-import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
-from jaxba.bench import panels, plots
-from jaxba.bench.profile import Target
-from jaxba.bench.report import file_names, run_metadata, to_html, write_all
+from jaxba.bench import charts
+from jaxba.bench.report import run_metadata, to_html, write_all
 from jaxba.bench.summary import summarize
 from jaxba.problem.bundle_problem import ProblemError
 from jaxba.solver.record import Record, TracePoint
@@ -58,7 +56,7 @@ class Tags(HTMLParser):
 
 
 def page_of(records, tolerance=1e-3, **metadata):
-    """The report without figures: its text, its tags, and the data of its charts."""
+    """The report: its text, its tags, and the data of its charts."""
     text = to_html(records, summarize(records, tolerance, metadata=metadata), tolerance)
     parser = Tags()
     parser.feed(text)
@@ -69,21 +67,7 @@ def page_of(records, tolerance=1e-3, **metadata):
 def test_write_all_writes_the_documented_files(tmp_path):
     records = [make_record("a", "classic", 30), make_record("a", "ceres", 14), make_record("dir/b c", "classic", 12)]
     files = write_all(records, tmp_path / "out", 1e-3, metadata={"device": "<cpu>", "threads": 2})
-    stems = (
-        "profile_tau_0.001",
-        "profile_relative",
-        "convergence_a",
-        "convergence_dir_b_c",
-        "lambda_a",
-        "lambda_dir_b_c",
-    )
-    expected = {f"{stem}.{kind}" for stem in stems for kind in ("png", "svg")} | {"summary.json", "report.html"}
-    assert names(tmp_path / "out") == expected == {path.name for path in files}
-    for path in files:
-        if path.suffix == ".png":
-            assert path.read_bytes().startswith(b"\x89PNG")
-        elif path.suffix == ".svg":
-            ElementTree.parse(path)
+    assert names(tmp_path / "out") == {"summary.json", "report.html"} == {path.name for path in files}
 
 
 def test_report_is_self_contained_well_formed_and_escaped():
@@ -107,12 +91,11 @@ def test_charts_of_the_report_have_the_numbers_of_the_records():
     assert titles[:6] == ["τ = 0.1", "τ = 0.01", "τ = 0.001", "f*(1+0.01)", "f*(1+0.001)", "f*(1+0.0001)"]
     charts = dict(zip(titles[:9], book["charts"][:9], strict=True))
     x, y, _ = charts["f*(1+0.01)"]["data"]
-    # as in the figures: x needs 3 accepted steps to 1e-2 of its best cost, y and z 9 iterations with two rejections
+    # x needs 3 accepted steps to 1e-2 of its best cost, y and z 9 iterations with two rejections
     assert [x["x"]["iterations"][0], x["y"]["iterations"][0]] == [1.0, 100.0]
     assert [3.0, 100.0] in [list(p) for p in zip(y["x"]["iterations"], y["y"]["iterations"], strict=True)]
-    assert text.count("The same curve by iterations: y = z.") == 6 + 2
     cost = charts["Accepted cost (pixels²)"]["data"][1]
-    rows = np.array([row[:4] for row in book["rows"][cost["rows"]]], float)
+    rows = np.array([row[:4] for row in cost["customdata"]], float)
     trace = records[1].trace
     np.testing.assert_allclose(rows[:, 0], [p.iteration for p in trace])
     np.testing.assert_allclose(rows[:, 1], [p.time_s for p in trace], rtol=1e-6)
@@ -125,11 +108,11 @@ def test_charts_of_the_report_have_the_numbers_of_the_records():
     assert heights == pytest.approx([best + tau * (1000 - best) for tau in (0.1, 0.01, 0.001)], rel=1e-6)
 
 
-def test_a_solver_has_one_colour_in_all_charts_and_figures():
+def test_a_solver_has_one_colour_in_all_charts():
     records = [make_record(p, s, 12) for p in "ab" for s in ("q", "classic", "learned", "r")]
     _, _, book = page_of(records)
     colours = {(trace["meta"], trace["line"]["color"]) for chart in book["charts"] for trace in chart["data"]}
-    styles = panels.solver_styles(["q", "classic", "learned", "r"])
+    styles = charts.solver_styles(["q", "classic", "learned", "r"])
     assert colours == {(name, style.color) for name, style in styles.items()}
 
 
@@ -162,59 +145,20 @@ def test_run_that_produced_no_numbers_still_makes_a_report(tmp_path):
 
 def test_many_solvers_have_different_styles_and_yardsticks_always_the_same():
     solvers = [f"s{i}" for i in range(20)] + ["ceres", "classic"]
-    styles = panels.solver_styles(solvers)
-    assert len({(s.color, str(s.linestyle)) for s in styles.values()}) == len(solvers)
-    assert styles["classic"] == panels.solver_styles(["x", "classic"])["classic"]
-    alone = panels.solver_styles(["mine", "ceres", "bold"])
-    assert alone["bold"] == panels.solver_styles(["bold"])["bold"]
+    styles = charts.solver_styles(solvers)
+    assert len({(s.color, s.dash) for s in styles.values()}) == len(solvers)
+    assert styles["classic"] == charts.solver_styles(["x", "classic"])["classic"]
+    alone = charts.solver_styles(["mine", "ceres", "bold"])
+    assert alone["bold"] == charts.solver_styles(["bold"])["bold"]
     assert len({style.color for style in alone.values()}) == 3
     assert list(styles) == solvers
 
 
-def test_profile_curves_have_the_fractions_computed_by_hand():
-    # x needs 3 accepted steps to 1e-2 f* (900 * 0.1**3 < 1), y 9 iterations with two rejections (900 * 0.37**7 < 1).
-    records = [make_record("a", "x", 12, rate=0.1), make_record("a", "y", 12, rate=0.37)]
-    figure = plots.plot_profiles(records, [Target("relative", 1e-2)], known_best={"a": 100.0})
-    by_iterations = figure.axes[1]
-    curves = {line.get_color(): np.asarray(line.get_xydata()) for line in by_iterations.get_lines()}
-    styles = panels.solver_styles(["x", "y"])
-    assert curves[styles["x"].color][0].tolist() == [1.0, 100.0]
-    assert [3.0, 100.0] in curves[styles["y"].color].tolist()
-
-
-def test_damping_chart_marks_rejections_hollow_and_zooms_into_the_end_of_classic():
-    records = [make_record("a", "classic", 30), make_record("a", "x", 60)]
-    main, zoom = plots.plot_lambda(records, "a").axes
-    assert zoom.get_xlim() == (20.5, 30.5)
-    hollow = [line for line in main.get_lines() if line.get_markerfacecolor() == "white"]
-    assert sorted(np.size(line.get_xdata()) for line in hollow) == [7, 15]
-    assert len(plots.plot_lambda([make_record("a", "x", 10)], "a").axes) == 1
-
-
-def dashed_levels(axes):
-    heights = [np.unique(np.asarray(line.get_ydata())) for line in axes.get_lines()]
-    return sorted(height[0] for height in heights if len(height) == 1)
-
-
-def test_convergence_plot_has_dashed_lines_at_the_tolerances():
-    figure = plots.plot_convergence([make_record("a", "x", 30)], "a", 1e-2, known_best={"a": 100.0})
-    top, bottom = figure.axes[0], figure.axes[2]
-    assert dashed_levels(top) == pytest.approx([100.9, 109.0, 190.0])
-    assert dashed_levels(bottom) == pytest.approx([1e-4, 1e-3, 1e-2])
-
-
-def test_same_figure_is_written_with_the_same_bytes(tmp_path):
-    for name in ("one", "two"):
-        plots.save_figure(plots.plot_lambda([make_record("a", "x", 12)], "a"), tmp_path / name)
-    for kind in ("png", "svg"):
-        assert (tmp_path / f"one.{kind}").read_bytes() == (tmp_path / f"two.{kind}").read_bytes()
-
-
-def test_file_names_are_safe_and_different():
-    found = file_names(["a/b", "a b", "A_b", "../..", "", "x" * 300, "ok-1.2"])
-    assert list(found.values())[:5] == ["a_b", "a_b-2", "A_b-3", "problem", "problem-2"]
-    assert len(found["x" * 300]) == 100
-    assert found["ok-1.2"] == "ok-1.2"
+def test_convergence_charts_have_dashed_lines_at_the_tolerances():
+    cost, distance, _ = charts.problem_charts([make_record("a", "x", 30)], "a", 1e-2, charts.solver_styles("x"))
+    heights = lambda chart: sorted(shape["y0"] for shape in chart["layout"]["shapes"])
+    assert heights(cost) == pytest.approx([100.9, 109.0, 190.0])
+    assert heights(distance) == pytest.approx([1e-4, 1e-3, 1e-2])
 
 
 def test_metadata_come_from_the_records_if_none_are_given():

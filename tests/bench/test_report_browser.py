@@ -75,11 +75,11 @@ def column(page: Any, title: str, number: int) -> list[str]:
 def test_a_click_on_a_head_sorts_by_number_and_a_second_one_the_other_way(page):
     head = "[...document.querySelectorAll('th')].find(t => t.textContent === 'final cost').click()"
     page.execute_script(head)
-    found = [float(text) for text in column(page, "Problems", 6)]
+    found = [float(text) for text in column(page, "Problems", 5)]
     assert found == sorted(found)
     assert len(set(found)) > 2
     page.execute_script(head)
-    assert [float(text) for text in column(page, "Problems", 6)] == sorted(found, reverse=True)
+    assert [float(text) for text in column(page, "Problems", 5)] == sorted(found, reverse=True)
 
 
 def test_the_switch_and_the_choice_of_problem_show_the_numbers_of_the_records(page):
@@ -114,21 +114,20 @@ def test_a_point_under_the_pointer_has_a_note_with_the_solver_and_its_numbers(pa
     assert "a<b>&" in text or "twin" in text  # the two lie on each other
 
 
-def test_a_solver_is_hidden_in_every_chart_and_table_and_equal_curves_are_named(page):
+def test_a_solver_is_hidden_in_every_chart_and_table(page):
     profile = chart(page, "τ = 0.001")
     assert set(traces(page, profile)) == set(RUNS)
     click(page, ".chip[data-key=ceres]")
     for title in ("τ = 0.1", "τ = 0.001", "f*(1+0.0001)", "Accepted cost (pixels²)", "Damping λ"):
         assert set(traces(page, chart(page, title))) == set(RUNS) - {"ceres"}
     assert page.execute_script("return [...document.querySelectorAll('tr[data-key=ceres]')].every(r => r.hidden)")
-    assert "a<b>& = twin" in page.find_element("tag name", "body").text
 
 
 def test_no_button_of_a_chart_sends_it_anywhere(page):
     titles = page.execute_script("return [...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)")
-    assert set(titles) == {"Download plot as a PNG", "Zoom", "Pan", "Reset axes"}
-    made = "Plotly.toImage('chart0').then(arguments[0], arguments[0])"
-    assert page.execute_async_script(made).startswith("data:image/png;base64,")
+    assert set(titles) == {"Download plot", "Zoom", "Pan", "Reset axes"}
+    made = "Plotly.toImage('chart0', {format: 'svg'}).then(arguments[0], arguments[0])"
+    assert page.execute_async_script(made).startswith("data:image/svg+xml,")
 
 
 def test_dark_and_light_differ_and_black_curves_turn_white(page):

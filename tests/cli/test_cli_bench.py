@@ -40,7 +40,7 @@ def bench(folder: Path, *argv: str) -> int:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
-    """A complete run with all of its figures."""
+    """A complete run with its report."""
     folder = tmp_path_factory.mktemp("bench") / "run"
     assert bench(folder, "scene:tiny", *BRIEF) == 0
     return folder
@@ -54,7 +54,7 @@ def folder(finished, tmp_path) -> Path:
 
 @pytest.fixture
 def undrawn(monkeypatch):
-    """Writes no figures, which takes seconds and is tested elsewhere."""
+    """Writes no report, which is tested elsewhere."""
     monkeypatch.setattr(report, "write_all", lambda *_, **__: [])
 
 
@@ -97,13 +97,10 @@ def test_the_numbers_of_a_line_are_those_of_the_solve(finished):
         assert line["threads"] >= 1
 
 
-def test_summary_figures_and_report_are_written(finished):
+def test_summary_and_report_are_written(finished):
     summary = json.loads((finished / "summary.json").read_text())
     assert [solver["solver"] for solver in summary["solvers"]] == ["classic", "ceres"]
     assert [problem["problem"] for problem in summary["problems"]] == ["tiny"]
-    for stem in ("profile_tau_0.001", "profile_relative", "convergence_tiny", "lambda_tiny"):
-        assert (finished / f"{stem}.png").read_bytes().startswith(b"\x89PNG")
-        assert b"<svg" in (finished / f"{stem}.svg").read_bytes()
     text = (finished / "report.html").read_text()
     assert text.startswith("<!DOCTYPE html>")
     assert "classic" in text
@@ -214,14 +211,6 @@ def test_ctrl_c_keeps_the_results_and_the_next_run_does_the_rest(tmp_path, undra
     assert [line["solver"] for line in lines(folder)] == ["classic", "ceres"]
 
 
-def test_two_processes_may_not_write_into_one_folder(folder, undrawn, capsys):
-    before = (folder / "results.jsonl").read_bytes()
-    with bench_run.only_writer(folder):
-        status = bench(folder, "scene:tiny", "--solvers", "gtsam", "--repeats", "1", "--max-iterations", "5")
-    check_one_line(status, capsys.readouterr().err, "another jaxba-bench is writing here")
-    assert (folder / "results.jsonl").read_bytes() == before
-
-
 def test_a_run_with_two_records_counts_once(folder, undrawn, capsys):
     path = folder / "results.jsonl"
     path.write_bytes(2 * path.read_bytes())
@@ -293,7 +282,7 @@ def test_names_with_brackets_and_colons_are_printed_as_they_are(tmp_path, undraw
     assert bench(tmp_path / "run[bold]", *argv) == 0
     out = capsys.readouterr().out
     assert "\nseq[red]:cat: ceres #1: 1 iteration," in f"\n{out}"
-    assert f"see {tmp_path / 'run[bold]' / 'report.html'}" in out.replace("\n", "")
+    assert str(tmp_path / "run[bold]" / "report.html") in out
 
 
 def test_a_file_name_that_is_not_valid_text_is_escaped(tmp_path, capsys):

@@ -190,114 +190,21 @@ def test_without_gymnasium_it_says_what_to_install(monkeypatch):
     assert "\n" not in str(caught.value)
 
 
-# Autoreset
+def test_options_of_a_reset_are_refused(envs):
+    with pytest.raises(ValueError, match="no options, is given reset_mask"):
+        envs.reset(options={"reset_mask": np.ones(6, bool)})
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
-def test_the_last_observation_comes_with_the_end_of_an_episode(game, mode):
-    """As in the mode `SAME_STEP`, in which it is an info."""
-    same, other = GymVectorGame(game), GymVectorGame(game, mode)
-    np.testing.assert_array_equal(same.reset(seed=3)[0], other.reset(seed=3)[0])
-    actions = np.linspace(-0.9, 0.9, 6, dtype=np.float32)[:, None]
-    for _ in range(10):
-        expected, found = same.step(actions), other.step(actions)
-        done = expected[2] | expected[3]
-        for k in (1, 2, 3):
-            np.testing.assert_array_equal(found[k], expected[k])
-        if done.any():
-            break
-        np.testing.assert_array_equal(found[0], expected[0])
-        assert found[4] == {}
-    assert done.any()
-    for k in np.flatnonzero(done):
-        np.testing.assert_array_equal(found[0][k], expected[4]["final_obs"][k])
-        assert found[4]["length"][k] == expected[4]["final_info"]["length"][k]
-    np.testing.assert_array_equal(found[0][~done], expected[0][~done])
-    np.testing.assert_array_equal(found[4]["_length"], done)
-    assert "final_obs" not in found[4]
-    same.close()
-    other.close()
-
-
-def test_in_the_next_step_a_new_episode_begins_whatever_the_action(game):
-    """It is the mode of gymnasium's own vector environments."""
-    twins = [GymVectorGame(game, AutoresetMode.NEXT_STEP) for _ in range(2)]
-    rng, ended, follow = np.random.default_rng(0), np.zeros(6, bool), 0
-    for env in twins:
-        env.reset(seed=1)
-    for _ in range(12):
-        actions = rng.uniform(-1, 1, size=(6, 1)).astype(np.float32)
-        others = np.where(ended[:, None], -actions, actions)
-        one, two = twins[0].step(actions), twins[1].step(others)
-        for k in range(4):
-            np.testing.assert_array_equal(one[k], two[k])
-        assert (one[1][ended] == 0).all()
-        assert not (one[2] | one[3])[ended].any()
-        lengths = one[4].get("length", np.zeros(6))
-        follow += int(ended.sum())
-        ended = one[2] | one[3]
-        assert ((lengths >= 1) & (lengths <= 4))[ended].all()
-    assert follow >= 6
-
-
-def test_without_autoreset_a_mask_says_where_new_episodes_begin(game):
-    env = GymVectorGame(game, AutoresetMode.DISABLED)
-    mask = np.array([True] + 5 * [False])
-    with pytest.raises(gymnasium.error.ResetNeeded, match="before the first one with a mask"):
-        env.reset(options={"reset_mask": mask})
-    env.reset(seed=1)
-    actions, done = np.zeros((6, 1), np.float32), np.zeros(6, bool)
-    while not done.any():
-        observation, _, terminated, truncated, _ = env.step(actions)
-        done = terminated | truncated
-    with pytest.raises(gymnasium.error.ResetNeeded, match=f"episodes .*{np.flatnonzero(done)[0]}.* reset_mask"):
-        env.step(actions)
-    given = {"reset_mask": done.copy()}
-    first, infos = env.reset(options=given)
-    assert infos == {}
-    assert list(given) == ["reset_mask"]  # which is the caller's
-    np.testing.assert_array_equal(first[~done], observation[~done])
-    assert (first[done] != observation[done]).any(axis=1).all()
-    env.step(actions)
-    env.close()
-
-
-def test_a_mask_begins_new_episodes_in_the_other_modes_too(envs):
-    envs.reset(seed=1)
-    last = envs.step(np.zeros((6, 1), np.float32))[0]
-    mask = np.array([False, True, False, False, True, False])
-    first, _ = envs.reset(seed=2, options={"reset_mask": mask})
-    np.testing.assert_array_equal(first[~mask], last[~mask])
-    assert (first[mask] != last[mask]).any(axis=1).all()
-    assert envs.observation_space.contains(first)
-
-
-@pytest.mark.parametrize(
-    ("mask", "error", "words"),
-    [
-        ([True] * 6, TypeError, "NumPy array of bools"),
-        (np.ones(6), TypeError, "NumPy array of bools"),
-        (np.ones(5, bool), ValueError, "some of 6"),
-        (np.zeros(6, bool), ValueError, "some of 6"),
-    ],
-)
-def test_masks_that_make_no_sense_are_refused(envs, mask, error, words):
-    envs.reset(seed=1)
-    with pytest.raises(error, match=words):
-        envs.reset(options={"reset_mask": mask})
-
-
-def test_wrappers_of_gymnasium_count_every_episode_in_every_mode(game):
-    for mode in (AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP):
-        counted = gymnasium.wrappers.vector.RecordEpisodeStatistics(GymVectorGame(game, mode))
-        counted.reset(seed=0)
-        ends = 0
-        for _ in range(9):
-            *_, terminated, truncated, infos = counted.step(np.zeros((6, 1), np.float32))
-            ends += int((terminated | truncated).sum())
-            if (terminated | truncated).any():
-                assert (infos["episode"]["l"][terminated | truncated] <= 5).all()
-        assert counted.episode_count == ends > 6
+def test_wrappers_of_gymnasium_count_every_episode(game):
+    counted = gymnasium.wrappers.vector.RecordEpisodeStatistics(GymVectorGame(game))
+    counted.reset(seed=0)
+    ends = 0
+    for _ in range(9):
+        *_, terminated, truncated, infos = counted.step(np.zeros((6, 1), np.float32))
+        ends += int((terminated | truncated).sum())
+        if (terminated | truncated).any():
+            assert (infos["episode"]["l"][terminated | truncated] <= 5).all()
+    assert counted.episode_count == ends > 6
 
 
 # Other processes

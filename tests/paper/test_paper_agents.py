@@ -12,7 +12,7 @@ from jaxba.game.random_scenes import SceneClass
 from jaxba.game.scene_bank import EASY_ENOUGH, MAX_RATIO, MIN_RATIO, BankConfig, Split, held_out_count, make_banks
 from jaxba.paper import agents, config
 from jaxba.paper.config import AgentsConfig, PaperConfig
-from jaxba.paper.tables_and_figures.small import SmallScene
+from jaxba.paper.tables_and_figures.figures import small_scene
 
 CONFIG = config.load("fast")
 
@@ -109,7 +109,7 @@ def test_a_fixed_lens_is_bitwise_unchanged_and_poses_change():
 
 
 def test_a_small_scene_is_determined_if_the_lens_is_known():
-    problem = SmallScene("s", "small", "5 x 5", 5, 3).read()
+    problem = small_scene(5, 3).read()
     assert (problem.num_cameras, problem.num_points, problem.num_observations) == (5, 5, 25)
     assert 2 * problem.num_observations > 6 * 5 + 3 * 5 - 7
     assert 2 * problem.num_observations < 9 * 5 + 3 * 5 - 7

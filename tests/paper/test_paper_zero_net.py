@@ -108,7 +108,7 @@ def test_three_layers_of_1280_have_the_papers_count_of_parameters():
 def test_a_network_is_read_as_it_was_written(tmp_path):
     net = zero_net.initial_network(SMALL, AGENT, jax.random.key(3))
     zero_net.save(tmp_path / "net.npz", net)
-    again = zero_net.restore(tmp_path / "net.npz", AGENT)
+    again = zero_net.restore(tmp_path / "net.npz", SMALL, AGENT)
     assert [p.name for p in tmp_path.iterdir()] == ["net.npz"]
     assert len(jax.tree.leaves(net)) == 6
     chex.assert_trees_all_equal(net, again, strict=True)

@@ -11,8 +11,8 @@ from jaxba import settings
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.game.random_scenes import SceneClass
 from jaxba.problem.options import StepOptions
-from jaxba.training import config
-from jaxba.training.config import SettingsError, TrainConfig, load, to_yaml
+from jaxba.settings import configurations
+from jaxba.training.config import SettingsError, TrainConfig, load
 from jaxba.training.sac import SacConfig
 
 
@@ -33,13 +33,13 @@ def refused(*overrides: str, name: str = "default") -> str:
 
 
 def test_the_presets_are_those_that_the_documentation_names():
-    assert {"default", "fast", "paper"} <= set(config.preset_names())
+    assert {"default", "fast", "paper"} <= set(configurations.names("train"))
 
 
-@pytest.mark.parametrize("name", config.preset_names())
+@pytest.mark.parametrize("name", configurations.names("train"))
 def test_what_is_written_reads_as_the_same_configuration(name, tmp_path):
     found = load(name)
-    assert load(written(tmp_path, to_yaml(found))) == found
+    assert load(written(tmp_path, settings.to_yaml(found))) == found
     assert hash(found) == hash(load(name))
 
 
@@ -182,7 +182,7 @@ def test_a_bad_file_is_named(text, message, tmp_path):
 
 
 def test_files_that_are_not_there_or_no_text(tmp_path):
-    known = ", ".join(config.preset_names())
+    known = ", ".join(configurations.names("train"))
     assert refused(name="fastest") == f"no configuration 'fastest'; known: {known}, or the path of a file"
     assert "No such file" in refused(name=str(tmp_path / "none.yaml"))
     assert "directory" in refused(name=f"{tmp_path}/").lower()

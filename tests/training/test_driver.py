@@ -20,7 +20,6 @@ from jaxba.game.random_scenes import Scenes
 from jaxba.game.scene_bank import Bank, Split
 from jaxba.runtime.atomic import TEMPORARY
 from jaxba.training import checkpoint, driver, log, task
-from jaxba.training.checkpoint import CheckpointError
 from jaxba.training.config import TrainConfig, load
 from jaxba.training.driver import Best, Hooks, Outcome, TrainError, prepare_folder
 from jaxba.training.sac import SacConfig
@@ -313,7 +312,7 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_is_one_line(tmp_path, monk
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(np, "savez", full)
-    with pytest.raises(CheckpointError, match=r"^[^\n]*step_6\.npz cannot be written: No space left on device$"):
+    with pytest.raises(TrainError, match=r"^[^\n]*step_6\.npz cannot be written: No space left on device$"):
         checkpoint.save(tmp_path, 6, checkpoint.pack(tree()), {}, 1)
     assert [item.name for item in tmp_path.iterdir()] == ["step_5.npz"]
 
@@ -329,7 +328,7 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_is_one_line(tmp_path, monk
 def test_a_checkpoint_of_something_else_is_refused(change, message):
     arrays = checkpoint.pack(tree())
     change(arrays)
-    with pytest.raises(CheckpointError, match=message):
+    with pytest.raises(TrainError, match=message):
         checkpoint.unpack(arrays, jax.eval_shape(tree))
 
 

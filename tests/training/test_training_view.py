@@ -1,23 +1,19 @@
-"""The live view of a training, and the page that it ends with."""
+"""The lines that a training prints, and the page that it ends with."""
 
 from __future__ import annotations
 
-import io
 import json
 import re
-from dataclasses import replace
 
 import browser
 import numpy as np
 import pytest
-from rich.console import Console
 
 from jaxba.bench import training_page
 from jaxba.bench.tables import Table
 from jaxba.game.evaluate import Score
 from jaxba.game.rollout import Trajectories
-from jaxba.training.config import load
-from jaxba.training.view import TrainingView
+from jaxba.training import view
 
 RULES = {
     "ceres": Score(6.0, 5.5, 6.0, 9.0, 0.02, 12.0, 1e-3),
@@ -37,41 +33,12 @@ def rows(chunk: int, scores: tuple[float, ...] | None = None) -> list[dict]:
     return found
 
 
-@pytest.fixture
-def config():
-    return replace(load("fast"), seeds=3, chunks=4)
-
-
-def shown(console: Console, drawn) -> str:
-    with console.capture() as capture:
-        console.print(drawn)
-    return capture.get()
-
-
-def test_a_terminal_shows_speed_spread_and_yardsticks(config):
-    console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
-    with TrainingView(console, config) as view:
-        view.rules = RULES
-        for chunk, scores in ((1, (5.0, 6.0, 7.0)), (2, (3.0, 4.0, 5.5))):
-            view.rows(rows(chunk, scores))
-        text = shown(console, view._drawn())
-    assert "chunk 2/4" in text
-    assert "1234 steps/s, 56 updates/s" in text
-    lines = {line.split("  ")[0]: line for line in text.splitlines()}
-    assert re.findall(r"[\d.]+", lines["held out: iterations"]) == ["4.17", "3.00", "5.50", "6.00", "5.00"]
-    assert re.findall(r"[\d.]+", lines["episodes of this chunk: iterations"]) == ["6.00", "5.00", "7.00", "7.50"]
-    assert re.findall(r"[\d.]+", lines["held out: failures (%)"])[0] == "1.00"
-    assert "█▁" in text
-
-
-def test_elsewhere_every_chunk_is_a_line(config):
-    file = io.StringIO()
-    with TrainingView(Console(file=file, width=200), config) as view:
-        view.rules = RULES
-        view.rows(rows(1, (5.0, 6.0, 7.0)))
-    lines = file.getvalue().splitlines()
-    assert lines[0] == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), 2 s"
-    assert lines[1].startswith("chunk 1/4: held out 6.00 iterations (5.00 to 7.00)")
+def test_a_chunk_has_a_line_and_its_held_out_scores_another():
+    first, second = view.lines(rows(1, (5.0, 6.0, 7.0)), 4, RULES, best=True)
+    assert first == "chunk 1/4: 1234 steps/s, 56 updates/s, 6.0 iterations (Ceres' rule 7.5), 2 s of 6"
+    assert second.startswith("chunk 1/4: held out 6.00 iterations (5.00 to 7.00)")
+    assert second.endswith(", failures 1.0 % (ceres 6.00, ceres+embedded 5.00), best so far")
+    assert len(view.lines(rows(2), 4, RULES)) == 1
 
 
 COSTS = 8.0 - np.tile([0, 1, 1, 2, 3, 4, 5, 6], (2, 1))

@@ -4,11 +4,8 @@ const root = document.documentElement;
 const state = { hidden: new Set(), axis: book.axes[0] || "", group: "0" };
 const all = (selector) => [...document.querySelectorAll(selector)];
 
-// A value of a trace is a list, or one list per axis of the switch, or the number of a column of the rows it refers to.
-function chosen(value, rows) {
-  if (value && typeof value === "object" && !Array.isArray(value)) value = value[state.axis];
-  return typeof value === "number" ? rows.map((row) => row[value]) : value;
-}
+// The numbers of a trace are a list, or one list per axis of the switch.
+const chosen = (values) => Array.isArray(values) ? values : values[state.axis];
 
 function themed() {
   const dark = root.dataset.theme === "dark";
@@ -28,14 +25,15 @@ const ink = (part) => part && part.color === "#000000" && root.dataset.theme ===
 function draw(chart) {
   const box = document.getElementById(chart.id);
   if (box.closest("[hidden]")) return;
-  const traces = chart.data.filter((trace) => !state.hidden.has(trace.meta)).map(({ rows, ...trace }) => {
-    const table = rows === undefined ? [] : book.rows[rows];
+  const traces = chart.data.filter((trace) => !state.hidden.has(trace.meta)).map((trace) => {
+    trace = { ...trace };
     for (const part of ["line", "marker"]) if (trace[part]) trace[part] = ink(trace[part]);
-    return { ...trace, customdata: table, x: chosen(trace.x, table), y: chosen(trace.y, table) };
+    return { ...trace, x: chosen(trace.x), y: chosen(trace.y) };
   });
   const xaxis = { ...chart.layout.xaxis, ...((chart.xaxes || {})[state.axis] || {}) };
   Plotly.react(box, traces, { ...chart.layout, xaxis, template: themed(), uirevision: state.axis },
     { responsive: true, displaylogo: false, plotlyServerURL: "", // without the button that sends a chart to a server
+      toImageButtonOptions: { format: "svg", filename: chart.title },
       modeBarButtons: [["toImage", "zoom2d", "pan2d", "resetScale2d"]] });
 }
 

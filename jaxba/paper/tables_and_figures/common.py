@@ -1,25 +1,112 @@
-"""What the tables and figures share: their rows, tables of rows, and phrases."""
+"""A table of the paper: methods on sets of problems, the claims that it tests, and its section of the report."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from jaxba.bench.sources import Source
-from jaxba.paper.markdown import Line, Section, lines_table
-from jaxba.paper.rows import Row
+from jaxba.bench.profile import ITERATION_LIMIT
+from jaxba.bench.tables import number, percentage
+from jaxba.paper.claims import Claim, Statement, judge
+from jaxba.paper.real_problems import Problems
+from jaxba.paper.results import Row
 from jaxba.paper.runner import Method, Runner, method_named
+from jaxba.solver.record import Record
 
 CLASSIC, CERES = "classic", "ceres"
-"""Names of the rules that all tables have: the paper's baseline and Ceres' rule."""
+"""Names of the rules with which every table compares: the paper's baseline and Ceres' rule."""
+
+SCENES = Problems("synthetic", ())
+"""Stands for the synthetic scenes, which are played and not solved one by one."""
 
 NOT_YET = "Not run in this folder yet."
 """Text of the report if there are no results."""
 
 
+class Line(NamedTuple):
+    """A method in a table, with the paper's iterations and seconds."""
+
+    label: str
+    method: Method
+    paper: float = math.nan
+    paper_s: float = math.nan
+
+
+def named(label: str, solver: str, paper: float = math.nan, paper_s: float = math.nan) -> Line:
+    """The line of a solver with a name of `jaxba-bench`."""
+    return Line(label, method_named(solver), paper, paper_s)
+
+
 @dataclass(frozen=True)
-class TableOrFigure:
+class Part:
+    """Methods on one set of problems."""
+
+    problems: Problems
+    """The problems, or `SCENES`."""
+
+    lines: Sequence[Line]
+    """Methods."""
+
+    statements: Sequence[Statement] = ()
+    """Claims about them; `{}` stands for the name of the problems."""
+
+    more: Callable[[Runner], Iterable[Claim]] = lambda _: ()
+    """Claims that rows do not tell."""
+
+    repeats: int = 0
+    """Repeats of each solve; as in the configuration if 0."""
+
+    limit: int = ITERATION_LIMIT
+    """Limit of linear solves."""
+
+    each: bool = False
+    """Whether a second table has the iterations on each problem."""
+
+    def run(self, runner: Runner) -> None:
+        """Computes the results that are missing."""
+        methods = [line.method for line in self.lines]
+        if self.problems is not SCENES:
+            runner.solve(self.problems.sources, methods, self.limit, self.repeats)
+            return
+        for method in methods:
+            runner.play(method)
+
+    def rows(self, runner: Runner) -> dict[str, Row]:
+        """By the name of a method, its row from the results so far, if there are any."""
+        on = runner.row_on_scenes if self.problems is SCENES else lambda m: runner.row_on(self.problems.sources, m)
+        found = (on(line.method) for line in self.lines)
+        return {row.method: row for row in found if row.solves}
+
+    def records(self, runner: Runner) -> list[Record]:
+        """The solves so far, of the first training run of each method."""
+        return runner.records_on(self.problems.sources, [line.method for line in self.lines])
+
+    def shown(self, runner: Runner, rows: Mapping[str, Row]) -> list[str]:
+        """Paragraphs and tables of the report."""
+        problems = self.problems
+        if problems.reason or not rows:
+            return [f"**{problems.name}**: {f'{problems.reason}.' if problems.reason else NOT_YET}"]
+        if problems is SCENES:
+            count = runner.number_of_scenes()
+            title = f"**{count} synthetic scenes** of the kind that the agents train on, none of them seen in training:"
+        else:
+            names = [source.name for source in problems.sources]
+            title = f"**{problems.name}**, {len(names)} problem{'s' * (len(names) != 1)}: {', '.join(names)}."
+            missing = ", ".join(f"`{name}`" for name in problems.missing)
+            title += f" In the configuration, but not on this machine: {missing}." if missing else ""
+        return [title, _comparison(self.lines, rows), *([self._per_problem(runner)] if self.each else [])]
+
+    def _per_problem(self, runner: Runner) -> str:
+        header = ["iterations to convergence / to f\\*(1+1e-3); ✗: not within 100", *(x.label for x in self.lines)]
+        cell = lambda source, line: _cell(runner.row_on([source], line.method))
+        return table(header, [[s.name, *(cell(s, line) for line in self.lines)] for s in self.problems.sources])
+
+
+@dataclass(frozen=True)
+class Table:
     """A table or figure of the paper."""
 
     name: str
@@ -28,63 +115,67 @@ class TableOrFigure:
     title: str
     """Description for `--list`."""
 
-    run: Callable[[Runner], None]
-    """Computes the results that are missing."""
+    heading: str
+    """Heading of its section."""
 
-    section: Callable[[Runner], Section]
-    """Makes the section of the report from the results so far."""
+    text: Callable[[Runner], str]
+    """Paragraph above the tables."""
 
+    parts: Callable[[Runner], list[Part]]
+    """Sets of problems with their methods and claims."""
 
-class Labelled(NamedTuple):
-    """A row before it is filled."""
+    def run(self, runner: Runner) -> None:
+        """Computes the results that are missing."""
+        for part in self.parts(runner):
+            part.run(runner)
 
-    label: str
-    method: Method
-    paper: float | None = None
-    """The paper's iterations."""
-    paper_s: float | None = None
-    """The paper's seconds."""
-
-
-def named(label: str, solver: str, paper: float | None = None, paper_s: float | None = None) -> Labelled:
-    """A row of a solver with a name of `jaxba-bench`."""
-    return Labelled(label, method_named(solver), paper, paper_s)
-
-
-def methods(rows: Sequence[Labelled]) -> list[Method]:
-    """The methods of the rows."""
-    return [row.method for row in rows]
+    def section(self, runner: Runner) -> tuple[list[str], list[Claim]]:
+        """Paragraphs of the report from the results so far, and the claims."""
+        body, claims = [self.text(runner)], []
+        for part in self.parts(runner):
+            rows = part.rows(runner)
+            claims += [*judge(part.statements, rows.get, part.problems.name), *part.more(runner)]
+            body += part.shown(runner, rows)
+        return [f"## {self.heading}", *filter(None, body)], claims
 
 
-class Lines(list[Line]):
-    """Rows of a table with our numbers."""
-
-    def __init__(self, runner: Runner, rows: Sequence[Labelled], sources: Sequence[Source] | None) -> None:
-        """Fills rows from the results so far, on real problems or, if None, on the scenes of the tables."""
-        pick = lambda method: runner.row_on_scenes(method) if sources is None else runner.row_on(sources, method)
-        super().__init__(Line(one.label, pick(one.method), one.paper, one.paper_s) for one in rows)
-        self.by_name = {line.row.method: line.row for line in self}
-
-    def known(self, method: str) -> Row | None:
-        """The row of a method, None if it was not run."""
-        row = self.by_name.get(method)
-        return row if row and row.solves else None
-
-    @property
-    def any(self) -> bool:
-        """Whether any method was run."""
-        return any(line.row.solves for line in self)
-
-    def table(self, with_time: bool = False) -> str:
-        """The table in Markdown, with ratios to classic and to Ceres' rule."""
-        return lines_table(self, self.by_name.get(CLASSIC), self.by_name.get(CERES), with_time)
+def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; the first column is aligned left, the others right."""
+    marks = [":--", *["--:"] * (len(header) - 1)]
+    plain = lambda cell: re.sub(r"([|<>*])", r"\\\1", " ".join(cell.split()))
+    lines = [header, marks, *([plain(cell) for cell in row] for row in body)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def problems(count: int) -> str:
-    """`1 problem`, `2 problems` and so on."""
-    return f"{count} problem{'' if count == 1 else 's'}"
+def format_iterations(value: float) -> str:
+    """A number of iterations with at most one decimal; a dash for NaN."""
+    return "-" if math.isnan(value) else f"{value:.1f}".removesuffix(".0")
 
 
-def listed(sources: Sequence[Source]) -> str:
-    """Names of problems."""
-    return ", ".join(source.name for source in sources)
+def _cell(row: Row) -> str:
+    if not row.solves:
+        return "-"
+    fraction = f" ({100 * row.success:.0f} %)" if 0 < row.success < 1 else ""
+    end = "✗" if row.success == 0 else format_iterations(row.iterations)
+    return f"{end}{fraction} / {'✗' if row.near >= ITERATION_LIMIT else format_iterations(row.near)}"
+
+
+def _comparison(lines: Sequence[Line], rows: Mapping[str, Row]) -> str:
+    """Every method beside the paper's numbers, and over classic and Ceres' rule; seconds where they were measured."""
+    timed = any(math.isfinite(row.seconds) for row in rows.values())
+    header = ["method", "paper", "ours", "seeds: range", "success", "to f\\*(1+1e-3)", "good ends"]
+    header += ["of classic: paper", "ours", "of Ceres' rule", *(["paper s", "s"] if timed else [])]
+    papers = next((line.paper for line in lines if line.method.name == CLASSIC), math.nan)
+    over = lambda row, base: row.iterations / rows[base].iterations if base in rows else math.nan
+    body = []
+    for line in lines:
+        row = rows.get(line.method.name) or Row(line.method.name, *[math.nan] * 6, seeds=0, solves=0)
+        spread = "rule" if row.solves else "-"
+        if row.seeds:
+            spread = f"{row.seeds}: {format_iterations(row.low)} to {format_iterations(row.high)}"
+        cells = [line.label, format_iterations(line.paper), format_iterations(row.iterations), spread]
+        cells += [percentage(row.success), format_iterations(row.near), percentage(row.good_ends)]
+        cells += [number(x, 2) for x in (line.paper / papers, over(row, CLASSIC), over(row, CERES))]
+        cells += [number(line.paper_s, 4), number(row.seconds, 3)] if timed else []
+        body.append(cells)
+    return table(header, body)
