@@ -1,4 +1,4 @@
-"""Writes the results of a benchmark: `summary.json`, and `report.html`, one page that needs no other file."""
+"""Writes the results of a benchmark: a summary, a page that needs no other file, and a picture of the profiles."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 from jaxba.bench import page, profile
 from jaxba.bench.charts import AXES, problem_charts, profile_chart, solver_styles
+from jaxba.bench.pictures import save_picture
 from jaxba.bench.summary import Summary, summarize, write_summary
 from jaxba.bench.tables import problem_table, tables
 from jaxba.problem.bundle_problem import ProblemError
@@ -23,7 +24,9 @@ def write_all(
     *,
     metadata: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """Writes `summary.json` and `report.html` into a folder and returns their paths. Existing files are replaced.
+    """Writes `summary.json`, `report.html` and `profile.png` into a folder and returns their paths.
+
+    Existing files are replaced. The picture has the performance profile at the tolerance, by iterations and by time.
 
     Args:
         records: at least one.
@@ -43,9 +46,11 @@ def write_all(
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     summary = summarize(records, tolerance, metadata or run_metadata(records))
-    files = [folder / "summary.json", folder / "report.html"]
+    files = [folder / "summary.json", folder / "report.html", folder / "profile.png"]
     write_summary(files[0], summary)
     write_text(files[1], to_html(records, summary, tolerance))
+    styles = solver_styles(profile.solver_names(records))
+    save_picture(profile_chart(records, profile.Target("tau", tolerance), styles), files[2])
     return files
 
 

@@ -108,7 +108,7 @@ def _check_apart(args: Arguments, jobs: Any) -> None:
     from jaxba.bench import run
     from jaxba.cli.overwriting import PROBLEM, check_apart, policy_file, problem_files
 
-    names = (run.SETTINGS, run.RESULTS, "summary.json", "report.html")
+    names = (run.SETTINGS, run.RESULTS, "summary.json", "report.html", "profile.png")
     problems = [one for job in jobs for one in problem_files(job.source.location)]
     policies = [policy_file(job.solver.policy) for job in jobs]
     read = {PROBLEM: problems, "a policy": policies, "the file of --suite": [args.suite]}

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from jaxba.bench import charts
+from jaxba.bench.pictures import picture
+from jaxba.bench.profile import Target
 from jaxba.bench.report import run_metadata, to_html, write_all
 from jaxba.bench.summary import summarize
 from jaxba.problem.bundle_problem import ProblemError
@@ -67,7 +69,21 @@ def page_of(records, tolerance=1e-3, **metadata):
 def test_write_all_writes_the_documented_files(tmp_path):
     records = [make_record("a", "classic", 30), make_record("a", "ceres", 14), make_record("dir/b c", "classic", 12)]
     files = write_all(records, tmp_path / "out", 1e-3, metadata={"device": "<cpu>", "threads": 2})
-    assert names(tmp_path / "out") == {"summary.json", "report.html"} == {path.name for path in files}
+    assert names(tmp_path / "out") == {"summary.json", "report.html", "profile.png"} == {path.name for path in files}
+    assert files[2].read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_picture_of_a_profile_has_the_curves_of_the_chart():
+    records = [make_record("a", "x", 12, rate=0.1), make_record("a", "y", 12, rate=0.37)]
+    styles = charts.solver_styles(["x", "y"])
+    chart = charts.profile_chart(records, Target("relative", 1e-2), styles)
+    by_iterations, by_time = picture(chart).axes
+    assert (by_iterations.get_xscale(), by_time.get_xscale()) == ("log", "log")
+    for line, solver, trace in zip(by_iterations.get_lines(), ("x", "y"), chart["data"], strict=True):
+        assert line.get_color() == styles[solver].color
+        np.testing.assert_array_equal(
+            line.get_xydata(), np.transpose([trace["x"]["iterations"], trace["y"]["iterations"]])
+        )
 
 
 def test_report_is_self_contained_well_formed_and_escaped():
