@@ -2,12 +2,11 @@
 
 from jaxba.damping.learned import AgentPolicy, ConstantAction, LearnedPolicy
 from jaxba.damping.policy import DampingPolicy, ProblemInfo
-from jaxba.damping.policy_file import PolicyFileError, load_policy, save_policy
+from jaxba.damping.policy_file import load_policy, save_policy
 from jaxba.damping.registry import (
     LEARNED,
     LEARNED_PLAIN,
     POLICIES,
-    UnknownPolicyError,
     brings_embedded,
     is_learned,
     make_policy,
@@ -25,10 +24,8 @@ __all__ = [
     "DampingPolicy",
     "Geometric",
     "LearnedPolicy",
-    "PolicyFileError",
     "ProblemInfo",
     "Schedule",
-    "UnknownPolicyError",
     "brings_embedded",
     "is_learned",
     "load_policy",

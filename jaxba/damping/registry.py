@@ -66,10 +66,6 @@ CONSTANT = "constant"
 """Prefix of `constant:VALUE`."""
 
 
-class UnknownPolicyError(InputError):
-    """A name that is not a policy. The message is one line for a person."""
-
-
 def make_policy(name: str) -> DampingPolicy:
     """The policy called `name`.
 
@@ -79,8 +75,7 @@ def make_policy(name: str) -> DampingPolicy:
             `constant:LAMBDA`.
 
     Raises:
-        UnknownPolicyError: no such policy, or a lambda that is not a positive number.
-        PolicyFileError: a path, but not of a policy file.
+        InputError: no such policy, a lambda that is not a positive number, or a path that is not of a policy file.
     """
     if name in SHIPPED:
         return _shipped(name)
@@ -92,17 +87,17 @@ def make_policy(name: str) -> DampingPolicy:
     if base == CONSTANT:
         return Schedule(values=(_damping(name, number),))
     if "+" in base:
-        raise UnknownPolicyError(
+        raise InputError(
             f"unknown damping policy {name!r}: its name has no '+'; the method and embedded iterations are options"
         )
     if base not in POLICIES:
         known = ", ".join([LEARNED, *POLICIES, "constant:LAMBDA", f"FILE{SUFFIX}"])
-        raise UnknownPolicyError(f"unknown damping policy {name!r}; known: {known}")
+        raise InputError(f"unknown damping policy {name!r}; known: {known}")
     policy = POLICIES[base][0]()
     if not colon:
         return policy
     if not hasattr(policy, "initial"):
-        raise UnknownPolicyError(f"{base!r} has no first lambda to set; use constant:LAMBDA")
+        raise InputError(f"{base!r} has no first lambda to set; use constant:LAMBDA")
     return replace(policy, initial=_damping(name, number))  # type: ignore[type-var]
 
 
@@ -126,5 +121,5 @@ def _damping(name: str, number: str) -> float:
     except ValueError:
         value = math.nan
     if not (value > 0 and math.isfinite(value)):
-        raise UnknownPolicyError(f"{name!r}: lambda must be a positive number, not {number!r}")
+        raise InputError(f"{name!r}: lambda must be a positive number, not {number!r}")
     return value

@@ -19,8 +19,8 @@ from jaxtyping import Float, Int
 
 from jaxba.linear.conjugate_gradients import conjugate_gradients
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.schur import CameraSystem, PointSystem, jacobian_product
-from jaxba.lm.method import DampedSystem, MethodStep
+from jaxba.linear.schur import CameraSystem, DampedSystem, PointSystem, jacobian_product
+from jaxba.lm.method import MethodStep
 from jaxba.methods.subspace import SubspaceMethod, best_in_span
 from jaxba.model.linearize import Linearization
 from jaxba.problem.options import ConjugateGradients, StepOptions

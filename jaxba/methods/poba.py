@@ -19,8 +19,8 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.linear.preconditioners import block_inverse
-from jaxba.linear.schur import CameraSystem, apply_reduced
-from jaxba.lm.method import DampedSystem, MethodStep
+from jaxba.linear.schur import CameraSystem, DampedSystem, apply_reduced
+from jaxba.lm.method import MethodStep
 from jaxba.methods.subspace import SubspaceMethod, best_in_span
 from jaxba.problem.options import StepOptions, check_count
 from jaxba.runtime import loops
@@ -41,7 +41,7 @@ class PowerSeries(SubspaceMethod):
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""
-        product = lambda x: apply_reduced(system.layout, system.linear, system.points, system.cameras, x)
+        product = lambda x: apply_reduced(system, x)
         inverse = block_inverse(system.cameras.blocks)
         step = series(product, system.cameras, inverse, system.cameras.right, self.order)
         improved = options.kept_steps > 0

@@ -18,7 +18,6 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxba.linear.schur import jacobian_product
-from jaxba.linear.step import Step
 from jaxba.lm.records import LMState, StepInfo
 from jaxba.lm.step import Proposal, initial_state, try_step
 from jaxba.model.linearize import linearize
@@ -27,9 +26,10 @@ from jaxba.peers.colmap import pyceres
 from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.geometry import COLMAP_FLIP as FLIP
 from jaxba.problem.options import ConjugateGradients, StepOptions
+from jaxba.refinement.acceptance import Step
 from jaxba.runtime.jit import jit
 from jaxba.solver.place import Placed
-from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.layout import Layout, build_layout
 
 FORCED_DECREASE = 1e200
 """Decrease of the cost by `AcceptAnyStep`, pixels squared: larger than the cost of any useful candidate."""
@@ -92,7 +92,7 @@ class StepAcceptance:
         )
         self.run, self.min_gain = run, np.float64(min_gain)
         problem = run.colmap.start
-        self.layout = jax.device_put(layout_for(problem, self.options))
+        self.layout = jax.device_put(build_layout(problem, self.options))
         self.state = initial_state(self.layout, problem, self.options)
         self.accept_any = AcceptAnyStep()
         run.colmap.add_point_cost(self.accept_any, int(problem.point_index[0]))

@@ -37,7 +37,7 @@ from jaxba.problem.rigs import EXTRINSICS_SIZE
 from jaxba.runtime.jit import jit
 from jaxba.runtime.numerics import numerics
 from jaxba.solver.place import check_problem, placed
-from jaxba.structure.layout import Layout, layout_for
+from jaxba.structure.layout import Layout, build_layout
 from jaxba.typing import ArrayRecord
 
 UNDETERMINED = 1e-9
@@ -134,7 +134,7 @@ def covariance(problem: BundleProblem, *, loss: Loss | None = None) -> Covarianc
         hint = "fix them with a gauge, constants or priors"
         raise ProblemError(f"{which} not determined by what is observed; {hint}")
     with numerics(np.float64):
-        layout = layout_for(problem, options)
+        layout = build_layout(problem, options)
         linear = jax.device_get(jit(_linear, static_argnames="options")(layout, problem, options))
     index, count = _unknown_index(problem, layout)
     free_points = np.ones(problem.num_points, bool)

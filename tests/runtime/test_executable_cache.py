@@ -106,7 +106,7 @@ def test_a_second_solve_reads_all_its_programs_and_repeats_itself_bit_by_bit(how
     with Compilations() as seen:
         again = once()
     parts = (
-        "initial_state",
+        "state_of",
         "problem_info",
         "begin",
         "propose",
