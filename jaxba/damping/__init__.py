@@ -5,7 +5,6 @@ from jaxba.damping.policy import DampingPolicy, ProblemInfo
 from jaxba.damping.policy_file import load_policy, save_policy
 from jaxba.damping.registry import (
     LEARNED,
-    LEARNED_PLAIN,
     POLICIES,
     brings_embedded,
     is_learned,
@@ -15,7 +14,6 @@ from jaxba.damping.rules import Ceres, Classic, Geometric, Schedule
 
 __all__ = [
     "LEARNED",
-    "LEARNED_PLAIN",
     "POLICIES",
     "AgentPolicy",
     "Ceres",

@@ -14,26 +14,25 @@ from jaxba.damping.policy_file import load_policy
 from jaxba.damping.rules import Ceres, Classic, Schedule, gauss_newton, gtsam, nielsen, stba, theseus
 from jaxba.typing import InputError
 
-LEARNED, LEARNED_PLAIN, LEARNED_DRIVER = "learned", "learned-plain", "learned-driver"
-"""The shipped policies: for a step with embedded iterations; for lambda alone (`learned+refine0`); and for lambda alone
-if another library makes the step and damps cameras and points alike. In the name of a solver, `learned` means the one
-that fits the step (solver/names.py)."""
+LEARNED, BOLD = "learned", "bold"
+"""Shipped networks, and the guard and step of the same without a network."""
+
+PLAIN, DRIVER = "-plain", "-driver"
+"""Endings of their variants: for lambda alone (`learned+refine0`), and for lambda alone if another library makes the
+step and damps cameras and points alike. In the name of a solver, `learned` and `bold` mean the one that fits the step
+(solver/names.py)."""
 
 SHIPPED = {
     LEARNED: "default.safetensors",
-    LEARNED_PLAIN: "plain.safetensors",
-    LEARNED_DRIVER: "driver.safetensors",
+    LEARNED + PLAIN: "plain.safetensors",
+    LEARNED + DRIVER: "driver.safetensors",
 }
 """Their files in `jaxba/policies`, each trained with the preset of `jaxba-train` that has the file's name."""
-
-BOLD, BOLD_PLAIN, BOLD_DRIVER = "bold", "bold-plain", "bold-driver"
-"""No network, but the guard and the step of the shipped policies, in the same order. In the name of a solver, `bold`
-means the one that fits the step."""
 
 GUARDED = "guarded"
 """The default policy of a solve."""
 
-_GUARD_OF = {BOLD: LEARNED, BOLD_PLAIN: LEARNED_PLAIN, BOLD_DRIVER: LEARNED_DRIVER}
+_GUARD_OF = {BOLD + name.removeprefix(LEARNED): name for name in SHIPPED}
 
 
 def bold(guard_of: str = LEARNED) -> ConstantAction:

@@ -13,7 +13,7 @@ from typing import cast, get_args
 from jaxba.damping import DampingPolicy, brings_embedded, make_policy
 from jaxba.damping.agent_config import AgentConfig
 from jaxba.damping.policy import trained_step
-from jaxba.damping.registry import BOLD, BOLD_DRIVER, BOLD_PLAIN, LEARNED, LEARNED_DRIVER, LEARNED_PLAIN, SUFFIX
+from jaxba.damping.registry import BOLD, DRIVER, LEARNED, PLAIN, SUFFIX
 from jaxba.problem.options import Refinement, StepOptions
 from jaxba.solver.methods import DEFAULT_METHOD, METHODS, make_method
 from jaxba.solver.options import Dtype, SolveOptions
@@ -141,14 +141,9 @@ def fitting_policy(policy: str, *, alone: bool = False, peer: bool = False) -> s
     Returns:
         A name for `make_policy`; other names than `learned` and `bold` are unchanged.
     """
-    if policy not in _ALONE or not alone:
+    if policy not in (LEARNED, BOLD) or not alone:
         return policy
-    plain, driver = _ALONE[policy]
-    return driver if peer else plain
-
-
-_ALONE = {LEARNED: (LEARNED_PLAIN, LEARNED_DRIVER), BOLD: (BOLD_PLAIN, BOLD_DRIVER)}
-"""Variants of these policies for steps without refinement: for jaxba's step, and for that of another library."""
+    return policy + (DRIVER if peer else PLAIN)
 
 
 def parse_solver(name: str) -> SolverName:

@@ -179,7 +179,8 @@ REWARDS = Ablation(
     lambda _: (
         "An iteration of the compiled game has no duration of its own. The clock gives it one of "
         f"{len(DURATIONS)} quantiles of measured durations, {min(DURATIONS):g} to {max(DURATIONS):g} of their mean "
-        f"(`jaxba/damping/features.py`), and the mean is the paper's on BAL, {agents.SECONDS:g} s, against a bonus of 10. "
+        f"(`jaxba/damping/features.py`), and the mean is the paper's on BAL, {agents.SECONDS:g} s, against a bonus "
+        "of 10. "
         "The agent of the other ablations has the constant reward. The shrinking bonus loses 1 % of its first value in "
         "each iteration."
     ),
