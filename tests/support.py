@@ -204,7 +204,7 @@ def step_info(accepted: bool, gain: float = 1.0, damping: float = 1.0, dtype=jnp
         **{name: number(value) for name, value in values.items()},
         accepted=jnp.asarray(accepted),
         weightless=jnp.asarray(False),
-        **dict.fromkeys(("cg_iterations", "repairs", "camera_rounds", "point_iterations"), jnp.asarray(0, jnp.int32)),
+        **dict.fromkeys(("cg_iterations", "repairs"), jnp.asarray(0, jnp.int32)),
     )
 
 

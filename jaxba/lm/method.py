@@ -30,9 +30,6 @@ class MethodStep(NamedTuple):
 class StepMethod(MethodTraits, ABC):
     """A way to compute the step of an iteration."""
 
-    description: str
-    """One line for the user."""
-
     rule: str = "ceres"
     """Name of the damping rule that the method was published with."""
 
@@ -63,7 +60,6 @@ class LevenbergMarquardt(StepMethod):
     """The method `lm`, which options without a method mean."""
 
     name = "lm"
-    description = "Levenberg-Marquardt: one reduced camera system, factored or by conjugate gradients"
 
     def options(self, base: StepOptions) -> StepOptions:
         """See `StepMethod`."""

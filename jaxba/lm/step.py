@@ -31,7 +31,7 @@ from jaxba.problem.bundle_problem import BundleProblem
 from jaxba.problem.intrinsics import POSE_SIZE
 from jaxba.problem.options import StepOptions
 from jaxba.problem.safe_math import safe_divide, safe_sqrt
-from jaxba.refinement.acceptance import COUNTS, Candidate, Step, comparison
+from jaxba.refinement.acceptance import Candidate, Step, comparison
 from jaxba.refinement.candidates import best_candidate
 from jaxba.runtime.numerics import check_x64, for_traces
 from jaxba.structure.devices import sum_over_devices
@@ -182,7 +182,7 @@ def take_step(
         step_fraction=candidate.step_fraction,
         damping_fraction=jnp.clip(safe_divide(step.damped, step.slope), 0, 1),
         weightless=proposal.weightless,
-        **{name: getattr(candidate, name) for name in COUNTS},
+        repairs=candidate.repairs,
     )
 
 

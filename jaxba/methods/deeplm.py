@@ -38,7 +38,6 @@ class GlobalConjugateGradients(SubspaceMethod):
     """Stopping rule; the preconditioner field is ignored. Source of 1e-3 and 150: the authors' code."""
 
     name = "deeplm"
-    description = "DeepLM's global solver: conjugate gradients on cameras and points together"
 
     def solve(self, system: DampedSystem, options: StepOptions) -> MethodStep:
         """See `StepMethod`."""

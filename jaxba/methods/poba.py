@@ -34,7 +34,6 @@ class PowerSeries(SubspaceMethod):
     """Order of the series: the highest power. Source: Weber et al. 2023, section 5."""
 
     name = "poba"
-    description = "power bundle adjustment: a power series for the inverse of the reduced camera system"
 
     def __post_init__(self) -> None:
         check_count("order", self.order, 0)

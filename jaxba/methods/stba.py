@@ -61,7 +61,6 @@ class StochasticClusters(StepMethod):
     """Richardson iterations on the true system after the clusters' solution. Source: the authors' code."""
 
     name = "stba"
-    description = "stochastic bundle adjustment: random clusters of cameras, then four Richardson iterations"
     rule = "stba"
     forms_reduced_system = True
 

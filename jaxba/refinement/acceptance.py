@@ -68,10 +68,6 @@ class Step(NamedTuple):
         return fraction * (0.5 * fraction * self.damped + (1 - 0.5 * fraction) * self.slope)
 
 
-COUNTS = ("repairs", "camera_rounds", "point_iterations")
-"""Fields of a candidate that count what the search for it took."""
-
-
 class Candidate(NamedTuple):
     """Proposed parameters, with the accept decision."""
 
@@ -83,8 +79,6 @@ class Candidate(NamedTuple):
     accepted: Bool[Array, ""]
     step_fraction: Float[Array, ""]  # length relative to the full step
     repairs: Int[Array, ""]  # camera rounds, trials and pattern moves after the first candidate
-    camera_rounds: Int[Array, ""]  # the camera rounds among them
-    point_iterations: Int[Array, ""]  # of all candidates, as many as each might make
 
 
 class Comparison(NamedTuple):
@@ -138,7 +132,7 @@ def assess(
     cameras: Float[Array, "parameters cameras"],
     points: Float[Array, "3 points"],
     step_fraction: Float[Array, ""],
-    before: Candidate,
+    repairs: Int[Array, ""],
     full_step: Bool[Array, ""],
 ) -> Candidate:
     """Refines the points of a candidate and decides whether it is accepted.
@@ -148,13 +142,11 @@ def assess(
         cameras: cameras of the candidate.
         points: points before their embedded iterations.
         step_fraction: it scales the predicted decrease.
-        before: the last candidate; the new one takes a repair more than it did.
+        repairs: camera rounds, trials and pattern moves until then, with this one.
         full_step: whether this is the full step, after which points may also start from their rays.
     """
     layout = against.layout
     predicted = against.step.predicted(step_fraction)
-    point_iterations = (before.point_iterations + against.options.refinement.points).astype(jnp.int32)
-    counts = before.repairs + 1, before.camera_rounds, point_iterations
     points, terms = _refined(against, cameras, points, predicted, full_step)
     cost, decrease = (sum_over_devices(layout, total(each)) for each in (terms, against.terms - terms))
     gain = safe_divide(decrease, predicted)
@@ -163,7 +155,7 @@ def assess(
     rounding = float(jnp.finfo(against.cost.dtype).eps) * against.cost
     accepted = accepted & ((predicted > rounding) | (decrease > COST_ROUNDING * rounding))
     accepted = accepted & jnp.isfinite(cost) & jnp.all(keep_focal_signs(against.cameras, cameras))
-    return Candidate(cameras, points, cost, predicted, gain, accepted, step_fraction, *counts)
+    return Candidate(cameras, points, cost, predicted, gain, accepted, step_fraction, repairs)
 
 
 def _refined(

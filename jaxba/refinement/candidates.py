@@ -30,7 +30,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxba.problem.options import StepOptions
-from jaxba.refinement.acceptance import COUNTS, Candidate, Comparison, Step, assess, select
+from jaxba.refinement.acceptance import Candidate, Comparison, Step, assess, select
 from jaxba.refinement.cameras import refine_cameras
 from jaxba.refinement.retraction import keep_focal_signs, move_cameras, step_between
 from jaxba.runtime import loops
@@ -121,9 +121,9 @@ def first_search(cameras: Any, points: Any, cost: Any, step: Step) -> Search:
     """
     constant = lambda value, dtype: cast(Array, np.full(cost.shape, value, dtype))
     one, infinite = constant(1, cost.dtype), constant(np.inf, cost.dtype)
-    yes, no, none = constant(1, bool), constant(0, bool), constant(0, np.int32)
-    initial = Candidate(cameras, points, infinite, -one, -infinite, no, one, constant(-1, np.int32), none, none)
-    return Search(initial, cameras, points, (step.cameras, step.points), one, yes, initial, none, no)
+    yes, no = constant(1, bool), constant(0, bool)
+    initial = Candidate(cameras, points, infinite, -one, -infinite, no, one, constant(-1, np.int32))
+    return Search(initial, cameras, points, (step.cameras, step.points), one, yes, initial, constant(0, np.int32), no)
 
 
 def _assess_next(against: Comparison, search: Search, refined: Float[Array, "parameters cameras"]) -> Candidate:
@@ -136,11 +136,10 @@ def _assess_next(against: Comparison, search: Search, refined: Float[Array, "par
     fraction = jnp.where(best.accepted, best.step_fraction, search.length)
     full_step = _is_full_step(search) & search.active
     last, refining = search.candidate, search.refining
-    again = last._replace(camera_rounds=last.camera_rounds + 1)
-    cameras, points, fraction, before = select(
-        refining, (refined, last.points, last.step_fraction, again), (cameras, points, fraction, best)
+    cameras, points, fraction, repairs = select(
+        refining, (refined, last.points, last.step_fraction, last.repairs), (cameras, points, fraction, best.repairs)
     )
-    return assess(against, cameras, points, fraction, before, full_step & ~refining)
+    return assess(against, cameras, points, fraction, repairs + 1, full_step & ~refining)
 
 
 def _is_full_step(search: Search) -> Bool[Array, ""]:
@@ -168,7 +167,7 @@ def _after_candidate(against: Comparison, search: Search) -> Search:
     best, candidate = search.best, search.candidate
     first = candidate.accepted & ~best.accepted
     better = candidate.accepted & best.accepted & (candidate.cost < best.cost)
-    tried = best._replace(**select(search.active, *({n: getattr(x, n) for n in COUNTS} for x in (candidate, best))))
+    tried = best._replace(repairs=jnp.where(search.active, candidate.repairs, best.repairs))
     best_now = select(search.active & (better | ~best.accepted), candidate, tried)
     refinement = against.options.refinement
     shortest = 1.5 * SHORTER ** (refinement.trials - 1)

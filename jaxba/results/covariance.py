@@ -269,8 +269,8 @@ def _system(
     used = place >= 0
     at = np.repeat(rows, index.shape[1])
     parts, height = [csr_matrix((by_camera.ravel()[used], (at[used], place[used])), (len(rows), count))], len(rows)
-    for priors in linear.priors:
-        parts, height = [*parts, _prior_rows(index, count, np.asarray(priors.blocks))], height + index.size
+    for blocks, _ in linear.priors:
+        parts, height = [*parts, _prior_rows(index, count, np.asarray(blocks))], height + index.size
     place = np.repeat(3 * point[:, None] + np.arange(3), 2, axis=0).ravel()
     seen, starts = np.bincount(point, minlength=points) > 0, np.searchsorted(point, np.arange(points + 1))
     by_points = csr_matrix((by_point.ravel(), (np.repeat(rows, 3), place)), (height, 3 * points))

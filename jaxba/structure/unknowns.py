@@ -92,12 +92,6 @@ class Unknowns(ArrayRecord):
         return self.poses.several or self.lenses.several
 
     @property
-    def plain(self) -> bool:
-        """Whether all numbers of BAL cameras and points are optimised, each by itself, and nothing else."""
-        whole = self.models == (BAL,) and len(self.columns) == self.size
-        return whole and self.free.everywhere and self.free_points.everywhere and not (self.shared or self.priors)
-
-    @property
     def width(self) -> int:
         """Number of unknowns in a camera's block."""
         return POSE_SIZE + len(self.columns)
